@@ -1,0 +1,67 @@
+"""Functions that are smooth where their textbook formulas divide zero by zero.
+
+Each takes the squared angle (or squared radius): in that variable the functions are analytic, so that
+values and derivatives of every order are exact on the axis and at any distance from it.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+# Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
+# them still has a first derivative good to 1e-13 of the function's own scale.
+_SMALL_ANGLE2 = 1e-2
+_SMALL_SLOPE2 = 1e-3
+
+
+def _series(t: Tensor, coefficients: list[float]) -> Tensor:
+    result = torch.full_like(t, coefficients[-1])
+    for c in reversed(coefficients[:-1]):
+        result = result * t + c
+    return result
+
+
+def _blend(t: Tensor, series: list[float], closed_form) -> Tensor:
+    small = t < _SMALL_ANGLE2
+    return torch.where(
+        small, _series(torch.where(small, t, 0.0), series), closed_form(torch.where(small, 1.0, t).sqrt())
+    )
+
+
+_COS = [(-1) ** n / math.factorial(2 * n) for n in range(8)]
+_SINC = [(-1) ** n / math.factorial(2 * n + 1) for n in range(8)]
+_COSC = [(-1) ** n / math.factorial(2 * n + 2) for n in range(8)]
+_ATAN = [(-1) ** n / (2 * n + 1) for n in range(8)]
+
+
+def cos_root(t: Tensor) -> Tensor:
+    """cos(theta) of t = theta^2."""
+    return _blend(t, _COS, torch.cos)
+
+
+def sinc_root(t: Tensor) -> Tensor:
+    """sin(theta) / theta of t = theta^2."""
+    return _blend(t, _SINC, lambda angle: torch.sin(angle) / angle)
+
+
+def cosc_root(t: Tensor) -> Tensor:
+    """(1 - cos(theta)) / theta^2 of t = theta^2."""
+
+    def half_angle(angle: Tensor) -> Tensor:  # 1 - cos cancels, sin^2 of the half does not
+        ratio = torch.sin(angle / 2) / angle
+        return 2 * ratio * ratio
+
+    return _blend(t, _COSC, half_angle)
+
+
+def angle_per_radius(rho2: Tensor, z: Tensor) -> Tensor:
+    """theta / rho with theta = atan2(rho, z) in [0, pi] and rho2 = rho^2; 1 / z on the axis.
+
+    Needs rho2 > 0 where z <= 0: the exact backward direction has every azimuth at once.
+    """
+    small = (z > 0) & (rho2 < _SMALL_SLOPE2 * z * z)
+    reciprocal = 1 / torch.where(small, z, 1.0)
+    near = reciprocal * _series(torch.where(small, rho2, 0.0) * reciprocal * reciprocal, _ATAN)
+    rho = torch.where(small, 1.0, rho2).sqrt()
+    return torch.where(small, near, torch.atan2(rho, z) / rho)

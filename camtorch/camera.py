@@ -1,0 +1,372 @@
+"""The camera: everything that follows from a chart and a lens, written once for all models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from camtorch.charts import Chart
+from camtorch.folds import FoldLimits
+from camtorch.lens import Lens
+from camtorch.parameters import as_image_size, as_parameter, as_planes, columns, is_concrete
+from camtorch.solve import attach
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+MODELS: dict[str, type[Camera]] = {}
+"""Every camera model by its key; defining a model adds it."""
+
+_INVALID_PIXEL = -1.0  # outside every picture, so that `contains` is False for it as well
+_TABLE_RADII = 256
+
+
+class Camera(nn.Module):
+    """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
+
+    A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
+
+    Convention: camera frame x right, y down, z forward. Pixels (u, v), u right, v down, the centre of the
+    top-left pixel is (0, 0). Image sizes are (height, width). Angles are radians.
+
+    Shapes: `*B` are the camera's batch dims, `*N` any number of point dims after them. A camera without
+    batch dims takes any shape. Batch dims of size 1 broadcast.
+
+    Args:
+        intrinsics: (*B, 4) fx, fy, cx, cy in pixels.
+        distortion: (*B, n) coefficients in the order of `distortion_names`; zeros if left out.
+        image_size: (height, width) in pixels, shared by the batch; needed only where a picture is concerned.
+
+    Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s. A tensor that requires grad
+    is kept as it is, so that gradients reach the network that predicted it.
+
+    Raises:
+        ValueError: a wrong shape or number of coefficients, NaN or infinite values, a focal length or an
+            image size that is not positive.
+        TypeError: parameters that are not numbers, an image size that is not two integers.
+    """
+
+    key: ClassVar[str]
+    distortion_names: Sequence[str] = ()
+    default_count: ClassVar[int] = 0
+    """How many zero coefficients a camera has that is made without distortion."""
+    odd_in_x: ClassVar[frozenset[str]] = frozenset()
+    """The coefficients that change sign when the scene is mirrored left to right."""
+    odd_in_y: ClassVar[frozenset[str]] = frozenset()
+    """Likewise top to bottom."""
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        if "key" in cls.__dict__:
+            MODELS[cls.key] = cls
+
+    def __init__(self, intrinsics, distortion=None, *, image_size: tuple[int, int] | None = None):
+        super().__init__()
+        owner = type(self).__name__
+        intrinsics = as_parameter(intrinsics, "intrinsics", owner)
+        if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
+            hint = f". For a matrix K use {owner}.from_matrix" if intrinsics.shape[-2:] == (3, 3) else ""
+            raise ValueError(
+                f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
+            )
+        if is_concrete(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
+            raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
+        if distortion is None:
+            distortion = intrinsics.detach().new_zeros((*intrinsics.shape[:-1], self.default_count))
+        distortion = as_parameter(distortion, "distortion", owner)
+        names = self.names_of(distortion.shape[-1]) if distortion.ndim else None
+        if names is None:
+            raise ValueError(
+                f"{owner}: distortion must be (*B, n) with {self.counts_text()}; got shape {tuple(distortion.shape)}"
+            )
+        try:
+            batch = torch.broadcast_shapes(intrinsics.shape[:-1], distortion.shape[:-1])
+        except RuntimeError:
+            raise ValueError(
+                f"{owner}: intrinsics {tuple(intrinsics.shape)} and distortion {tuple(distortion.shape)} "
+                "have batch dims that do not fit together"
+            ) from None
+        self.distortion_names = names
+        self.image_size = as_image_size(image_size, owner)
+        self._keep("intrinsics", intrinsics, batch)
+        self._keep("distortion", distortion, batch)
+
+    def _keep(self, name: str, value: Tensor, batch: torch.Size) -> None:
+        """Parameters are registered as such; other tensors of a graph, and no coefficients at all, as buffers."""
+        shape = (*batch, value.shape[-1])
+        if value.shape != shape:
+            learnable = isinstance(value, nn.Parameter)
+            value = value.expand(shape)
+            value = nn.Parameter(value.detach().clone()) if learnable else value
+        if value.numel() == 0 and not value.shape[-1]:
+            self.register_buffer(name, value.detach(), persistent=False)
+        elif isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_buffer(name, value, persistent=False)
+
+    # -- what a model states
+
+    def optics(self, k: Sequence[Tensor]) -> tuple[Chart, Lens]:
+        """The chart and the lens made of the coefficients, each a tensor that broadcasts against planes of points."""
+        raise NotImplementedError
+
+    @classmethod
+    def names_of(cls, count: int) -> tuple[str, ...] | None:
+        """The names of that many coefficients, or None if the model does not take so many."""
+        return tuple(cls.distortion_names) if count == len(cls.distortion_names) else None
+
+    @classmethod
+    def counts_text(cls) -> str:
+        """How many coefficients the model takes, in words."""
+        return f"n = {len(cls.distortion_names)} ({' '.join(cls.distortion_names) or 'none'})"
+
+    # -- both directions
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The same as `project`."""
+        return self.project(points)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Project points, or rays, of the camera frame to pixels.
+
+        Args:
+            points: (*B, *N, 3), in any unit of length; the distance does not matter.
+
+        Returns:
+            pixels (*B, *N, 2), and valid (*B, *N) bool: the point is finite, the chart covers its ray, and the ray
+            lies before the fold of the lens. Whether the pixel is on the picture is another question: `contains`.
+            An invalid point gets the pixel (-1, -1) and zero gradient.
+        """
+        (x, y, z), restore = as_planes(points, "points", 3, self.batch_shape, self._tensors, type(self).__name__)
+        focal_x, focal_y, centre_x, centre_y, k, usable = self._coefficients()
+        chart, lens = self.optics(k)
+        size = torch.maximum(torch.maximum(x.detach().abs(), y.detach().abs()), z.detach().abs())
+        # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
+        valid = (size > torch.finfo(size.dtype).tiny * 1e6) & (size < torch.inf) & usable
+        shrink = torch.where(valid, size, 1.0).reciprocal()
+        valid = valid & chart.covers(*(plane.detach() * shrink for plane in (x, y, z)))
+        # The shrinking is a constant: projection does not depend on the distance, so its derivative is none either
+        axis = torch.where(valid, shrink, 1.0)
+        a, b = chart.to_plane(
+            *(torch.where(valid, plane, on_axis) * axis for plane, on_axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+        )
+        if lens.stages:
+            frozen_chart, frozen = self.optics([c.detach() for c in k])
+            a_0, b_0 = a.detach(), b.detach()
+            _, sense = frozen.jacobian(a_0, b_0)
+            valid = valid & _regular(sense) & FoldLimits(frozen, frozen_chart, like=a_0).before(a_0, b_0)
+            a, b = lens(torch.where(valid, a, 0.0), torch.where(valid, b, 0.0))
+        u = torch.where(valid, focal_x * a + centre_x, _INVALID_PIXEL)
+        v = torch.where(valid, focal_y * b + centre_y, _INVALID_PIXEL)
+        return restore(u, v), restore(valid)
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """The ray through each pixel.
+
+        Args:
+            pixels: (*B, *N, 2).
+
+        Returns:
+            rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
+            ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
+        """
+        (u, v), restore = as_planes(pixels, "pixels", 2, self.batch_shape, self._tensors, type(self).__name__)
+        focal_x, focal_y, centre_x, centre_y, k, usable = self._coefficients()
+        chart, lens = self.optics(k)
+        known = torch.isfinite(u.detach()) & torch.isfinite(v.detach()) & usable
+        p = (torch.where(known, u, centre_x) - centre_x) / focal_x
+        q = (torch.where(known, v, centre_y) - centre_y) / focal_y
+        if not lens.stages:
+            valid = known & chart.on_plane(p.detach(), q.detach())
+            a, b = torch.where(valid, p, 0.0), torch.where(valid, q, 0.0)
+        else:
+            frozen_chart, frozen = self.optics([c.detach() for c in k])
+            a_0, b_0, valid = self._solve(frozen_chart, frozen, p.detach(), q.detach())
+            valid = valid & known
+            a_0, b_0 = torch.where(valid, a_0, 0.0), torch.where(valid, b_0, 0.0)
+            (ua, ub, va, vb), _ = frozen.jacobian(a_0, b_0)
+            determinant = ua * vb - ub * va
+            inverse = (vb / determinant, -ub / determinant, -va / determinant, ua / determinant)
+            target = torch.where(valid, p, 0.0), torch.where(valid, q, 0.0)
+            a, b = attach(lens, (a_0, b_0), inverse, target)
+        x, y, z = chart.to_ray(a, b)
+        rays = restore(torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0))
+        return rays, restore(valid)
+
+    @staticmethod
+    def _solve(chart: Chart, lens: Lens, p: Tensor, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Graph-free: the plane point that the lens sends to (p, q), and whether there is one."""
+        a, b = lens.invert(p, q, chart.radii(_TABLE_RADII, like=p))
+        _, sense = lens.jacobian(a, b)
+        u, v = lens(a, b)
+        miss = torch.maximum((u - p).abs(), (v - q).abs())
+        # what rounding leaves of a root: the polynomials' terms may be larger than their sum
+        rounding = 1024 * torch.finfo(p.dtype).eps * (1 + torch.maximum(p.abs(), q.abs()))
+        regular = _regular(sense) & FoldLimits(lens, chart, like=p).before(a, b)
+        return a, b, (miss <= rounding) & regular & chart.on_plane(a, b)
+
+    @property
+    def _tensors(self) -> tuple[Tensor, Tensor]:
+        return self.intrinsics, self.distortion
+
+    def _coefficients(self):
+        """fx, fy, cx, cy and the coefficients as columns, and which cameras can be used.
+
+        A camera that learning drove to NaN or to a focal length that is not positive is replaced by
+        an ideal one, and all its results are invalid.
+        """
+        intrinsics, distortion = self._tensors
+        values = torch.cat((intrinsics.detach(), distortion.detach()), -1)
+        usable = torch.isfinite(values).all(-1, keepdim=True) & (values[..., :2] > 0).all(-1, keepdim=True)
+        ideal = values.new_tensor([1.0, 1.0, 0.0, 0.0])
+        fx, fy, cx, cy = columns(torch.where(usable, intrinsics, ideal))
+        return fx, fy, cx, cy, columns(torch.where(usable, distortion, 0.0)), usable
+
+    # -- the picture
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """*B, the batch dims of the parameters."""
+        return self.intrinsics.shape[:-1]
+
+    @property
+    def K(self) -> Tensor:  # noqa: N802 (the field's name for it)
+        """The (*B, 3, 3) camera matrix."""
+        fx, fy, cx, cy = self.intrinsics.unbind(-1)
+        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+        return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+
+    @classmethod
+    def from_matrix(cls, K, distortion=None, *, image_size=None, ignore_skew: bool = False) -> Self:  # noqa: N803
+        """A camera from its (*B, 3, 3) matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+
+        Raises:
+            ValueError: not such a matrix, or a skew (its K[0, 1]) that is not zero and not to be ignored.
+        """
+        K = K if isinstance(K, Tensor) else torch.as_tensor(K)  # noqa: N806
+        if K.shape[-2:] != (3, 3):
+            raise ValueError(f"{cls.__name__}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
+        if is_concrete(K):
+            bottom = K[..., 2, :].detach()
+            if bool((bottom != bottom.new_tensor([0, 0, 1])).any()) or bool((K[..., 1, 0] != 0).any()):
+                raise ValueError(f"{cls.__name__}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
+            skew = K[..., 0, 1].detach()
+            if not ignore_skew and bool((skew != 0).any()):
+                raise ValueError(
+                    f"{cls.__name__}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
+                    "ignore_skew=True drops it"
+                )
+        intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
+        if distortion is None:
+            return cls(intrinsics, image_size=image_size)
+        return cls(intrinsics, distortion, image_size=image_size)
+
+    def contains(self, pixels: Tensor) -> Tensor:
+        """Bool (...): whether pixels (..., 2) lie on the picture, its outer pixel edges included."""
+        height, width = self._size("contains")
+        u, v = pixels.unbind(-1)
+        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+
+    def pixel_grid(self) -> Tensor:
+        """(H, W, 2): the centre of every pixel."""
+        height, width = self._size("pixel_grid")
+        like = {"dtype": torch.promote_types(self.intrinsics.dtype, torch.float32), "device": self.intrinsics.device}
+        v, u = torch.meshgrid(torch.arange(height, **like), torch.arange(width, **like), indexing="ij")
+        return torch.stack((u, v), -1)
+
+    def rays(self) -> tuple[Tensor, Tensor]:
+        """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W)."""
+        grid = self.pixel_grid()
+        return self.unproject(grid.expand(*self.batch_shape, *grid.shape))
+
+    def _size(self, what: str) -> tuple[int, int]:
+        if self.image_size is None:
+            raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
+        return self.image_size
+
+    # -- the camera of an edited picture
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Self:
+        """The camera of the picture's part of that size whose top-left pixel is (left, top); parts outside are allowed."""
+        return self._edited(shift=(-left, -top), size=(height, width))
+
+    def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
+        """The camera of the picture with that many more pixels on each side."""
+        height, width = self._size("pad")
+        return self._edited(shift=(left, top), size=(height + top + bottom, width + left + right))
+
+    def resize(self, height: int, width: int) -> Self:
+        """The camera of the picture scaled to that size; pixel edges scale, as in cv2.resize and align_corners=False."""
+        old_height, old_width = self._size("resize")
+        as_image_size((height, width), f"{type(self).__name__}.resize")
+        return self._edited(scale=(width / old_width, height / old_height), size=(height, width))
+
+    def hflip(self) -> Self:
+        """The camera that sees the scene mirrored left to right: its picture is this one's, flipped."""
+        return self._edited(mirror="x", size=self._size("hflip"))
+
+    def vflip(self) -> Self:
+        """The camera that sees the scene mirrored top to bottom: its picture is this one's, flipped."""
+        return self._edited(mirror="y", size=self._size("vflip"))
+
+    def _edited(self, *, size, shift=(0, 0), scale=(1.0, 1.0), mirror: str = "") -> Self:
+        fx, fy, cx, cy = self.intrinsics.unbind(-1)
+        cx, cy = (cx + 0.5) * scale[0] - 0.5 + shift[0], (cy + 0.5) * scale[1] - 0.5 + shift[1]
+        odd: frozenset[str] = frozenset()
+        if mirror == "x":
+            cx, odd = size[1] - 1 - cx, self.odd_in_x
+        elif mirror == "y":
+            cy, odd = size[0] - 1 - cy, self.odd_in_y
+        intrinsics = torch.stack((fx * scale[0], fy * scale[1], cx, cy), -1)
+        arguments = [intrinsics]
+        if self.distortion.shape[-1]:
+            sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
+            arguments.append(self.distortion * sign)
+        edited = type(self)(*arguments, image_size=size)
+        for mine, its in zip(self._tensors, edited._tensors, strict=True):
+            if its.is_leaf and its.shape[-1]:
+                its.requires_grad_(mine.requires_grad)
+        return edited
+
+    # -- nn.Module
+
+    def _apply(self, fn, recurse=True):
+        # model.half() must not round a principal point to whole pixels: geometry stays in at least float32
+        def at_least_float32(tensor: Tensor) -> Tensor:
+            moved = fn(tensor)
+            if moved.is_floating_point() and torch.finfo(moved.dtype).bits < 32:
+                return tensor.to(moved.device)
+            return moved
+
+        return super()._apply(at_least_float32, recurse)
+
+    def __getstate__(self):
+        # a tensor of a graph cannot be copied with its graph: the copy is a leaf
+        state = self.__dict__.copy()
+        state["_buffers"] = {
+            name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
+        }
+        return state
+
+    def extra_repr(self) -> str:
+        """Batch, size and, for a single camera, its numbers."""
+        parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
+        if not self.batch_shape and is_concrete(self.intrinsics):
+            named = zip(
+                ("fx", "fy", "cx", "cy", *self.distortion_names), torch.cat(self._tensors, -1).tolist(), strict=True
+            )
+            parts += [f"{name}={value:.6g}" for name, value in named]
+        elif self.distortion_names:
+            parts.append(f"distortion=({' '.join(self.distortion_names)})")
+        if self.image_size:
+            parts.append(f"image_size={self.image_size}")
+        return ", ".join(parts)
+
+
+def _regular(sense: Tensor) -> Tensor:
+    """Whether a lens is regular here, by more than what its inverse could leave the floating-point range with."""
+    return sense > torch.finfo(sense.dtype).tiny ** 0.25

@@ -1,0 +1,48 @@
+"""The Brown-Conrady camera with OpenCV's rational, thin-prism and tilt terms."""
+
+from camtorch.camera import Camera
+from camtorch.charts import Perspective
+from camtorch.lens import Lens, Planar, Polynomial, Rational, Tilt
+
+
+class BrownConrady(Camera):
+    """OpenCV's pinhole camera with distortion; valid up to its fold.
+
+    With a = x/z, b = y/z and t = a^2 + b^2:
+
+        R  = (1 + k1 t + k2 t^2 + k3 t^3) / (1 + k4 t + k5 t^2 + k6 t^3)
+        a' = a R + 2 p1 a b + p2 (t + 2 a^2) + s1 t + s2 t^2
+        b' = b R + p1 (t + 2 b^2) + 2 p2 a b + s3 t + s4 t^2
+
+    then the homography of a sensor tilted by (tau_x, tau_y) radians. A ray is valid for z > 0, before the
+    pole of R and before the fold of the map; the fold depends on the azimuth once p, s or tau are not zero.
+
+    Distortion: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]], so 4, 5, 8, 12 or 14 coefficients; 5
+    if left out. Source: OpenCV 4 and 5, `projectPoints`. COLMAP OPENCV (4) and FULL_OPENCV (8). See `Camera`
+    for shapes, conventions and errors.
+    """
+
+    key = "brown_conrady"
+    distortion_names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+    default_count = 5
+    counts = (4, 5, 8, 12, 14)
+    odd_in_x = frozenset({"p2", "s1", "s2", "tau_y"})
+    odd_in_y = frozenset({"p1", "s3", "s4", "tau_x"})
+
+    @classmethod
+    def names_of(cls, count):
+        return cls.distortion_names[:count] if count in cls.counts else None
+
+    @classmethod
+    def counts_text(cls):
+        return "n = 4, 5, 8, 12 or 14 (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]])"
+
+    def optics(self, k):
+        k1, k2, p1, p2, *more = k
+        numerator = [k1, k2, *more[:1]]
+        radial = Rational(numerator, more[1:4]) if len(more) > 1 else Polynomial(numerator)
+        # OpenCV numbers the decentering coefficients the other way round: p2 is the one along x
+        stages = [Planar(radial, tangential=(p2, p1), prism=more[4:8])]
+        if len(more) > 8:
+            stages.append(Tilt(*more[8:]))
+        return Perspective(), Lens(*stages)

@@ -1,0 +1,23 @@
+"""The cylindrical panorama."""
+
+from camtorch.camera import Camera
+from camtorch.charts import CylinderChart
+from camtorch.lens import Lens
+
+
+class Cylindrical(Camera):
+    """A cylindrical panorama around the y axis: vertical lines of the scene stay straight, angles past 90 degrees show.
+
+    u = fx atan2(x, z) + cx, v = fy y / hypot(x, z) + cy: fx in pixels per radian, fy in pixels per unit of height,
+    (cx, cy) the pixel of the forward direction. Valid within half a turn to either side, but for straight up and down.
+
+    Distortion: none. See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "cylindrical"
+
+    def __init__(self, intrinsics, *, image_size=None):
+        super().__init__(intrinsics, image_size=image_size)
+
+    def optics(self, k):
+        return CylinderChart(), Lens()

@@ -1,0 +1,23 @@
+"""The equirectangular panorama."""
+
+from camtorch.camera import Camera
+from camtorch.charts import SphereChart
+from camtorch.lens import Lens
+
+
+class Equirectangular(Camera):
+    """An equirectangular panorama: longitude across, latitude down.
+
+    u = fx atan2(x, z) + cx, v = fy atan2(y, hypot(x, z)) + cy: fx and fy in pixels per radian, (cx, cy) the pixel of
+    the forward direction. Valid within half a turn to either side, but for straight up and down.
+
+    Distortion: none. COLMAP EQUIRECTANGULAR. See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "equirectangular"
+
+    def __init__(self, intrinsics, *, image_size=None):
+        super().__init__(intrinsics, image_size=image_size)
+
+    def optics(self, k):
+        return SphereChart(), Lens()

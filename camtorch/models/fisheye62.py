@@ -1,0 +1,30 @@
+"""The Fisheye62 camera: radial and tangential terms of a fisheye."""
+
+from camtorch.camera import Camera
+from camtorch.charts import Equidistant
+from camtorch.lens import Lens, Planar, Polynomial
+
+
+class Fisheye62(Camera):
+    """Project Aria's fisheye with six radial and two tangential coefficients.
+
+    With theta = atan2(hypot(x, y), z), real past 90 degrees:
+
+        r   = theta (1 + k0 theta^2 + k1 theta^4 + ... + k5 theta^12),  (a, b) = r (cos phi, sin phi)
+        a' = a + p0 (2 a^2 + r^2) + 2 p1 a b
+        b' = b + p1 (2 b^2 + r^2) + 2 p0 a b
+
+    (u, v) = f (a', b') + c. A ray is valid before the fold of r and, on its azimuth, before that of the tangential terms.
+
+    Distortion: k0 k1 k2 k3 k4 k5 p0 p1. Source: Project Aria, `Fisheye62.h`, which sends z < 0 to the pixel of the
+    antipodal point; here it is the model's own. See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "fisheye62"
+    distortion_names = ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1")
+    default_count = 8
+    odd_in_x = frozenset({"p0"})
+    odd_in_y = frozenset({"p1"})
+
+    def optics(self, k):
+        return Equidistant(), Lens(Planar(Polynomial(k[:6])), Planar(tangential=k[6:]))

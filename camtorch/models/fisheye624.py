@@ -1,0 +1,34 @@
+"""The Fisheye624 camera: radial, tangential and thin-prism terms of a fisheye."""
+
+from camtorch.camera import Camera
+from camtorch.charts import Equidistant
+from camtorch.lens import Lens, Planar, Polynomial
+
+
+class Fisheye624(Camera):
+    """Project Aria's fisheye with six radial, two tangential and four thin-prism coefficients.
+
+    With theta = atan2(hypot(x, y), z), real past 90 degrees:
+
+        r   = theta (1 + k0 theta^2 + k1 theta^4 + ... + k5 theta^12),  (a, b) = r (cos phi, sin phi)
+        a' = a + p0 (2 a^2 + r^2) + 2 p1 a b + s0 r^2 + s1 r^4
+        b' = b + p1 (2 b^2 + r^2) + 2 p0 a b + s2 r^2 + s3 r^4
+
+    (u, v) = f (a', b') + c. A ray is valid before the fold of r and, on its azimuth, before that of the small rest.
+
+    Distortion: k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3. Source: Project Aria, `FisheyeRadTanThinPrism.h`, which sends z < 0
+    to the pixel of the antipodal point; here it is the model's own. COLMAP RAD_TAN_THIN_PRISM_FISHEYE. See
+    `Camera` for shapes, conventions and errors.
+    """
+
+    key = "fisheye624"
+    distortion_names = ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3")
+    default_count = 12
+    odd_in_x = frozenset({"p0", "s0", "s1"})
+    odd_in_y = frozenset({"p1", "s2", "s3"})
+
+    def optics(self, k):
+        return Equidistant(), Lens(Planar(Polynomial(k[:6])), Planar(tangential=k[6:8], prism=k[8:]))
+
+
+FisheyeRadTanThinPrism = Fisheye624

@@ -1,0 +1,69 @@
+"""The Kannala-Brandt fisheye camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from camtorch.camera import Camera
+from camtorch.charts import Equidistant
+from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.parameters import as_parameter, is_concrete
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class KannalaBrandt(Camera):
+    """The radially symmetric fisheye: r = theta (1 + k1 theta^2 + k2 theta^4 + ...).
+
+    theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real; (u, v) = f r (cos phi, sin phi) + c. A ray
+    is valid before the first root of dr/dtheta.
+
+    Distortion: k1 k2 ..., any number of coefficients, at least one; 4 if left out. Source: OpenCV
+    `fisheye`, there with 4. The same as Aria KANNALA_BRANDT_K3, Basalt kb4, COLMAP OPENCV_FISHEYE. See `Camera`
+    for shapes, conventions and errors.
+    """
+
+    key = "kannala_brandt"
+    distortion_names = ("k1", "k2", "k3", "k4")
+    default_count = 4
+
+    @classmethod
+    def names_of(cls, count):
+        return tuple(f"k{i}" for i in range(1, count + 1)) or None
+
+    @classmethod
+    def counts_text(cls):
+        return "n >= 1 (k1 k2 ...)"
+
+    def optics(self, k):
+        return Equidistant(), Lens(Planar(Polynomial(k)))
+
+    @classmethod
+    def from_general(cls, intrinsics, coefficients, *, image_size=None) -> Self:
+        """From the paper's form r = k1 theta + k2 theta^3 + ..., which has no leading 1.
+
+        Args:
+            intrinsics: (*B, 4) fx, fy, cx, cy; 1, 1 for the focal lengths where the coefficients are in pixels.
+            coefficients: (*B, n), n >= 1: k1, k2, ... of the paper; k1 > 0 is folded into the focal lengths.
+
+        Source: Kannala and Brandt, "A generic camera model and calibration method for conventional,
+        wide-angle, and fish-eye lenses", PAMI 2006, equation (6).
+
+        Raises:
+            ValueError: no coefficients, or a first one that is not positive.
+        """
+        plain = not any(isinstance(value, torch.Tensor) and value.requires_grad for value in (intrinsics, coefficients))
+        intrinsics = as_parameter(intrinsics, "intrinsics", cls.__name__)
+        coefficients = as_parameter(coefficients, "coefficients", cls.__name__)
+        if coefficients.ndim == 0 or coefficients.shape[-1] == 0:
+            raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 1; got {tuple(coefficients.shape)}")
+        first = coefficients[..., :1]
+        if is_concrete(first) and not bool((first > 0).all()):
+            raise ValueError(f"{cls.__name__}: the first coefficient must be positive; got {first.tolist()}")
+        focal, centre = torch.broadcast_tensors(intrinsics[..., :2] * first, intrinsics[..., 2:])
+        rest = coefficients[..., 1:] / first if coefficients.shape[-1] > 1 else torch.zeros_like(first)
+        parameters = [torch.cat((focal, centre), -1), rest]
+        return cls(*(p.detach() if plain else p for p in parameters), image_size=image_size)

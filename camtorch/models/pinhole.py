@@ -1,0 +1,20 @@
+"""The pinhole camera."""
+
+from camtorch.camera import Camera
+from camtorch.charts import Perspective
+from camtorch.lens import Lens
+
+
+class Pinhole(Camera):
+    """A pinhole camera: u = fx x/z + cx, v = fy y/z + cy, for z > 0.
+
+    Distortion: none. COLMAP PINHOLE, Aria LINEAR. See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "pinhole"
+
+    def __init__(self, intrinsics, *, image_size=None):
+        super().__init__(intrinsics, image_size=image_size)
+
+    def optics(self, k):
+        return Perspective(), Lens()

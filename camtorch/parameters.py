@@ -1,0 +1,117 @@
+"""The door: what users pass as parameters and points, checked and brought into shape."""
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+def is_concrete(tensor: Tensor) -> bool:
+    """Whether the values may be looked at: not while a graph is traced, nor inside vmap, grad or jacfwd."""
+    return not (
+        torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor) or tensor.is_meta
+    )
+
+
+def as_parameter(value, name: str, owner: str) -> Tensor:
+    """A checked floating-point tensor: kept if it is part of a graph, else an `nn.Parameter` of its values.
+
+    Lists take torch's default dtype, arrays and tensors keep theirs, but never less than float32.
+
+    Raises:
+        TypeError: not numbers. ValueError: NaN or infinite values.
+    """
+    in_graph = isinstance(value, Tensor) and (
+        value.requires_grad or isinstance(value, nn.Parameter) or not is_concrete(value)
+    )
+    if not in_graph:
+        try:
+            value = torch.as_tensor(value).detach().clone()
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise TypeError(
+                f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
+            ) from None
+        if value.is_complex() or value.dtype == torch.bool:
+            raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
+        if not value.is_floating_point():
+            value = value.to(torch.get_default_dtype())
+        value = nn.Parameter(value.to(torch.promote_types(value.dtype, torch.float32)))
+    if is_concrete(value) and not bool(torch.isfinite(value).all()):
+        raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
+    return value
+
+
+def as_image_size(value, owner: str) -> tuple[int, int] | None:
+    """(height, width) as two positive ints, or None.
+
+    Raises:
+        TypeError: not two integers. ValueError: one of them is not positive.
+    """
+    if value is None:
+        return None
+    try:
+        if any(isinstance(side, bool) for side in value):
+            raise TypeError
+        height, width = (operator.index(side) for side in value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{owner}: image_size must be two integers (height, width); got {value!r}") from None
+    if height <= 0 or width <= 0:
+        raise ValueError(f"{owner}: image_size must be positive (height, width); got {(height, width)}")
+    return height, width
+
+
+def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
+    """The dtype to compute in: the widest of all, at least float32; integer values take the parameters' dtype."""
+    dtype = torch.float32
+    for tensor in (values, *parameters):
+        if tensor.is_floating_point():
+            dtype = torch.promote_types(dtype, tensor.dtype)
+    return dtype
+
+
+def as_planes(
+    values, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
+) -> tuple[tuple[Tensor, ...], Callable[..., Tensor]]:
+    """Split (*B, *N, size) into `size` contiguous planes (*B, N).
+
+    Returns the planes, and a function that gives planes (*B, N) their shape back: one plane becomes
+    (*B, *N), several become (*B, *N, count), a view of planes side by side.
+
+    Raises:
+        TypeError: not real numbers. ValueError: the shape does not fit `batch`.
+    """
+    if not isinstance(values, Tensor):
+        try:
+            values = torch.as_tensor(values, device=parameters[0].device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise TypeError(f"{owner}: {name} must be a tensor; got {type(values).__name__}: {error}") from None
+    if values.is_complex() or values.dtype == torch.bool:
+        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {values.dtype}")
+    takes = f"{name} must be (*B, *N, {size}) with batch dims *B = {tuple(batch)}"
+    if values.ndim == 0 or values.shape[-1] != size:
+        raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}")
+    lead, rest = values.shape[: len(batch)], values.shape[len(batch) : -1]
+    try:
+        if len(lead) < len(batch) or values.ndim <= len(batch):
+            raise RuntimeError
+        lead_out = torch.broadcast_shapes(lead, batch)
+    except RuntimeError:
+        raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}") from None
+    planes = (
+        values.to(working_dtype(values, *parameters)).movedim(-1, 0).reshape(size, *lead, math.prod(rest)).contiguous()
+    )
+
+    def restore(*results: Tensor) -> Tensor:
+        shape = (*lead_out, *rest)
+        if len(results) == 1:
+            return results[0].expand(*lead_out, -1).reshape(shape)
+        return torch.stack([r.expand(*lead_out, -1).reshape(shape) for r in results]).movedim(0, -1)
+
+    return planes.unbind(0), restore
+
+
+def columns(parameters: Tensor) -> tuple[Tensor, ...]:
+    """(*B, n) -> n tensors (*B, 1), or (1,), that broadcast against planes."""
+    return parameters.unsqueeze(-1).unbind(-2)
