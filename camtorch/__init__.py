@@ -1,6 +1,8 @@
 """Cameras as layers for PyTorch: learnable camera models, exact in both directions, and every warp between them."""
 
 from camtorch.camera import MODELS, Camera
+from camtorch.dewarp import Dewarp
+from camtorch.extrinsics import Extrinsics
 from camtorch.models import (
     BrownConrady,
     Cylindrical,
@@ -11,6 +13,7 @@ from camtorch.models import (
     KannalaBrandt,
     Pinhole,
 )
+from camtorch.warp import Warp
 
 __version__ = "0.1.0"
 
@@ -19,10 +22,13 @@ __all__ = [
     "BrownConrady",
     "Camera",
     "Cylindrical",
+    "Dewarp",
     "Equirectangular",
+    "Extrinsics",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
     "Pinhole",
+    "Warp",
 ]

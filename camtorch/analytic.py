@@ -56,7 +56,7 @@ def cosc_root(t: Tensor) -> Tensor:
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor) -> Tensor:
-    """theta / rho with theta = atan2(rho, z) in [0, pi] and rho2 = rho^2; 1 / z on the axis.
+    """The ratio theta / rho with theta = atan2(rho, z) in [0, pi] and rho2 = rho^2; 1 / z on the axis.
 
     Needs rho2 > 0 where z <= 0: the exact backward direction has every azimuth at once.
     """

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from camtorch.charts import Chart
-from camtorch.folds import FoldLimits
+from camtorch.domain import Domain
 from camtorch.lens import Lens
-from camtorch.parameters import as_image_size, as_parameter, as_planes, columns, is_concrete
-from camtorch.solve import attach
+from camtorch.parameters import Memo, as_image_size, as_parameter, as_planes, columns, is_concrete
+from camtorch.picture import Picture
+from camtorch.solve import attach, invert
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -21,10 +22,9 @@ MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
 _INVALID_PIXEL = -1.0  # outside every picture, so that `contains` is False for it as well
-_TABLE_RADII = 256
 
 
-class Camera(nn.Module):
+class Camera(Picture):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
     A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
@@ -50,13 +50,8 @@ class Camera(nn.Module):
     """
 
     key: ClassVar[str]
-    distortion_names: Sequence[str] = ()
     default_count: ClassVar[int] = 0
     """How many zero coefficients a camera has that is made without distortion."""
-    odd_in_x: ClassVar[frozenset[str]] = frozenset()
-    """The coefficients that change sign when the scene is mirrored left to right."""
-    odd_in_y: ClassVar[frozenset[str]] = frozenset()
-    """Likewise top to bottom."""
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
@@ -91,22 +86,9 @@ class Camera(nn.Module):
             ) from None
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
-        self._keep("intrinsics", intrinsics, batch)
-        self._keep("distortion", distortion, batch)
-
-    def _keep(self, name: str, value: Tensor, batch: torch.Size) -> None:
-        """Parameters are registered as such; other tensors of a graph, and no coefficients at all, as buffers."""
-        shape = (*batch, value.shape[-1])
-        if value.shape != shape:
-            learnable = isinstance(value, nn.Parameter)
-            value = value.expand(shape)
-            value = nn.Parameter(value.detach().clone()) if learnable else value
-        if value.numel() == 0 and not value.shape[-1]:
-            self.register_buffer(name, value.detach(), persistent=False)
-        elif isinstance(value, nn.Parameter):
-            self.register_parameter(name, value)
-        else:
-            self.register_buffer(name, value, persistent=False)
+        self._memo = Memo()
+        self.hold("intrinsics", intrinsics, (*batch, 4))
+        self.hold("distortion", distortion, (*batch, len(names)))
 
     # -- what a model states
 
@@ -155,10 +137,9 @@ class Camera(nn.Module):
             *(torch.where(valid, plane, on_axis) * axis for plane, on_axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
         )
         if lens.stages:
-            frozen_chart, frozen = self.optics([c.detach() for c in k])
+            domain = self._domain(k, like=a)
             a_0, b_0 = a.detach(), b.detach()
-            _, sense = frozen.jacobian(a_0, b_0)
-            valid = valid & _regular(sense) & FoldLimits(frozen, frozen_chart, like=a_0).before(a_0, b_0)
+            valid = valid & domain.contains(a_0, b_0, domain.lens.linearise(a_0, b_0)[2])
             a, b = lens(torch.where(valid, a, 0.0), torch.where(valid, b, 0.0))
         u = torch.where(valid, focal_x * a + centre_x, _INVALID_PIXEL)
         v = torch.where(valid, focal_y * b + centre_y, _INVALID_PIXEL)
@@ -184,11 +165,11 @@ class Camera(nn.Module):
             valid = known & chart.on_plane(p.detach(), q.detach())
             a, b = torch.where(valid, p, 0.0), torch.where(valid, q, 0.0)
         else:
-            frozen_chart, frozen = self.optics([c.detach() for c in k])
-            a_0, b_0, valid = self._solve(frozen_chart, frozen, p.detach(), q.detach())
-            valid = valid & known
+            domain = self._domain(k, like=p)
+            a_0, b_0, found = invert(domain, p.detach(), q.detach())
+            valid = known & found & chart.on_plane(a_0, b_0)
             a_0, b_0 = torch.where(valid, a_0, 0.0), torch.where(valid, b_0, 0.0)
-            (ua, ub, va, vb), _ = frozen.jacobian(a_0, b_0)
+            _, (ua, ub, va, vb), _ = domain.lens.linearise(a_0, b_0)
             determinant = ua * vb - ub * va
             inverse = (vb / determinant, -ub / determinant, -va / determinant, ua / determinant)
             target = torch.where(valid, p, 0.0), torch.where(valid, q, 0.0)
@@ -197,17 +178,14 @@ class Camera(nn.Module):
         rays = restore(torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0))
         return rays, restore(valid)
 
-    @staticmethod
-    def _solve(chart: Chart, lens: Lens, p: Tensor, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Graph-free: the plane point that the lens sends to (p, q), and whether there is one."""
-        a, b = lens.invert(p, q, chart.radii(_TABLE_RADII, like=p))
-        _, sense = lens.jacobian(a, b)
-        u, v = lens(a, b)
-        miss = torch.maximum((u - p).abs(), (v - q).abs())
-        # what rounding leaves of a root: the polynomials' terms may be larger than their sum
-        rounding = 1024 * torch.finfo(p.dtype).eps * (1 + torch.maximum(p.abs(), q.abs()))
-        regular = _regular(sense) & FoldLimits(lens, chart, like=p).before(a, b)
-        return a, b, (miss <= rounding) & regular & chart.on_plane(a, b)
+    def _domain(self, k: Sequence[Tensor], like: Tensor) -> Domain:
+        """The domain of the lens, without a graph, in the dtype and on the device of `like`."""
+
+        def tabulate() -> Domain:
+            chart, lens = self.optics([c.detach() for c in k])
+            return Domain(lens, chart, like)
+
+        return self._memo(self._tensors, (like.dtype, like.device), tabulate)
 
     @property
     def _tensors(self) -> tuple[Tensor, Tensor]:
@@ -265,92 +243,10 @@ class Camera(nn.Module):
             return cls(intrinsics, image_size=image_size)
         return cls(intrinsics, distortion, image_size=image_size)
 
-    def contains(self, pixels: Tensor) -> Tensor:
-        """Bool (...): whether pixels (..., 2) lie on the picture, its outer pixel edges included."""
-        height, width = self._size("contains")
-        u, v = pixels.unbind(-1)
-        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
-
-    def pixel_grid(self) -> Tensor:
-        """(H, W, 2): the centre of every pixel."""
-        height, width = self._size("pixel_grid")
-        like = {"dtype": torch.promote_types(self.intrinsics.dtype, torch.float32), "device": self.intrinsics.device}
-        v, u = torch.meshgrid(torch.arange(height, **like), torch.arange(width, **like), indexing="ij")
-        return torch.stack((u, v), -1)
-
     def rays(self) -> tuple[Tensor, Tensor]:
         """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W)."""
         grid = self.pixel_grid()
         return self.unproject(grid.expand(*self.batch_shape, *grid.shape))
-
-    def _size(self, what: str) -> tuple[int, int]:
-        if self.image_size is None:
-            raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
-        return self.image_size
-
-    # -- the camera of an edited picture
-
-    def crop(self, top: int, left: int, height: int, width: int) -> Self:
-        """The camera of the picture's part of that size whose top-left pixel is (left, top); parts outside are allowed."""
-        return self._edited(shift=(-left, -top), size=(height, width))
-
-    def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
-        """The camera of the picture with that many more pixels on each side."""
-        height, width = self._size("pad")
-        return self._edited(shift=(left, top), size=(height + top + bottom, width + left + right))
-
-    def resize(self, height: int, width: int) -> Self:
-        """The camera of the picture scaled to that size; pixel edges scale, as in cv2.resize and align_corners=False."""
-        old_height, old_width = self._size("resize")
-        as_image_size((height, width), f"{type(self).__name__}.resize")
-        return self._edited(scale=(width / old_width, height / old_height), size=(height, width))
-
-    def hflip(self) -> Self:
-        """The camera that sees the scene mirrored left to right: its picture is this one's, flipped."""
-        return self._edited(mirror="x", size=self._size("hflip"))
-
-    def vflip(self) -> Self:
-        """The camera that sees the scene mirrored top to bottom: its picture is this one's, flipped."""
-        return self._edited(mirror="y", size=self._size("vflip"))
-
-    def _edited(self, *, size, shift=(0, 0), scale=(1.0, 1.0), mirror: str = "") -> Self:
-        fx, fy, cx, cy = self.intrinsics.unbind(-1)
-        cx, cy = (cx + 0.5) * scale[0] - 0.5 + shift[0], (cy + 0.5) * scale[1] - 0.5 + shift[1]
-        odd: frozenset[str] = frozenset()
-        if mirror == "x":
-            cx, odd = size[1] - 1 - cx, self.odd_in_x
-        elif mirror == "y":
-            cy, odd = size[0] - 1 - cy, self.odd_in_y
-        intrinsics = torch.stack((fx * scale[0], fy * scale[1], cx, cy), -1)
-        arguments = [intrinsics]
-        if self.distortion.shape[-1]:
-            sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
-            arguments.append(self.distortion * sign)
-        edited = type(self)(*arguments, image_size=size)
-        for mine, its in zip(self._tensors, edited._tensors, strict=True):
-            if its.is_leaf and its.shape[-1]:
-                its.requires_grad_(mine.requires_grad)
-        return edited
-
-    # -- nn.Module
-
-    def _apply(self, fn, recurse=True):
-        # model.half() must not round a principal point to whole pixels: geometry stays in at least float32
-        def at_least_float32(tensor: Tensor) -> Tensor:
-            moved = fn(tensor)
-            if moved.is_floating_point() and torch.finfo(moved.dtype).bits < 32:
-                return tensor.to(moved.device)
-            return moved
-
-        return super()._apply(at_least_float32, recurse)
-
-    def __getstate__(self):
-        # a tensor of a graph cannot be copied with its graph: the copy is a leaf
-        state = self.__dict__.copy()
-        state["_buffers"] = {
-            name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
-        }
-        return state
 
     def extra_repr(self) -> str:
         """Batch, size and, for a single camera, its numbers."""
@@ -365,8 +261,3 @@ class Camera(nn.Module):
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
         return ", ".join(parts)
-
-
-def _regular(sense: Tensor) -> Tensor:
-    """Whether a lens is regular here, by more than what its inverse could leave the floating-point range with."""
-    return sense > torch.finfo(sense.dtype).tiny ** 0.25

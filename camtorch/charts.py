@@ -75,9 +75,12 @@ class Perspective(Chart):
         return unit(a, b, torch.ones_like(a))
 
     def radii(self, count, like):
-        # sinh: even steps near the centre, even ratios far out, where distortion is a power law
-        end = math.asinh(1.5 * self.limit(like.dtype))
-        return torch.linspace(0, end, count, dtype=like.dtype, device=like.device).sinh()
+        # even steps of the angle up to 88 degrees; beyond, where distortion is a power law, even ratios
+        options = {"dtype": like.dtype, "device": like.device}
+        inner = torch.linspace(0, math.radians(88), 3 * count // 4, **options).tan()
+        last = math.tan(math.radians(88))
+        outer = torch.linspace(0, math.log(1.5 * self.limit(like.dtype) / last), count - len(inner) + 1, **options)
+        return torch.cat((inner, last * outer[1:].exp()))
 
 
 class Equidistant(Chart):
@@ -104,7 +107,7 @@ class Equidistant(Chart):
 
 
 class CylinderChart(Chart):
-    """(longitude, height): longitude = atan2(x, z), height = y / hypot(x, z). Every ray but straight up and down."""
+    """(longitude, height) = (atan2(x, z), y / hypot(x, z)). Every ray but straight up and down."""
 
     def covers(self, x, y, z):
         return y.abs() < Perspective.limit(y.dtype) * torch.maximum(x.abs(), z.abs())
@@ -120,7 +123,7 @@ class CylinderChart(Chart):
 
 
 class SphereChart(Chart):
-    """(longitude, latitude): longitude = atan2(x, z), latitude = atan2(y, hypot(x, z)). Every ray but straight up and down."""
+    """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))). Every ray but straight up and down."""
 
     def covers(self, x, y, z):
         return x * x + z * z > torch.finfo(y.dtype).tiny ** 0.5

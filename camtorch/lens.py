@@ -4,16 +4,16 @@ A stage is built from coefficient planes that broadcast against the points. `Pla
 that is polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from camtorch.solve import invert_planar, invert_radial
-
 Planes2 = tuple[Tensor, Tensor]
 Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
+Linear = tuple[Planes2, Jacobian, Tensor]
 
 
 class Polynomial:
@@ -23,23 +23,19 @@ class Polynomial:
         self.coefficients = coefficients
 
     def __call__(self, t: Tensor) -> Tensor:
-        value = torch.zeros_like(t)
-        for c in reversed(self.coefficients):
-            value = (value + c) * t
-        return value + 1
+        return self.derivatives(t, 0)[0]
 
-    def derivatives(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """R, dR/dt and d2R/dt2."""
-        value, first, half_second = torch.zeros_like(t), torch.zeros_like(t), torch.zeros_like(t)
-        for c in (*reversed(self.coefficients), 1):
-            half_second = half_second * t + first
-            first = first * t + value
-            value = value * t + c
-        return value, first, 2 * half_second
-
-    def sense(self, t: Tensor) -> Tensor:
-        """Positive where the factor is defined: a polynomial is everywhere."""
-        return torch.ones_like(t)
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t: Horner's scheme, extended to the Taylor coefficients at t."""
+        # a zero stays a number until it is none: no work for what the highest powers do not have
+        taylor = [self.coefficients[-1]] + [0.0] * order
+        for c in (*reversed(self.coefficients[:-1]), 1.0):
+            for i in range(order, 0, -1):
+                taylor[i] = taylor[i - 1] if isinstance(taylor[i], float) else taylor[i] * t + taylor[i - 1]
+            taylor[0] = taylor[0] * t + c
+        return tuple(
+            torch.zeros_like(t) if isinstance(x, float) else math.factorial(i) * x for i, x in enumerate(taylor)
+        )
 
 
 class Rational:
@@ -51,17 +47,14 @@ class Rational:
     def __call__(self, t: Tensor) -> Tensor:
         return self.numerator(t) / self.denominator(t)
 
-    def derivatives(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """R, dR/dt and d2R/dt2, from N = R D differentiated twice."""
-        n, n1, n2 = self.numerator.derivatives(t)
-        d, d1, d2 = self.denominator.derivatives(t)
-        value = n / d
-        first = (n1 - value * d1) / d
-        return value, first, (n2 - 2 * first * d1 - value * d2) / d
-
-    def sense(self, t: Tensor) -> Tensor:
-        """Positive before the pole."""
-        return self.denominator(t)
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t, from N = R D differentiated by Leibniz' rule."""
+        n, d = self.numerator.derivatives(t, order), self.denominator.derivatives(t, order)
+        ratio: list[Tensor] = []
+        for i in range(order + 1):
+            known = sum(math.comb(i, j) * ratio[j] * d[i - j] for j in range(i))
+            ratio.append((n[i] - known) / d[0])
+        return tuple(ratio)
 
 
 @dataclass
@@ -83,8 +76,11 @@ class Planar:
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         t = a * a + b * b
-        factor = self.radial(t) if self.radial else None
-        u, v = (a, b) if factor is None else (a * factor, b * factor)
+        factor = self.radial(t) if self.radial else 1.0
+        return self._value(a, b, t, factor)
+
+    def _value(self, a: Tensor, b: Tensor, t: Tensor, factor: Tensor | float) -> Planes2:
+        u, v = a * factor, b * factor
         if self.tangential:
             px, py = self.tangential
             twice_dot = 2 * (px * a + py * b)
@@ -94,17 +90,11 @@ class Planar:
             u, v = u + t * (s0 + t * s1), v + t * (s2 + t * s3)
         return u, v
 
-    def jacobian(self, a: Tensor, b: Tensor) -> tuple[Jacobian, Tensor]:
-        """The derivatives, and the sense: positive where the map is defined, regular and keeps its orientation."""
+    def linearise(self, a: Tensor, b: Tensor) -> Linear:
+        """The value, its derivatives, and the sense: positive where the map is defined, regular and not turned over."""
         t = a * a + b * b
-        defined = None
-        if self.radial:
-            factor, slope, _ = self.radial.derivatives(t)
-            slope = 2 * slope
-            ua, ub, vb = factor + slope * a * a, slope * a * b, factor + slope * b * b
-            defined = self.radial.sense(t)
-        else:
-            ua, ub, vb = torch.ones_like(t), torch.zeros_like(t), torch.ones_like(t)
+        factor, slope = self.radial.derivatives(t, 1) if self.radial else (torch.ones_like(t), torch.zeros_like(t))
+        ua, ub, vb = factor + 2 * slope * a * a, 2 * slope * a * b, factor + 2 * slope * b * b
         va = ub
         if self.tangential:
             px, py = self.tangential
@@ -115,14 +105,15 @@ class Planar:
             s0, s1, s2, s3 = self.prism
             gx, gy = 2 * (s0 + 2 * t * s1), 2 * (s2 + 2 * t * s3)
             ua, ub, va, vb = ua + gx * a, ub + gx * b, va + gy * a, vb + gy * b
-        # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
-        sense = torch.minimum(ua * vb - ub * va, ua + vb)
-        return (ua, ub, va, vb), sense if defined is None else torch.minimum(sense, defined)
+        sense = _sense(ua, ub, va, vb)
+        if isinstance(self.radial, Rational):
+            sense = torch.minimum(sense, self.radial.denominator(t))
+        return self._value(a, b, t, factor), (ua, ub, va, vb), sense
 
-    def invert(self, u: Tensor, v: Tensor, radii: Tensor) -> Planes2:
-        """Graph-free: the point before the first fold that is sent to (u, v), as near as there is one."""
-        a, b = invert_radial(self.radial, radii, u, v) if self.radial else (u, v)
-        return (a, b) if self.is_radial else invert_planar(self, u, v, a, b)
+
+def _sense(ua: Tensor, ub: Tensor, va: Tensor, vb: Tensor) -> Tensor:
+    # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
+    return torch.minimum(ua * vb - ub * va, ua + vb)
 
 
 class Tilt:
@@ -138,62 +129,42 @@ class Tilt:
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
         self.rotation = ((cy, sy * sx, -sy * cx), (torch.zeros_like(cx), cx, sx), (sy, -cy * sx, cy * cx))
 
-    def _projected(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
+        return self.linearise(a, b)[0]
+
+    def linearise(self, a: Tensor, b: Tensor) -> Linear:
+        """The value, its derivatives, and the sense."""
         (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = self.rotation
         reciprocal = 1 / (r20 * a + r21 * b + r22)
-        u = r22 * (r00 * a + r01 * b + r02) * reciprocal - r02
-        v = r22 * (r10 * a + r11 * b + r12) * reciprocal - r12
-        return u, v, reciprocal
-
-    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
-        return self._projected(a, b)[:2]
-
-    def jacobian(self, a: Tensor, b: Tensor) -> tuple[Jacobian, Tensor]:
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = self.rotation
-        u, v, reciprocal = self._projected(a, b)
-        u, v = u + r02, v + r12
+        u = r22 * (r00 * a + r01 * b + r02) * reciprocal
+        v = r22 * (r10 * a + r11 * b + r12) * reciprocal
         ua, ub = (r22 * r00 - u * r20) * reciprocal, (r22 * r01 - u * r21) * reciprocal
         va, vb = (r22 * r10 - v * r20) * reciprocal, (r22 * r11 - v * r21) * reciprocal
-        return (ua, ub, va, vb), torch.minimum(torch.minimum(ua * vb - ub * va, ua + vb), reciprocal)
-
-    def invert(self, u: Tensor, v: Tensor, radii: Tensor) -> Planes2:
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = self.rotation
-        x, y = (u + r02) / r22, (v + r12) / r22
-        reciprocal = 1 / (r02 * x + r12 * y + r22)
-        return (r00 * x + r10 * y + r20) * reciprocal, (r01 * x + r11 * y + r21) * reciprocal
+        return (u - r02, v - r12), (ua, ub, va, vb), torch.minimum(_sense(ua, ub, va, vb), reciprocal)
 
 
 class Lens:
-    """A chain of stages, the first of which sits on the chart's plane; no stages make the identity.
-
-    Only the first stage may have a radial factor: its inverse is tabulated on the chart's radii.
-    """
+    """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
     def __init__(self, *stages: Planar | Tilt):
         self.stages = stages
 
     @property
     def is_radial(self) -> bool:
-        return all(stage.is_radial for stage in self.stages)
+        """Whether the lens is a single radial factor: then its inverse is a matter of one variable."""
+        return len(self.stages) == 1 and self.stages[0].is_radial
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         for stage in self.stages:
             a, b = stage(a, b)
         return a, b
 
-    def jacobian(self, a: Tensor, b: Tensor) -> tuple[Jacobian, Tensor]:
-        """Derivatives of the chain, and the smallest sense of its stages."""
-        jacobian, sense = self.stages[0].jacobian(a, b)
-        for before, stage in zip(self.stages, self.stages[1:], strict=False):
-            a, b = before(a, b)
-            (ua, ub, va, vb), here = stage.jacobian(a, b)
+    def linearise(self, a: Tensor, b: Tensor) -> Linear:
+        """The value and the derivatives of the chain, and the smallest sense of its stages."""
+        value, jacobian, sense = self.stages[0].linearise(a, b)
+        for stage in self.stages[1:]:
+            value, (ua, ub, va, vb), here = stage.linearise(*value)
             pa, pb, qa, qb = jacobian
             jacobian = ua * pa + ub * qa, ua * pb + ub * qb, va * pa + vb * qa, va * pb + vb * qb
             sense = torch.minimum(sense, here)
-        return jacobian, sense
-
-    def invert(self, u: Tensor, v: Tensor, radii: Tensor) -> Planes2:
-        """Graph-free: the plane point that the lens sends to (u, v), as near as there is one."""
-        for stage in reversed(self.stages):
-            u, v = stage.invert(u, v, radii)
-        return u, v
+        return value, jacobian, sense

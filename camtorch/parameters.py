@@ -8,6 +8,74 @@ import torch
 from torch import Tensor, nn
 
 
+class GeometryModule(nn.Module):
+    """A module whose tensors are geometry: Parameters, or tensors of a graph, never of less than float32."""
+
+    def hold(self, name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+        """Register `value` expanded to `shape`: a Parameter as such, all else as a buffer outside the state_dict."""
+        if value.shape != shape:
+            learnable = isinstance(value, nn.Parameter)
+            value = value.expand(shape)
+            value = nn.Parameter(value.detach().clone()) if learnable else value
+        if shape[-1] == 0:  # an optimizer has nothing to learn here
+            value = value.detach()
+        if isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_buffer(name, value, persistent=False)
+
+    def _apply(self, fn, recurse=True):
+        # network.half() must not round a principal point to whole pixels
+        def at_least_float32(tensor: Tensor) -> Tensor:
+            moved = fn(tensor)
+            if moved.is_floating_point() and torch.finfo(moved.dtype).bits < 32:
+                return tensor.to(moved.device)
+            return moved
+
+        return super()._apply(at_least_float32, recurse)
+
+    def __getstate__(self):
+        # a tensor of a graph cannot be copied with its graph: the copy is a leaf
+        state = self.__dict__.copy()
+        state["_buffers"] = {
+            name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
+        }
+        return state
+
+
+class Memo:
+    """The last result of a computation, kept until one of its inputs changes.
+
+    Values are compared, not versions: a change through `.data`, or by functional_call, leaves no other trace.
+    Nothing is kept while the values may not be looked at. Copies and pickles begin empty.
+    """
+
+    def __init__(self):
+        self._kept = None
+
+    def __call__(self, inputs: Sequence[Tensor], options: tuple, compute: Callable[[], object]):
+        """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
+        if not all(is_concrete(t) for t in inputs):
+            return compute()
+        if self._kept is not None:
+            kept_inputs, kept_options, result = self._kept
+            if options == kept_options and all(map(_same, inputs, kept_inputs)):
+                return result
+        # what inference mode makes could not be used in a graph later
+        with torch.inference_mode(False), torch.no_grad():
+            copies = [t.detach().clone() for t in inputs]
+            result = compute()
+        self._kept = (copies, options, result)
+        return result
+
+    def __getstate__(self):
+        return {"_kept": None}
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    return a.shape == b.shape and a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
+
+
 def is_concrete(tensor: Tensor) -> bool:
     """Whether the values may be looked at: not while a graph is traced, nor inside vmap, grad or jacfwd."""
     return not (

@@ -1,71 +1,112 @@
-"""The inverse of a lens: two graph-free solvers, and one function that gives their result its derivatives."""
+"""The inverse of a lens: graph-free solvers, and one function that gives their result its derivatives."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from camtorch.parameters import is_concrete
+
+if TYPE_CHECKING:
+    from camtorch.domain import Domain
+
 Planes2 = tuple[Tensor, Tensor]
 
-_RADIAL_STEPS = 5  # of third order, from an interval of the table: 1e-2 -> 1e-6 -> 1e-18, with reserve for wild lenses
-_PLANAR_STEPS = 12
+_RADIAL_STEPS = 6  # of third order, from one interval of the table: 1e-2, 1e-6, 1e-18, with a reserve for wild lenses
+_START_ROUNDS = 2
+_GIVE_UP = 1e-4
+_PLANAR_STEPS = 20  # it ends after about 4 where values may be looked at; the rest is for points next to a fold
 
 
-def invert_radial(radial, radii: Tensor, u: Tensor, v: Tensor) -> Planes2:
-    """The point m with m R(|m|^2) = (u, v), before the first turn of |m| R.
+def invert(domain: Domain, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The plane point that the lens of `domain` sends to (u, v), both (*B, N), and whether there is one."""
+    a, b = (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v)
+    (x, y), _, sense = domain.lens.linearise(a, b)
+    miss = torch.maximum((u - x).abs(), (v - y).abs())
+    return a, b, (miss <= _rounding(u, v)) & domain.contains(a, b, sense)
 
-    radial: a radial factor with `derivatives`; radii: (S,) increasing, from 0 to the end of the chart;
-    u, v: (*B, N). A target beyond the turn ends at the turn.
 
-    The table of |m| R brackets the root; inside the bracket the steps of Cauchy's method (the root of
-    the local parabola) converge with third order, at the turn as well, where Newton's method crawls.
+def _rounding(u: Tensor, v: Tensor) -> Tensor:
+    """What rounding may leave of a root: the terms of a polynomial can be much larger than their sum."""
+    return 1024 * torch.finfo(u.dtype).eps * (1 + torch.maximum(u.abs(), v.abs()))
+
+
+def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
+    """Steps of Cauchy's method inside a bracket.
+
+    They go to the root of the local parabola: of third order, and at the fold too, where Newton's method crawls.
     """
+    factor = domain.lens.stages[0].radial
     target = (u * u + v * v).sqrt()
-    table = radii * radial(radii * radii)
-    # a table that has turned must not catch targets a second time: from the turn on it is the maximum
-    table = torch.cummax(torch.nan_to_num(table, nan=0.0), dim=-1).values.expand(*target.shape[:-1], -1)
-    low = (torch.searchsorted(table.contiguous(), target.contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
-    lower = radii[low]
-    # the turn may lie one interval behind the last node that still rises
-    upper = radii[(low + 2).clamp(max=len(radii) - 1)]
-    rho = lower
+    lower, rho, upper = domain.bracket(target, u, v)
     for _ in range(_RADIAL_STEPS):
         t = rho * rho
-        value, first, second = radial.derivatives(t)
+        value, first, second = factor.derivatives(t, 2)
         slope = value + 2 * t * first
         bend = rho * (6 * first + 4 * t * second)
         error = target - rho * value
         denominator = slope.abs() + (slope * slope + 2 * bend * error).clamp(min=0).sqrt()
         step = 2 * error / torch.where(denominator > 0, denominator, 1.0)
         rho = torch.minimum(torch.maximum(rho + torch.where(slope < 0, -step, step), lower), upper)
-    factor = radial(rho * rho)
-    return u / factor, v / factor
+    scale = factor(rho * rho)
+    return u / scale, v / scale
 
 
-def invert_planar(stage, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Planes2:
-    """Newton's method in the plane from (a, b); a step that does not come nearer, or crosses a fold, is shortened."""
+def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
+    """Newton's method in the plane, each step shortened until it comes nearer and stays in the domain.
 
-    def miss(a: Tensor, b: Tensor):
-        x, y = stage(a, b)
-        du, dv = u - x, v - y
-        return du, dv, du * du + dv * dv
-
-    du, dv, best = miss(a, b)
-    length = torch.ones_like(best)
+    Nearer in Deuflhard's sense: the next step by the same Jacobian is shorter. Where a lens stretches one direction
+    far more than the other, the residual itself would reject every good step.
+    """
+    lens = domain.lens
+    a, b = _planar_start(domain, u, v)
+    value, jacobian, _ = lens.linearise(a, b)
+    enough = _rounding(u, v) / 64
+    length = torch.ones_like(u)
     for _ in range(_PLANAR_STEPS):
-        (ua, ub, va, vb), _ = stage.jacobian(a, b)
-        determinant = ua * vb - ub * va
-        scale = length / torch.where(determinant != 0, determinant, 1.0)
-        next_a, next_b = a + (vb * du - ub * dv) * scale, b + (ua * dv - va * du) * scale
-        next_du, next_dv, error = miss(next_a, next_b)
-        better = (error < best) & (stage.jacobian(next_a, next_b)[1] > 0)
-        a, b = torch.where(better, next_a, a), torch.where(better, next_b, b)
-        du, dv, best = (
-            torch.where(better, next_du, du),
-            torch.where(better, next_dv, dv),
-            torch.where(better, error, best),
-        )
-        length = torch.where(better, 1.0, length / 4)
+        miss = u - value[0], v - value[1]
+        active = (torch.maximum(miss[0].abs(), miss[1].abs()) > enough) & (length > _GIVE_UP)
+        if is_concrete(active) and not bool(active.any()):
+            break
+        step = _newton_step(jacobian, *miss)
+        trial = a + length * step[0], b + length * step[1]
+        trial_value, trial_jacobian, sense = lens.linearise(*trial)
+        ahead = _newton_step(jacobian, u - trial_value[0], v - trial_value[1])
+        nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < step[0] * step[0] + step[1] * step[1]
+        good = active & nearer & domain.contains(*trial, sense)
+        old, new = (a, b, *value, *jacobian), (*trial, *trial_value, *trial_jacobian)
+        a, b, x, y, *jacobian = (torch.where(good, n, o) for n, o in zip(new, old, strict=True))
+        value = x, y
+        length = torch.where(good, (length * 4).clamp(max=1), length / 4)
+    return a, b
+
+
+def _newton_step(jacobian, du: Tensor, dv: Tensor) -> Planes2:
+    ua, ub, va, vb = jacobian
+    determinant = ua * vb - ub * va
+    scale = 1 / torch.where(determinant != 0, determinant, 1.0)
+    return (vb * du - ub * dv) * scale, (ua * dv - va * du) * scale
+
+
+def _planar_start(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
+    """From the table, on the azimuth of (u, v), then on that azimuth turned by what the lens turned it, if better."""
+    target = (u * u + v * v).sqrt()
+    off_axis = target > 0
+    c, s = (torch.where(off_axis, w / torch.where(off_axis, target, 1.0), axis) for w, axis in ((u, 1.0), (v, 0.0)))
+    a, b, best = torch.zeros_like(u), torch.zeros_like(v), target * target
+    for _ in range(_START_ROUNDS):
+        rho = domain.bracket(target, c, s)[1]
+        x, y = domain.lens(rho * c, rho * s)
+        error = (u - x) ** 2 + (v - y) ** 2
+        better = error < best
+        a, b, best = torch.where(better, rho * c, a), torch.where(better, rho * s, b), torch.where(better, error, best)
+        cosine, sine = u * x + v * y, v * x - u * y
+        norm = (cosine * cosine + sine * sine).sqrt()
+        norm = torch.where(norm > 0, norm, torch.inf)
+        c, s = (c * cosine - s * sine) / norm, (s * cosine + c * sine) / norm
     return a, b
 
 
@@ -78,9 +119,9 @@ def attach(
     """Give a graph-free solution of function(solution) = target its exact first and second derivatives.
 
     Two steps of the chord method x <- x - J^-1 (f(x) - y) with the constant Jacobian of the solution. If
-    parameters and target move by d, the solution after one step is off by O(d^2) and after two by O(d^3):
+    parameters and target move by d, the solution is off by O(d^2) after one step and by O(d^3) after two:
     its Taylor series agrees with that of the implicit function up to second order. The Jacobian itself never
-    enters the graph. On the values the steps polish what rounding the solver left.
+    enters the graph. On the values the steps polish what rounding left.
     """
     (a, b), (au, av, bu, bv), (u, v) = solution, inverse_jacobian, target
     for _ in range(2):

@@ -48,6 +48,7 @@ class KannalaBrandt(Camera):
         Args:
             intrinsics: (*B, 4) fx, fy, cx, cy; 1, 1 for the focal lengths where the coefficients are in pixels.
             coefficients: (*B, n), n >= 1: k1, k2, ... of the paper; k1 > 0 is folded into the focal lengths.
+            image_size: (height, width) in pixels.
 
         Source: Kannala and Brandt, "A generic camera model and calibration method for conventional,
         wide-angle, and fish-eye lenses", PAMI 2006, equation (6).

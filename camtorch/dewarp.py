@@ -1,0 +1,115 @@
+"""Dewarp: a Warp that chooses its own target."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from camtorch.camera import Camera
+from camtorch.models import Cylindrical, Equirectangular, Pinhole
+from camtorch.parameters import as_image_size
+from camtorch.warp import Warp, _turn
+
+_WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold
+# projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for
+_PROJECTIONS = {
+    "perspective": (Pinhole, _WIDEST_PERSPECTIVE, _WIDEST_PERSPECTIVE),
+    "cylindrical": (Cylindrical, 2 * math.pi, 2 * math.tan(math.radians(50))),
+    "equirectangular": (Equirectangular, 2 * math.pi, math.pi),
+}
+_LINE_SAMPLES = 257
+
+
+class Dewarp(Warp):
+    """Undistort pictures: a `Warp` from `camera` to an undistorted camera that it chooses, `dewarp.target`.
+
+    Args:
+        camera: the camera of the given images, with image_size; with a batch dim the target gets one as well.
+        projection: "perspective" (straight lines stay straight; up to about 120 degrees), "cylindrical" (vertical lines
+            do, for wide views) or "equirectangular" (everything).
+        fov: horizontal field of view of the target in radians, centred on its axis. By default the target shows
+            what the picture's middle row and column show, and never more than 120 degrees in perspective.
+        image_size: (height, width) of the target; the source's by default.
+        rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
+        mode, padding_mode: see `Warp`.
+
+    The target has square pixels and does not learn. It is finite for every camera, also where the lens folds
+    inside the picture or sees past 90 degrees.
+
+    Raises:
+        ValueError: an unknown projection, a fov outside (0, pi) for perspective or (0, 2 pi], and as `Warp`.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        *,
+        projection: str = "perspective",
+        fov: float | None = None,
+        image_size: tuple[int, int] | None = None,
+        rotation: Tensor | None = None,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+    ):
+        if projection not in _PROJECTIONS:
+            raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
+        if not isinstance(camera, Camera):
+            raise TypeError(f"Dewarp: camera must be a Camera; got {type(camera).__name__}")
+        if camera.image_size is None:
+            raise ValueError("Dewarp: the camera needs an image_size=(height, width)")
+        size = as_image_size(image_size, "Dewarp") or camera.image_size
+        model = _PROJECTIONS[projection][0]
+        with torch.no_grad():
+            if fov is not None:
+                height, width = size
+                focal = camera.intrinsics.new_tensor(width / _plane_width(projection, fov))
+                centre = camera.intrinsics.new_tensor([(width - 1) / 2, (height - 1) / 2])
+                intrinsics = torch.cat((focal.expand(2), centre))
+            else:
+                intrinsics = _fitted(camera, projection, size, rotation)
+        target = model(intrinsics, image_size=size).requires_grad_(False)
+        super().__init__(camera, target, rotation, mode=mode, padding_mode=padding_mode)
+
+
+def _plane_width(projection: str, fov: float) -> float:
+    widest = math.pi if projection == "perspective" else 2 * math.pi
+    if not (
+        isinstance(fov, (int, float)) and 0 < fov <= widest and not (projection == "perspective" and fov >= math.pi)
+    ):
+        raise ValueError(
+            f"Dewarp: fov must be in radians, between 0 and {widest:.4g} for a {projection} target; got {fov!r}"
+        )
+    return 2 * math.tan(fov / 2) if projection == "perspective" else fov
+
+
+def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:
+    """(*B, 4): the target that shows what the middle row and column of the camera's picture show."""
+    model, widest, tallest = _PROJECTIONS[projection]
+    height, width = camera.image_size
+    like = {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}
+    across = torch.linspace(-0.5, width - 0.5, _LINE_SAMPLES, **like)
+    down = torch.linspace(-0.5, height - 0.5, _LINE_SAMPLES, **like)
+    row = torch.stack((across, torch.full_like(across, (height - 1) / 2)), -1)
+    column = torch.stack((torch.full_like(down, (width - 1) / 2), down), -1)
+    pixels = torch.cat((row, column)).expand(*camera.batch_shape, -1, -1)
+    rays, has_ray = camera.unproject(pixels)
+    if rotation is not None:
+        rotation = torch.as_tensor(rotation)
+        while rays.ndim - 2 < rotation.ndim - 2:
+            rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
+    plane, shown = model([1.0, 1.0, 0.0, 0.0]).to(**like).project(_turn(rotation, rays, "rays"))
+    shown = (shown & has_ray).unsqueeze(-1)
+    limit = plane.new_tensor([widest, tallest]) / 2
+    plane = torch.maximum(torch.minimum(plane, limit), -limit)
+    # a lens that shows nothing in this direction gets a quarter turn straight ahead
+    some = shown.any(-2)
+    low = torch.where(some, torch.where(shown, plane, torch.inf).amin(-2), -1.0)
+    high = torch.where(some, torch.where(shown, plane, -torch.inf).amax(-2), 1.0)
+    extent = torch.maximum(high - low, 1e-3 * limit)
+    target = plane.new_tensor([size[1], size[0]])
+    # all that is shown fits in, unless that takes more than the limit on one side
+    focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit)).amax(-1)).unsqueeze(-1)
+    centre = (target - 1) / 2 - focal * (low + high) / 2
+    return torch.cat((focal, focal, centre), -1)

@@ -1,0 +1,108 @@
+"""The domain of a lens, tabulated: how far out it stays one-to-one, and where to start its inverse."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from camtorch.charts import Chart
+    from camtorch.lens import Lens
+
+_AZIMUTHS, _RADII = 256, 64
+_RADII_RADIAL = 256  # for a radial lens, where one azimuth stands for all
+
+
+class Domain:
+    """The lens of each camera on azimuths and radii of the chart's plane. Graph-free.
+
+    On each azimuth the sense of the lens (positive where it is regular) is followed outwards over the radii. It is
+    lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
+    dips below zero between them. Up to there the sense changes its sign once at the most, so that its
+    value at the point itself tells exactly on which side of the fold the point lies.
+    """
+
+    def __init__(self, lens: Lens, chart: Chart, like: Tensor):
+        """like: gives the dtype and device. The tables have the shape (*B, azimuths, radii)."""
+        self.lens = lens
+        self.azimuths = 1 if lens.is_radial else _AZIMUTHS
+        self.radii = chart.radii(_RADII_RADIAL if lens.is_radial else _RADII, like)
+        angles = torch.arange(self.azimuths, dtype=like.dtype, device=like.device) * (2 * math.pi / self.azimuths)
+        plane = [torch.outer(f(angles), self.radii).flatten() for f in (torch.cos, torch.sin)]
+        (x, y), _, sense = lens.linearise(*plane)
+        shape = (self.azimuths, len(self.radii))
+        self.lost = _first_loss(sense.unflatten(-1, shape))
+        self.limits = self._limits()
+        self.reach = self._ascending((x * x + y * y).sqrt().unflatten(-1, shape))
+
+    def _limits(self) -> Tensor:
+        """(*B, azimuths): the radius, up to the next azimuth, before which the sense at the point itself decides."""
+        last = len(self.radii) - 1
+        index = self.lost.floor().long().clamp(max=last)
+        inner, outer = self.radii[index], self.radii[(index + 1).clamp(max=last)]
+        limit = torch.where(self.lost <= last, inner + (self.lost - index) * (outer - inner), torch.inf)
+        # between two azimuths the fold moves smoothly, or it ends there: then the nearer one is on the safe side
+        smooth = (self.lost - self.lost.roll(-1, -1)).abs() <= 1.5
+        following = limit.roll(-1, -1)
+        return torch.where(smooth, torch.maximum(limit, following), torch.minimum(limit, following))
+
+    def _ascending(self, reach: Tensor) -> Tensor:
+        """(*B, azimuths, radii): how far from the centre the lens sends a node; infinite past the fold."""
+        nodes = torch.arange(len(self.radii), dtype=reach.dtype, device=reach.device)
+        before = (nodes < self.lost.unsqueeze(-1)) & (reach < torch.inf)
+        return torch.cummax(torch.where(before, reach, torch.inf), -1).values
+
+    def contains(self, a: Tensor, b: Tensor, sense: Tensor) -> Tensor:
+        """Bool: plane points (*B, N) before the fold of their azimuth; `sense` is that of the lens at these points."""
+        # nearer to zero its reciprocal could leave the floating-point range
+        regular = sense > torch.finfo(a.dtype).tiny ** 0.25
+        limits = self.limits
+        if self.azimuths > 1:
+            limits = torch.gather(limits.expand(*a.shape[:-1], -1), -1, self._azimuth(a, b, 0.0))
+        return regular & (a * a + b * b < limits * limits)
+
+    def bracket(self, target: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The radii (*B, N) between which the lens reaches `target` on the azimuth of (a, b), and a guess between them.
+
+        Looked for before the fold only: a target that is not reached ends up next to it.
+        """
+        size = len(self.radii)
+        row = self._azimuth(a, b, 0.5) * size if self.azimuths > 1 else torch.zeros_like(target, dtype=torch.long)
+        table = self.reach.flatten(-2).expand(*target.shape[:-1], -1)
+        low = _last_not_above(table, row, size, target)
+        near, far = torch.gather(table, -1, row + low), torch.gather(table, -1, row + low + 1)
+        # next to the fold only its inner side is safe to start from
+        fraction = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
+        lower, upper = self.radii[low], self.radii[(low + 2).clamp(max=size - 1)]
+        return lower, lower + fraction.clamp(0, 1) * (self.radii[low + 1] - lower), upper
+
+    def _azimuth(self, a: Tensor, b: Tensor, offset: float) -> Tensor:
+        """The index of the azimuth at or below that of the points; `offset` 0.5 gives the nearest one."""
+        turn = torch.atan2(b, a) * (self.azimuths / (2 * math.pi)) + offset
+        return turn.floor().long().remainder(self.azimuths)
+
+
+def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> Tensor:
+    """The index, up to length - 2, of the last entry not above the target in the ascending row that begins at `row`."""
+    low, high = torch.zeros_like(row), torch.full_like(row, length - 1)
+    for _ in range((length - 1).bit_length()):
+        middle = (low + high) // 2
+        above = torch.gather(table, -1, row + middle) > target
+        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+    return low.clamp(max=length - 2)
+
+
+def _first_loss(sense: Tensor) -> Tensor:
+    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where the sense is first lost; S where it never is."""
+    before, here, after = sense[..., :-2], sense[..., 1:-1], sense[..., 2:]
+    bend, tilt = before - 2 * here + after, before - after
+    bend_safe = torch.where(bend > 0, bend, 1.0)
+    dips = (bend > 0) & (tilt.abs() <= bend) & (here - tilt * tilt / (8 * bend_safe) <= 0)
+    offset = torch.where(dips & (here > 0), tilt / (2 * bend_safe), 0.0)
+    nodes = torch.arange(sense.shape[-1], dtype=sense.dtype, device=sense.device)
+    inner = torch.where(dips | ~(here > 0), nodes[1:-1] + offset, torch.inf)
+    ends = torch.where(sense[..., [0, -1]] > 0, torch.inf, nodes[[0, -1]])
+    return torch.cat((inner, ends), -1).amin(-1).clamp(max=sense.shape[-1])

@@ -1,0 +1,88 @@
+"""The picture of a camera: its size, its pixels, and the cameras of its edited versions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from camtorch.parameters import GeometryModule, as_image_size
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class Picture(GeometryModule):
+    """The part of a camera that its intrinsics and image size alone decide. Used through `Camera`."""
+
+    intrinsics: Tensor
+    distortion: Tensor
+    distortion_names: tuple[str, ...] = ()
+    image_size: tuple[int, int] | None
+    odd_in_x: ClassVar[frozenset[str]] = frozenset()
+    """The coefficients that change sign when the scene is mirrored left to right."""
+    odd_in_y: ClassVar[frozenset[str]] = frozenset()
+    """Likewise top to bottom."""
+
+    def contains(self, pixels: Tensor) -> Tensor:
+        """Bool (...): whether pixels (..., 2) lie on the picture, its outer pixel edges included."""
+        height, width = self._size("contains")
+        u, v = pixels.unbind(-1)
+        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+
+    def pixel_grid(self) -> Tensor:
+        """(H, W, 2): the centre of every pixel."""
+        height, width = self._size("pixel_grid")
+        like = {"dtype": torch.promote_types(self.intrinsics.dtype, torch.float32), "device": self.intrinsics.device}
+        v, u = torch.meshgrid(torch.arange(height, **like), torch.arange(width, **like), indexing="ij")
+        return torch.stack((u, v), -1)
+
+    def _size(self, what: str) -> tuple[int, int]:
+        if self.image_size is None:
+            raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
+        return self.image_size
+
+    # -- the camera of an edited picture
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Self:
+        """The camera of the part of the picture whose top-left pixel is (left, top); it may reach outside."""
+        return self._edited(shift=(-left, -top), size=(height, width))
+
+    def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
+        """The camera of the picture with that many more pixels on each side."""
+        height, width = self._size("pad")
+        return self._edited(shift=(left, top), size=(height + top + bottom, width + left + right))
+
+    def resize(self, height: int, width: int) -> Self:
+        """The camera of the picture scaled to that size; pixel edges scale, as with align_corners=False."""
+        old_height, old_width = self._size("resize")
+        as_image_size((height, width), f"{type(self).__name__}.resize")
+        return self._edited(scale=(width / old_width, height / old_height), size=(height, width))
+
+    def hflip(self) -> Self:
+        """The camera that sees the scene mirrored left to right: its picture is this one's, flipped."""
+        return self._edited(mirror="x", size=self._size("hflip"))
+
+    def vflip(self) -> Self:
+        """The camera that sees the scene mirrored top to bottom: its picture is this one's, flipped."""
+        return self._edited(mirror="y", size=self._size("vflip"))
+
+    def _edited(self, *, size, shift=(0, 0), scale=(1.0, 1.0), mirror: str = "") -> Self:
+        fx, fy, cx, cy = self.intrinsics.unbind(-1)
+        cx, cy = (cx + 0.5) * scale[0] - 0.5 + shift[0], (cy + 0.5) * scale[1] - 0.5 + shift[1]
+        odd: frozenset[str] = frozenset()
+        if mirror == "x":
+            cx, odd = size[1] - 1 - cx, self.odd_in_x
+        elif mirror == "y":
+            cy, odd = size[0] - 1 - cy, self.odd_in_y
+        intrinsics = torch.stack((fx * scale[0], fy * scale[1], cx, cy), -1)
+        arguments = [intrinsics]
+        if self.distortion.shape[-1]:
+            sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
+            arguments.append(self.distortion * sign)
+        edited = type(self)(*arguments, image_size=size)
+        for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
+            if its.is_leaf and its.shape[-1]:
+                its.requires_grad_(mine.requires_grad)
+        return edited

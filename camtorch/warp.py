@@ -1,0 +1,248 @@
+"""Every image operation between two cameras: one Warp."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from torch import Tensor, nn
+
+from camtorch.camera import Camera
+from camtorch.extrinsics import check_rotation, rotate_planes
+from camtorch.parameters import GeometryModule, Memo, as_planes
+
+_MODES = ("bilinear", "nearest", "bicubic")
+_PADDINGS = ("zeros", "border", "reflection")
+_OUTSIDE = -3.0  # a sampling position that no picture reaches, not even with its interpolation margin
+_FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
+_EDGE_SAMPLES = 64  # per box edge: a 500 px edge bent to a radius of 300 px is then enclosed to 0.03 px
+
+
+class Warp(GeometryModule):
+    """The picture that `target` would see, made from the picture of `source`, both at one place.
+
+    Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are (B, C, H, W). Points, boxes and
+    rays move from source to target. A batch of cameras or rotations, of size B, goes sample by sample with
+    the images; cameras without batch dims serve all of them.
+
+    Args:
+        source: the camera of the given images.
+        target: the camera of the images to make; its `image_size` is theirs.
+        rotation: (3, 3) or (B, 3, 3) rotation matrix; may require grad. None is no rotation.
+        mode: "bilinear", "nearest" (masks, labels) or "bicubic".
+        padding_mode: "zeros", "border" or "reflection", for pixels that the source sees outside its
+            picture. A pixel without a ray, or whose ray the source cannot map, is always zero.
+
+    The sampling grid is kept while nothing that it depends on can learn or has changed.
+
+    Raises:
+        ValueError: a mode that does not exist, cameras without image_size, a rotation of another shape or that is
+            none, batch dims that do not fit. TypeError: source or target is not a Camera.
+    """
+
+    def __init__(
+        self,
+        source: Camera,
+        target: Camera,
+        rotation: Tensor | None = None,
+        *,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+    ):
+        super().__init__()
+        for name, camera in (("source", source), ("target", target)):
+            if not isinstance(camera, Camera):
+                raise TypeError(f"Warp: {name} must be a Camera; got {type(camera).__name__}")
+            if camera.image_size is None:
+                raise ValueError(f"Warp: the {name} camera needs an image_size=(height, width)")
+        if padding_mode not in _PADDINGS:
+            raise ValueError(f"Warp: padding_mode must be one of {_PADDINGS}; got {padding_mode!r}")
+        self.source, self.target = source, target
+        self.mode, self.padding_mode = _checked_mode(mode), padding_mode
+        self._set_rotation(rotation)
+        shapes = [source.batch_shape, target.batch_shape, () if rotation is None else self.rotation.shape[:-2]]
+        try:
+            self.batch_shape = torch.broadcast_shapes(*shapes)
+        except RuntimeError:
+            self.batch_shape = None
+        if self.batch_shape is None or len(self.batch_shape) > 1:
+            raise ValueError(
+                "Warp: source, target and rotation may each have one batch dim, of one size; "
+                f"got {', '.join(str(tuple(s)) for s in shapes)}"
+            )
+        self._memo = Memo()
+
+    def _set_rotation(self, rotation) -> None:
+        if rotation is None:
+            self.register_buffer("rotation", None)
+            return
+        rotation = torch.as_tensor(rotation)
+        if rotation.shape[-2:] != (3, 3):
+            raise ValueError(f"Warp: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
+        if not rotation.is_floating_point():
+            rotation = rotation.to(torch.get_default_dtype())
+        check_rotation(rotation, "rotation", "Warp")
+        if isinstance(rotation, nn.Parameter):
+            self.register_parameter("rotation", rotation)
+        else:
+            self.register_buffer("rotation", rotation, persistent=not rotation.requires_grad)
+
+    # -- pictures
+
+    def forward(self, images: Tensor, *, mode: str | None = None) -> Tensor:
+        """Warp pictures.
+
+        Args:
+            images: (B, C, H, W) of the source's image_size, floating point, integer or bool.
+            mode: instead of the warp's own, for example "nearest" for a mask.
+
+        Returns:
+            (B, C, H', W') of the target's image_size and of the same dtype. Half precision is sampled in float32;
+            integers are rounded and stay in their range, bool is true from one half on.
+
+        Raises:
+            ValueError: another shape or size. TypeError: complex images.
+        """
+        if not isinstance(images, Tensor) or images.is_complex():
+            what = getattr(images, "dtype", type(images).__name__)
+            raise TypeError(f"Warp: images must be a tensor of real numbers; got {what}")
+        if images.ndim != 4:
+            raise ValueError(f"Warp: images must be (B, C, H, W); got shape {tuple(images.shape)}")
+        if tuple(images.shape[-2:]) != self.source.image_size:
+            raise ValueError(
+                f"Warp: images are {tuple(images.shape[-2:])} (height, width), "
+                f"but the source camera's image_size is {self.source.image_size}"
+            )
+        mode = self.mode if mode is None else _checked_mode(mode)
+        grid, mapped, _ = self._sampling()
+        batch = max(len(images), len(grid)) if len(images) else 0
+        if len(grid) not in (1, batch) or len(images) not in (1, batch):
+            raise ValueError(f"Warp: {len(images)} images do not fit {len(grid)} cameras")
+        dtype = _sampling_dtype(images.dtype)
+        result = F.grid_sample(
+            images.to(dtype).expand(batch, -1, -1, -1),
+            grid.to(dtype).expand(batch, -1, -1, -1),
+            mode=mode,
+            padding_mode=self.padding_mode,
+            align_corners=False,
+        )
+        if self.padding_mode != "zeros":
+            result = torch.where(mapped.unsqueeze(1), result, 0.0)
+        return _cast_back(result, images.dtype)
+
+    def grid(self) -> Tensor:
+        """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -3 where there is none."""
+        return self._sampling()[0]
+
+    def valid_mask(self) -> Tensor:
+        """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its picture."""
+        return self._sampling()[2].unsqueeze(1)
+
+    def _sampling(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The grid, where a ray was mapped at all, and where onto the source's picture."""
+        inputs = [t for t in self._inputs() if t is not None]
+        learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+        if learns:
+            return self._compute_sampling()
+        return self._memo(inputs, (self.source.image_size, self.target.image_size), self._compute_sampling)
+
+    def _inputs(self) -> tuple[Tensor | None, ...]:
+        s, t = self.source, self.target
+        return s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation
+
+    def _compute_sampling(self) -> tuple[Tensor, Tensor, Tensor]:
+        rays, has_ray = self.target.rays()
+        if rays.ndim == 3:
+            rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
+        rotation = None if self.rotation is None else self.rotation.mT
+        pixels, mapped = self.source.project(_turn(rotation, rays, "rays"))
+        mapped = mapped & has_ray
+        height, width = self.source.image_size
+        scale = pixels.new_tensor([2 / width, 2 / height])
+        grid = (pixels + 0.5) * scale - 1
+        grid = torch.where(mapped.unsqueeze(-1), grid.clamp(-_FAR, _FAR), _OUTSIDE)
+        return grid, mapped, mapped & self.source.contains(pixels)
+
+    # -- labels
+
+    def transform_points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Move pixels (B, *N, 2), or (*N, 2) for cameras without batch, from the source's to the target's picture.
+
+        Returns:
+            pixels of the same shape, and valid (B, *N) bool: the source pixel has a ray, and the target sees
+            it on its picture. Pixels off the picture keep their place; those without one get (-1, -1).
+        """
+        moved, mapped = self._move(pixels)
+        return moved, mapped & self.target.contains(moved)
+
+    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        rays, has_ray = self.source.unproject(pixels)
+        moved, mapped = self.target.project(_turn(self.rotation, rays, "pixels"))
+        valid = mapped & has_ray
+        return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
+
+    def transform_boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
+        """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.
+
+        Returns:
+            the boxes that enclose the moved outlines (curved: the edges are sampled), not clipped to the
+            picture, and valid (B, *N) bool: some part of the outline lies on the target's picture. A box
+            none of whose outline can be mapped is (-1, -1, -1, -1).
+        """
+        if boxes.ndim == 0 or boxes.shape[-1] != 4:
+            raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
+        if not boxes.is_floating_point():
+            boxes = boxes.to(self.source.intrinsics.dtype)
+        x1, y1, x2, y2 = (side.unsqueeze(-1) for side in boxes.unbind(-1))
+        along = torch.linspace(0, 1, _EDGE_SAMPLES + 1, dtype=boxes.dtype, device=boxes.device)[:-1]
+        x, y = x1 + (x2 - x1) * along, y1 + (y2 - y1) * along
+        x_back, y_back = x2 + (x1 - x2) * along, y2 + (y1 - y2) * along
+        outline_x = torch.cat((x, x2.expand_as(x), x_back, x1.expand_as(x)), -1)
+        outline_y = torch.cat((y1.expand_as(y), y, y2.expand_as(y), y_back), -1)
+        moved, mapped = self._move(torch.stack((outline_x, outline_y), -1))
+        some = mapped.any(-1, keepdim=True)
+        low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
+        high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)
+        enclosing = torch.where(some, torch.cat((low, high), -1), -1.0)
+        return enclosing, (mapped & self.target.contains(moved)).any(-1)
+
+    def transform_rays(self, rays: Tensor) -> Tensor:
+        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
+        return _turn(self.rotation, rays, "rays")
+
+    def inverse(self) -> Warp:
+        """The warp from target to source. What lay outside the picture, or between its pixels, stays lost."""
+        rotation = None if self.rotation is None else self.rotation.mT
+        return Warp(self.target, self.source, rotation, mode=self.mode, padding_mode=self.padding_mode)
+
+    def extra_repr(self) -> str:
+        """The options."""
+        return f"mode={self.mode!r}, padding_mode={self.padding_mode!r}, rotation={self.rotation is not None}"
+
+
+def _turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
+    if rotation is None:
+        return rays
+    planes, restore = as_planes(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
+    return restore(*rotate_planes(rotation, planes))
+
+
+def _checked_mode(mode: str) -> str:
+    if mode not in _MODES:
+        raise ValueError(f"Warp: mode must be one of {_MODES}; got {mode!r}")
+    return mode
+
+
+def _sampling_dtype(dtype: torch.dtype) -> torch.dtype:
+    """Wide enough that every value of the dtype, a class id too, is exact."""
+    if dtype.is_floating_point:
+        return torch.promote_types(dtype, torch.float32)
+    return torch.float32 if dtype.itemsize <= 2 else torch.float64
+
+
+def _cast_back(result: Tensor, dtype: torch.dtype) -> Tensor:
+    if dtype == torch.bool:
+        return result >= 0.5
+    if not dtype.is_floating_point:
+        limits = torch.iinfo(dtype)
+        result = result.round().clamp(limits.min, limits.max)
+    return result.to(dtype)
