@@ -10,7 +10,7 @@ from torch import Tensor
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
 from camtorch.parameters import as_image_size
-from camtorch.warp import Warp, _turn
+from camtorch.warp import Warp, as_rotation, turn
 
 _WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold
 # projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for
@@ -60,6 +60,7 @@ class Dewarp(Warp):
         if camera.image_size is None:
             raise ValueError("Dewarp: the camera needs an image_size=(height, width)")
         size = as_image_size(image_size, "Dewarp") or camera.image_size
+        rotation = as_rotation(rotation, "Dewarp")
         model = _PROJECTIONS[projection][0]
         with torch.no_grad():
             if fov is not None:
@@ -96,20 +97,25 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     pixels = torch.cat((row, column)).expand(*camera.batch_shape, -1, -1)
     rays, has_ray = camera.unproject(pixels)
     if rotation is not None:
-        rotation = torch.as_tensor(rotation)
         while rays.ndim - 2 < rotation.ndim - 2:
             rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-    plane, shown = model([1.0, 1.0, 0.0, 0.0]).to(**like).project(_turn(rotation, rays, "rays"))
+    plane, shown = model([1.0, 1.0, 0.0, 0.0]).to(**like).project(turn(rotation, rays, "rays"))
     shown = (shown & has_ray).unsqueeze(-1)
     limit = plane.new_tensor([widest, tallest]) / 2
     plane = torch.maximum(torch.minimum(plane, limit), -limit)
+    if projection != "perspective":
+        # over a pole the longitude jumps: across counts what the row shows, up and down what the column does
+        is_row = torch.arange(2 * _LINE_SAMPLES, device=plane.device).unsqueeze(-1) < _LINE_SAMPLES
+        shown = shown & torch.cat((is_row, ~is_row), -1)
+    shown = shown.expand(plane.shape)
     # a lens that shows nothing in this direction gets a quarter turn straight ahead
     some = shown.any(-2)
     low = torch.where(some, torch.where(shown, plane, torch.inf).amin(-2), -1.0)
     high = torch.where(some, torch.where(shown, plane, -torch.inf).amax(-2), 1.0)
     extent = torch.maximum(high - low, 1e-3 * limit)
     target = plane.new_tensor([size[1], size[0]])
-    # all that is shown fits in, unless that takes more than the limit on one side
-    focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit)).amax(-1)).unsqueeze(-1)
+    # all that is shown fits in, unless that takes a wider picture than the widest
+    sides = slice(None) if projection == "perspective" else slice(1)
+    focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit))[sides].amax(-1)).unsqueeze(-1)
     centre = (target - 1) / 2 - focal * (low + high) / 2
     return torch.cat((focal, focal, centre), -1)

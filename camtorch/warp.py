@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor, nn
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotate_planes
 from camtorch.parameters import GeometryModule, Memo, as_planes
+from camtorch.sampling import MODES, PADDINGS, sample
 
-_MODES = ("bilinear", "nearest", "bicubic")
-_PADDINGS = ("zeros", "border", "reflection")
 _OUTSIDE = -3.0  # a sampling position that no picture reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 _EDGE_SAMPLES = 64  # per box edge: a 500 px edge bent to a radius of 300 px is then enclosed to 0.03 px
@@ -54,11 +52,11 @@ class Warp(GeometryModule):
                 raise TypeError(f"Warp: {name} must be a Camera; got {type(camera).__name__}")
             if camera.image_size is None:
                 raise ValueError(f"Warp: the {name} camera needs an image_size=(height, width)")
-        if padding_mode not in _PADDINGS:
-            raise ValueError(f"Warp: padding_mode must be one of {_PADDINGS}; got {padding_mode!r}")
+        if padding_mode not in PADDINGS:
+            raise ValueError(f"Warp: padding_mode must be one of {PADDINGS}; got {padding_mode!r}")
         self.source, self.target = source, target
         self.mode, self.padding_mode = _checked_mode(mode), padding_mode
-        self._set_rotation(rotation)
+        self._set_rotation(as_rotation(rotation, "Warp"))
         shapes = [source.batch_shape, target.batch_shape, () if rotation is None else self.rotation.shape[:-2]]
         try:
             self.batch_shape = torch.broadcast_shapes(*shapes)
@@ -71,20 +69,11 @@ class Warp(GeometryModule):
             )
         self._memo = Memo()
 
-    def _set_rotation(self, rotation) -> None:
-        if rotation is None:
-            self.register_buffer("rotation", None)
-            return
-        rotation = torch.as_tensor(rotation)
-        if rotation.shape[-2:] != (3, 3):
-            raise ValueError(f"Warp: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
-        if not rotation.is_floating_point():
-            rotation = rotation.to(torch.get_default_dtype())
-        check_rotation(rotation, "rotation", "Warp")
+    def _set_rotation(self, rotation: Tensor | None) -> None:
         if isinstance(rotation, nn.Parameter):
             self.register_parameter("rotation", rotation)
         else:
-            self.register_buffer("rotation", rotation, persistent=not rotation.requires_grad)
+            self.register_buffer("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
 
     # -- pictures
 
@@ -117,17 +106,12 @@ class Warp(GeometryModule):
         batch = max(len(images), len(grid)) if len(images) else 0
         if len(grid) not in (1, batch) or len(images) not in (1, batch):
             raise ValueError(f"Warp: {len(images)} images do not fit {len(grid)} cameras")
-        dtype = _sampling_dtype(images.dtype)
-        result = F.grid_sample(
-            images.to(dtype).expand(batch, -1, -1, -1),
-            grid.to(dtype).expand(batch, -1, -1, -1),
-            mode=mode,
-            padding_mode=self.padding_mode,
-            align_corners=False,
-        )
+        if len(images) != batch:  # one picture for many cameras
+            images = images.expand(batch, -1, -1, -1)
+        result = sample(images, grid.expand(batch, -1, -1, -1), mode, self.padding_mode)
         if self.padding_mode != "zeros":
-            result = torch.where(mapped.unsqueeze(1), result, 0.0)
-        return _cast_back(result, images.dtype)
+            result = torch.where(mapped.unsqueeze(1), result, 0)
+        return result
 
     def grid(self) -> Tensor:
         """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -3 where there is none."""
@@ -154,7 +138,7 @@ class Warp(GeometryModule):
         if rays.ndim == 3:
             rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
         rotation = None if self.rotation is None else self.rotation.mT
-        pixels, mapped = self.source.project(_turn(rotation, rays, "rays"))
+        pixels, mapped = self.source.project(turn(rotation, rays, "rays"))
         mapped = mapped & has_ray
         height, width = self.source.image_size
         scale = pixels.new_tensor([2 / width, 2 / height])
@@ -176,7 +160,7 @@ class Warp(GeometryModule):
 
     def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         rays, has_ray = self.source.unproject(pixels)
-        moved, mapped = self.target.project(_turn(self.rotation, rays, "pixels"))
+        moved, mapped = self.target.project(turn(self.rotation, rays, "pixels"))
         valid = mapped & has_ray
         return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
 
@@ -199,6 +183,7 @@ class Warp(GeometryModule):
         outline_x = torch.cat((x, x2.expand_as(x), x_back, x1.expand_as(x)), -1)
         outline_y = torch.cat((y1.expand_as(y), y, y2.expand_as(y), y_back), -1)
         moved, mapped = self._move(torch.stack((outline_x, outline_y), -1))
+        mapped = mapped & torch.isfinite(boxes).all(-1, keepdim=True)
         some = mapped.any(-1, keepdim=True)
         low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
         high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)
@@ -207,7 +192,7 @@ class Warp(GeometryModule):
 
     def transform_rays(self, rays: Tensor) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
-        return _turn(self.rotation, rays, "rays")
+        return turn(self.rotation, rays, "rays")
 
     def inverse(self) -> Warp:
         """The warp from target to source. What lay outside the picture, or between its pixels, stays lost."""
@@ -219,7 +204,20 @@ class Warp(GeometryModule):
         return f"mode={self.mode!r}, padding_mode={self.padding_mode!r}, rotation={self.rotation is not None}"
 
 
-def _turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
+def as_rotation(rotation, owner: str) -> Tensor | None:
+    """A checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
+    if rotation is None:
+        return None
+    rotation = rotation if isinstance(rotation, Tensor) else torch.as_tensor(rotation)
+    if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
+        raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
+    if not rotation.is_floating_point():
+        rotation = rotation.to(torch.get_default_dtype())
+    check_rotation(rotation, "rotation", owner)
+    return rotation
+
+
+def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
     if rotation is None:
         return rays
     planes, restore = as_planes(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
@@ -227,22 +225,6 @@ def _turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
 
 
 def _checked_mode(mode: str) -> str:
-    if mode not in _MODES:
-        raise ValueError(f"Warp: mode must be one of {_MODES}; got {mode!r}")
+    if mode not in MODES:
+        raise ValueError(f"Warp: mode must be one of {MODES}; got {mode!r}")
     return mode
-
-
-def _sampling_dtype(dtype: torch.dtype) -> torch.dtype:
-    """Wide enough that every value of the dtype, a class id too, is exact."""
-    if dtype.is_floating_point:
-        return torch.promote_types(dtype, torch.float32)
-    return torch.float32 if dtype.itemsize <= 2 else torch.float64
-
-
-def _cast_back(result: Tensor, dtype: torch.dtype) -> Tensor:
-    if dtype == torch.bool:
-        return result >= 0.5
-    if not dtype.is_floating_point:
-        limits = torch.iinfo(dtype)
-        result = result.round().clamp(limits.min, limits.max)
-    return result.to(dtype)

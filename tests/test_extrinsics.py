@@ -1,0 +1,123 @@
+"""Laws of the rigid pose."""
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from torch.autograd import gradcheck, gradgradcheck
+
+import camtorch as ct
+
+F64 = torch.float64
+ROTATIONS = {
+    "zero": [0.0, 0.0, 0.0],
+    "tiny": [1e-12, -2e-12, 1e-13],
+    "small": [1e-3, 2e-3, -5e-4],
+    "series edge": [0.06, -0.05, 0.063],  # angle 0.1, where the series ends
+    "some": [0.4, -0.3, 0.9],
+    "half turn": [math.pi, 0.0, 0.0],
+    "nearly half a turn": [0.0, math.pi - 1e-9, 0.0],
+}
+
+
+def pose(rotation, translation=(0.3, -0.2, 1.5)):
+    return ct.Extrinsics(torch.tensor(rotation, dtype=F64), torch.tensor(translation, dtype=F64))
+
+
+@pytest.mark.parametrize("rotation", ROTATIONS.values(), ids=ROTATIONS)
+def test_rotation_is_the_matrix_exponential(rotation):
+    x, y, z = rotation
+    generator = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=F64)
+    matrix = pose(rotation).matrix()
+    torch.testing.assert_close(matrix[:3, :3], torch.linalg.matrix_exp(generator), atol=4e-15, rtol=0)
+    assert matrix[3].tolist() == [0, 0, 0, 1]
+    assert matrix[:3, 3].tolist() == [0.3, -0.2, 1.5]
+
+
+@pytest.mark.parametrize("rotation", ROTATIONS.values(), ids=ROTATIONS)
+def test_from_matrix_inverts_matrix(rotation):
+    original = pose(rotation)
+    again = ct.Extrinsics.from_matrix(original.matrix())
+    torch.testing.assert_close(again.matrix(), original.matrix(), atol=1e-12, rtol=0)
+    torch.testing.assert_close(ct.Extrinsics.from_matrix(original.matrix()[:3]).matrix(), again.matrix())
+
+
+def test_inverse_compose_position_and_points():
+    a, b = pose(ROTATIONS["some"]), pose([-1.2, 0.3, 0.1], (1.0, 2.0, -0.5))
+    points = torch.randn(5, 4, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(a.compose(b)(points), a(b(points)))
+    torch.testing.assert_close(a.inverse()(a(points)), points)
+    torch.testing.assert_close(a(a.position), torch.zeros(3, dtype=F64))
+    matrix = a.matrix()
+    torch.testing.assert_close(a(points), points @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+@pytest.mark.parametrize("rotation", ROTATIONS.values(), ids=ROTATIONS)
+def test_derivatives_also_at_zero_rotation(rotation):
+    points = torch.randn(3, 3, dtype=F64, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    inputs = tuple(torch.tensor(v, dtype=F64, requires_grad=True) for v in (rotation, (0.3, -0.2, 1.5)))
+
+    def transform(r, t, p):
+        return ct.Extrinsics(r, t)(p)
+
+    assert gradcheck(transform, (*inputs, points))
+    assert gradgradcheck(transform, (*inputs, points))
+
+
+def test_composition_at_the_identity_has_finite_gradients():
+    a, b = pose(ROTATIONS["zero"]), pose(ROTATIONS["zero"])
+    a.compose(b).rotation.sum().backward()
+    torch.testing.assert_close(a.rotation.grad, torch.ones(3, dtype=F64))
+    torch.testing.assert_close(b.rotation.grad, torch.ones(3, dtype=F64))
+
+
+@pytest.mark.parametrize("point_dims", [(), (4,), (2, 3)])
+def test_batch_equals_loop(point_dims):
+    generator = torch.Generator().manual_seed(2)
+    rotation, translation = (torch.randn(6, 3, dtype=F64, generator=generator) for _ in range(2))
+    points = torch.randn(6, *point_dims, 3, dtype=F64, generator=generator)
+    batch = ct.Extrinsics(rotation, translation)
+    for i in range(6):
+        single = ct.Extrinsics(rotation[i], translation[i])
+        torch.testing.assert_close(batch(points)[i], single(points[i]))
+        torch.testing.assert_close(batch.inverse().matrix()[i], single.inverse().matrix())
+        torch.testing.assert_close(batch.compose(batch).matrix()[i], single.compose(single).matrix())
+
+
+def test_is_a_layer_and_a_module():
+    layer = torch.nn.Sequential(pose(ROTATIONS["some"]), ct.KannalaBrandt([300.0, 300.0, 320.0, 240.0]).double())
+    pixels, valid = layer(torch.tensor([0.1, 0.2, 3.0], dtype=F64))
+    assert bool(valid)
+    for copied in (copy.deepcopy(layer), pickle.loads(pickle.dumps(layer))):
+        assert torch.equal(copied(torch.tensor([0.1, 0.2, 3.0], dtype=F64))[0], pixels)
+    fresh = torch.nn.Sequential(pose([0.0, 0.0, 0.0]), ct.KannalaBrandt([1.0, 1.0, 0.0, 0.0]).double())
+    fresh.load_state_dict(layer.state_dict(), strict=True)
+    assert torch.equal(fresh(torch.tensor([0.1, 0.2, 3.0], dtype=F64))[0], pixels)
+
+
+def test_autocast_leaves_geometry_alone():
+    extrinsics = pose(ROTATIONS["some"]).float()
+    points = torch.randn(10, 3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = extrinsics(points)
+    assert torch.equal(inside, extrinsics(points))
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: ct.Extrinsics([0.0, 0.0], [0.0, 0.0, 0.0]), r"rotation .*\(2,\)"),
+        (lambda: ct.Extrinsics([0.0, 0.0, 0.0], [0.0, math.nan, 0.0]), "translation .*finite"),
+        (lambda: ct.Extrinsics(torch.zeros(2, 3), torch.zeros(3, 3)), "do not fit"),
+        (lambda: ct.Extrinsics.from_matrix(torch.eye(3)), r"matrix .*\(3, 3\)"),
+        (lambda: ct.Extrinsics.from_matrix(2 * torch.eye(4)), "last row"),
+        (lambda: ct.Extrinsics.from_matrix(torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))), "rotation matrices"),
+        (lambda: ct.Extrinsics.from_matrix(torch.full((4, 4), math.nan)), "matri"),
+        (lambda: pose([0.0, 0.0, 0.0])(torch.zeros(4, 2)), r"points_world .*\(4, 2\)"),
+    ],
+)
+def test_bad_input_is_named(make, says):
+    with pytest.raises(ValueError, match=says):
+        make()

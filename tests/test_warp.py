@@ -1,0 +1,320 @@
+"""Laws of Warp: pictures, labels and derivatives move together."""
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+
+import camtorch as ct
+
+SIZE = (48, 64)
+
+
+def turn(yaw=0.0, pitch=0.0, roll=0.0, dtype=torch.float32):
+    vector = torch.tensor([math.radians(pitch), math.radians(yaw), math.radians(roll)], dtype=dtype)
+    return ct.Extrinsics(vector, torch.zeros(3, dtype=dtype)).matrix()[:3, :3].detach()
+
+
+def fisheye(size=SIZE, scale=1.0, **options):
+    intrinsics = torch.tensor([24.0, 24.5, 31.0, 23.0], **options) * scale
+    return ct.KannalaBrandt(intrinsics, torch.tensor([0.02, -0.01, 0.004, -0.001], **options), image_size=size)
+
+
+def pinhole(size=SIZE, **options):
+    return ct.Pinhole(torch.tensor([30.0, 30.0, 31.5, 23.5], **options), image_size=size)
+
+
+def smooth(size=SIZE, batch=1, dtype=torch.float64):
+    """A picture without detail that interpolation could lose."""
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=dtype) for side in size), indexing="ij")
+    picture = torch.stack((torch.sin(u / 9) * torch.cos(v / 7), u / size[1], v / size[0]))
+    return torch.stack([picture * (1 + 0.1 * i) for i in range(batch)])
+
+
+@pytest.mark.parametrize("key", sorted(ct.MODELS))
+def test_the_identity_warp_is_the_identity(key):
+    camera = ct.MODELS[key](torch.tensor([30.0, 30.0, 31.5, 23.5], dtype=torch.float64), image_size=SIZE)
+    warp = ct.Warp(camera, camera)
+    images = smooth()
+    # every pixel has a ray in these cameras, but for the equirectangular one, which is 2.1 radians wide all the same
+    assert warp.valid_mask().all()
+    torch.testing.assert_close(warp(images), images, atol=1e-12, rtol=0)
+    pixels = camera.pixel_grid()
+    moved, valid = warp.transform_points(pixels)
+    assert valid.all()
+    torch.testing.assert_close(moved, pixels, atol=1e-10, rtol=0)
+
+
+def test_the_picture_agrees_with_the_points():
+    """A picture of the coordinates, warped, holds the source coordinates that the inverse gives for each pixel."""
+    warp = ct.Warp(fisheye(dtype=torch.float64), pinhole(dtype=torch.float64), turn(10, -5, 3, torch.float64))
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
+    warped = warp(torch.stack((u, v))[None])[0].movedim(0, -1)
+    back, valid = warp.inverse().transform_points(warp.target.pixel_grid())
+    inside = valid & (back > 0).all(-1) & (back < torch.tensor([SIZE[1] - 1, SIZE[0] - 1])).all(-1)
+    assert inside.sum() > 0.8 * inside.numel()
+    torch.testing.assert_close(warped[inside], back[inside], atol=1e-9, rtol=0)
+    assert torch.equal(warp.valid_mask()[0, 0], valid)
+    again, _ = warp.transform_points(back[inside])
+    torch.testing.assert_close(again, warp.target.pixel_grid()[inside].double(), atol=1e-9, rtol=0)
+
+
+def test_rays_turn_with_the_rotation():
+    rotation = turn(20, 10, -5, torch.float64)
+    source, target = fisheye(dtype=torch.float64), pinhole(dtype=torch.float64)
+    warp = ct.Warp(source, target, rotation)
+    rays = torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator()), dim=-1)
+    torch.testing.assert_close(warp.transform_rays(rays), rays @ rotation.T)
+    seen, _ = target.project(warp.transform_rays(rays))
+    pixels, in_source = source.project(rays)
+    moved, valid = warp.transform_points(pixels)
+    torch.testing.assert_close(moved[valid], seen[valid], atol=1e-9, rtol=0)
+    assert bool((valid <= in_source).all())
+    assert ct.Warp(source, target).transform_rays(rays) is rays
+
+
+def test_a_pinhole_turned_is_a_homography():
+    camera, rotation = pinhole(dtype=torch.float64), turn(7, -4, 11, torch.float64)
+    homography = camera.K.detach() @ rotation @ torch.linalg.inv(camera.K.detach())
+    pixels = torch.cat((camera.pixel_grid(), torch.ones(*SIZE, 1, dtype=torch.float64)), -1)
+    expected = pixels @ homography.T
+    moved, valid = ct.Warp(camera, camera, rotation).transform_points(camera.pixel_grid())
+    expected = expected[..., :2] / expected[..., 2:]
+    torch.testing.assert_close(moved.detach(), expected, atol=1e-9, rtol=0)
+    assert torch.equal(valid, camera.contains(expected))
+
+
+def test_boxes_enclose_the_curved_outline():
+    # a source that bends straight edges outwards: the corners alone would cut the box off
+    warp = ct.Warp(pinhole((480, 640), dtype=torch.float64), fisheye((480, 640), dtype=torch.float64))
+    warp = ct.Warp(
+        ct.Pinhole(torch.tensor([300.0, 300, 320, 240], dtype=torch.float64), image_size=(480, 640)),
+        ct.KannalaBrandt(torch.tensor([300.0, 300, 320, 240], dtype=torch.float64), image_size=(480, 640)),
+    )
+    box = torch.tensor([[100.0, 20.0, 540.0, 460.0]], dtype=torch.float64)
+    moved, valid = warp.transform_boxes(box)
+    assert valid.all()
+    fine = torch.linspace(0, 1, 5001, dtype=torch.float64)
+    x, y = 100 + 440 * fine, 20 + 440 * fine
+    sides = [(x, 20 + 0 * x), (x, 460 + 0 * x), (100 + 0 * y, y), (540 + 0 * y, y)]
+    outline, _ = warp.transform_points(torch.cat([torch.stack(side, -1) for side in sides]))
+    expected = torch.cat((outline.amin(0), outline.amax(0)))
+    torch.testing.assert_close(moved[0], expected, atol=0.03, rtol=0)
+    corners, _ = warp.transform_points(torch.stack((x[[0, -1]], y[[0, -1]]), -1))
+    assert moved[0, 0] < corners[0, 0] - 1  # the corners would miss more than a pixel
+
+
+def test_boxes_off_the_picture_keep_their_place_and_say_so():
+    camera = pinhole(dtype=torch.float64)
+    boxes = torch.tensor([[[-50.0, 5.0, -10.0, 9.0], [-5.0, 5.0, 9.0, 9.0], [math.nan, 0.0, 1.0, 1.0]]])
+    moved, valid = ct.Warp(camera, camera).transform_boxes(boxes[0])
+    assert valid.tolist() == [False, True, False]
+    torch.testing.assert_close(moved[:2], boxes[0, :2].double(), atol=1e-9, rtol=0)
+    assert moved[2].tolist() == [-1, -1, -1, -1]
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64, torch.bool])
+def test_labels_keep_dtype_and_values(dtype):
+    warp = ct.Warp(fisheye(), pinhole(), turn(5), mode="nearest")
+    top = 2 if dtype == torch.bool else 250 if dtype == torch.uint8 else 30000 if dtype == torch.int16 else 2**31 - 2
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.randint(0, top, (2, 1, *SIZE), generator=generator).to(dtype)
+    warped = warp(labels)
+    assert warped.dtype == dtype
+    assert set(warped.unique().tolist()) <= set(labels.unique().tolist()) | {0}
+    assert torch.equal(ct.Warp(fisheye(), pinhole(), turn(5))(labels, mode="nearest"), warped)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.uint8])
+def test_low_precision_pictures_are_sampled_in_float32(dtype):
+    warp = ct.Warp(fisheye(), pinhole(), turn(5)).requires_grad_(False)
+    images = (smooth(dtype=torch.float32).abs() * 200).to(dtype)
+    expected = warp(images.float())
+    expected = expected.round() if dtype == torch.uint8 else expected
+    assert torch.equal(warp(images), expected.to(dtype))
+
+
+def test_bicubic_overshoot_stays_in_the_range_of_integers():
+    images = torch.zeros(1, 1, *SIZE, dtype=torch.uint8)
+    images[..., 8:] = 255
+    warp = ct.Warp(pinhole(), pinhole(), turn(0.3), mode="bicubic").requires_grad_(False)
+    smooth_version = warp(images.float())
+    assert smooth_version.min() < -1
+    assert smooth_version.max() > 256
+    assert torch.equal(warp(images), smooth_version.round().clamp(0, 255).to(torch.uint8))
+
+
+def test_pixels_without_a_ray_are_black_in_every_padding_mode():
+    # the target looks half behind the source, which sees the front alone
+    for padding_mode in ("zeros", "border", "reflection"):
+        warp = ct.Warp(pinhole(), fisheye(), turn(100), padding_mode=padding_mode).requires_grad_(False)
+        _, mapped, _ = warp._sampling()
+        assert (~mapped).any()
+        assert mapped.any()
+        warped = warp(torch.ones(1, 1, *SIZE))
+        assert warped[0, 0][~mapped[0]].abs().max() == 0
+    assert warped[0, 0][mapped[0]].min() > 0.999
+
+
+def test_per_sample_cameras_equal_a_loop():
+    intrinsics = torch.tensor([[24.0, 24.0, 31.0, 23.0], [28.0, 27.0, 33.0, 22.0], [20.0, 21.0, 30.0, 24.0]])
+    sources = ct.KannalaBrandt(intrinsics, torch.tensor([0.02, -0.01]), image_size=SIZE)
+    targets = ct.Pinhole(intrinsics + 4, image_size=(40, 50))
+    rotations = torch.stack([turn(yaw) for yaw in (-10.0, 0.0, 15.0)])
+    images = smooth(batch=3, dtype=torch.float32)
+    points = torch.rand(3, 7, 2, generator=torch.Generator().manual_seed(0)) * 40
+    boxes = torch.cat((points, points + 5), -1)
+    rays = torch.nn.functional.normalize(torch.randn(3, 5, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    shared_source, shared_target = fisheye(), pinhole((40, 50))
+    combinations = [
+        (sources, targets, rotations),
+        (sources, shared_target, None),
+        (shared_source, targets, None),
+        (shared_source, shared_target, rotations),
+        (sources, shared_target, rotations[1]),
+    ]
+    for source, target, rotation in combinations:
+        warp = ct.Warp(source, target, rotation)
+        results = [warp(images), warp.valid_mask(), warp.grid(), *warp.transform_points(points)]
+        results += [*warp.transform_boxes(boxes), warp.transform_rays(rays)]
+        for i in range(3):
+            one_source = (
+                source
+                if not source.batch_shape
+                else ct.KannalaBrandt(source.intrinsics[i].detach(), source.distortion[i].detach(), image_size=SIZE)
+            )
+            one_target = (
+                target if not target.batch_shape else ct.Pinhole(target.intrinsics[i].detach(), image_size=(40, 50))
+            )
+            one_rotation = rotation[i] if rotation is not None and rotation.ndim == 3 else rotation
+            one = ct.Warp(one_source, one_target, one_rotation)
+            singles = [one(images[i : i + 1])[0], one.valid_mask()[0], one.grid()[0], *one.transform_points(points[i])]
+            singles += [*one.transform_boxes(boxes[i]), one.transform_rays(rays[i])]
+            for batched, single in zip(results, singles, strict=True):
+                # the same numbers, summed in another order by vectorised kernels
+                torch.testing.assert_close(batched[i], single, atol=2e-4, rtol=1e-5)
+
+
+def test_one_image_through_many_cameras():
+    warp = ct.Warp(fisheye(), pinhole(), torch.stack([turn(yaw) for yaw in (-10.0, 0.0, 15.0)]))
+    assert warp(smooth(dtype=torch.float32)).shape == (3, 3, *SIZE)
+
+
+def test_derivatives_reach_image_cameras_and_rotation():
+    options = {"dtype": torch.float64, "requires_grad": True}
+    size = (12, 16)
+    images = smooth(size)[:, :1].requires_grad_()
+    k = torch.tensor([6.0, 6.5, 7.75, 5.75], **options)
+    d = torch.tensor([0.02, -0.01, 0.004, -0.001], **options)
+    t = torch.tensor([8.0, 8.0, 3.5, 2.5], **options)
+    r = torch.tensor([0.01, 0.05, -0.02], **options)
+
+    def picture(images, k, d, t, r):
+        rotation = ct.Extrinsics(r, torch.zeros(3, dtype=torch.float64)).matrix()[:3, :3]
+        return ct.Warp(ct.KannalaBrandt(k, d, image_size=size), ct.Pinhole(t, image_size=(6, 8)), rotation)(images)
+
+    # bilinear sampling is piecewise smooth: the step of the check must not cross a pixel boundary
+    assert torch.autograd.gradcheck(picture, (images, k, d, t, r), eps=1e-7, atol=1e-6, rtol=1e-5)
+
+
+def test_the_grid_is_kept_until_something_changes():
+    warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
+    first = warp.grid()
+    assert warp.grid() is first
+    warp.source.intrinsics.data.add_(1.0)
+    second = warp.grid()
+    assert second is not first
+    assert not torch.equal(second, first)
+    warp.source.intrinsics.requires_grad_(True)
+    assert warp.grid().requires_grad
+    with torch.no_grad():
+        assert warp.grid() is warp.grid()
+    warp.load_state_dict(ct.Warp(fisheye(), pinhole()).state_dict(), strict=True)
+    with torch.no_grad():
+        assert torch.equal(warp.grid(), first)
+
+
+def test_a_grid_kept_from_inference_mode_serves_training():
+    warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
+    with torch.inference_mode():
+        warp(smooth(dtype=torch.float32))
+    images = smooth(dtype=torch.float32).requires_grad_()
+    warp(images).sum().backward()
+    assert images.grad.abs().sum() > 0
+
+
+def test_copies_pickles_and_transforms():
+    rotation = torch.nn.Parameter(turn(5))
+    warp = ct.Warp(fisheye(), pinhole(), rotation)
+    images = smooth(dtype=torch.float32)
+    expected = warp(images)
+    for copied in (copy.deepcopy(warp), pickle.loads(pickle.dumps(warp))):
+        assert torch.equal(copied(images), expected)
+    state = dict(warp.named_parameters())
+    assert set(state) == {"rotation", "source.intrinsics", "source.distortion", "target.intrinsics"}
+    again = torch.func.functional_call(warp, {"source.intrinsics": state["source.intrinsics"] + 1}, (images,))
+    assert not torch.equal(again, expected)
+    many = torch.func.vmap(
+        lambda k: torch.func.functional_call(warp, {"source.intrinsics": k}, (images,)),
+    )(torch.stack([state["source.intrinsics"]] * 2))
+    torch.testing.assert_close(many[1], expected, atol=1e-5, rtol=0)
+    forward = torch.func.jacfwd(lambda k: torch.func.functional_call(warp, {"source.intrinsics": k}, (images,)).sum())
+    reverse = torch.func.jacrev(lambda k: torch.func.functional_call(warp, {"source.intrinsics": k}, (images,)).sum())
+    torch.testing.assert_close(
+        forward(state["source.intrinsics"]), reverse(state["source.intrinsics"]), atol=1e-2, rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_compile_and_export(learn):
+    warp = ct.Warp(fisheye(), pinhole(), turn(5)).requires_grad_(learn)
+    images = smooth(dtype=torch.float32)
+    expected = warp(images).detach()
+    compiled = torch.compile(warp, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(images).detach(), expected, atol=1e-5, rtol=0)
+    exported = torch.export.export(warp, (images,)).module()
+    torch.testing.assert_close(exported(images).detach(), expected, atol=1e-5, rtol=0)
+
+
+def test_autocast_leaves_the_grid_alone():
+    warp = ct.Warp(fisheye(), pinhole(), turn(5))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = warp.grid()
+    assert torch.equal(inside, warp.grid())
+
+
+def test_empty_batches_and_no_points():
+    warp = ct.Warp(fisheye(), pinhole())
+    assert warp(torch.zeros(0, 3, *SIZE)).shape == (0, 3, *SIZE)
+    assert warp.transform_points(torch.zeros(0, 2))[0].shape == (0, 2)
+    boxes, valid = warp.transform_boxes(torch.zeros(0, 4))
+    assert boxes.shape == (0, 4)
+    assert valid.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("act", "error", "says"),
+    [
+        (lambda: ct.Warp(fisheye(), "target"), TypeError, "target"),
+        (lambda: ct.Warp(fisheye(None), pinhole()), ValueError, "source.*image_size"),
+        (lambda: ct.Warp(fisheye(), pinhole(), mode="linear"), ValueError, "linear"),
+        (lambda: ct.Warp(fisheye(), pinhole(), padding_mode="wrap"), ValueError, "wrap"),
+        (lambda: ct.Warp(fisheye(), pinhole(), torch.eye(4)), ValueError, r"rotation.*\(4, 4\)"),
+        (lambda: ct.Warp(fisheye(), pinhole(), 2 * torch.eye(3)), ValueError, "rotation"),
+        (lambda: ct.Warp(fisheye(), pinhole())(torch.zeros(1, 3, 64, 48)), ValueError, r"\(64, 48\).*\(48, 64\)"),
+        (lambda: ct.Warp(fisheye(), pinhole())(torch.zeros(3, *SIZE)), ValueError, r"\(B, C, H, W\).*\(3, 48, 64\)"),
+        (lambda: ct.Warp(fisheye(), pinhole())([[1.0]]), TypeError, "images"),
+        (lambda: ct.Warp(fisheye(), pinhole()).transform_boxes(torch.zeros(2, 3)), ValueError, r"boxes.*\(2, 3\)"),
+        (lambda: ct.Warp(fisheye(), pinhole()).transform_points(torch.zeros(2, 3)), ValueError, r"\(2, 3\)"),
+        (
+            lambda: ct.Warp(fisheye(), pinhole(), turn().expand(3, 3, 3))(torch.zeros(2, 3, *SIZE)),
+            ValueError,
+            "2 images do not fit 3 cameras",
+        ),
+    ],
+)
+def test_bad_input_is_named(act, error, says):
+    with pytest.raises(error, match=says):
+        act()
