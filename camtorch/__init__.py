@@ -3,6 +3,7 @@
 from camtorch.camera import MODELS, Camera
 from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
+from camtorch.io import CameraFileError
 from camtorch.models import (
     BrownConrady,
     Cylindrical,
@@ -21,6 +22,7 @@ __all__ = [
     "MODELS",
     "BrownConrady",
     "Camera",
+    "CameraFileError",
     "Cylindrical",
     "Dewarp",
     "Equirectangular",

@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch.charts import Chart
 from camtorch.domain import Domain
 from camtorch.lens import Lens
-from camtorch.parameters import Memo, as_image_size, as_parameter, as_planes, columns, is_concrete
+from camtorch.parameters import Memo, as_image_size, as_parameter, as_planes, as_real, columns, is_concrete
 from camtorch.picture import Picture
 from camtorch.solve import attach, invert
 
@@ -225,7 +225,7 @@ class Camera(Picture):
         Raises:
             ValueError: not such a matrix, or a skew (its K[0, 1]) that is not zero and not to be ignored.
         """
-        K = K if isinstance(K, Tensor) else torch.as_tensor(K)  # noqa: N806
+        K = as_real(K, "K", cls.__name__)  # noqa: N806
         if K.shape[-2:] != (3, 3):
             raise ValueError(f"{cls.__name__}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
         if is_concrete(K):

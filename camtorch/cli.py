@@ -78,17 +78,15 @@ def _size(text: str) -> tuple[int, int]:
 def _dewarp(arguments: argparse.Namespace) -> None:
     import torch
 
-    from camtorch import Dewarp, pictures
+    from camtorch import Dewarp, image_files
     from camtorch.io import opencv
 
-    widest = 180 if arguments.projection == "perspective" else 360
-    if arguments.fov is not None and not (0 < arguments.fov <= widest and arguments.fov != 180 == widest):
-        below = "below" if widest == 180 else "at most"
-        raise ValueError(
-            f"--fov must be above 0 and {below} {widest} for {arguments.projection}; got {arguments.fov:g}"
-        )
-    pictures.check_target(arguments.output, force=arguments.force)
-    picture, orientation = pictures.read(arguments.image)
+    fov = arguments.fov
+    if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
+        allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
+        raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}")
+    image_files.check_target(arguments.output, force=arguments.force)
+    picture, orientation = image_files.read(arguments.image)
     camera = opencv.read(arguments.camera, arguments.model, name=arguments.name).requires_grad_(False)
     size = tuple(picture.shape[-2:])
     if camera.image_size is None:
@@ -98,23 +96,22 @@ def _dewarp(arguments: argparse.Namespace) -> None:
             raise ValueError(_resolutions(arguments, size, camera.image_size))
         camera = camera.resize(*size)
     with torch.no_grad():
-        fov = None if arguments.fov is None else math.radians(arguments.fov)
-        warp = Dewarp(camera, projection=arguments.projection, fov=fov, image_size=arguments.size)
+        warp = Dewarp(camera, projection=arguments.projection, fov=fov and math.radians(fov), image_size=arguments.size)
         result = warp(picture[None])[0]
         seen = float(warp.valid_mask().float().mean())
-    pictures.write(arguments.output, pictures.from_tensor(result), orientation=orientation)
+    image_files.write(arguments.output, image_files.from_tensor(result), orientation=orientation)
     height, width = result.shape[-2:]
     print(
-        f"{arguments.output}: {camera.key} dewarped to {arguments.projection}, {_degrees(warp.target):.1f} degrees wide, "
-        f"{width}x{height}, {100 * seen:.1f} % of its pixels seen"
+        f"{arguments.output}: {camera.key} dewarped to {arguments.projection}, {_degrees(warp.target):.1f} degrees "
+        f"wide, {width}x{height}, {100 * seen:.1f} % of its pixels seen"
     )
 
 
 def _resolutions(arguments: argparse.Namespace, picture: tuple[int, int], camera: tuple[int, int]) -> str:
     (height, width), (camera_height, camera_width) = picture, camera
     text = (
-        f"{arguments.image} is {width}x{height}, but the camera in {arguments.camera} is for {camera_width}x{camera_height}; "
-        "--rescale scales the camera to the picture"
+        f"{arguments.image} is {width}x{height}, but the camera in {arguments.camera} is for "
+        f"{camera_width}x{camera_height}; --rescale scales the camera to the picture"
     )
     if abs(width / camera_width - height / camera_height) * max(camera) > 1:
         text += ", but their shapes differ too, so the picture may be cropped, which scaling does not undo"
@@ -131,11 +128,11 @@ def _degrees(target) -> float:
 
 
 def _demo(arguments: argparse.Namespace) -> None:
-    from camtorch import demo, pictures
+    from camtorch import demo, image_files
 
-    pictures.check_target(arguments.output, force=arguments.force)
+    image_files.check_target(arguments.output, force=arguments.force)
     studies = demo.run(lambda line: print(line, flush=True))
-    pictures.write(arguments.output, demo.picture(studies))
+    image_files.write(arguments.output, demo.picture(studies))
     print(f"{arguments.output}: the sources, what became of them, and what separates that from the truth")
 
 

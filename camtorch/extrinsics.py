@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from camtorch.analytic import cosc_root, sinc_root
-from camtorch.parameters import GeometryModule, as_parameter, as_planes, is_concrete
+from camtorch.parameters import GeometryModule, as_parameter, as_planes, as_real, is_concrete
 
 
 class Extrinsics(GeometryModule):
@@ -67,11 +67,9 @@ class Extrinsics(GeometryModule):
         Raises:
             ValueError: another shape, a last row that is not (0, 0, 0, 1), an R that is not a rotation.
         """
-        matrix = matrix if isinstance(matrix, Tensor) else torch.as_tensor(matrix)
+        matrix = as_real(matrix, "matrix", "Extrinsics")
         if matrix.shape[-2:] not in ((4, 4), (3, 4)):
             raise ValueError(f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}")
-        if not matrix.is_floating_point():
-            matrix = matrix.to(torch.get_default_dtype())
         if matrix.shape[-2] == 4 and is_concrete(matrix):
             bottom = matrix[..., 3, :].detach()
             if bool((bottom != bottom.new_tensor([0, 0, 0, 1])).any()):

@@ -83,32 +83,44 @@ def is_concrete(tensor: Tensor) -> bool:
     )
 
 
-def as_parameter(value, name: str, owner: str) -> Tensor:
-    """A checked floating-point tensor: kept if it is part of a graph, else an `nn.Parameter` of its values.
+def as_real(value, name: str, owner: str) -> Tensor:
+    """A floating-point tensor of finite numbers: the tensor itself, or made of a list or an array.
 
-    Lists take torch's default dtype, arrays and tensors keep theirs, but never less than float32.
+    Lists and integers take torch's default dtype, arrays and tensors keep theirs.
 
     Raises:
-        TypeError: not numbers. ValueError: NaN or infinite values.
+        TypeError: not real numbers, or a list of tensors that require grad, whose graph would be lost.
+        ValueError: NaN or infinite values.
     """
-    in_graph = isinstance(value, Tensor) and (
-        value.requires_grad or isinstance(value, nn.Parameter) or not is_concrete(value)
-    )
-    if not in_graph:
+    if not isinstance(value, Tensor):
+        if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
+            raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
         try:
-            value = torch.as_tensor(value).detach().clone()
+            value = torch.as_tensor(value)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(
                 f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
             ) from None
-        if value.is_complex() or value.dtype == torch.bool:
-            raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
-        if not value.is_floating_point():
-            value = value.to(torch.get_default_dtype())
-        value = nn.Parameter(value.to(torch.promote_types(value.dtype, torch.float32)))
+    if value.is_complex() or value.dtype == torch.bool:
+        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
+    if not value.is_floating_point():
+        value = value.to(torch.get_default_dtype())
     if is_concrete(value) and not bool(torch.isfinite(value).all()):
         raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
     return value
+
+
+def as_parameter(value, name: str, owner: str) -> Tensor:
+    """A checked tensor: kept if it is part of a graph, else a new `nn.Parameter` of at least float32.
+
+    Raises:
+        TypeError, ValueError: as `as_real`.
+    """
+    value = as_real(value, name, owner)
+    if value.requires_grad or isinstance(value, nn.Parameter) or not is_concrete(value):
+        return value
+    dtype = torch.promote_types(value.dtype, torch.float32)
+    return nn.Parameter(value.detach().to(dtype, copy=True))
 
 
 def as_image_size(value, owner: str) -> tuple[int, int] | None:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotate_planes
-from camtorch.parameters import GeometryModule, Memo, as_planes
+from camtorch.parameters import GeometryModule, Memo, as_planes, as_real
 from camtorch.sampling import MODES, PADDINGS, sample
 
 _OUTSIDE = -3.0  # a sampling position that no picture reaches, not even with its interpolation margin
@@ -208,16 +208,15 @@ def as_rotation(rotation, owner: str) -> Tensor | None:
     """A checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
     if rotation is None:
         return None
-    rotation = rotation if isinstance(rotation, Tensor) else torch.as_tensor(rotation)
+    rotation = as_real(rotation, "rotation", owner)
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
         raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
-    if not rotation.is_floating_point():
-        rotation = rotation.to(torch.get_default_dtype())
     check_rotation(rotation, "rotation", owner)
     return rotation
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
+    """Apply a rotation, if there is one, to (*B, *N, 3); `name` is what an error calls them."""
     if rotation is None:
         return rays
     planes, restore = as_planes(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")

@@ -9,7 +9,7 @@ import torch
 from camtorch.camera import Camera
 from camtorch.charts import Equidistant
 from camtorch.lens import Lens, Planar, Polynomial
-from camtorch.parameters import as_parameter, is_concrete
+from camtorch.parameters import as_real, is_concrete
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -56,9 +56,10 @@ class KannalaBrandt(Camera):
         Raises:
             ValueError: no coefficients, or a first one that is not positive.
         """
-        plain = not any(isinstance(value, torch.Tensor) and value.requires_grad for value in (intrinsics, coefficients))
-        intrinsics = as_parameter(intrinsics, "intrinsics", cls.__name__)
-        coefficients = as_parameter(coefficients, "coefficients", cls.__name__)
+        intrinsics = as_real(intrinsics, "intrinsics", cls.__name__)
+        coefficients = as_real(coefficients, "coefficients", cls.__name__)
+        if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
+            raise ValueError(f"{cls.__name__}: intrinsics must be (*B, 4); got shape {tuple(intrinsics.shape)}")
         if coefficients.ndim == 0 or coefficients.shape[-1] == 0:
             raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 1; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
@@ -66,5 +67,4 @@ class KannalaBrandt(Camera):
             raise ValueError(f"{cls.__name__}: the first coefficient must be positive; got {first.tolist()}")
         focal, centre = torch.broadcast_tensors(intrinsics[..., :2] * first, intrinsics[..., 2:])
         rest = coefficients[..., 1:] / first if coefficients.shape[-1] > 1 else torch.zeros_like(first)
-        parameters = [torch.cat((focal, centre), -1), rest]
-        return cls(*(p.detach() if plain else p for p in parameters), image_size=image_size)
+        return cls(torch.cat((focal, centre), -1), rest, image_size=image_size)

@@ -1,0 +1,218 @@
+"""A sunlit room that exists as formulas: every ray has a colour, every edge and corner a known place.
+
+Convention: the room's frame is x right, y down, z forward, in metres; every camera stands at its origin.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from camtorch import room
+from camtorch.camera import Camera
+
+Planes = tuple[Tensor, Tensor, Tensor]
+_CHUNK = 1 << 17
+
+# -- where the rays go
+
+
+def _slabs(origin: Planes, ray: Planes, box) -> tuple[Tensor, Tensor, Tensor]:
+    """Distances at which rays enter and leave a box, and the axis of the face they enter through."""
+    near = far = axis = None
+    for i in range(3):
+        a, b = (box[0][i] - origin[i]) / ray[i], (box[1][i] - origin[i]) / ray[i]
+        low, high = torch.minimum(a, b), torch.maximum(a, b)
+        if near is None:
+            near, far, axis = low, high, torch.zeros_like(low, dtype=torch.long)
+        else:
+            axis = torch.where(low > near, i, axis)
+            near, far = torch.maximum(near, low), torch.minimum(far, high)
+    return near, far, axis
+
+
+def _ball(origin: Planes, ray: Planes, centre, radius: float) -> Tensor:
+    """The distance to a ball, infinite where it is missed."""
+    to = [c - o for c, o in zip(centre, origin, strict=True)]
+    along = sum(a * b for a, b in zip(to, ray, strict=True))
+    inside = radius**2 - (sum(a * a for a in to) - along**2)
+    distance = along - inside.clamp(min=0).sqrt()
+    return torch.where((inside > 0) & (distance > 0), distance, torch.inf)
+
+
+def _facing(ray: Planes, axis: Tensor) -> Tensor:
+    """(3, N): the unit vector along each ray's axis that looks back at where the ray came from."""
+    directions, axis = torch.stack(ray), axis[None]
+    return torch.zeros_like(directions).scatter_(0, axis, -directions.gather(0, axis).sign())
+
+
+def _hit(origin: Planes, ray: Planes) -> tuple[Tensor, Tensor, Tensor]:
+    """Distance to the first surface, which one it is, and its normal."""
+    walls = torch.stack(
+        [(torch.where(r > 0, h, w) - o) / r for o, r, w, h in zip(origin, ray, room.LOW, room.HIGH, strict=True)]
+    )
+    distance, axis = walls.min(0)
+    normal = _facing(ray, axis)
+    what = 2 * axis + (normal.sum(0) < 0)
+    for bounds, boxes, balls in room.GROUPS:
+        near, far, _ = _slabs(origin, ray, bounds)
+        some = ((near < far) & (far > 0) & (near < distance)).nonzero()[:, 0]
+        o, r = tuple(c[some] for c in origin), tuple(c[some] for c in ray)
+        best, kind, face = distance[some], what[some], axis[some]
+        for box, label in boxes:
+            near, far, entry = _slabs(o, r, box)
+            closer = (near < far) & (near > 0) & (near < best)
+            best, face = torch.where(closer, near, best), torch.where(closer, entry, face)
+            kind = torch.where(closer, label, kind)
+        n = _facing(r, face)
+        for centre, radius, label in balls:
+            near = _ball(o, r, centre, radius)
+            closer = near < best
+            best, kind = torch.where(closer, near, best), torch.where(closer, label, kind)
+            out = torch.stack([(a + near * b - c) / radius for a, b, c in zip(o, r, centre, strict=True)])
+            n = torch.where(closer, out, n)
+        distance[some], what[some], normal[:, some] = best, kind, n
+    return distance, what, normal
+
+
+def _light(origin: Planes, ray: Planes, mirror: bool = True) -> Tensor:
+    """(3, N) linear light that comes from the first surface along each ray; `mirror` follows it once more."""
+    distance, what, normal = _hit(origin, ray)
+    point = tuple(o + distance * r for o, r in zip(origin, ray, strict=True))
+    albedo, glow, gloss = torch.empty_like(normal), torch.empty_like(normal), torch.empty_like(distance)
+    for kind in what.bincount().nonzero()[:, 0].tolist():
+        here = (what == kind).nonzero()[:, 0]
+        albedo[:, here], glow[:, here], gloss[here] = room.surface(
+            kind, tuple(c[here] for c in point), tuple(c[here] for c in ray)
+        )
+    light = albedo * _irradiance(point, normal) + glow
+    if mirror:
+        here = (gloss > 0).nonzero()[:, 0]
+        n, r = [c[here] for c in normal], [c[here] for c in ray]
+        facing = sum(a * b for a, b in zip(n, r, strict=True))
+        turned = tuple(a - 2 * facing * b for a, b in zip(r, n, strict=True))
+        start = tuple(c[here] + 1e-3 * b for c, b in zip(point, n, strict=True))
+        share = gloss[here] + (0.75 - gloss[here]) * (1 + facing).clamp(0, 1) ** 5
+        light[:, here] = light[:, here] * (1 - share) + share * _light(start, turned, mirror=False)
+    return light
+
+
+def _irradiance(point: Planes, normal: Tensor) -> Tensor:
+    """(3, N): soft light of the room, the window and the lamps, and the sun through the panes."""
+    x, y, z = point
+    corner = torch.ones_like(x)
+    for c, n, low, high in zip(point, normal, room.LOW, room.HIGH, strict=True):
+        for gap in (c - low, high - c):
+            corner = corner * (1 - 0.42 * torch.exp(-gap / 0.35) * (1 - n.abs()))
+    on_floor = room.soft(y, 1.0, 2.0, 0.02)
+    corner = corner * (1 - 0.6 * on_floor * room.soft(x, -0.75, 0.75, 0.12) * room.soft(z, 2.0, 2.9, 0.12))
+    light = corner * (0.5 - 0.08 * normal[1]) * torch.tensor([[1.08], [1.0], [0.93]])
+    to = (-x, -0.3 - y, 4.3 - z)
+    square = sum(c * c for c in to) + 1e-6
+    facing = sum(a * b for a, b in zip(to, normal, strict=True)).clamp(min=0) * to[2].clamp(min=0) / square
+    light = light + 3.0 * facing / (square + 0.9) * torch.tensor([[1.0], [0.93], [0.84]]) * corner
+    for lamp in room.LAMPS:
+        to = [c - p for c, p in zip(lamp, point, strict=True)]
+        square = sum(c * c for c in to) + 1e-6
+        facing = sum(a * b for a, b in zip(to, normal, strict=True)).clamp(min=0) * square.rsqrt()
+        light = light + 0.3 * facing / (square + 0.2) * torch.tensor([[1.0], [0.85], [0.62]]) * corner
+    facing = sum(a * b for a, b in zip(room.SUN, normal, strict=True))
+    way = ((room.HIGH[2] - z) / room.SUN[2]).clamp(min=0)
+    sun = facing.clamp(min=0) * room.panes(x + way * room.SUN[0], y + way * room.SUN[1], 0.004 + 0.008 * way)
+    lit = (sun > 1e-3).nonzero()[:, 0]
+    start = tuple(p[lit] + 1e-3 * n[lit] for p, n in zip(point, normal, strict=True))
+    direction = tuple(torch.full_like(start[0], c) for c in room.SUN)
+    shaded = _ball(start, direction, room.GLOBE, room.GLOBE_RADIUS) < torch.inf
+    for box in (*room.TABLE, room.CUBE):
+        near, far, _ = _slabs(start, direction, box)
+        shaded = shaded | ((near < far) & (near > 0))
+    sun[lit] = torch.where(shaded, 0.0, sun[lit])
+    return light + 4.2 * sun * torch.tensor([[1.0], [0.76], [0.46]])
+
+
+# -- what the outside sees
+
+
+def radiance(rays: Tensor) -> Tensor:
+    """(..., 3) colours in [0, 1], ready for a screen, of rays (..., 3) from the origin."""
+    flat = rays.reshape(-1, 3).to(torch.float32)
+    flat = torch.where(flat.abs() < 1e-9, 1e-9, flat)
+    colours = torch.empty_like(flat)
+    for start in range(0, len(flat), _CHUNK):
+        ray = flat[start : start + _CHUNK].T.contiguous().unbind(0)
+        light = _light(tuple(torch.zeros_like(c) for c in ray), ray)
+        colours[start : start + _CHUNK] = (1 - torch.exp(-1.3 * light)).pow(1 / 2.2).T
+    return colours.reshape(rays.shape)
+
+
+def visible(points: Tensor) -> Tensor:
+    """(...) bool: nothing stands between the origin and a point (..., 3) on a surface."""
+    flat = points.reshape(-1, 3).to(torch.float32)
+    length = flat.norm(dim=-1)
+    ray = torch.where(flat.abs() < 1e-9, 1e-9, flat).div(length[:, None]).T.contiguous().unbind(0)
+    distance, _, _ = _hit(tuple(torch.zeros_like(c) for c in ray), ray)
+    return (distance > length - 2e-3).reshape(points.shape[:-1])
+
+
+@torch.no_grad()
+def render(camera: Camera, rotation: Tensor | None = None, *, samples: int = 12) -> Tensor:
+    """The picture (3, H, W) in [0, 1] that a camera at the origin takes of the room; black where it has no rays.
+
+    Args:
+        camera: with image_size and without batch dims.
+        rotation: (3, 3), camera from room.
+        samples: rays per pixel, spread over it as a lattice; their mean is the pixel, as on a sensor.
+    """
+    height, width = camera.image_size
+    # Rays of the pixels' corners, interpolated within the pixel: off by 1 / (8 focal lengths) of a pixel, and
+    # the lens is inverted once for all samples
+    corners, valid = camera.unproject(camera.crop(0, 0, height + 1, width + 1).pixel_grid() - 0.5)
+    valid = (valid[1:, 1:] & valid[1:, :-1] & valid[:-1, 1:] & valid[:-1, :-1])[..., None]
+    rays = corners.to(torch.float32) if rotation is None else (corners @ rotation.to(corners)).to(torch.float32)
+    # the lattice's step is a golden section of its size: even over each axis and over the square
+    step = max(1, round(samples * 0.618))
+    while math.gcd(step, samples) > 1:
+        step += 1
+    picture = torch.zeros(height, width, 3)
+    for i in range(samples):
+        across, down = (i + 0.5) / samples, (i * step % samples + 0.5) / samples
+        rows = torch.lerp(rays[:, :-1], rays[:, 1:], across)
+        picture += torch.where(valid, radiance(torch.lerp(rows[:-1], rows[1:], down)), 0.0)
+    return (picture / samples).permute(2, 0, 1)
+
+
+def keypoints() -> Tensor:
+    """(N, 3): corners between four squares, on the test chart and on the floor beside the rug."""
+    x, y, z = room.TEST_CHART[0], room.TEST_CHART[2], room.HIGH[2]
+    chart = [(x + room.SQUARE * i, y + room.SQUARE * j, z) for i in range(1, 4) for j in range(1, 5)]
+    floor = [(room.TILE * (i - 0.5), room.HIGH[1], 0.05 + room.TILE * j) for i in range(-3, 5) for j in range(-2, 8)]
+    floor = [p for p in floor if not (abs(p[0]) < room.RUG[1] + 0.1 and room.RUG[2] - 0.1 < p[2] < room.RUG[3] + 0.1)]
+    return torch.tensor(chart + floor, dtype=torch.float64)
+
+
+def lines() -> Tensor:
+    """(N, 2, 3): the ends of straight edges between two colours, with nothing else close by."""
+    left, right, back, floor = room.LOW[0], room.HIGH[0], room.HIGH[2], room.HIGH[1]
+    edges = []
+    for y in (room.RAIL + 0.1, 1.13):
+        edges += [((left, y, back), (right, y, back)), ((right, y, room.LOW[2]), (right, y, back))]
+        edges += [((left, y, room.LOW[2]), (left, y, room.DOOR[0] - 0.12))]
+    for (a, b, c, d), margin, place in (
+        (room.WINDOW, 0.0, lambda u, v: (u, v, back)),
+        (room.TEST_CHART, room.FRAME, lambda u, v: (u, v, back)),
+        (room.PRINT, room.FRAME, lambda u, v: (u, v, back)),
+        (room.POSTER, room.FRAME, lambda u, v: (left, v, u)),
+        (room.SHELF, 0.0, lambda u, v: (right, v, u)),
+    ):
+        ends = (
+            place(a - margin, c - margin),
+            place(b + margin, c - margin),
+            place(b + margin, d + margin),
+            place(a - margin, d + margin),
+        )
+        edges += zip(ends, (*ends[1:], ends[0]), strict=True)
+    edges += [((left, room.DOOR[2], z), (left, floor - 0.2, z)) for z in room.DOOR[:2]]
+    edges += [((low[0], high[1], z), (high[0], high[1], z)) for low, high in room.BEAMS for z in (low[2], high[2])]
+    return torch.tensor(edges, dtype=torch.float64)

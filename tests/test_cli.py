@@ -1,0 +1,178 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import camtorch as ct
+from camtorch.cli import main
+
+FILES = Path(__file__).parent / "files"
+FISHEYE = "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
+MATRIX = "K: [28, 0, 47, 0, 28, 32, 0, 0, 1]\nD: [-0.02, 0.004, -0.003, 0.0006]\n"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, with a picture and its camera."""
+    monkeypatch.chdir(tmp_path)
+    Path("camera.yml").write_text(FISHEYE + MATRIX)
+    colours = np.random.default_rng(0).integers(0, 256, (64, 96, 3), dtype=np.uint8)
+    Image.fromarray(colours).save("in.png")
+    return tmp_path
+
+
+def command(*words, expect=0):
+    assert main([str(word) for word in words]) == expect
+
+
+def refused(capsys, *words):
+    """The one line of the error."""
+    command(*words, expect=2)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("camtorch: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def opened(path):
+    """A picture that keeps no file open."""
+    with Image.open(path) as image:
+        image.load()
+        return image
+
+
+def camera():
+    return ct.KannalaBrandt([28.0, 28, 47, 32], [-0.02, 0.004, -0.003, 0.0006], image_size=(64, 96)).double()
+
+
+def test_dewarp_writes_what_dewarp_makes(folder, capsys):
+    command("dewarp", "in.png", "--camera", "camera.yml", "--fov", 90, "--size", "80x60", "-o", "out.png")
+    assert capsys.readouterr().out == (
+        "out.png: kannala_brandt dewarped to perspective, 90.0 degrees wide, 80x60, 100.0 % of its pixels seen\n"
+    )
+    picture = torch.from_numpy(np.array(opened("in.png"))).permute(2, 0, 1)[None]
+    expected = ct.Dewarp(camera(), fov=torch.pi / 2, image_size=(60, 80))(picture)[0].permute(1, 2, 0)
+    assert np.array_equal(np.array(opened("out.png")), expected.numpy())
+    assert [path.name for path in sorted(folder.iterdir())] == ["camera.yml", "in.png", "out.png"]
+
+
+@pytest.mark.parametrize("projection", ["perspective", "cylindrical", "equirectangular"])
+def test_projections(folder, capsys, projection):
+    command("dewarp", "in.png", "--camera", "camera.yml", "--projection", projection, "-o", "out.png")
+    assert projection in capsys.readouterr().out
+    assert opened("out.png").size == (96, 64)
+
+
+def test_camera_without_size_takes_the_pictures(folder):
+    Path("bare.yml").write_text(MATRIX)
+    command("dewarp", "in.png", "--camera", "camera.yml", "-o", "a.png")
+    command("dewarp", "in.png", "--camera", "bare.yml", "--model", "kannala_brandt", "-o", "b.png")
+    assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
+
+
+def test_another_resolution_needs_rescale(folder, capsys):
+    opened("in.png").resize((48, 32)).save("half.png")
+    error = refused(capsys, "dewarp", "half.png", "--camera", "camera.yml", "-o", "out.png")
+    assert "half.png is 48x32, but the camera in camera.yml is for 96x64; --rescale" in error
+    assert "cropped" not in error
+    command("dewarp", "half.png", "--camera", "camera.yml", "--rescale", "-o", "out.png")
+    assert opened("out.png").size == (48, 32)
+    capsys.readouterr()
+    opened("in.png").resize((48, 48)).save("square.png")
+    assert "cropped" in refused(capsys, "dewarp", "square.png", "--camera", "camera.yml", "-o", "new.png")
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["dewarp"], "required: IMAGE, --camera"),
+        (["undistort"], "invalid choice: 'undistort'"),
+        (["dewarp", "none.png", "--camera", "camera.yml", "-o", "o.png"], "none.png: no such file"),
+        (["dewarp", "camera.yml", "--camera", "camera.yml", "-o", "o.png"], "camera.yml: not a picture"),
+        (["dewarp", "cut.png", "--camera", "camera.yml", "-o", "o.png"], "cut.png: "),
+        (["dewarp", ".", "--camera", "camera.yml", "-o", "o.png"], ": Is a directory"),
+        (["dewarp", "in.png", "--camera", "none.yml", "-o", "o.png"], "none.yml: No such file"),
+        (["dewarp", "in.png", "--camera", "in.png", "-o", "o.png"], "in.png: byte 0: not text"),
+        (["dewarp", "in.png", "--camera", "bad.yml", "-o", "o.png"], "bad.yml: K: a camera matrix has 3 x 3"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--model", "x", "-o", "o.png"], "known are brown_conrady"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "none/o.png"], "none/o.png: there is no folder"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "o.docx"], "written as .docx"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "o"], "written as a nameless type"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "."], "is a folder"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "in.png"], "in.png: exists already; --force"),
+        (["dewarp", "alpha.png", "--camera", "camera.yml", "-o", "o.jpg"], "o.jpg: cannot write mode RGBA as JPEG"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--size", "80", "-o", "o.png"], "'80' is not WIDTHxHEIGHT"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--size", "0x9", "-o", "o.png"], "1 to 32768"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--size", "9x-9", "-o", "o.png"], "not WIDTHxHEIGHT"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "wide", "-o", "o.png"], "--fov: invalid float"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "180", "-o", "o.png"], "below 180 degrees"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "nan", "-o", "o.png"], "--fov must be above 0"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "0", "-o", "o.png"], "--fov must be above 0"),
+        (["demo", "-o", "in.png"], "in.png: exists already"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(folder, capsys, words, text):
+    Path("bad.yml").write_text("K: [1, 2]")
+    Path("cut.png").write_bytes(Path("in.png").read_bytes()[:3000])
+    opened("in.png").convert("RGBA").save("alpha.png")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert text in refused(capsys, *words)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_force_overwrites_and_keeps_nothing_of_the_old(folder):
+    Path("out.png").write_text("old")
+    command("dewarp", "in.png", "--camera", "camera.yml", "--force", "-o", "out.png")
+    assert opened("out.png").size == (96, 64)
+    assert Path("out.png").stat().st_mode & 0o777 == Path("in.png").stat().st_mode & 0o777
+
+
+def test_several_cameras_in_one_file(folder, capsys):
+    words = ["dewarp", "in.png", "--camera", FILES / "opencv_stereo.yml", "-o", "out.png"]
+    assert "several cameras" in refused(capsys, *words)
+    command(*words, "--name", "1")
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA", "1", "P", "CMYK", "I;16"])
+def test_kinds_of_picture(folder, mode):
+    ramp = np.broadcast_to(np.linspace(0, 255, 96).astype(np.uint8), (64, 96))
+    if mode == "I;16":
+        image = Image.fromarray(ramp.astype(np.uint16) * 257)
+    else:
+        image = Image.fromarray(np.stack((ramp,) * 3, -1)).convert(mode)
+    image.save("kind.tif")
+    Path("level.yml").write_text("K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]")
+    command("dewarp", "kind.tif", "--camera", "level.yml", "-o", "out.tif")
+    out = opened("out.tif")
+    assert out.mode == {"1": "L", "P": "RGB", "CMYK": "RGB"}.get(mode, mode)
+    if mode not in ("1", "P"):
+        # the camera of a picture without distortion: nothing may change
+        expected = image if mode == "I;16" else image.convert(out.mode)
+        assert np.abs(np.asarray(out).astype(int) - np.asarray(expected).astype(int)).max() <= 1
+
+
+def test_exif_orientation_stays_as_it_is(folder):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    opened("in.png").save("turned.jpg", exif=exif)
+    command("dewarp", "turned.jpg", "--camera", "camera.yml", "-o", "out.jpg")
+    out = opened("out.jpg")
+    assert out.size == (96, 64)
+    assert out.getexif()[0x0112] == 6
+
+
+def test_without_pillow(folder, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    error = refused(capsys, "dewarp", "in.png", "--camera", "camera.yml", "-o", "out.png")
+    assert "pip install 'camtorch[cli]'" in error
+
+
+def test_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "camtorch", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"camtorch {ct.__version__}\n"

@@ -1,0 +1,212 @@
+import json
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import camtorch as ct
+from camtorch.io import CameraFileError, opencv
+
+FILES = Path(__file__).parent / "files"
+PLAIN = FILES / "opencv_camera.yml"
+K = [500.0, 0, 320, 0, 500, 240, 0, 0, 1]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "camera.yml"
+
+
+def written(path, text):
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def reads_or_says_why(path):
+    """Any content gives a camera or the one error, whose text names the file."""
+    try:
+        camera = opencv.read(path)
+    except CameraFileError as error:
+        text = str(error)
+    else:
+        text = f"{path}: a camera"
+        assert torch.isfinite(camera.intrinsics).all()
+        assert torch.isfinite(camera.distortion).all()
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("name", ["opencv_camera.yml", "opencv_camera.json"])
+def test_brown_conrady(name):
+    camera = opencv.read(FILES / name)
+    assert type(camera) is ct.BrownConrady
+    assert camera.intrinsics.dtype == torch.float64
+    assert camera.intrinsics.tolist() == [1064.3, 1065.1, 641.7, 396.4]
+    assert camera.distortion.tolist() == [-0.3021, 0.1254, 0.00021, -0.00017, -0.0289]
+    assert camera.image_size == (800, 1280)
+
+
+def test_fisheye_flag_means_kannala_brandt():
+    camera = opencv.read(FILES / "opencv_fisheye.yml")
+    assert type(camera) is ct.KannalaBrandt
+    assert camera.intrinsics.tolist() == [561.8, 562.4, 957.3, 644.6]
+    assert camera.distortion.tolist() == [-0.0237, 0.0041, -0.0029, 0.0006]
+    assert camera.image_size == (1280, 1920)
+
+
+def test_old_header_other_names_and_what_is_not_asked_for_may_be_nan():
+    camera = opencv.read(FILES / "opencv_old.yml")
+    assert type(camera) is ct.BrownConrady
+    assert camera.intrinsics.tolist() == [501.25, 501.5, 320.75, 239.5]
+    assert camera.distortion.tolist() == [0.125, -0.25, 0.0005, -0.00025, 0.0625, 0.25, -0.125, 0.03125]
+    assert camera.image_size == (480, 640)
+
+
+@pytest.mark.parametrize(
+    ("flag", "model"),
+    [(flag, ct.KannalaBrandt) for flag in ("1", "true", "yes", "1.")]
+    + [(flag, ct.BrownConrady) for flag in ("0", "false", "No", "0.0")],
+)
+def test_flag_values(path, flag, model):
+    written(path, f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\nfisheye_model: {flag}\n")
+    assert type(opencv.read(path)) is model
+
+
+def test_json_flag_is_a_boolean_too(path):
+    for flag, model in ((True, ct.KannalaBrandt), (False, ct.BrownConrady)):
+        written(path, json.dumps({"K": K, "D": [0.1, 0, 0, 0], "fisheye": flag}))
+        assert type(opencv.read(path)) is model
+
+
+def test_model_argument_decides(path):
+    written(path, f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\n")
+    assert type(opencv.read(path, "kannala_brandt")) is ct.KannalaBrandt
+    with pytest.raises(CameraFileError, match=r"D: 4 coefficients; Pinhole takes n = 0"):
+        opencv.read(path, "pinhole")
+    with pytest.raises(ValueError, match=r"unknown model 'fish'; known are brown_conrady, .*pinhole"):
+        opencv.read(path, "fish")
+
+
+def test_without_distortion_or_size(path):
+    camera = opencv.read(written(path, f"camera_matrix: [{K[:3]}, {K[3:6]}, {K[6:]}]\n"))
+    assert type(camera) is ct.Pinhole
+    assert camera.image_size is None
+
+
+def test_stereo_file_asks_for_a_name():
+    with pytest.raises(CameraFileError, match=r"opencv_stereo.yml: M1, M2: several cameras; choose one by name='1'"):
+        opencv.read(FILES / "opencv_stereo.yml")
+    assert opencv.read(FILES / "opencv_stereo.yml", name="2").intrinsics.tolist() == [1064.3, 1065.1, 641.7, 396.4]
+    with pytest.raises(CameraFileError, match=r"no camera is called '3'; there are \['1', '2'\]"):
+        opencv.read(FILES / "opencv_stereo.yml", name="3")
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "reason"),
+    [
+        ("", "content", "not keys and values"),
+        ("- 1", "content", "not keys and values"),
+        ("a: [1", "line 1", "expected"),
+        ("{'K': 1}", "line 1", "double quotes"),
+        ("x: 1", "camera_matrix", "missing"),
+        ("K: !!python/object/apply:os.getcwd []", "line 1", "constructor"),
+        ("K: !!opencv-matrix 3", "line 1", "keys and values"),
+        ("K: &a [*a]", "line 1", "recursive"),
+        ("[" * 3000, "content", "deep"),
+        ('{"K": ' + "[" * 100000, "content", "deep"),
+        (f"K: {K}\nK: {K}", "line 1", "twice"),
+        (f"K: {K}\nM: {K}", "M", "one camera has this and K"),
+        ("K: 5", "K", "neither"),
+        ("K: [1, 2]", "K", "3 x 3"),
+        ("K: {rows: 3, cols: 3, data: [1, 2]}", "K.data", "2 numbers, where rows and cols say 3 x 3"),
+        ("K: {rows: 1e99, cols: 1e99, data: [1, 2]}", "K.data", "1e[+]99"),
+        ("K: {cols: 3, data: [1, 2]}", "K.rows", "no number"),
+        ("K: {rows: 3, cols: 3}", "K.data", "no list"),
+        ("K: [500, 0.5, 320, 0, 500, 240, 0, 0, 1]", r"K\[1\]", "skew of 0.5.*write 0"),
+        ("K: [500, 0, 320, 0, 500, 240, 0, 0, 2]", "K", "is not"),
+        ("K: [500, 0, 320, 0, .nan, 240, 0, 0, 1]", r"K\[4\]", "'.nan' is no finite number"),
+        ("K: [500, 0, 320, 0, -500, 240, 0, 0, 1]", "K", "focal lengths must be positive"),
+        (f"K: {K}\nD: [0, 0, inf, 0]", r"D\[2\]", "no finite number"),
+        (f"K: {K}\nD: [0, 0, 0]", "D", "3 coefficients; BrownConrady takes n = 4, 5"),
+        (f"K: {K}\nimage_width: 640", "image_height", "missing"),
+        (f"K: {K}\nimage_width: 640\nimage_height: 1e30", "image_height", "no number of pixels"),
+        (f"K: {K}\nimage_width: 640.5\nimage_height: 480", "image_width", "no number of pixels"),
+        (f"K: {K}\nfisheye_model: [1]", "fisheye_model", "neither true nor false"),
+        (f"K: {K}\nD: [0, 0, 0, 0]\ndistortion_model: equidistant", "distortion_model", "another model"),
+        (f"K: {K}\nxi: 1.2", "xi", "another model"),
+        ("<?xml version='1.0'?>", "line 1", "XML"),
+        (b"\xff\xd8\xff\xe0", "byte 0", "not text"),
+        ("a\0b: 1", "content", "not allowed"),
+        ("K: " + "9" * 5000, "K", "neither"),
+    ],
+)
+def test_every_fault_has_a_place_and_a_reason(path, text, place, reason):
+    with pytest.raises(CameraFileError, match=rf"camera.yml: {place}: (?s:.*){reason}") as caught:
+        opencv.read(written(path, text))
+    assert pickle.loads(pickle.dumps(caught.value)).args == caught.value.args
+
+
+def test_xml_comes_later():
+    with pytest.raises(CameraFileError, match="XML cannot be read yet"):
+        opencv.read(FILES / "opencv_camera.xml")
+
+
+def test_a_missing_file_is_an_ordinary_error(path):
+    with pytest.raises(FileNotFoundError):
+        opencv.read(path)
+
+
+def test_pyyaml_missing(path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "yaml", None)
+    with pytest.raises(ImportError, match=r"pip install 'camtorch\[cli\]'"):
+        opencv.read(PLAIN)
+    assert opencv.read(FILES / "opencv_camera.json").image_size == (800, 1280)
+
+
+@pytest.mark.parametrize("name", ["opencv_camera.yml", "opencv_camera.json", "opencv_fisheye.yml"])
+def test_truncated_anywhere(path, name):
+    whole = (FILES / name).read_bytes()
+    for length in range(len(whole)):
+        reads_or_says_why(written(path, whole[:length]))
+
+
+@settings(max_examples=200)
+@given(content=st.binary(max_size=300))
+def test_random_bytes(tmp_path_factory, content):
+    reads_or_says_why(written(tmp_path_factory.getbasetemp() / "bytes.yml", content))
+
+
+@settings(max_examples=200)
+@given(position=st.integers(0, 600), content=st.binary(min_size=1, max_size=8))
+def test_damaged_bytes(tmp_path_factory, position, content):
+    whole = PLAIN.read_bytes()
+    damaged = whole[:position] + content + whole[position + len(content) :]
+    reads_or_says_why(written(tmp_path_factory.getbasetemp() / "damaged.yml", damaged))
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=9) | st.dictionaries(st.sampled_from(["rows", "cols", "data"]), inner),
+    max_leaves=20,
+)
+keys = st.sampled_from(["K", "D", "M1", "camera_matrix", "image_width", "image_height", "fisheye_model", "xi"])
+
+
+@settings(max_examples=300)
+@given(content=st.dictionaries(keys, values, max_size=5))
+def test_random_values(tmp_path_factory, content):
+    reads_or_says_why(written(tmp_path_factory.getbasetemp() / "values.json", json.dumps(content)))
+
+
+@settings(max_examples=100)
+@given(intrinsics=st.tuples(*[st.floats(1, 1e4)] * 4), distortion=st.lists(st.floats(-1, 1), min_size=5, max_size=5))
+def test_numbers_come_back_to_the_last_bit(tmp_path_factory, intrinsics, distortion):
+    fx, fy, cx, cy = intrinsics
+    matrix = {"rows": 3, "cols": 3, "dt": "d", "data": [fx, 0, cx, 0, fy, cy, 0, 0, 1]}
+    path = tmp_path_factory.getbasetemp() / "exact.json"
+    camera = opencv.read(written(path, json.dumps({"camera_matrix": matrix, "dist_coeffs": distortion})))
+    assert camera.intrinsics.tolist() == list(intrinsics)
+    assert camera.distortion.tolist() == distortion
