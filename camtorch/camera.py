@@ -13,7 +13,7 @@ from camtorch.domain import Domain
 from camtorch.lens import Lens
 from camtorch.parameters import Memo, as_image_size, as_parameter, as_planes, as_real, columns, is_concrete
 from camtorch.picture import Picture
-from camtorch.solve import attach, invert
+from camtorch.solve import attach, invert, rounding
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -123,27 +123,34 @@ class Camera(Picture):
             lies before the fold of the lens. Whether the pixel is on the picture is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        (x, y, z), restore = as_planes(points, "points", 3, self.batch_shape, self._tensors, type(self).__name__)
+        planes, restore = as_planes(points, "points", 3, self.batch_shape, self._tensors, type(self).__name__)
         focal_x, focal_y, centre_x, centre_y, k, usable = self._coefficients()
-        chart, lens = self.optics(k)
-        size = torch.maximum(torch.maximum(x.detach().abs(), y.detach().abs()), z.detach().abs())
-        # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
-        valid = (size > torch.finfo(size.dtype).tiny * 1e6) & (size < torch.inf) & usable
-        shrink = torch.where(valid, size, 1.0).reciprocal()
-        valid = valid & chart.covers(*(plane.detach() * shrink for plane in (x, y, z)))
-        # The shrinking is a constant: projection does not depend on the distance, so its derivative is none either
-        axis = torch.where(valid, shrink, 1.0)
-        a, b = chart.to_plane(
-            *(torch.where(valid, plane, on_axis) * axis for plane, on_axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
-        )
-        if lens.stages:
-            domain = self._domain(k, like=a)
-            a_0, b_0 = a.detach(), b.detach()
-            valid = valid & domain.contains(a_0, b_0, domain.lens.linearise(a_0, b_0)[2])
-            a, b = lens(torch.where(valid, a, 0.0), torch.where(valid, b, 0.0))
+        a, b, valid = self._see(planes, *self.optics(k), self._domain(k, like=planes[0]), usable)
         u = torch.where(valid, focal_x * a + centre_x, _INVALID_PIXEL)
         v = torch.where(valid, focal_y * b + centre_y, _INVALID_PIXEL)
         return restore(u, v), restore(valid)
+
+    @staticmethod
+    def _see(
+        planes: Sequence[Tensor], chart: Chart, lens: Lens, domain: Domain | None, usable: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Where the lens sends points (three planes), (0, 0) if nowhere, and which of them it does send."""
+        x, y, z = (plane.detach() for plane in planes)
+        size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
+        # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
+        valid = (size > torch.finfo(size.dtype).tiny * 1e6) & (size < torch.inf) & usable
+        # a constant: the projection does not depend on the distance, so this has no part in its derivative
+        shrink = torch.where(valid, size, 1.0).reciprocal()
+        valid = valid & chart.covers(x * shrink, y * shrink, z * shrink)
+        shrink = torch.where(valid, shrink, 1.0)
+        a, b = chart.to_plane(
+            *(torch.where(valid, plane, axis) * shrink for plane, axis in zip(planes, (0.0, 0.0, 1.0), strict=True))
+        )
+        if domain is not None:
+            a_0, b_0 = a.detach(), b.detach()
+            valid = valid & domain.contains(a_0, b_0, domain.lens.linearise(a_0, b_0)[2])
+            a, b = lens(torch.where(valid, a, 0.0), torch.where(valid, b, 0.0))
+        return a, b, valid
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -158,32 +165,38 @@ class Camera(Picture):
         (u, v), restore = as_planes(pixels, "pixels", 2, self.batch_shape, self._tensors, type(self).__name__)
         focal_x, focal_y, centre_x, centre_y, k, usable = self._coefficients()
         chart, lens = self.optics(k)
-        known = torch.isfinite(u.detach()) & torch.isfinite(v.detach()) & usable
-        p = (torch.where(known, u, centre_x) - centre_x) / focal_x
-        q = (torch.where(known, v, centre_y) - centre_y) / focal_y
-        if not lens.stages:
-            valid = known & chart.on_plane(p.detach(), q.detach())
+        domain = self._domain(k, like=u)
+        valid = torch.isfinite(u.detach()) & torch.isfinite(v.detach()) & usable
+        p = (torch.where(valid, u, centre_x) - centre_x) / focal_x
+        q = (torch.where(valid, v, centre_y) - centre_y) / focal_y
+        if domain is None:
+            valid = valid & chart.on_plane(p.detach(), q.detach())
             a, b = torch.where(valid, p, 0.0), torch.where(valid, q, 0.0)
         else:
-            domain = self._domain(k, like=p)
-            a_0, b_0, found = invert(domain, p.detach(), q.detach())
-            valid = known & found & chart.on_plane(a_0, b_0)
-            a_0, b_0 = torch.where(valid, a_0, 0.0), torch.where(valid, b_0, 0.0)
-            _, (ua, ub, va, vb), _ = domain.lens.linearise(a_0, b_0)
-            determinant = ua * vb - ub * va
-            inverse = (vb / determinant, -ub / determinant, -va / determinant, ua / determinant)
-            target = torch.where(valid, p, 0.0), torch.where(valid, q, 0.0)
-            a, b = attach(lens, (a_0, b_0), inverse, target)
-        x, y, z = chart.to_ray(a, b)
-        rays = restore(torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0))
-        return rays, restore(valid)
+            target = p.detach(), q.detach()
+            start = invert(domain, *target)
+            _, (ua, ub, va, vb), sense = domain.lens.linearise(*start)
+            valid = valid & domain.contains(*start, sense) & chart.on_plane(*start)
+            scale = torch.where(valid, ua * vb - ub * va, 1.0).reciprocal()
+            inverse = [w * scale for w in (vb, -ub, -va, ua)]
+            # next to a fold the polished solution may lie on its other side: what counts is where its ray is seen
+            polished = chart.to_ray(*attach(domain.lens, start, inverse, target))
+            seen_p, seen_q, seen = self._see([w.detach() for w in polished], chart, domain.lens, domain, usable)
+            miss = torch.maximum((seen_p - target[0]).abs(), (seen_q - target[1]).abs())
+            stretch = torch.maximum(ua.abs() + ub.abs(), va.abs() + vb.abs()) * torch.maximum(*(w.abs() for w in start))
+            valid = valid & seen & (miss <= rounding(*target, stretch)).detach()
+            start, inverse, target = ([torch.where(valid, w, 0.0) for w in ws] for ws in (start, inverse, (p, q)))
+            a, b = attach(lens, start, inverse, target)
+        rays = chart.to_ray(a, b)
+        x, y, z = (torch.where(valid, w, axis) for w, axis in zip(rays, (0.0, 0.0, 1.0), strict=True))
+        return restore(x, y, z), restore(valid)
 
-    def _domain(self, k: Sequence[Tensor], like: Tensor) -> Domain:
-        """The domain of the lens, without a graph, in the dtype and on the device of `like`."""
+    def _domain(self, k: Sequence[Tensor], like: Tensor) -> Domain | None:
+        """The domain of the lens, if there is one: graph-free, in the dtype and on the device of `like`."""
 
-        def tabulate() -> Domain:
+        def tabulate() -> Domain | None:
             chart, lens = self.optics([c.detach() for c in k])
-            return Domain(lens, chart, like)
+            return Domain(lens, chart, like) if lens.stages else None
 
         return self._memo(self._tensors, (like.dtype, like.device), tabulate)
 

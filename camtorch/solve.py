@@ -16,22 +16,23 @@ if TYPE_CHECKING:
 Planes2 = tuple[Tensor, Tensor]
 
 _RADIAL_STEPS = 6  # of third order, from one interval of the table: 1e-2, 1e-6, 1e-18, with a reserve for wild lenses
-_START_ROUNDS = 2
+_START_ROUNDS = 6
+_CLOSE = 0.1
+_SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
-_PLANAR_STEPS = 20  # it ends after about 4 where values may be looked at; the rest is for points next to a fold
+# Ends after about 4 steps where the values may be looked at. The rest is for points next to a fold, or so far out
+# that a prism dominates; a traced graph is unrolled, and has to do with fewer.
+_PLANAR_STEPS, _TRACED_STEPS = 60, 20
 
 
-def invert(domain: Domain, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The plane point that the lens of `domain` sends to (u, v), both (*B, N), and whether there is one."""
-    a, b = (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v)
-    (x, y), _, sense = domain.lens.linearise(a, b)
-    miss = torch.maximum((u - x).abs(), (v - y).abs())
-    return a, b, (miss <= _rounding(u, v)) & domain.contains(a, b, sense)
+def invert(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
+    """The plane point that the lens of `domain` sends to (u, v), both (*B, N), or one near it if there is none."""
+    return (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v)
 
 
-def _rounding(u: Tensor, v: Tensor) -> Tensor:
-    """What rounding may leave of a root: the terms of a polynomial can be much larger than their sum."""
-    return 1024 * torch.finfo(u.dtype).eps * (1 + torch.maximum(u.abs(), v.abs()))
+def rounding(u: Tensor, v: Tensor, stretch: Tensor | float = 0.0) -> Tensor:
+    """How far from (u, v) rounding may leave a lens that `stretch`es the rounding of its solution by so much."""
+    return 32 * torch.finfo(u.dtype).eps * (1 + torch.maximum(u.abs(), v.abs()) + stretch)
 
 
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
@@ -64,9 +65,9 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
     lens = domain.lens
     a, b = _planar_start(domain, u, v)
     value, jacobian, _ = lens.linearise(a, b)
-    enough = _rounding(u, v) / 64
+    enough = rounding(u, v) / 8
     length = torch.ones_like(u)
-    for _ in range(_PLANAR_STEPS):
+    for _ in range(_PLANAR_STEPS if is_concrete(length) else _TRACED_STEPS):
         miss = u - value[0], v - value[1]
         active = (torch.maximum(miss[0].abs(), miss[1].abs()) > enough) & (length > _GIVE_UP)
         if is_concrete(active) and not bool(active.any()):
@@ -92,21 +93,26 @@ def _newton_step(jacobian, du: Tensor, dv: Tensor) -> Planes2:
 
 
 def _planar_start(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
-    """From the table, on the azimuth of (u, v), then on that azimuth turned by what the lens turned it, if better."""
-    target = (u * u + v * v).sqrt()
-    off_axis = target > 0
-    c, s = (torch.where(off_axis, w / torch.where(off_axis, target, 1.0), axis) for w, axis in ((u, 1.0), (v, 0.0)))
+    """The best of some points that the lens sends as far out as (u, v), each on another azimuth.
+
+    The azimuth is followed by the secant method: it is nearly that of (u, v), unless a prism dominates.
+    """
+    target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
     a, b, best = torch.zeros_like(u), torch.zeros_like(v), target * target
+    azimuth, step, last_off = wanted, torch.zeros_like(u), torch.zeros_like(u)
     for _ in range(_START_ROUNDS):
+        c, s = torch.cos(azimuth), torch.sin(azimuth)
         rho = domain.bracket(target, c, s)[1]
         x, y = domain.lens(rho * c, rho * s)
         error = (u - x) ** 2 + (v - y) ** 2
         better = error < best
         a, b, best = torch.where(better, rho * c, a), torch.where(better, rho * s, b), torch.where(better, error, best)
-        cosine, sine = u * x + v * y, v * x - u * y
-        norm = (cosine * cosine + sine * sine).sqrt()
-        norm = torch.where(norm > 0, norm, torch.inf)
-        c, s = (c * cosine - s * sine) / norm, (s * cosine + c * sine) / norm
+        if is_concrete(best) and bool((best <= _CLOSE**2 * target * target).all()):
+            break
+        off = torch.atan2(x * v - y * u, x * u + y * v)
+        slope = torch.where(step != 0, (last_off - off) / torch.where(step != 0, step, 1.0), 1.0)
+        step, last_off = (off / slope.clamp(_SLOWEST_TURN, 2.0)).clamp(-1.0, 1.0), off
+        azimuth = azimuth + step
     return a, b
 
 

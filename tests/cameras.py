@@ -1,0 +1,128 @@
+"""The cameras that the laws are tried on: real calibrations, and ranges to draw others from.
+
+A model is tested by being in `ct.MODELS`. Its real calibrations are the mpmath files of its family; what else
+helps to try it hard is its entry in RANGES. A model that has neither is tried with its default coefficients.
+"""
+
+import json
+import math
+from pathlib import Path
+
+import torch
+from hypothesis import strategies as st
+
+import camtorch as ct
+
+GOLDEN = {path.stem: json.loads(path.read_text()) for path in sorted((Path(__file__).parent / "golden").glob("*.json"))}
+KEYS = sorted(ct.MODELS)
+
+# Largest coefficient drawn, plausible and wild, by the first letters of its name
+RANGES = {
+    "brown_conrady": {"k": (0.3, 1.0), "p": (2e-3, 0.05), "s": (2e-3, 0.05), "tau": (0.05, 0.3)},
+    "kannala_brandt": {"k": (0.05, 0.5)},
+    "fisheye62": {"k": (0.05, 0.5), "p": (2e-3, 0.05)},
+    "fisheye624": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
+}
+
+
+def tensor(values) -> torch.Tensor:
+    """Float64 of numbers with nulls, which become NaN."""
+
+    def filled(value, width):
+        if isinstance(value, list):
+            return [filled(v, width[1:]) for v in value]
+        if value is None and width:
+            return [filled(None, width[1:])] * width[0]
+        return math.nan if value is None else value
+
+    def shape(value):
+        lengths = [shape(v) for v in value if v is not None] if isinstance(value, list) else []
+        return (len(value), *max(lengths, key=len, default=())) if isinstance(value, list) else ()
+
+    return torch.tensor(filled(values, shape(values)), dtype=torch.float64)
+
+
+def make(key, intrinsics, distortion=None, **options):
+    """A camera of any model, also of those that take no distortion."""
+    has_some = distortion is not None and distortion.shape[-1] > 0
+    arguments = (distortion,) if has_some else ()
+    return ct.MODELS[key](intrinsics, *arguments, **options)
+
+
+def golden_camera(case):
+    """The camera of a file; a brown_conrady vector loses no coefficient, be it zero."""
+    parameters = tensor(case["parameters"])
+    size = tuple(case["image_size"])
+    if case["family"] == "kannala_brandt_general":
+        return ct.KannalaBrandt.from_general(parameters[:4], parameters[4:], image_size=size)
+    return make(case["family"], parameters[:4], parameters[4:], image_size=size)
+
+
+def real(key) -> dict:
+    """Name -> camera, float64: the real calibrations of a model, or the one with its default coefficients."""
+    named = {
+        name: golden_camera(case)
+        for name, case in GOLDEN.items()
+        if name.startswith("mpmath") and case["family"] == key
+    }
+    default = make(key, torch.tensor([300.0, 310.0, 318.5, 242.25], dtype=torch.float64), image_size=(480, 640))
+    return named or {"default": default}
+
+
+def one(key):
+    """One real calibration, the one with the most going on."""
+    return list(real(key).values())[-1]
+
+
+REAL = [(key, name) for key in KEYS for name in real(key)]
+
+
+def spread(key, dtype=torch.float64):
+    """A camera with every coefficient away from zero, so that no term of the formula can be forgotten."""
+    count = len(one(key).distortion_names)
+    sign = torch.tensor([1.0, -1.0]).repeat(count)[:count]
+    widths = torch.tensor([_width(key, name, wild=False) for name in one(key).distortion_names])
+    intrinsics = torch.tensor([301.0, 310.5, 318.25, 243.5], dtype=dtype)
+    return make(key, intrinsics, (0.3 * sign * widths).to(dtype), image_size=(480, 640))
+
+
+def _width(key, name, wild):
+    ranges = RANGES.get(key, {})
+    letters = max((letters for letters in ranges if name.startswith(letters)), key=len, default=None)
+    return ranges[letters][wild] if letters else 0.0
+
+
+@st.composite
+def drawn(draw, key, wild):
+    """A random camera of about 640 x 480, plausible or wild, with any number of coefficients that the model takes."""
+
+    def number(low, high):
+        return draw(st.floats(low, high, allow_subnormal=False))
+
+    model = ct.MODELS[key]
+    counts = [n for n in range(1, 15) if RANGES.get(key) and model.names_of(n)]
+    names = model.names_of(draw(st.sampled_from(counts))) if counts else ()
+    focal = number(150, 600)
+    intrinsics = [focal, focal * number(0.9, 1.1), 320 + number(-20, 20), 240 + number(-20, 20)]
+    widths = [_width(key, name, wild) for name in names]
+    distortion = [number(-width, width) for width in widths]
+    intrinsics, distortion = (torch.tensor(v, dtype=torch.float64) for v in (intrinsics, distortion))
+    return make(key, intrinsics, distortion, image_size=(480, 640))
+
+
+def fan(end_degrees, angles=45, azimuths=24) -> torch.Tensor:
+    """(angles * azimuths, 3): rays from the axis outwards, on even azimuths, none of them a coordinate axis."""
+    theta = torch.linspace(0, math.radians(end_degrees), angles, dtype=torch.float64)
+    phi = torch.linspace(0, 2 * math.pi, azimuths + 1, dtype=torch.float64)[:-1] + 0.1
+    theta, phi = (plane.flatten() for plane in torch.meshgrid(theta, phi, indexing="ij"))
+    return torch.stack((theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()), -1)
+
+
+def pixel_lattice(camera, rows=25, columns=33) -> torch.Tensor:
+    """(rows * columns, 2): pixels over the whole picture, its corners included."""
+    height, width = camera.image_size
+    like = {"dtype": camera.intrinsics.dtype}
+    v, u = torch.meshgrid(
+        torch.linspace(0, height - 1, rows, **like), torch.linspace(0, width - 1, columns, **like), indexing="ij"
+    )
+    return torch.stack((u, v), -1).reshape(-1, 2)

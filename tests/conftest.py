@@ -1,0 +1,16 @@
+import warnings
+
+import torch
+from hypothesis import settings
+
+with warnings.catch_warnings():
+    # forward-mode derivatives load it on first use, and it uses the deprecated torch.jit.script
+    warnings.simplefilter("ignore")
+    import torch._decomp.decompositions_for_jvp
+
+# xdist has a process on every core already
+torch.set_num_threads(1)
+
+# the same examples on every machine and in every run; speed is not what these tests are about
+settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=20, database=None)
+settings.load_profile("camtorch")

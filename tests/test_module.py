@@ -1,0 +1,426 @@
+"""A camera is a torch module like any other: compiled, transformed, exported, copied, saved, learned, predicted."""
+
+import copy
+import pickle
+import re
+
+import pytest
+import torch
+from cameras import KEYS, fan, make, one, pixel_lattice, spread
+from torch import nn
+from torch.func import functional_call, jacfwd, jacrev, vmap
+
+import camtorch as ct
+
+every_model = pytest.mark.parametrize("key", KEYS)
+both_directions = pytest.mark.parametrize("method", ["project", "unproject"])
+
+
+class Unproject(nn.Module):
+    def __init__(self, camera):
+        super().__init__()
+        self.camera = camera
+
+    def forward(self, pixels):
+        return self.camera.unproject(pixels)
+
+
+def module_and_input(key, method, dtype=torch.float64):
+    """A module for one direction of a real camera, and what goes in, some of it invalid."""
+    camera = one(key).to(dtype)
+    if method == "project":
+        return camera, fan(120, 5, 7).to(dtype)
+    pixels = pixel_lattice(camera, 5, 7)
+    return Unproject(camera), torch.cat((pixels, pixels[:3] * 1e4))
+
+
+def assert_same(results, expected, **tolerance):
+    for result, reference in zip(results, expected, strict=True):
+        torch.testing.assert_close(result, reference, **tolerance)
+
+
+def parameters_of(module):
+    return {name: p.detach() for name, p in module.named_parameters()}
+
+
+# -- compile, export, transforms
+
+
+def backend(key, method):
+    """Down to aten, but for unprojection through lenses that are not radial: that long trace is the same for all."""
+    lens = one(key).optics(one(key).distortion.unbind(-1))[1]
+    short = method == "project" or not lens.stages or lens.is_radial or key == "fisheye624"
+    return "aot_eager" if short else "eager"
+
+
+@every_model
+@both_directions
+def test_compile_without_graph_breaks(key, method):
+    torch._dynamo.reset()
+    module, values = module_and_input(key, method)
+    compiled = torch.compile(module, fullgraph=True, backend=backend(key, method))
+    gradients = []
+    for function in (compiled, module):
+        leaf = values.clone().requires_grad_()
+        result, valid = function(leaf)
+        gradients.append((result, valid, *torch.autograd.grad(result.sum(), [leaf, *module.parameters()])))
+    assert_same(*gradients)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # inductor imports what still uses it
+def test_compile_to_machine_code():
+    torch._dynamo.reset()
+    camera = one("pinhole")  # the smallest graph: inductor takes its time
+    points = fan(100, 5, 7)
+    compiled = torch.compile(camera, fullgraph=True)
+    # contracted multiplications and additions round differently
+    assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
+
+
+@every_model
+@both_directions
+def test_export(key, method):
+    module, values = module_and_input(key, method)
+    count = torch.export.Dim("count", min=2)
+    exported = torch.export.export(module, (values,), dynamic_shapes=({0: count},)).module()
+    for rows in (values, values[:9]):
+        assert_same(exported(rows), module(rows))
+
+
+@every_model
+@both_directions
+def test_vmap_over_values(key, method):
+    module, values = module_and_input(key, method)
+    assert_same(vmap(module)(values), module(values))
+    grid = values[:32].unflatten(0, (4, 8))
+    assert_same(vmap(vmap(module))(grid), module(grid))
+
+
+@every_model
+@both_directions
+def test_vmap_over_cameras(key, method):
+    module, values = module_and_input(key, method)
+    stacked = {name: torch.stack((p, 1.05 * p, 0.9 * p)) for name, p in parameters_of(module).items()}
+    results = vmap(lambda parameters: functional_call(module, parameters, (values,)))(stacked)
+    for i in range(3):
+        assert_same([r[i] for r in results], functional_call(module, {n: p[i] for n, p in stacked.items()}, (values,)))
+
+
+@every_model
+@both_directions
+def test_forward_and_reverse_mode_agree(key, method):
+    module, values = module_and_input(key, method)
+
+    def result(parameters, values):
+        return functional_call(module, parameters, (values,))[0]
+
+    inputs = (parameters_of(module), values[::6])
+    by_row = [transform(result, argnums=(0, 1))(*inputs) for transform in (jacrev, jacfwd)]
+    (reverse, reverse_by_value), (forward, forward_by_value) = by_row
+    assert reverse.keys() == forward.keys()
+    pairs = [(reverse[name], forward[name]) for name in reverse] + [(reverse_by_value, forward_by_value)]
+    for mine, reference in pairs:
+        assert reference.isfinite().all()
+        # both are exact; what they round differently scales with the largest derivative
+        torch.testing.assert_close(mine, reference, rtol=0, atol=1e-12 * reference.abs().max().item() + 1e-15)
+
+
+@every_model
+@both_directions
+def test_functional_call(key, method):
+    module, values = module_and_input(key, method)
+    before = module(values)
+    changed = {name: p * 1.02 for name, p in parameters_of(module).items()}
+    fresh = copy.deepcopy(module)
+    fresh.load_state_dict(changed)
+    assert_same(functional_call(module, changed, (values,)), fresh(values))
+    assert_same(module(values), before)
+
+
+@every_model
+@both_directions
+def test_gradient_checkpointing_and_inference_mode(key, method):
+    module, values = module_and_input(key, method)
+    with torch.inference_mode():
+        inferred = [t.clone() for t in module(values)]
+    result = module(values)
+    assert_same(inferred, [t.detach() for t in result])
+    result[0].sum().backward()
+    checkpointed = torch.utils.checkpoint.checkpoint(module, values, use_reentrant=False)
+    assert_same(checkpointed, result)
+
+
+# -- copies and files
+
+
+@every_model
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))], ids=["deepcopy", "pickle"])
+def test_copies(key, copied):
+    camera = one(key)
+    camera.intrinsics.requires_grad_(False)
+    points = fan(100, 5, 7)
+    expected = camera.project(points)
+    again = copied(camera)
+    assert type(again) is type(camera)
+    assert again.image_size == camera.image_size
+    assert again.distortion_names == camera.distortion_names
+    assert [p.requires_grad for p in again.parameters()] == [p.requires_grad for p in camera.parameters()]
+    assert_same(again.project(points), expected)
+    with torch.no_grad():
+        again.intrinsics *= 2
+    assert_same(camera.project(points), expected)
+
+
+@every_model
+def test_copies_of_a_predicted_camera_have_the_values(key):
+    parameters = [t.detach().requires_grad_() for t in (spread(key).intrinsics, spread(key).distortion)]
+    camera = make(key, *(p * 1 for p in parameters))
+    for again in (copy.deepcopy(camera), pickle.loads(pickle.dumps(camera))):
+        assert_same(again.project(fan(40)), camera.project(fan(40)))
+
+
+@every_model
+def test_state_dict_is_strict(key):
+    camera = spread(key)
+    state = camera.state_dict()
+    expected = {"intrinsics", "distortion"} if camera.distortion_names else {"intrinsics"}
+    assert set(state) == expected
+    other = make(key, 2 * camera.intrinsics.detach(), 0 * camera.distortion.detach())
+    points = fan(60, 5, 7)
+    other.project(points)
+    other.load_state_dict(state, strict=True)
+    assert_same(other.project(points), camera.project(points))
+    with pytest.raises(RuntimeError, match="intrinsics"):
+        other.load_state_dict({}, strict=True)
+
+
+@every_model
+def test_every_change_of_a_parameter_is_noticed(key):
+    """Whatever a camera keeps between calls, it follows its parameters."""
+    camera = spread(key)
+    points, pixels = fan(60, 5, 7), pixel_lattice(camera, 4, 5)
+
+    def check():
+        fresh = make(key, camera.intrinsics.detach(), camera.distortion.detach())
+        assert_same(camera.project(points), fresh.project(points))
+        assert_same(camera.unproject(pixels), fresh.unproject(pixels))
+
+    check()
+    for parameter in camera.parameters():
+        parameter.data.mul_(1.1)
+        check()
+        with torch.no_grad():
+            parameter *= 1.1
+        check()
+        parameter.data = parameter.data * 0.9
+        check()
+    optimizer = torch.optim.Adam(camera.parameters(), lr=1e-2)
+    camera.project(points)[0].sum().backward()
+    optimizer.step()
+    check()
+
+
+# -- learning
+
+
+@every_model
+def test_plain_values_become_parameters(key):
+    camera = spread(key)
+    assert camera.intrinsics.requires_grad
+    count = 2 if camera.distortion_names else 1
+    assert len(list(camera.parameters())) == count
+    values = camera.intrinsics.tolist()
+    for plain in (values, camera.intrinsics.detach().numpy(), camera.intrinsics.detach()):
+        again = ct.MODELS[key](plain)
+        assert isinstance(again.intrinsics, nn.Parameter)
+        assert again.intrinsics is not plain
+    assert ct.MODELS[key](values).intrinsics.dtype == torch.get_default_dtype()
+    assert ct.MODELS[key]([300, 300, 320, 240]).intrinsics.is_floating_point()
+    parameter = nn.Parameter(camera.intrinsics.detach())
+    assert ct.MODELS[key](parameter).intrinsics is parameter
+
+
+@every_model
+@both_directions
+def test_gradients_reach_the_network_that_predicted_the_camera(key, method):
+    camera = spread(key).float()
+    count = len(camera.distortion_names)
+    torch.manual_seed(0)
+    network = nn.Linear(5, 4 + count)
+    images = torch.rand(3, 5)
+    predicted = network(images)
+    intrinsics = camera.intrinsics.detach() * (1 + 0.1 * predicted[:, :4])
+    distortion = camera.distortion.detach() * (1 + 0.1 * predicted[:, 4:])
+    seen = make(key, intrinsics, distortion)
+    assert seen.batch_shape == (3,)
+    assert list(seen.parameters()) == []
+    values = fan(40, 4, 5).float() if method == "project" else pixel_lattice(camera, 4, 5)
+    result, valid = getattr(seen, method)(values.expand(3, *values.shape))
+    assert valid.any()
+    (result**2).sum().backward()
+    assert network.weight.grad.isfinite().all()
+    assert (network.weight.grad.abs().amax(-1) > 0).all()
+
+
+@every_model
+def test_a_camera_is_found_from_its_own_pixels(key):
+    """Gauss-Newton steps with autograd's Jacobians find the parameters that made the pixels."""
+    truth = spread(key)
+    rays = fan(45, 8, 12)
+    pixels = truth.project(rays)[0].detach()
+    fx, fy, cx, cy = truth.intrinsics.tolist()
+    start = torch.tensor([1.02 * fx, 0.98 * fy, cx + 3, cy - 2], dtype=torch.float64)
+    camera = make(key, start, 0.9 * truth.distortion.detach())
+    sizes = [p.numel() for p in camera.parameters()]
+
+    def residuals(vector):
+        parameters = dict(zip(parameters_of(camera), vector.split(sizes), strict=True))
+        return (functional_call(camera, parameters, (rays,))[0] - pixels).flatten()
+
+    vector = nn.utils.parameters_to_vector(camera.parameters()).detach()
+    for _ in range(15):
+        vector = vector - torch.linalg.lstsq(jacrev(residuals)(vector), residuals(vector)).solution
+    assert residuals(vector).abs().max() < 1e-9
+
+
+@every_model
+@both_directions
+@pytest.mark.parametrize("broken", ["nan focal", "negative focal", "zero focal", "infinite centre", "nan coefficient"])
+def test_parameters_driven_astray_are_invalid_not_nan(key, method, broken):
+    """One camera of a batch is lost: its results are invalid, finite and without gradient; the others do not notice."""
+    single, values = module_and_input(key, method)
+    camera = single if method == "project" else single.camera
+    batch = [p.detach().expand(2, -1).clone() for p in (camera.intrinsics, camera.distortion)]
+    name = "nan coefficient" if broken == "nan coefficient" and camera.distortion_names else broken
+    both = make(key, *batch)
+    values = values.expand(2, *values.shape).clone().requires_grad_()
+    weights = torch.linspace(1, 2, 3, dtype=torch.float64)[: 5 - values.shape[-1]]
+    expected, expected_valid = getattr(make(key, *batch), method)(values)
+    (expected_gradient,) = torch.autograd.grad((expected * weights).sum(), values)
+    with torch.no_grad():
+        place = {"nan focal": (0, torch.nan), "negative focal": (1, -300.0), "zero focal": (0, 0.0)}
+        if name == "nan coefficient" and camera.distortion_names:
+            both.distortion[1, 0] = torch.nan
+        else:
+            index, value = place.get(name, (2, torch.inf))
+            both.intrinsics[1, index] = value
+    result, valid = getattr(both, method)(values)
+    assert result.isfinite().all()
+    assert not valid[1].any()
+    assert_same((result[0], valid[0]), (expected[0], expected_valid[0]))
+    gradient, *by_parameter = torch.autograd.grad((result * weights).sum(), [values, *both.parameters()])
+    assert (gradient[1] == 0).all()
+    torch.testing.assert_close(gradient[0], expected_gradient[0])
+    for parameter in by_parameter:
+        assert parameter.isfinite().all()
+        assert (parameter[1] == 0).all()
+
+
+# -- dtypes
+
+
+@every_model
+@both_directions
+def test_autocast_does_not_touch_geometry(key, method):
+    module, values = module_and_input(key, method, torch.float32)
+    expected = module(values)
+    with torch.autocast("cpu", torch.bfloat16):
+        results = module(values)
+    assert results[0].dtype == torch.float32
+    assert_same(results, expected, rtol=0, atol=0)
+
+
+@every_model
+def test_low_precision_networks_keep_their_geometry(key):
+    network = nn.ModuleDict({"layer": nn.Linear(2, 2), "camera": one(key).float()})
+    before = network["camera"].intrinsics.detach().clone()
+    for moved in (network.bfloat16(), network.half(), network.to(torch.bfloat16)):
+        assert moved["layer"].weight.dtype != torch.float32
+        assert moved["camera"].intrinsics.dtype == torch.float32
+        assert torch.equal(moved["camera"].intrinsics, before)
+    assert network.double()["camera"].intrinsics.dtype == torch.float64
+    assert network["camera"].distortion.dtype == torch.float64
+
+
+@every_model
+@both_directions
+@pytest.mark.parametrize(
+    ("of_camera", "of_values", "expected"),
+    [
+        (torch.float32, torch.float32, torch.float32),
+        (torch.float32, torch.float64, torch.float64),
+        (torch.float64, torch.float32, torch.float64),
+        (torch.float32, torch.bfloat16, torch.float32),
+        (torch.float32, torch.int64, torch.float32),
+        (torch.float64, torch.uint8, torch.float64),
+    ],
+)
+def test_dtype_promotion(key, method, of_camera, of_values, expected):
+    module, _ = module_and_input(key, method, of_camera)
+    values = torch.tensor([[3, 4, 10], [1, 0, 5]] if method == "project" else [[200, 150], [180, 240]])
+    result, valid = module(values.to(of_values))
+    assert result.dtype == expected
+    assert valid.dtype == torch.bool
+    assert_same((result, valid), module(values.to(expected)))
+
+
+@every_model
+def test_half_parameters_become_float32(key):
+    intrinsics = torch.tensor([300.0, 310.0, 320.0, 240.0])
+    assert ct.MODELS[key](intrinsics.half()).intrinsics.dtype == torch.float32
+
+
+# -- what one sees
+
+
+@every_model
+def test_repr(key):
+    camera = spread(key)
+    text = repr(camera)
+    assert text.startswith(type(camera).__name__)
+    assert "fx=301" in text
+    assert "480, 640" in text
+    for name, value in zip(camera.distortion_names, camera.distortion.tolist(), strict=True):
+        assert re.search(rf"\b{name}={re.escape(f'{value:.6g}')}", text)
+    batched = make(key, camera.intrinsics.detach().expand(2, 4), camera.distortion.detach())
+    assert "batch_shape=(2,)" in repr(batched)
+
+
+@every_model
+def test_forward_is_project_and_layers_chain(key):
+    camera = one(key)
+    points = fan(60, 5, 7)
+    assert_same(camera(points), camera.project(points))
+    mounted = nn.Sequential(ct.Extrinsics([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).double(), camera)
+    assert_same(mounted(points), camera.project(points))
+
+
+def test_the_models_that_must_be_there():
+    names = {"pinhole", "brown_conrady", "kannala_brandt", "fisheye62", "fisheye624"}
+    assert names <= set(ct.MODELS)
+    assert ct.FisheyeRadTanThinPrism is ct.Fisheye624
+    for key, model in ct.MODELS.items():
+        assert model.key == key
+        assert issubclass(model, ct.Camera)
+
+
+def test_a_model_is_one_class():
+    """Defining a class with a key is all that a new model needs."""
+    from camtorch.charts import Equidistant
+    from camtorch.lens import Lens
+
+    try:
+
+        class Spherical(ct.Camera):
+            key = "spherical_of_this_test"
+
+            def optics(self, k):
+                return Equidistant(), Lens()
+
+        camera = ct.MODELS["spherical_of_this_test"]([100.0, 100.0, 50.0, 40.0])
+        rays = fan(170).float()
+        again, valid = camera.unproject(camera.project(rays)[0])
+        assert valid.all()
+        torch.testing.assert_close(again, rays, rtol=0, atol=1e-5)
+    finally:
+        ct.MODELS.pop("spherical_of_this_test", None)
