@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch.charts import Chart
 from camtorch.domain import Domain
 from camtorch.lens import Lens
-from camtorch.parameters import Memo, as_image_size, as_parameter, as_planes, as_real, columns, is_concrete
+from camtorch.parameters import Memo, as_image_size, as_planes, as_real, columns, is_concrete
 from camtorch.picture import Picture
 from camtorch.solve import attach, invert, rounding
 
@@ -40,8 +40,9 @@ class Camera(Picture):
         distortion: (*B, n) coefficients in the order of `distortion_names`; zeros if left out.
         image_size: (height, width) in pixels, shared by the batch; needed only where a picture is concerned.
 
-    Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s. A tensor that requires grad
-    is kept as it is, so that gradients reach the network that predicted it.
+    Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s of the shapes above. An `nn.Parameter`
+    and a tensor that requires grad are kept as they are, so that gradients reach the network that predicted
+    them, and a lens shared by a batch stays one.
 
     Raises:
         ValueError: a wrong shape or number of coefficients, NaN or infinite values, a focal length or an
@@ -61,7 +62,7 @@ class Camera(Picture):
     def __init__(self, intrinsics, distortion=None, *, image_size: tuple[int, int] | None = None):
         super().__init__()
         owner = type(self).__name__
-        intrinsics = as_parameter(intrinsics, "intrinsics", owner)
+        intrinsics = as_real(intrinsics, "intrinsics", owner)
         if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
             hint = f". For a matrix K use {owner}.from_matrix" if intrinsics.shape[-2:] == (3, 3) else ""
             raise ValueError(
@@ -71,7 +72,7 @@ class Camera(Picture):
             raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
         if distortion is None:
             distortion = intrinsics.detach().new_zeros((*intrinsics.shape[:-1], self.default_count))
-        distortion = as_parameter(distortion, "distortion", owner)
+        distortion = as_real(distortion, "distortion", owner)
         names = self.names_of(distortion.shape[-1]) if distortion.ndim else None
         if names is None:
             raise ValueError(
@@ -138,7 +139,7 @@ class Camera(Picture):
         x, y, z = (plane.detach() for plane in planes)
         size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
         # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
-        valid = (size > torch.finfo(size.dtype).tiny * 1e6) & (size < torch.inf) & usable
+        valid = (size > torch.finfo(size.dtype).tiny ** 0.5) & (size < torch.inf) & usable
         # a constant: the projection does not depend on the distance, so this has no part in its derivative
         shrink = torch.where(valid, size, 1.0).reciprocal()
         valid = valid & chart.covers(x * shrink, y * shrink, z * shrink)
@@ -166,7 +167,8 @@ class Camera(Picture):
         focal_x, focal_y, centre_x, centre_y, k, usable = self._coefficients()
         chart, lens = self.optics(k)
         domain = self._domain(k, like=u)
-        valid = torch.isfinite(u.detach()) & torch.isfinite(v.detach()) & usable
+        far = torch.maximum(((u - centre_x) / focal_x).detach().abs(), ((v - centre_y) / focal_y).detach().abs())
+        valid = (far < torch.finfo(far.dtype).max ** 0.25) & usable  # NaN is not; nor may a square overflow
         p = (torch.where(valid, u, centre_x) - centre_x) / focal_x
         q = (torch.where(valid, v, centre_y) - centre_y) / focal_y
         if domain is None:
@@ -211,7 +213,7 @@ class Camera(Picture):
         an ideal one, and all its results are invalid.
         """
         intrinsics, distortion = self._tensors
-        values = torch.cat((intrinsics.detach(), distortion.detach()), -1)
+        values = torch.cat([t.detach().expand(*self.batch_shape, -1) for t in self._tensors], -1)
         usable = torch.isfinite(values).all(-1, keepdim=True) & (values[..., :2] > 0).all(-1, keepdim=True)
         ideal = values.new_tensor([1.0, 1.0, 0.0, 0.0])
         fx, fy, cx, cy = columns(torch.where(usable, intrinsics, ideal))
@@ -222,12 +224,12 @@ class Camera(Picture):
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the parameters."""
-        return self.intrinsics.shape[:-1]
+        return torch.broadcast_shapes(self.intrinsics.shape[:-1], self.distortion.shape[:-1])
 
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name for it)
         """The (*B, 3, 3) camera matrix."""
-        fx, fy, cx, cy = self.intrinsics.unbind(-1)
+        fx, fy, cx, cy = self.intrinsics.expand(*self.batch_shape, 4).unbind(-1)
         zero, one = torch.zeros_like(fx), torch.ones_like(fx)
         return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
 

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from camtorch.analytic import angle_per_radius, cos_root, sinc_root
 
+_SMALLEST_RADIUS = 1e-4  # a hundredth of a degree
+
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
 
@@ -44,11 +46,19 @@ class Chart:
         raise NotImplementedError
 
     def radii(self, count: int, like: Tensor) -> Tensor:
-        """(count,) radii from the centre of the plane to the end of the chart, as dense as a lens varies.
+        """(count,) ascending radii from the centre of the plane to the end of the chart.
 
-        Only charts that a lens follows need them: on these its fold is looked for.
+        Half of them in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree.
+        Only charts that a lens follows need them.
         """
         raise NotImplementedError
+
+
+def _even_steps_and_ratios(count: int, steps_to: float, end: float, like: Tensor, bend) -> Tensor:
+    options = {"dtype": like.dtype, "device": like.device}
+    steps = bend(torch.linspace(0, steps_to, count // 2, **options))
+    ratios = torch.linspace(math.log(_SMALLEST_RADIUS), math.log(end), count - count // 2, **options).exp()
+    return torch.cat((steps, ratios)).sort().values
 
 
 class Perspective(Chart):
@@ -75,12 +85,7 @@ class Perspective(Chart):
         return unit(a, b, torch.ones_like(a))
 
     def radii(self, count, like):
-        # even steps of the angle up to 88 degrees; beyond, where distortion is a power law, even ratios
-        options = {"dtype": like.dtype, "device": like.device}
-        inner = torch.linspace(0, math.radians(88), 3 * count // 4, **options).tan()
-        last = math.tan(math.radians(88))
-        outer = torch.linspace(0, math.log(1.5 * self.limit(like.dtype) / last), count - len(inner) + 1, **options)
-        return torch.cat((inner, last * outer[1:].exp()))
+        return _even_steps_and_ratios(count, math.radians(88), 1.5 * self.limit(like.dtype), like, torch.tan)
 
 
 class Equidistant(Chart):
@@ -103,7 +108,12 @@ class Equidistant(Chart):
         return a * sinc, b * sinc, cos_root(theta2)
 
     def radii(self, count, like):
-        return torch.linspace(0, math.pi, count, dtype=like.dtype, device=like.device)
+        return _even_steps_and_ratios(count, math.pi, math.pi, like, torch.positive)
+
+
+def _half_turn(dtype: torch.dtype) -> float:
+    # pi rounded to float32 is larger than pi, and seen from the other side
+    return math.pi * (1 - torch.finfo(dtype).eps)
 
 
 class CylinderChart(Chart):
@@ -116,7 +126,7 @@ class CylinderChart(Chart):
         return torch.atan2(x, z), y * (x * x + z * z).rsqrt()
 
     def on_plane(self, a, b):
-        return (a.abs() <= math.pi) & (b.abs() < Perspective.limit(b.dtype))
+        return (a.abs() < _half_turn(a.dtype)) & (b.abs() < Perspective.limit(b.dtype))
 
     def to_ray(self, a, b):
         return unit(torch.sin(a), b, torch.cos(a))
@@ -132,7 +142,7 @@ class SphereChart(Chart):
         return torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())
 
     def on_plane(self, a, b):
-        return (a.abs() <= math.pi) & (b.abs() < math.pi / 2)
+        return (a.abs() < _half_turn(a.dtype)) & (b.abs() < math.pi / 2)
 
     def to_ray(self, a, b):
         across = torch.cos(b)

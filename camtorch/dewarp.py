@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
@@ -53,7 +53,7 @@ class Dewarp(Warp):
         mode: str = "bilinear",
         padding_mode: str = "zeros",
     ):
-        if projection not in _PROJECTIONS:
+        if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
         if not isinstance(camera, Camera):
             raise TypeError(f"Dewarp: camera must be a Camera; got {type(camera).__name__}")
@@ -70,15 +70,17 @@ class Dewarp(Warp):
                 intrinsics = torch.cat((focal.expand(2), centre))
             else:
                 intrinsics = _fitted(camera, projection, size, rotation)
-        target = model(intrinsics, image_size=size).requires_grad_(False)
+        target = model(nn.Parameter(intrinsics, requires_grad=False), image_size=size)
         super().__init__(camera, target, rotation, mode=mode, padding_mode=padding_mode)
 
 
 def _plane_width(projection: str, fov: float) -> float:
     widest = math.pi if projection == "perspective" else 2 * math.pi
-    if not (
-        isinstance(fov, (int, float)) and 0 < fov <= widest and not (projection == "perspective" and fov >= math.pi)
-    ):
+    try:
+        fov = float(fov)
+    except (TypeError, ValueError):
+        raise TypeError(f"Dewarp: fov must be a number; got {type(fov).__name__}") from None
+    if not (1e-6 < fov < widest or fov == widest == 2 * math.pi):
         raise ValueError(
             f"Dewarp: fov must be in radians, between 0 and {widest:.4g} for a {projection} target; got {fov!r}"
         )

@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from camtorch.charts import Chart
     from camtorch.lens import Lens
 
-_AZIMUTHS, _RADII = 256, 64
-_RADII_RADIAL = 256  # for a radial lens, where one azimuth stands for all
+_AZIMUTHS = 256
+_RADII = 2048  # on one azimuth, which stands for all where the lens is radial
+_SMOOTH, _BULGE = 0.02, 0.001
+_COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 
 
 class Domain:
@@ -23,37 +25,34 @@ class Domain:
     lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
     dips below zero between them. Up to there the sense changes its sign once at the most, so that its
     value at the point itself tells exactly on which side of the fold the point lies.
+
+    A lens that is not radial mostly folds where its radial factor does: there its radii are dense.
     """
 
     def __init__(self, lens: Lens, chart: Chart, like: Tensor):
         """like: gives the dtype and device. The tables have the shape (*B, azimuths, radii)."""
         self.lens = lens
+        fine = chart.radii(_RADII, like)
         self.azimuths = 1 if lens.is_radial else _AZIMUTHS
-        self.radii = chart.radii(_RADII_RADIAL if lens.is_radial else _RADII, like)
+        self.radii = fine if lens.is_radial else _around(lens.radial_part(), chart, fine)
+        self.count = self.radii.shape[-1]
         angles = torch.arange(self.azimuths, dtype=like.dtype, device=like.device) * (2 * math.pi / self.azimuths)
-        plane = [torch.outer(f(angles), self.radii).flatten() for f in (torch.cos, torch.sin)]
-        (x, y), _, sense = lens.linearise(*plane)
-        shape = (self.azimuths, len(self.radii))
-        self.lost = _first_loss(sense.unflatten(-1, shape))
-        self.limits = self._limits()
-        self.reach = self._ascending((x * x + y * y).sqrt().unflatten(-1, shape))
+        a, b = ((f(angles)[:, None] * self.radii.unsqueeze(-2)).flatten(-2) for f in (torch.cos, torch.sin))
+        (x, y), _, sense = lens.linearise(a, b)
+        shape = (self.azimuths, self.count)
+        lost = _first_loss(sense.unflatten(-1, shape))
+        self.limits = self._limits(lost)
+        self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
 
-    def _limits(self) -> Tensor:
+    def _limits(self, lost: Tensor) -> Tensor:
         """(*B, azimuths): the radius, up to the next azimuth, before which the sense at the point itself decides."""
-        last = len(self.radii) - 1
-        index = self.lost.floor().long().clamp(max=last)
-        inner, outer = self.radii[index], self.radii[(index + 1).clamp(max=last)]
-        limit = torch.where(self.lost <= last, inner + (self.lost - index) * (outer - inner), torch.inf)
-        # between two azimuths the fold moves smoothly, or it ends there: then the nearer one is on the safe side
-        smooth = (self.lost - self.lost.roll(-1, -1)).abs() <= 1.5
+        limit = _radius_at(self.radii.unsqueeze(-2), lost)
         following = limit.roll(-1, -1)
-        return torch.where(smooth, torch.maximum(limit, following), torch.minimum(limit, following))
-
-    def _ascending(self, reach: Tensor) -> Tensor:
-        """(*B, azimuths, radii): how far from the centre the lens sends a node; infinite past the fold."""
-        nodes = torch.arange(len(self.radii), dtype=reach.dtype, device=reach.device)
-        before = (nodes < self.lost.unsqueeze(-1)) & (reach < torch.inf)
-        return torch.cummax(torch.where(before, reach, torch.inf), -1).values
+        nearer, further = torch.minimum(limit, following), torch.maximum(limit, following)
+        # Between two azimuths the fold moves smoothly, and may bulge: the sense tells where it lies. Or it ends there:
+        # then the nearer one is on the safe side.
+        smooth = ((lost - lost.roll(-1, -1)).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
+        return torch.where(smooth, further * (1 + _BULGE), nearer)
 
     def contains(self, a: Tensor, b: Tensor, sense: Tensor) -> Tensor:
         """Bool: plane points (*B, N) before the fold of their azimuth; `sense` is that of the lens at these points."""
@@ -69,15 +68,15 @@ class Domain:
 
         Looked for before the fold only: a target that is not reached ends up next to it.
         """
-        size = len(self.radii)
-        row = self._azimuth(a, b, 0.5) * size if self.azimuths > 1 else torch.zeros_like(target, dtype=torch.long)
+        row = self._azimuth(a, b, 0.5) * self.count if self.azimuths > 1 else torch.zeros_like(target, dtype=torch.long)
         table = self.reach.flatten(-2).expand(*target.shape[:-1], -1)
-        low = _last_not_above(table, row, size, target)
+        low = _last_not_above(table, row, self.count, target)
         near, far = torch.gather(table, -1, row + low), torch.gather(table, -1, row + low + 1)
         # next to the fold only its inner side is safe to start from
         fraction = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
-        lower, upper = self.radii[low], self.radii[(low + 2).clamp(max=size - 1)]
-        return lower, lower + fraction.clamp(0, 1) * (self.radii[low + 1] - lower), upper
+        radii = self.radii.expand(*target.shape[:-1], -1)
+        lower, inner, upper = (torch.gather(radii, -1, (low + i).clamp(max=self.count - 1)) for i in range(3))
+        return lower, lower + fraction.clamp(0, 1) * (inner - lower), upper
 
     def _azimuth(self, a: Tensor, b: Tensor, offset: float) -> Tensor:
         """The index of the azimuth at or below that of the points; `offset` 0.5 gives the nearest one."""
@@ -93,6 +92,36 @@ def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> 
         above = torch.gather(table, -1, row + middle) > target
         low, high = torch.where(above, low, middle), torch.where(above, middle, high)
     return low.clamp(max=length - 2)
+
+
+def _around(radial: Lens | None, chart: Chart, fine: Tensor) -> Tensor:
+    """(*B, radii): the chart's, and more of them the nearer to the fold of the radial part, if it has one."""
+    if radial is None:
+        return chart.radii(_COARSE + _CLOSE, fine)
+    fold = _radius_at(fine, _first_loss(radial.linearise(fine, torch.zeros_like(fine))[2]).unsqueeze(-1))
+    # without a fold on the chart, the middle of a chart does no harm
+    fold = torch.where(fold < torch.inf, fold, 1.0)
+    spread = 1 + 0.5 * torch.linspace(-1, 1, _CLOSE, dtype=fine.dtype, device=fine.device) ** 3
+    close = (fold * spread).clamp(max=fine[-1])
+    coarse = chart.radii(_COARSE, fine).expand(*close.shape[:-1], -1)
+    return torch.cat((coarse, close), -1).sort(-1).values
+
+
+def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
+    """The radius at fractional node positions (*B, A) of radii (*B, 1 or A, S); infinite from S on."""
+    last = radii.shape[-1] - 1
+    index = position.floor().long().clamp(max=last).unsqueeze(-1)
+    radii = radii.expand(*index.shape[:-1], -1)
+    inner, outer = torch.gather(radii, -1, index), torch.gather(radii, -1, (index + 1).clamp(max=last))
+    between = inner + (position.unsqueeze(-1) - index) * (outer - inner)
+    return torch.where(position <= last, between.squeeze(-1), torch.inf)
+
+
+def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
+    """How far from the centre the lens sends each node, ascending; infinite past the fold."""
+    nodes = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
+    before = (nodes < lost.unsqueeze(-1)) & (reach < torch.inf)
+    return torch.cummax(torch.where(before, reach, torch.inf), -1).values
 
 
 def _first_loss(sense: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from camtorch.analytic import cosc_root, sinc_root
-from camtorch.parameters import GeometryModule, as_parameter, as_planes, as_real, is_concrete
+from camtorch.parameters import GeometryModule, as_planes, as_real, is_concrete
 
 
 class Extrinsics(GeometryModule):
@@ -27,8 +27,8 @@ class Extrinsics(GeometryModule):
 
     def __init__(self, rotation, translation):
         super().__init__()
-        rotation = as_parameter(rotation, "rotation", "Extrinsics")
-        translation = as_parameter(translation, "translation", "Extrinsics")
+        rotation = as_real(rotation, "rotation", "Extrinsics")
+        translation = as_real(translation, "translation", "Extrinsics")
         for name, value in (("rotation", rotation), ("translation", translation)):
             if value.ndim == 0 or value.shape[-1] != 3:
                 raise ValueError(f"Extrinsics: {name} must be (*B, 3); got shape {tuple(value.shape)}")
@@ -45,7 +45,7 @@ class Extrinsics(GeometryModule):
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the pose."""
-        return self.rotation.shape[:-1]
+        return torch.broadcast_shapes(self.rotation.shape, self.translation.shape)[:-1]
 
     def forward(self, points_world: Tensor) -> Tensor:
         """World points (*B, *N, 3) to the camera frame, same shape."""
@@ -56,7 +56,8 @@ class Extrinsics(GeometryModule):
 
     def matrix(self) -> Tensor:
         """The (*B, 4, 4) matrix [[R, t], [0, 1]]."""
-        top = torch.cat((rotation_matrix(self.rotation), self.translation.unsqueeze(-1)), -1)
+        rotation, translation = (t.expand(*self.batch_shape, 3) for t in (self.rotation, self.translation))
+        top = torch.cat((rotation_matrix(rotation), translation.unsqueeze(-1)), -1)
         bottom = top.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*self.batch_shape, 1, 4)
         return torch.cat((top, bottom), -2)
 
@@ -80,21 +81,24 @@ class Extrinsics(GeometryModule):
 
     def inverse(self) -> Extrinsics:
         """World from camera."""
-        planes = rotate_planes(rotation_matrix(-self.rotation), self.translation.unsqueeze(-1).unbind(-2))
-        return Extrinsics(-self.rotation, -torch.cat(planes, -1))
+        return Extrinsics(-self.rotation, self.position).freeze_like(self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""
+        if not isinstance(other, Extrinsics):
+            raise TypeError(f"Extrinsics: compose takes Extrinsics; got {type(other).__name__}")
         mine, its = rotation_matrix(self.rotation), rotation_matrix(other.rotation)
         columns = rotate_planes(mine.unsqueeze(-3), its.mT.unsqueeze(-1).unbind(-2))
         moved = rotate_planes(mine, other.translation.unsqueeze(-1).unbind(-2))
         product = torch.cat(columns, -1).mT
-        return Extrinsics(rotation_vector(product), torch.cat(moved, -1) + self.translation)
+        composed = Extrinsics(rotation_vector(product), torch.cat(moved, -1) + self.translation)
+        return composed.freeze_like(self, other)
 
     @property
     def position(self) -> Tensor:
         """(*B, 3): where the camera stands in the world, -R^T t."""
-        return self.inverse().translation
+        turned_back = rotate_planes(rotation_matrix(-self.rotation), self.translation.unsqueeze(-1).unbind(-2))
+        return -torch.cat(turned_back, -1)
 
     def extra_repr(self) -> str:
         """Batch, or the numbers of a single pose."""
@@ -127,10 +131,15 @@ def rotation_vector(matrix: Tensor) -> Tensor:
 
 
 def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Apply (*B, 3, 3) to three planes (*B, N): by components, which autocast leaves in their precision."""
+    """Apply (*B, 3, 3) to three planes (*B, N): by components, which autocast leaves in their precision.
+
+    A point that is not finite becomes NaN, which has no part in the gradient of the matrix.
+    """
     x, y, z = planes
+    finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
+    x, y, z = (torch.where(finite, plane, 0.0) for plane in planes)
     rows = [[matrix[..., i, j, None] for j in range(3)] for i in range(3)]
-    return tuple(a * x + b * y + c * z for a, b, c in rows)
+    return tuple(torch.where(finite, a * x + b * y + c * z, torch.nan) for a, b, c in rows)
 
 
 def check_rotation(matrix: Tensor, name: str, owner: str) -> None:

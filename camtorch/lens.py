@@ -4,6 +4,8 @@ A stage is built from coefficient planes that broadcast against the points. `Pla
 that is polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -153,6 +155,11 @@ class Lens:
     def is_radial(self) -> bool:
         """Whether the lens is a single radial factor: then its inverse is a matter of one variable."""
         return len(self.stages) == 1 and self.stages[0].is_radial
+
+    def radial_part(self) -> Lens | None:
+        """The lens of the first stage's radial factor alone, if it has one."""
+        first = self.stages[0]
+        return Lens(Planar(first.radial)) if isinstance(first, Planar) and first.radial else None
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         for stage in self.stages:

@@ -1,28 +1,45 @@
 """The door: what users pass as parameters and points, checked and brought into shape."""
 
+from __future__ import annotations
+
 import math
 import operator
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 class GeometryModule(nn.Module):
     """A module whose tensors are geometry: Parameters, or tensors of a graph, never of less than float32."""
 
     def hold(self, name: str, value: Tensor, shape: tuple[int, ...]) -> None:
-        """Register `value` expanded to `shape`: a Parameter as such, all else as a buffer outside the state_dict."""
-        if value.shape != shape:
-            learnable = isinstance(value, nn.Parameter)
-            value = value.expand(shape)
-            value = nn.Parameter(value.detach().clone()) if learnable else value
+        """Register plain values as a new Parameter of that shape, a Parameter or a tensor of a graph as it is.
+
+        Those keep their own shape, which broadcasts to `shape`: a lens shared by a batch of cameras stays one.
+        """
+        wide = torch.promote_types(value.dtype, torch.float32)
         if shape[-1] == 0:  # an optimizer has nothing to learn here
-            value = value.detach()
-        if isinstance(value, nn.Parameter):
+            self.register_buffer(name, value.detach().expand(shape), persistent=False)
+        elif isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
+        elif in_graph(value):
+            self.register_buffer(name, value.to(wide), persistent=False)
         else:
-            self.register_buffer(name, value, persistent=False)
+            self.register_parameter(name, nn.Parameter(value.detach().to(wide).expand(shape).clone()))
+
+    def freeze_like(self, *sources: nn.Module) -> Self:
+        """Leave nothing to learn where the modules that this one was made from have nothing either."""
+        tensors = [t for source in sources for t in (*source.parameters(), *source.buffers())]
+        if not any(t.requires_grad for t in tensors):
+            for parameter in self.parameters():
+                parameter.requires_grad = False
+        return self
 
     def _apply(self, fn, recurse=True):
         # network.half() must not round a principal point to whole pixels
@@ -55,12 +72,14 @@ class Memo:
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple, compute: Callable[[], object]):
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
-        if not all(is_concrete(t) for t in inputs):
+        if not all(is_concrete(t) and not _has_tangent(t) for t in inputs):
             return compute()
         if self._kept is not None:
             kept_inputs, kept_options, result = self._kept
             if options == kept_options and all(map(_same, inputs, kept_inputs)):
                 return result
+        if torch._C._functorch.peek_interpreter_stack() is not None:  # what a transform makes dies with it
+            return compute()
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
             copies = [t.detach().clone() for t in inputs]
@@ -74,6 +93,15 @@ class Memo:
 
 def _same(a: Tensor, b: Tensor) -> bool:
     return a.shape == b.shape and a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
+
+
+def _has_tangent(tensor: Tensor) -> bool:
+    return forward_ad._current_level >= 0 and forward_ad.unpack_dual(tensor).tangent is not None
+
+
+def in_graph(tensor: Tensor) -> bool:
+    """Whether derivatives, of either mode, or a transform pass through the tensor."""
+    return tensor.requires_grad or not is_concrete(tensor) or _has_tangent(tensor)
 
 
 def is_concrete(tensor: Tensor) -> bool:
@@ -110,19 +138,6 @@ def as_real(value, name: str, owner: str) -> Tensor:
     return value
 
 
-def as_parameter(value, name: str, owner: str) -> Tensor:
-    """A checked tensor: kept if it is part of a graph, else a new `nn.Parameter` of at least float32.
-
-    Raises:
-        TypeError, ValueError: as `as_real`.
-    """
-    value = as_real(value, name, owner)
-    if value.requires_grad or isinstance(value, nn.Parameter) or not is_concrete(value):
-        return value
-    dtype = torch.promote_types(value.dtype, torch.float32)
-    return nn.Parameter(value.detach().to(dtype, copy=True))
-
-
 def as_image_size(value, owner: str) -> tuple[int, int] | None:
     """(height, width) as two positive ints, or None.
 
@@ -132,7 +147,7 @@ def as_image_size(value, owner: str) -> tuple[int, int] | None:
     if value is None:
         return None
     try:
-        if any(isinstance(side, bool) for side in value):
+        if isinstance(value, (set, frozenset, dict)) or any(isinstance(side, bool) for side in value):
             raise TypeError
         height, width = (operator.index(side) for side in value)
     except (TypeError, ValueError):
@@ -151,6 +166,22 @@ def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
     return dtype
 
 
+def as_values(values, name: str, owner: str, device: torch.device | None = None) -> Tensor:
+    """A tensor of real numbers, NaN and infinity among them, of what is one or can be made one.
+
+    Raises:
+        TypeError: it cannot.
+    """
+    if not isinstance(values, Tensor):
+        try:
+            values = torch.as_tensor(values, device=device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise TypeError(f"{owner}: {name} must be a tensor; got {type(values).__name__}: {error}") from None
+    if values.is_complex() or values.dtype == torch.bool:
+        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {values.dtype}")
+    return values
+
+
 def as_planes(
     values, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[tuple[Tensor, ...], Callable[..., Tensor]]:
@@ -162,13 +193,7 @@ def as_planes(
     Raises:
         TypeError: not real numbers. ValueError: the shape does not fit `batch`.
     """
-    if not isinstance(values, Tensor):
-        try:
-            values = torch.as_tensor(values, device=parameters[0].device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise TypeError(f"{owner}: {name} must be a tensor; got {type(values).__name__}: {error}") from None
-    if values.is_complex() or values.dtype == torch.bool:
-        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {values.dtype}")
+    values = as_values(values, name, owner, parameters[0].device)
     takes = f"{name} must be (*B, *N, {size}) with batch dims *B = {tuple(batch)}"
     if values.ndim == 0 or values.shape[-1] != size:
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}")

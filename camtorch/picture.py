@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch.parameters import GeometryModule, as_image_size
+from camtorch.parameters import GeometryModule, as_image_size, as_values
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -28,6 +28,9 @@ class Picture(GeometryModule):
     def contains(self, pixels: Tensor) -> Tensor:
         """Bool (...): whether pixels (..., 2) lie on the picture, its outer pixel edges included."""
         height, width = self._size("contains")
+        pixels = as_values(pixels, "pixels", type(self).__name__)
+        if pixels.ndim == 0 or pixels.shape[-1] != 2:
+            raise ValueError(f"{type(self).__name__}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
         u, v = pixels.unbind(-1)
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
@@ -82,7 +85,4 @@ class Picture(GeometryModule):
             sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
             arguments.append(self.distortion * sign)
         edited = type(self)(*arguments, image_size=size)
-        for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
-            if its.is_leaf and its.shape[-1]:
-                its.requires_grad_(mine.requires_grad)
-        return edited
+        return edited.freeze_like(self)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
@@ -37,8 +39,10 @@ def sample(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor
     if dtype == torch.bool:
         return result >= 0.5
     if not dtype.is_floating_point:
-        limits = torch.iinfo(dtype)
-        result = result.round().clamp(limits.min, limits.max)
+        low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
+        # the largest int64 is no float64: the next one would wrap around
+        high = high if int(float(high)) == high else math.nextafter(float(high), 0.0)
+        result = result.round().clamp(low, high)
     return result.to(dtype)
 
 

@@ -7,10 +7,10 @@ from torch import Tensor, nn
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotate_planes
-from camtorch.parameters import GeometryModule, Memo, as_planes, as_real
+from camtorch.parameters import GeometryModule, Memo, as_planes, as_real, as_values, in_graph
 from camtorch.sampling import MODES, PADDINGS, sample
 
-_OUTSIDE = -3.0  # a sampling position that no picture reaches, not even with its interpolation margin
+_OUTSIDE = -9.0  # a sampling position that no picture reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 _EDGE_SAMPLES = 64  # per box edge: a 500 px edge bent to a radius of 300 px is then enclosed to 0.03 px
 
@@ -103,23 +103,24 @@ class Warp(GeometryModule):
             )
         mode = self.mode if mode is None else _checked_mode(mode)
         grid, mapped, _ = self._sampling()
-        batch = max(len(images), len(grid)) if len(images) else 0
-        if len(grid) not in (1, batch) or len(images) not in (1, batch):
-            raise ValueError(f"Warp: {len(images)} images do not fit {len(grid)} cameras")
-        if len(images) != batch:  # one picture for many cameras
-            images = images.expand(batch, -1, -1, -1)
-        result = sample(images, grid.expand(batch, -1, -1, -1), mode, self.padding_mode)
+        if grid.shape[0] == 1:
+            grid = grid.expand(images.shape[0], -1, -1, -1)
+        elif images.shape[0] == 1:
+            images = images.expand(grid.shape[0], -1, -1, -1)
+        elif images.shape[0] != grid.shape[0]:
+            raise ValueError(f"Warp: {images.shape[0]} images do not fit {grid.shape[0]} cameras")
+        result = sample(images, grid, mode, self.padding_mode)
         if self.padding_mode != "zeros":
             result = torch.where(mapped.unsqueeze(1), result, 0)
         return result
 
     def grid(self) -> Tensor:
-        """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -3 where there is none."""
-        return self._sampling()[0]
+        """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
+        return self._sampling()[0].clone()
 
     def valid_mask(self) -> Tensor:
         """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its picture."""
-        return self._sampling()[2].unsqueeze(1)
+        return self._sampling()[2].unsqueeze(1).clone()
 
     def _sampling(self) -> tuple[Tensor, Tensor, Tensor]:
         """The grid, where a ray was mapped at all, and where onto the source's picture."""
@@ -127,7 +128,8 @@ class Warp(GeometryModule):
         learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
         if learns:
             return self._compute_sampling()
-        return self._memo(inputs, (self.source.image_size, self.target.image_size), self._compute_sampling)
+        cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
+        return self._memo(inputs, (*cameras, self.rotation is None), self._compute_sampling)
 
     def _inputs(self) -> tuple[Tensor | None, ...]:
         s, t = self.source, self.target
@@ -172,6 +174,7 @@ class Warp(GeometryModule):
             picture, and valid (B, *N) bool: some part of the outline lies on the target's picture. A box
             none of whose outline can be mapped is (-1, -1, -1, -1).
         """
+        boxes = as_values(boxes, "boxes", "Warp", self.source.intrinsics.device)
         if boxes.ndim == 0 or boxes.shape[-1] != 4:
             raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
         if not boxes.is_floating_point():
@@ -192,6 +195,9 @@ class Warp(GeometryModule):
 
     def transform_rays(self, rays: Tensor) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
+        rays = as_values(rays, "rays", "Warp", self.source.intrinsics.device)
+        if rays.ndim == 0 or rays.shape[-1] != 3:
+            raise ValueError(f"Warp: rays must be (B, *N, 3); got shape {tuple(rays.shape)}")
         return turn(self.rotation, rays, "rays")
 
     def inverse(self) -> Warp:
@@ -212,7 +218,7 @@ def as_rotation(rotation, owner: str) -> Tensor | None:
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
         raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
     check_rotation(rotation, "rotation", owner)
-    return rotation
+    return rotation if isinstance(rotation, nn.Parameter) or in_graph(rotation) else rotation.detach().clone()
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
