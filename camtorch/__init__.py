@@ -1,5 +1,6 @@
 """Cameras as layers for PyTorch: learnable camera models, exact in both directions, and every warp between them."""
 
+from camtorch import io
 from camtorch.camera import MODELS, Camera
 from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
@@ -33,4 +34,5 @@ __all__ = [
     "KannalaBrandt",
     "Pinhole",
     "Warp",
+    "io",
 ]

@@ -35,8 +35,8 @@ class Dewarp(Warp):
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
         mode, padding_mode: see `Warp`.
 
-    The target has square pixels and does not learn. It is finite for every camera, also where the lens folds
-    inside the picture or sees past 90 degrees.
+    The target has square pixels, is chosen once, and does not learn. It is finite for every camera, also where the
+    lens folds inside the picture or sees past 90 degrees.
 
     Raises:
         ValueError: an unknown projection, a fov outside (0, pi) for perspective or (0, 2 pi], and as `Warp`.

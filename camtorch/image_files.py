@@ -112,6 +112,8 @@ def write(path, image, *, orientation: int | None = None) -> None:
         os.replace(name, path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
+        if isinstance(error, OSError) and "cannot write mode" in str(error):
+            reason = f"{path.suffix} files hold no picture of mode {image.mode}; .png does"
         raise PictureError(f"{path}: {reason}") from None
     finally:
         if name is not None:

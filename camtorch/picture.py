@@ -14,7 +14,11 @@ if TYPE_CHECKING:
 
 
 class Picture(GeometryModule):
-    """The part of a camera that its intrinsics and image size alone decide. Used through `Camera`."""
+    """The part of a camera that its intrinsics and image size alone decide. Used through `Camera`.
+
+    The camera of an edited picture has no Parameters of its own while the original learns: its intrinsics are made
+    from the original's, and that is where gradients go. From a frozen camera, or under no_grad, it is a plain copy.
+    """
 
     intrinsics: Tensor
     distortion: Tensor

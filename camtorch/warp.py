@@ -92,10 +92,13 @@ class Warp(GeometryModule):
             ValueError: another shape or size. TypeError: complex images.
         """
         if not isinstance(images, Tensor) or images.is_complex():
-            what = getattr(images, "dtype", type(images).__name__)
-            raise TypeError(f"Warp: images must be a tensor of real numbers; got {what}")
+            what = f"dtype {images.dtype}" if isinstance(images, Tensor) else type(images).__name__
+            raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}")
         if images.ndim != 4:
-            raise ValueError(f"Warp: images must be (B, C, H, W); got shape {tuple(images.shape)}")
+            raise ValueError(
+                f"Warp: images must be (B, C, H, W); got shape {tuple(images.shape)}. One picture goes in as "
+                "image[None], masks without channels as masks[:, None]"
+            )
         if tuple(images.shape[-2:]) != self.source.image_size:
             raise ValueError(
                 f"Warp: images are {tuple(images.shape[-2:])} (height, width), "

@@ -53,7 +53,8 @@ def camera():
 def test_dewarp_writes_what_dewarp_makes(folder, capsys):
     command("dewarp", "in.png", "--camera", "camera.yml", "--fov", 90, "--size", "80x60", "-o", "out.png")
     assert capsys.readouterr().out == (
-        "out.png: kannala_brandt dewarped to perspective, 90.0 degrees wide, 80x60, 100.0 % of its pixels seen\n"
+        "out.png: kannala_brandt dewarped to perspective, 90.0 degrees wide, 80x60, fx 40 fy 40 cx 39.5 cy 29.5; "
+        "100.0 % of it is filled and shows 23 % of the photograph\n"
     )
     picture = torch.from_numpy(np.array(opened("in.png"))).permute(2, 0, 1)[None]
     expected = ct.Dewarp(camera(), fov=torch.pi / 2, image_size=(60, 80))(picture)[0].permute(1, 2, 0)

@@ -121,3 +121,32 @@ def test_autocast_leaves_geometry_alone():
 def test_bad_input_is_named(make, says):
     with pytest.raises(ValueError, match=says):
         make()
+
+
+def test_a_point_that_is_not_finite_leaves_the_gradient_of_the_pose_alone():
+    layer = torch.nn.Sequential(pose(ROTATIONS["some"]), ct.Pinhole([300.0, 300.0, 320.0, 240.0]).double())
+    points = torch.rand(4, 3, dtype=F64)
+    layer(points[1:])[0].sum().backward()
+    expected = layer[0].rotation.grad.clone()
+    layer.zero_grad()
+    points[0, 1] = math.nan
+    pixels, valid = layer(points)
+    pixels.sum().backward()
+    assert valid.tolist() == [False, True, True, True]
+    torch.testing.assert_close(layer[0].rotation.grad, expected)
+
+
+def test_a_shared_parameter_stays_one():
+    rotation, translation = torch.rand(4, 3), torch.nn.Parameter(torch.zeros(3))
+    extrinsics = ct.Extrinsics(rotation, translation)
+    assert extrinsics.translation is translation
+    extrinsics(torch.rand(4, 2, 3)).sum().backward()
+    torch.testing.assert_close(translation.grad, torch.full((3,), 8.0))
+    assert extrinsics.matrix().shape == (4, 4, 4)
+
+
+def test_what_comes_of_a_frozen_pose_is_frozen():
+    frozen = pose(ROTATIONS["some"]).requires_grad_(False)
+    for derived in (frozen.position, *frozen.inverse().parameters(), *frozen.compose(frozen).parameters()):
+        assert not derived.requires_grad
+    assert pose(ROTATIONS["some"]).position.requires_grad

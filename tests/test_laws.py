@@ -590,3 +590,32 @@ def test_coefficients_left_out_are_zeros(key, data):
         torch.testing.assert_close(
             make(key, camera.intrinsics.detach(), padded).project(rays)[0], camera.project(rays)[0], rtol=1e-12, atol=0
         )
+
+
+@pytest.mark.parametrize(
+    ("focal", "coefficients", "end"),
+    [(15000.0, [-2013.7, 1814797, 0, 0, 11058511], 0.04), (1000.0, [-2.558, 2.9014, 0, 0, 0.1175], 1.0)],
+)
+def test_a_fold_and_its_end_close_together_are_found(focal, coefficients, end):
+    """The radius turns back for a moment: within a degree of a telephoto lens, and within a wide one."""
+    intrinsics = torch.tensor([focal, focal, 2000, 1500], dtype=torch.float64)
+    camera = ct.BrownConrady(intrinsics, torch.tensor(coefficients, dtype=torch.float64))
+    a = torch.linspace(0, end, 40001, dtype=torch.float64)
+    _, valid = camera.project(torch.stack((a, 0 * a, 1 + 0 * a), -1))
+    k1, k2, _, _, k3 = coefficients
+    slope = 1 + 3 * k1 * a**2 + 5 * k2 * a**4 + 7 * k3 * a**6
+    expected = (slope > 0).cummin(0).values
+    assert not expected.all()
+    assert slope[-1] > 0
+    assert (valid != expected).sum() <= 1
+
+
+def test_a_lens_shared_by_predicted_cameras_learns():
+    lens = torch.nn.Parameter(torch.tensor([0.02, -0.01, 0.003, -0.001]))
+    predicted = torch.tensor([[280.0, 281, 319.5, 239.5]] * 3, requires_grad=True)
+    camera = ct.KannalaBrandt(predicted * 1, lens)
+    assert camera.distortion is lens
+    assert camera.batch_shape == (3,)
+    camera.project(torch.rand(3, 5, 3))[0].sum().backward()
+    assert (lens.grad != 0).all()
+    assert (predicted.grad != 0).any()

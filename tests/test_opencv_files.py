@@ -97,7 +97,7 @@ def test_without_distortion_or_size(path):
 
 
 def test_stereo_file_asks_for_a_name():
-    with pytest.raises(CameraFileError, match=r"opencv_stereo.yml: M1, M2: several cameras; choose one by name='1'"):
+    with pytest.raises(CameraFileError, match=r"opencv_stereo.yml: M1, M2: several cameras; choose one by its name"):
         opencv.read(FILES / "opencv_stereo.yml")
     assert opencv.read(FILES / "opencv_stereo.yml", name="2").intrinsics.tolist() == [1064.3, 1065.1, 641.7, 396.4]
     with pytest.raises(CameraFileError, match=r"no camera is called '3'; there are \['1', '2'\]"):

@@ -321,3 +321,64 @@ def test_empty_batches_and_no_points():
 def test_bad_input_is_named(act, error, says):
     with pytest.raises(error, match=says):
         act()
+
+
+def test_the_grid_follows_a_new_rotation_and_a_new_camera():
+    rotation = turn(30)
+    warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
+    straight = warp.grid()
+    warp.rotation = rotation
+    assert not torch.equal(warp.grid(), straight)
+    warp.rotation = None
+    assert torch.equal(warp.grid(), straight)
+    warp.target = ct.Equirectangular([30.0, 30.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
+    assert not torch.equal(warp.grid(), straight)
+
+
+def test_plain_rotations_are_copied():
+    matrix = turn(30)
+    for given in (matrix, matrix.numpy()):
+        warp = ct.Warp(fisheye(), pinhole(), given).requires_grad_(False)
+        before = warp.grid()
+        given[:] = given.T.copy() if not isinstance(given, torch.Tensor) else given.T.clone()
+        assert torch.equal(warp.grid(), before)
+
+
+def test_export_takes_any_batch_size():
+    warp = ct.Warp(fisheye(), pinhole(), turn(5)).requires_grad_(False)
+    images = smooth(batch=2, dtype=torch.float32)
+    exported = torch.export.export(warp, (images,), dynamic_shapes=({0: torch.export.Dim("b")},)).module()
+    many = smooth(batch=5, dtype=torch.float32)
+    torch.testing.assert_close(exported(many), warp(many), atol=1e-5, rtol=0)
+
+
+def test_a_transform_leaves_no_trace():
+    warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
+    images = smooth(dtype=torch.float32)
+    torch.func.grad(lambda images: warp(images).sum())(images)
+    assert warp.grid().data_ptr()
+
+
+def test_forward_mode_through_a_kept_grid():
+    warp = ct.Warp(fisheye(dtype=torch.float64), pinhole(dtype=torch.float64)).requires_grad_(False)
+    images, shift = smooth(), torch.tensor([1.0, 0.5, -2.0, 1.5], dtype=torch.float64)
+    warp(images)
+    step = 1e-6
+
+    def picture(k):
+        return torch.func.functional_call(warp, {"source.intrinsics": k}, (images,))
+
+    k = warp.source.intrinsics.detach()
+    with torch.autograd.forward_ad.dual_level():
+        dual = picture(torch.autograd.forward_ad.make_dual(k, shift))
+        tangent = torch.autograd.forward_ad.unpack_dual(dual).tangent
+    expected = (picture(k + step * shift) - picture(k - step * shift)) / (2 * step)
+    # where a sampling position crosses a pixel within the step, the difference is none of one polynomial
+    assert ((tangent - expected).abs() < 1e-6).double().mean() > 0.999
+
+
+@pytest.mark.parametrize("mode", ["nearest", "bilinear", "bicubic"])
+def test_the_largest_class_id_survives(mode):
+    for dtype in (torch.int32, torch.int64):
+        labels = torch.full((1, 1, *SIZE), torch.iinfo(dtype).max, dtype=dtype)
+        assert ct.Warp(pinhole(), pinhole())(labels, mode=mode)[..., 5:-5, 5:-5].min() > 0

@@ -17,4 +17,6 @@ class CameraFileError(ValueError):
         return "{}: {}: {}".format(*self.args)
 
 
-__all__ = ["CameraFileError"]
+from camtorch.io import opencv  # noqa: E402 (it raises the error above)
+
+__all__ = ["CameraFileError", "opencv"]

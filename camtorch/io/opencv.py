@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from typing import Any, NoReturn
 
 import torch
@@ -21,6 +22,7 @@ _HEIGHT = re.compile(r"(?i:(?:image_?)?height)")
 _FISHEYE = re.compile(r"(?i:(?:is_?)?fisheye(?:_?model)?)")
 _OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model|xi)")
 _LARGEST_SIDE = 1 << 20
+_FISHEYE_COUNT = 4  # of cv2.fisheye, and one of the counts of cv2.calibrateCamera
 
 
 def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
@@ -30,12 +32,12 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`) and, where it has them,
             distortion coefficients (`distortion_coefficients`, `distCoeffs`, `D`), `image_width` and `image_height`.
         model: a key of `camtorch.MODELS`. If left out: without coefficients a pinhole, with a true `fisheye_model` a
-            Kannala-Brandt, else a Brown-Conrady camera.
+            Kannala-Brandt, else a Brown-Conrady camera, with a warning where 4 coefficients could be either.
         name: which camera of a file with several: the end of its keys, "1" for `M1` and `D1`.
 
     Raises:
-        CameraFileError: no such file, or not one usable camera in it.
-        OSError: the file cannot be opened. ValueError: an unknown model. ImportError: YAML without PyYAML.
+        CameraFileError: not one usable camera in the file.
+        OSError: no such file, or it cannot be opened. ValueError: an unknown model. ImportError: YAML without PyYAML.
     """
     if model is not None and model not in MODELS:
         raise ValueError(f"unknown model {model!r}; known are {', '.join(sorted(MODELS))}")
@@ -78,12 +80,16 @@ class _File:
         """The keys of the camera's matrix and distortion, None where it has no distortion."""
         matrices, distortions = self.by_name(_MATRIX), self.by_name(_DISTORTION)
         if not matrices:
-            self.fail("camera_matrix", "missing, under this name and cameraMatrix, K and M")
+            self.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
         if name is None and len(matrices) > 1:
-            self.fail(", ".join(matrices.values()), f"several cameras; choose one by name={min(matrices)!r}, ...")
+            self.fail(
+                ", ".join(matrices.values()),
+                f"several cameras; choose one by its name, as in name={min(matrices)!r} or --name {min(matrices)}",
+            )
         name = next(iter(matrices)) if name is None else name
         if name not in matrices:
-            self.fail(", ".join(matrices.values()), f"no camera is called {name!r:.60}; there are {sorted(matrices)}")
+            there = f"there are {sorted(matrices)}" if any(matrices) else "the only one has no name"
+            self.fail(", ".join(matrices.values()), f"no camera is called {name!r:.60}; {there}")
         return matrices[name], distortions.get(name)
 
     def by_name(self, pattern: re.Pattern) -> dict[str, str]:
@@ -97,12 +103,22 @@ class _File:
 
     def model(self, distortion: list[float]) -> str:
         for key in filter(_OTHER_LENS.fullmatch, self.keys):
-            self.fail(key, "the file may mean another model than OpenCV's own two; name it: model='brown_conrady', ...")
+            self.fail(
+                key,
+                "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
+                "or --model kannala_brandt",
+            )
         flag = self.keys.get(self.find(_FISHEYE), "0")
         if not isinstance(flag, (str, bool)):
             self.fail(self.find(_FISHEYE), "is neither true nor false")
         if str(flag).strip().lower() not in ("", "0", "0.", "0.0", "false", "no", "off", "n"):
             return "kannala_brandt"
+        if len(distortion) == _FISHEYE_COUNT and self.find(_FISHEYE) is None:
+            warnings.warn(
+                f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
+                "If they come from cv2.fisheye, the model is kannala_brandt",
+                stacklevel=4,
+            )
         return "brown_conrady" if distortion else "pinhole"
 
     def image_size(self) -> tuple[int, int] | None:
