@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch.charts import Chart
 from camtorch.domain import Domain
 from camtorch.lens import Lens
-from camtorch.parameters import Memo, as_image_size, as_planes, as_real, columns, is_concrete
+from camtorch.parameters import Memo, as_batch, as_image_size, as_planes, as_real, columns, is_concrete
 from camtorch.picture import Picture
 from camtorch.solve import attach, invert, rounding
 
@@ -78,13 +78,7 @@ class Camera(Picture):
             raise ValueError(
                 f"{owner}: distortion must be (*B, n) with {self.counts_text()}; got shape {tuple(distortion.shape)}"
             )
-        try:
-            batch = torch.broadcast_shapes(intrinsics.shape[:-1], distortion.shape[:-1])
-        except RuntimeError:
-            raise ValueError(
-                f"{owner}: intrinsics {tuple(intrinsics.shape)} and distortion {tuple(distortion.shape)} "
-                "have batch dims that do not fit together"
-            ) from None
+        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
         self._memo = Memo()

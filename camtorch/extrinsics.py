@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from camtorch.analytic import cosc_root, sinc_root
-from camtorch.parameters import GeometryModule, as_planes, as_real, is_concrete
+from camtorch.parameters import GeometryModule, as_batch, as_planes, as_real, is_concrete
 
 
 class Extrinsics(GeometryModule):
@@ -32,13 +32,7 @@ class Extrinsics(GeometryModule):
         for name, value in (("rotation", rotation), ("translation", translation)):
             if value.ndim == 0 or value.shape[-1] != 3:
                 raise ValueError(f"Extrinsics: {name} must be (*B, 3); got shape {tuple(value.shape)}")
-        try:
-            shape = torch.broadcast_shapes(rotation.shape, translation.shape)
-        except RuntimeError:
-            raise ValueError(
-                f"Extrinsics: rotation {tuple(rotation.shape)} and translation {tuple(translation.shape)} "
-                "have batch dims that do not fit together"
-            ) from None
+        shape = (*as_batch("Extrinsics", rotation=rotation.shape, translation=translation.shape), 3)
         self.hold("rotation", rotation, shape)
         self.hold("translation", translation, shape)
 
@@ -87,6 +81,7 @@ class Extrinsics(GeometryModule):
         """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""
         if not isinstance(other, Extrinsics):
             raise TypeError(f"Extrinsics: compose takes Extrinsics; got {type(other).__name__}")
+        as_batch("Extrinsics", this=(*self.batch_shape, 3), other=(*other.batch_shape, 3))
         mine, its = rotation_matrix(self.rotation), rotation_matrix(other.rotation)
         columns = rotate_planes(mine.unsqueeze(-3), its.mT.unsqueeze(-1).unbind(-2))
         moved = rotate_planes(mine, other.translation.unsqueeze(-1).unbind(-2))

@@ -157,6 +157,31 @@ def as_image_size(value, owner: str) -> tuple[int, int] | None:
     return height, width
 
 
+def as_whole(value, name: str, owner: str) -> int:
+    """A whole number of pixels.
+
+    Raises:
+        TypeError: it is none.
+    """
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{owner}: {name} must be a whole number of pixels; got {value!r}") from None
+
+
+def as_batch(owner: str, **shapes: Sequence[int]) -> torch.Size:
+    """The batch dims, all but the last, that the named shapes broadcast to.
+
+    Raises:
+        ValueError: they do not.
+    """
+    try:
+        return torch.broadcast_shapes(*(shape[:-1] for shape in shapes.values()))
+    except RuntimeError:
+        named = " and ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
+        raise ValueError(f"{owner}: the batch dims of {named} do not fit together") from None
+
+
 def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
     """The dtype to compute in: the widest of all, at least float32; integer values take the parameters' dtype."""
     dtype = torch.float32

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch.parameters import GeometryModule, as_image_size, as_values
+from camtorch.parameters import GeometryModule, as_image_size, as_values, as_whole
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -54,11 +54,14 @@ class Picture(GeometryModule):
 
     def crop(self, top: int, left: int, height: int, width: int) -> Self:
         """The camera of the part of the picture whose top-left pixel is (left, top); it may reach outside."""
+        top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
         return self._edited(shift=(-left, -top), size=(height, width))
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """The camera of the picture with that many more pixels on each side."""
         height, width = self._size("pad")
+        sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
+        left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
         return self._edited(shift=(left, top), size=(height + top + bottom, width + left + right))
 
     def resize(self, height: int, width: int) -> Self:

@@ -9,7 +9,7 @@ import torch
 from camtorch.camera import Camera
 from camtorch.charts import Equidistant
 from camtorch.lens import Lens, Planar, Polynomial
-from camtorch.parameters import as_real, is_concrete
+from camtorch.parameters import as_batch, as_real, is_concrete
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -65,6 +65,7 @@ class KannalaBrandt(Camera):
         first = coefficients[..., :1]
         if is_concrete(first) and not bool((first > 0).all()):
             raise ValueError(f"{cls.__name__}: the first coefficient must be positive; got {first.tolist()}")
+        as_batch(cls.__name__, intrinsics=intrinsics.shape, coefficients=coefficients.shape)
         focal, centre = torch.broadcast_tensors(intrinsics[..., :2] * first, intrinsics[..., 2:])
         rest = coefficients[..., 1:] / first if coefficients.shape[-1] > 1 else torch.zeros_like(first)
         return cls(torch.cat((focal, centre), -1), rest, image_size=image_size)
