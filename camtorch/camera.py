@@ -191,8 +191,8 @@ class Camera(Picture):
         """The domain of the lens, if there is one: graph-free, in the dtype and on the device of `like`."""
 
         def tabulate() -> Domain | None:
-            chart, lens = self.optics([c.detach() for c in k])
-            return Domain(lens, chart, like) if lens.stages else None
+            frozen = [c.detach() for c in k]
+            return Domain(self.optics, frozen, like) if self.optics(frozen)[1].stages else None
 
         return self._memo(self._tensors, (like.dtype, like.device), tabulate)
 

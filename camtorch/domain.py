@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -29,8 +31,13 @@ class Domain:
     A lens that is not radial mostly folds where its radial factor does: there its radii are dense.
     """
 
-    def __init__(self, lens: Lens, chart: Chart, like: Tensor):
-        """like: gives the dtype and device. The tables have the shape (*B, azimuths, radii)."""
+    def __init__(self, optics: Callable[[Sequence[Tensor]], tuple[Chart, Lens]], k: Sequence[Tensor], like: Tensor):
+        """optics, k: a model's chart and lens of graph-free coefficients. like: gives the dtype and device.
+
+        The tables have the shape (*B, azimuths, radii).
+        """
+        self.optics, self.k = optics, k
+        chart, lens = optics(k)
         self.lens = lens
         fine = chart.radii(_RADII, like)
         self.azimuths = 1 if lens.is_radial else _AZIMUTHS
@@ -43,6 +50,17 @@ class Domain:
         lost = _first_loss(sense.unflatten(-1, shape))
         self.limits = self._limits(lost)
         self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
+        # where the limits of each camera begin, were they in one row
+        cameras = self.limits.shape[:-1]
+        self.row = torch.arange(math.prod(cameras), device=like.device).view(*cameras, 1) * self.azimuths
+
+    def lanes(self, mask: Tensor) -> Domain:
+        """The domain of some points of planes (*B, N) by themselves, as planes (M,); it answers `contains` alone."""
+        domain = copy.copy(self)
+        domain.k = [c.expand_as(mask)[mask] for c in self.k]
+        domain.lens = self.optics(domain.k)[1]
+        domain.row = self.row.expand_as(mask)[mask]
+        return domain
 
     def _limits(self, lost: Tensor) -> Tensor:
         """(*B, azimuths): the radius, up to the next azimuth, before which the sense at the point itself decides."""
@@ -58,9 +76,8 @@ class Domain:
         """Bool: plane points (*B, N) before the fold of their azimuth; `sense` is that of the lens at these points."""
         # nearer to zero its reciprocal could leave the floating-point range
         regular = sense > torch.finfo(a.dtype).tiny ** 0.25
-        limits = self.limits
-        if self.azimuths > 1:
-            limits = torch.gather(limits.expand(*a.shape[:-1], -1), -1, self._azimuth(a, b, 0.0))
+        index = self.row + self._azimuth(a, b, 0.0) if self.azimuths > 1 else self.row.expand_as(a)
+        limits = torch.gather(self.limits.flatten(), 0, index.flatten()).view(index.shape)
         return regular & (a * a + b * b < limits * limits)
 
     def bracket(self, target: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:

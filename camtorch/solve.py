@@ -20,9 +20,9 @@ _START_ROUNDS = 6
 _CLOSE = 0.1
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
-# Ends after about 4 steps where the values may be looked at. The rest is for points next to a fold, or so far out
-# that a prism dominates; a traced graph is unrolled, and has to do with fewer.
-_PLANAR_STEPS, _TRACED_STEPS = 60, 20
+# Nearly all points need 4 or 5 steps. The rest lie next to a fold, or so far out that a prism dominates, or have no
+# solution; a traced graph is unrolled, cannot set them apart, and has to do with fewer.
+_FIRST_STEPS, _LATE_STEPS, _TRACED_STEPS = 6, 54, 20
 
 
 def invert(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
@@ -57,20 +57,33 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
 
 
 def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
+    """Newton's method for all points; for the few that need many steps, by themselves."""
+    u, v, a, b = torch.broadcast_tensors(u, v, *_planar_start(domain, u, v))
+    if not is_concrete(a):
+        return _newton(domain, u, v, a, b, _TRACED_STEPS)[:2]
+    a, b, active = _newton(domain, u, v, a, b, _FIRST_STEPS)
+    if bool(active.any()):
+        late = _newton(domain.lanes(active), *(plane[active] for plane in (u, v, a, b)), _LATE_STEPS)
+        a, b = (plane.masked_scatter(active, solved) for plane, solved in zip((a, b), late[:2], strict=True))
+    return a, b
+
+
+def _newton(domain: Domain, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     """Newton's method in the plane, each step shortened until it comes nearer and stays in the domain.
 
     Nearer in Deuflhard's sense: the next step by the same Jacobian is shorter. Where a lens stretches one direction
     far more than the other, the residual itself would reject every good step.
+
+    Returns the points, and which of them would still move.
     """
     lens = domain.lens
-    a, b = _planar_start(domain, u, v)
     value, jacobian, _ = lens.linearise(a, b)
     enough = rounding(u, v) / 8
     length = torch.ones_like(u)
-    for _ in range(_PLANAR_STEPS if is_concrete(length) else _TRACED_STEPS):
+    for step_number in range(steps + 1):
         miss = u - value[0], v - value[1]
         active = (torch.maximum(miss[0].abs(), miss[1].abs()) > enough) & (length > _GIVE_UP)
-        if is_concrete(active) and not bool(active.any()):
+        if step_number == steps or (is_concrete(active) and not bool(active.any())):
             break
         step = _newton_step(jacobian, *miss)
         trial = a + length * step[0], b + length * step[1]
@@ -82,7 +95,7 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
         a, b, x, y, *jacobian = (torch.where(good, n, o) for n, o in zip(new, old, strict=True))
         value = x, y
         length = torch.where(good, (length * 4).clamp(max=1), length / 4)
-    return a, b
+    return a, b, active
 
 
 def _newton_step(jacobian, du: Tensor, dv: Tensor) -> Planes2:

@@ -107,7 +107,10 @@ def test_another_resolution_needs_rescale(folder, capsys):
         (["dewarp", "in.png", "--camera", "camera.yml", "-o", "o"], "written as a nameless type"),
         (["dewarp", "in.png", "--camera", "camera.yml", "-o", "."], "is a folder"),
         (["dewarp", "in.png", "--camera", "camera.yml", "-o", "in.png"], "in.png: exists already; --force"),
-        (["dewarp", "alpha.png", "--camera", "camera.yml", "-o", "o.jpg"], "o.jpg: cannot write mode RGBA as JPEG"),
+        (
+            ["dewarp", "alpha.png", "--camera", "camera.yml", "-o", "o.jpg"],
+            "o.jpg: .jpg files hold no picture of mode RGBA",
+        ),
         (["dewarp", "in.png", "--camera", "camera.yml", "--size", "80", "-o", "o.png"], "'80' is not WIDTHxHEIGHT"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--size", "0x9", "-o", "o.png"], "1 to 32768"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--size", "9x-9", "-o", "o.png"], "not WIDTHxHEIGHT"),

@@ -308,6 +308,9 @@ def before_fold(camera, rays, samples, azimuths):
         # stage by stage: a tilt may bring back what the pole of the stage before it sent to infinity
         (ua, va), (ub, vb) = (jvp(Lens(*lens.stages[:last]), (a, b), along)[1] for along in tangents)
         before &= (ua * vb - ub * va > 0).view(samples, azimuths).cummin(0).values
+    radial = getattr(lens.stages[0], "radial", None)
+    if hasattr(radial, "denominator"):  # a pole with a zero right behind it is narrower than the samples
+        before &= (radial.denominator(a * a + b * b) > 0).view(samples, azimuths).cummin(0).values
     return before
 
 
