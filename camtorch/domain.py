@@ -76,8 +76,10 @@ class Domain:
         """Bool: plane points (*B, N) before the fold of their azimuth; `sense` is that of the lens at these points."""
         # nearer to zero its reciprocal could leave the floating-point range
         regular = sense > torch.finfo(a.dtype).tiny ** 0.25
-        index = self.row + self._azimuth(a, b, 0.0) if self.azimuths > 1 else self.row.expand_as(a)
-        limits = torch.gather(self.limits.flatten(), 0, index.flatten()).view(index.shape)
+        limits = self.limits
+        if self.azimuths > 1:
+            index = self.row + self._azimuth(a, b, 0.0)
+            limits = torch.gather(limits.flatten(), 0, index.flatten()).view(index.shape)
         return regular & (a * a + b * b < limits * limits)
 
     def bracket(self, target: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
