@@ -74,7 +74,7 @@ class Planar:
 
     @property
     def is_radial(self) -> bool:
-        return not self.tangential and not self.prism
+        return len(self.tangential) == len(self.prism) == 0
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         t = a * a + b * b

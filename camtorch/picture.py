@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch.parameters import GeometryModule, as_image_size, as_values, as_whole
 
@@ -92,4 +92,7 @@ class Picture(GeometryModule):
             sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
             arguments.append(self.distortion * sign)
         edited = type(self)(*arguments, image_size=size)
-        return edited.freeze_like(self)
+        for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
+            if isinstance(its, nn.Parameter) and not mine.requires_grad:
+                its.requires_grad = False
+        return edited

@@ -424,3 +424,20 @@ def test_a_model_is_one_class():
         torch.testing.assert_close(again, rays, rtol=0, atol=1e-5)
     finally:
         ct.MODELS.pop("spherical_of_this_test", None)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_compile_with_every_number_of_coefficients(count):
+    camera = ct.BrownConrady([300.0, 300.0, 32.0, 24.0], [-0.3, 0.1, 1e-3, -5e-4, *[1e-3] * 10][:count])
+    points = torch.tensor([[0.1, -0.2, 1.0], [0.3, 0.2, -1.0]])
+    compiled = torch.compile(camera, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(points)[0], camera(points)[0])
+
+
+def test_an_edited_camera_learns_what_the_original_learns():
+    camera = ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01], image_size=(480, 640))
+    camera.intrinsics.requires_grad_(False)
+    edited = camera.crop(0, 0, 100, 100)
+    assert not any(p.requires_grad for p in edited.parameters())
+    edited.project(torch.tensor([0.1, 0.2, 1.0]))[0].sum().backward()
+    assert (camera.distortion.grad != 0).all()
