@@ -118,7 +118,7 @@ def test_single_precision(key, name, width, limit):
     # in a corner beyond its image circle a lens may stretch the angle sevenfold, and its rounding with it
     stretch = vmap(jacrev(lambda ray: exact.project(ray)[0]))(rays).norm(dim=(-1, -2))
     assert (error < (8 * 2**-24 * stretch).clamp(min=limit))[valid & expected].all()
-    assert (error < 10 * limit)[valid].all()
+    assert (error < limit)[valid & ~expected].all()
 
     condition = rad_per_px(exact, rays) * exact.intrinsics[0]
     clear = ~expected | (condition < 1e2)  # a hundredth of a radian from the fold

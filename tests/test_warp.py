@@ -88,7 +88,6 @@ def test_a_pinhole_turned_is_a_homography():
 
 def test_boxes_enclose_the_curved_outline():
     # a source that bends straight edges outwards: the corners alone would cut the box off
-    warp = ct.Warp(pinhole((480, 640), dtype=torch.float64), fisheye((480, 640), dtype=torch.float64))
     warp = ct.Warp(
         ct.Pinhole(torch.tensor([300.0, 300, 320, 240], dtype=torch.float64), image_size=(480, 640)),
         ct.KannalaBrandt(torch.tensor([300.0, 300, 320, 240], dtype=torch.float64), image_size=(480, 640)),
