@@ -8,20 +8,32 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
+from camtorch import mapping, opaque
+from camtorch.blocks import Cameras, Project, Unproject
 from camtorch.charts import Chart
 from camtorch.domain import Domain
 from camtorch.lens import Lens
-from camtorch.parameters import Memo, as_batch, as_image_size, as_planes, as_real, columns, is_concrete
+from camtorch.opaque import search_open, tables
+from camtorch.parameters import (
+    Memo,
+    as_batch,
+    as_image_size,
+    as_real,
+    as_rows,
+    columns,
+    has_tangent,
+    in_transform,
+    is_concrete,
+    may_look,
+)
 from camtorch.picture import Picture
-from camtorch.solve import attach, invert, rounding
+from camtorch.solve import invert
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
-
-_INVALID_PIXEL = -1.0  # outside every picture, so that `contains` is False for it as well
 
 
 class Camera(Picture):
@@ -56,6 +68,8 @@ class Camera(Picture):
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
+        cls._model = f"{cls.__module__}.{cls.__qualname__}"
+        opaque.MODELS[cls._model] = cls.optics
         if "key" in cls.__dict__:
             MODELS[cls.key] = cls
 
@@ -87,7 +101,8 @@ class Camera(Picture):
 
     # -- what a model states
 
-    def optics(self, k: Sequence[Tensor]) -> tuple[Chart, Lens]:
+    @staticmethod
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         """The chart and the lens made of the coefficients, each a tensor that broadcasts against planes of points."""
         raise NotImplementedError
 
@@ -118,34 +133,21 @@ class Camera(Picture):
             lies before the fold of the lens. Whether the pixel is on the picture is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        planes, restore = as_planes(points, "points", 3, self.batch_shape, self._tensors, type(self).__name__)
-        focal_x, focal_y, centre_x, centre_y, k, usable = self._coefficients()
-        a, b, valid = self._see(planes, *self.optics(k), self._domain(k, like=planes[0]), usable)
-        u = torch.where(valid, focal_x * a + centre_x, _INVALID_PIXEL)
-        v = torch.where(valid, focal_y * b + centre_y, _INVALID_PIXEL)
-        return restore(u, v), restore(valid)
+        rows, lead, restore = as_rows(points, "points", 3, self.batch_shape, self._tensors, type(self).__name__)
+        return self._map(Project, self._project_by_formulas, rows, lead, restore)
 
-    @staticmethod
-    def _see(
-        planes: Sequence[Tensor], chart: Chart, lens: Lens, domain: Domain | None, usable: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the lens sends points (three planes), (0, 0) if nowhere, and which of them it does send."""
-        x, y, z = (plane.detach() for plane in planes)
-        size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
-        # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
-        valid = (size > torch.finfo(size.dtype).tiny ** 0.5) & (size < torch.inf) & usable
-        # a constant: the projection does not depend on the distance, so this has no part in its derivative
-        shrink = torch.where(valid, size, 1.0).reciprocal()
-        valid = valid & chart.covers(x * shrink, y * shrink, z * shrink)
-        shrink = torch.where(valid, shrink, 1.0)
-        a, b = chart.to_plane(
-            *(torch.where(valid, plane, axis) * shrink for plane, axis in zip(planes, (0.0, 0.0, 1.0), strict=True))
+    def _project_by_formulas(self, points: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
+        intrinsics, distortion, domain, usable = self._traced(points, intrinsics, distortion)
+        chart, lens = self.optics(columns(distortion))
+        ray = mapping.to_ray(chart, *(plane.contiguous() for plane in points.unbind(-1)))
+        a, b, mask = mapping.see(ray, chart, lens, domain, order)
+        mask = mapping.both(mask, usable)
+        focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
+        pixels = (
+            mapping.replace(mask, w, mapping.INVALID_PIXEL) for w in (focal_x * a + centre_x, focal_y * b + centre_y)
         )
-        if domain is not None:
-            a_0, b_0 = a.detach(), b.detach()
-            valid = valid & domain.contains(a_0, b_0, domain.lens.linearise(a_0, b_0)[2])
-            a, b = lens(torch.where(valid, a, 0.0), torch.where(valid, b, 0.0))
-        return a, b, valid
+        pixels = torch.stack(tuple(pixels))
+        return pixels, _valid(mask, pixels[0])
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -157,61 +159,82 @@ class Camera(Picture):
             rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
-        (u, v), restore = as_planes(pixels, "pixels", 2, self.batch_shape, self._tensors, type(self).__name__)
-        focal_x, focal_y, centre_x, centre_y, k, usable = self._coefficients()
-        chart, lens = self.optics(k)
-        domain = self._domain(k, like=u)
-        far = torch.maximum(((u - centre_x) / focal_x).detach().abs(), ((v - centre_y) / focal_y).detach().abs())
-        valid = (far < torch.finfo(far.dtype).max ** 0.25) & usable  # NaN is not; nor may a square overflow
-        p = (torch.where(valid, u, centre_x) - centre_x) / focal_x
-        q = (torch.where(valid, v, centre_y) - centre_y) / focal_y
-        if domain is None:
-            valid = valid & chart.on_plane(p.detach(), q.detach())
-            a, b = torch.where(valid, p, 0.0), torch.where(valid, q, 0.0)
+        rows, lead, restore = as_rows(pixels, "pixels", 2, self.batch_shape, self._tensors, type(self).__name__)
+        return self._map(Unproject, self._unproject_by_formulas, rows, lead, restore)
+
+    def _unproject_by_formulas(self, pixels: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
+        intrinsics, distortion, domain, usable = self._traced(pixels, intrinsics, distortion)
+        chart, lens = self.optics(columns(distortion))
+        target = mapping.to_target(*(plane.contiguous() for plane in pixels.unbind(-1)), columns(intrinsics))
+        mask = mapping.both(target.mask, usable)
+        p, q = (mapping.replace(mask, w, 0.0) for w in target[:2])
+        p_0, q_0 = p.detach(), q.detach()
+        if lens.stages:
+            found = invert(domain, p_0, q_0)
+            a, b, solved = search_open(self._model, domain.k, p_0, q_0, *found)
+            solved = mapping.to_mask(solved)
+            solution = mapping.clean(solved, found._replace(a=a, b=b))
         else:
-            target = p.detach(), q.detach()
-            start = invert(domain, *target)
-            _, (ua, ub, va, vb), sense = domain.lens.linearise(*start)
-            valid = valid & domain.contains(*start, sense) & chart.on_plane(*start)
-            scale = torch.where(valid, ua * vb - ub * va, 1.0).reciprocal()
-            inverse = [w * scale for w in (vb, -ub, -va, ua)]
-            # next to a fold the polished solution may lie on its other side: what counts is where its ray is seen
-            polished = chart.to_ray(*attach(domain.lens, start, inverse, target))
-            seen_p, seen_q, seen = self._see([w.detach() for w in polished], chart, domain.lens, domain, usable)
-            miss = torch.maximum((seen_p - target[0]).abs(), (seen_q - target[1]).abs())
-            stretch = torch.maximum(ua.abs() + ub.abs(), va.abs() + vb.abs()) * torch.maximum(*(w.abs() for w in start))
-            valid = valid & seen & (miss <= rounding(*target, stretch)).detach()
-            start, inverse, target = ([torch.where(valid, w, 0.0) for w in ws] for ws in (start, inverse, (p, q)))
-            a, b = attach(lens, start, inverse, target)
-        rays = chart.to_ray(a, b)
-        x, y, z = (torch.where(valid, w, axis) for w, axis in zip(rays, (0.0, 0.0, 1.0), strict=True))
-        return restore(x, y, z), restore(valid)
+            solved = mapping.to_mask(chart.on_plane(p_0, q_0))
+            solution = p_0, q_0
+        mask = mapping.both(mask, solved)
+        if torch.compiler.is_compiling() and not any(t.requires_grad for t in (pixels, intrinsics, distortion)):
+            order = 0
+        rays = torch.stack(mapping.rays_of(solution, (p, q), mask, chart, lens, order))
+        return rays, _valid(mask, rays[0])
 
-    def _domain(self, k: Sequence[Tensor], like: Tensor) -> Domain | None:
-        """The domain of the lens, if there is one: graph-free, in the dtype and on the device of `like`."""
+    # -- how both are evaluated
 
-        def tabulate() -> Domain | None:
-            frozen = [c.detach() for c in k]
-            return Domain(self.optics, frozen, like) if self.optics(frozen)[1].stages else None
+    def _map(self, blockwise, by_formulas, rows: Tensor, lead: torch.Size, restore) -> tuple[Tensor, Tensor]:
+        """Rows (C, N, size) by blocks, or by formulas that are traced: compiled, or by a transform of torch.func."""
+        count = rows.shape[0]
+        intrinsics, distortion = (
+            t.to(rows.dtype).expand(*lead, t.shape[-1]).reshape(count, t.shape[-1]) for t in self._tensors
+        )
+        inputs = rows, intrinsics, distortion
+        if not in_transform() and all(is_concrete(t) and not has_tangent(t) for t in inputs):
+            results = blockwise.apply(*inputs, self._cameras(intrinsics, distortion), by_formulas)
+        else:
+            # what is compiled has no derivatives of derivatives
+            results = by_formulas(*inputs, order=1 if torch.compiler.is_compiling() else 2)
+        return tuple(restore(result) for result in results)
 
-        return self._memo(self._tensors, (like.dtype, like.device), tabulate)
+    def _cameras(self, intrinsics: Tensor, distortion: Tensor) -> Cameras:
+        """The rows' cameras, kept until a value changes."""
 
-    @property
-    def _tensors(self) -> tuple[Tensor, Tensor]:
-        return self.intrinsics, self.distortion
+        def look() -> Cameras:
+            with torch.no_grad():
+                usable = _usable(intrinsics, distortion)
+                values = (torch.where(usable, t.detach(), ideal) for t, ideal in ((intrinsics, 1.0), (distortion, 0.0)))
+                values = [t.clone() for t in values]
+                mask = None if may_look(usable) and bool(usable.all()) else usable.to(intrinsics.dtype)
+                return Cameras(values[0], Domain(self.optics, values[1]), mask)
 
-    def _coefficients(self):
-        """fx, fy, cx, cy and the coefficients as columns, and which cameras can be used.
+        return self._memo((intrinsics, distortion), (intrinsics.dtype, intrinsics.device), look)
+
+    def _traced(self, rows: Tensor, intrinsics: Tensor, distortion: Tensor):
+        """The parameters that can be used, their domain, and the mask of the usable cameras, while values are traced.
 
         A camera that learning drove to NaN or to a focal length that is not positive is replaced by
         an ideal one, and all its results are invalid.
         """
-        intrinsics, distortion = self._tensors
-        values = torch.cat([t.detach().expand(*self.batch_shape, -1) for t in self._tensors], -1)
-        usable = torch.isfinite(values).all(-1, keepdim=True) & (values[..., :2] > 0).all(-1, keepdim=True)
-        ideal = values.new_tensor([1.0, 1.0, 0.0, 0.0])
-        fx, fy, cx, cy = columns(torch.where(usable, intrinsics, ideal))
-        return fx, fy, cx, cy, columns(torch.where(usable, distortion, 0.0)), usable
+        if all(is_concrete(t) and not has_tangent(t) for t in (intrinsics, distortion)):
+            cameras = self._cameras(intrinsics, distortion)
+            domain, usable = cameras.domain, cameras.usable
+        else:
+            mask = _usable(intrinsics.detach(), distortion.detach())
+            usable = mask.to(rows.dtype)
+            k = torch.where(mask, distortion.detach(), 0.0)
+            domain = Domain(self.optics, k)
+            if domain.lens.stages:
+                domain.with_tables(*tables(self._model, k))
+        if usable is not None:
+            intrinsics, distortion = torch.where(usable > 0, intrinsics, 1.0), torch.where(usable > 0, distortion, 0.0)
+        return intrinsics, distortion, domain, usable
+
+    @property
+    def _tensors(self) -> tuple[Tensor, Tensor]:
+        return self.intrinsics, self.distortion
 
     # -- the picture
 
@@ -270,3 +293,13 @@ class Camera(Picture):
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
         return ", ".join(parts)
+
+
+def _usable(intrinsics: Tensor, distortion: Tensor) -> Tensor:
+    """Bool (C, 1): finite, and with focal lengths that are positive."""
+    finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
+    return (finite & (intrinsics[..., :2] > 0).all(-1)).unsqueeze(-1)
+
+
+def _valid(mask: Tensor | None, like: Tensor) -> Tensor:
+    return torch.ones_like(like, dtype=torch.bool) if mask is None else (mask > 0).expand_as(like)

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from camtorch.analytic import angle_per_radius, cos_root, sinc_root
 
-_SMALLEST_RADIUS = 1e-4  # a hundredth of a degree
-
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
+
+_SMALLEST_RADIUS = 1e-4  # a hundredth of a degree
 
 
 def unit(x: Tensor, y: Tensor, z: Tensor) -> Planes3:
@@ -23,35 +23,68 @@ def unit(x: Tensor, y: Tensor, z: Tensor) -> Planes3:
     return x * scale, y * scale, z * scale
 
 
+def floor_of(dtype: torch.dtype) -> float:
+    """A square that is nothing beside 1, and whose reciprocal's square is still a number."""
+    return torch.finfo(dtype).tiny ** 0.5
+
+
 class Chart:
-    """What a camera asks of a chart. Rays arrive with their largest component at 1, results are unit length.
+    """What a camera asks of a chart. Rays arrive with their largest component near 1, and results are unit length.
 
     The axis (0, 0, 1) is covered by every chart and lies at (0, 0).
+
+    Margins are positive where something holds. Methods named `pull` turn the cotangents of a result into those of
+    what it was made from, to first order: on a CPU autograd takes twice as long for the same.
     """
 
-    def covers(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Bool: the rays that this chart has a point for."""
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """Positive for the rays that this chart has a point for."""
         raise NotImplementedError
 
-    def to_plane(self, x: Tensor, y: Tensor, z: Tensor) -> Planes2:
-        """The plane point of covered rays."""
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
+        """Whether rays with z >= nearest > 0 and no component larger than `extent` are certainly covered."""
         raise NotImplementedError
+
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
+        """The plane point of covered rays; the derivatives of that order shall be exact, on the axis too."""
+        raise NotImplementedError
+
+    def pull_point(self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor) -> Planes3:
+        """The cotangent of a covered ray, of the cotangent of its plane point."""
+        return _pull(lambda *ray: self.to_plane(*ray, order=1), (x, y, z), (ga, gb))
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
-        """Bool: the points of the plane that are the image of a ray."""
+        """Positive for the points of the plane that are the image of a ray."""
         raise NotImplementedError
 
-    def to_ray(self, a: Tensor, b: Tensor) -> Planes3:
-        """The unit ray of points on the plane."""
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
+        """The unit ray of points on the plane; see `to_plane`."""
         raise NotImplementedError
+
+    def pull_ray(self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor) -> Planes2:
+        """The cotangent of a point on the plane, of the cotangent of its ray."""
+        return _pull(lambda *point: self.to_ray(*point, order=1), (a, b), (gx, gy, gz))
+
+    def end(self, dtype: torch.dtype) -> float:
+        """The radius on the plane at which the chart ends. Only charts that a lens follows need it."""
+        raise NotImplementedError
+
+    def usual_end(self, dtype: torch.dtype) -> float:
+        """The radius beyond which no picture reaches; inverses are tabulated up to there."""
+        return self.end(dtype)
 
     def radii(self, count: int, like: Tensor) -> Tensor:
         """(count,) ascending radii from the centre of the plane to the end of the chart.
 
         Half of them in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree.
-        Only charts that a lens follows need them.
         """
         raise NotImplementedError
+
+
+def _pull(function, inputs: tuple[Tensor, ...], cotangents: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    with torch.enable_grad():
+        leaves = [w.detach().requires_grad_() for w in inputs]
+        return torch.autograd.grad(function(*leaves), leaves, cotangents)
 
 
 def _even_steps_and_ratios(count: int, steps_to: float, end: float, like: Tensor, bend) -> Tensor:
@@ -64,48 +97,87 @@ def _even_steps_and_ratios(count: int, steps_to: float, end: float, like: Tensor
 class Perspective(Chart):
     """(x/z, y/z): rays in front of the camera.
 
-    Rays within `1 / limit` of 90 degrees are left out: there the ninth power of the radius, which
+    Rays within `1 / end` of 90 degrees are left out: there the ninth power of the radius, which
     distortion polynomials reach, leaves the floating-point range.
     """
 
-    @staticmethod
-    def limit(dtype: torch.dtype) -> float:
+    def end(self, dtype):
         return min(1e9, torch.finfo(dtype).max ** (1 / 9))
 
-    def covers(self, x, y, z):
-        return torch.maximum(x.abs(), y.abs()) < self.limit(z.dtype) * z
+    def usual_end(self, dtype):
+        return math.tan(math.radians(87))
 
-    def to_plane(self, x, y, z):
-        return x / z, y / z
+    def margin(self, x, y, z):
+        return self.end(z.dtype) * z - torch.maximum(x.abs(), y.abs())
+
+    def covers_all(self, nearest, extent, dtype):
+        return self.end(dtype) * nearest > extent
+
+    def to_plane(self, x, y, z, order=2):
+        reciprocal = z.reciprocal()
+        return x * reciprocal, y * reciprocal
+
+    def pull_point(self, x, y, z, ga, gb):
+        reciprocal = z.reciprocal()
+        gx, gy = ga * reciprocal, gb * reciprocal
+        return gx, gy, -torch.addcmul(gx * x, gy, y) * reciprocal
 
     def on_plane(self, a, b):
-        return torch.maximum(a.abs(), b.abs()) < self.limit(a.dtype)
+        return self.end(a.dtype) - torch.maximum(a.abs(), b.abs())
 
-    def to_ray(self, a, b):
-        return unit(a, b, torch.ones_like(a))
+    def to_ray(self, a, b, order=2):
+        z = torch.addcmul(a * a + 1, b, b).rsqrt()
+        return a * z, b * z, z
+
+    def pull_ray(self, a, b, gx, gy, gz):
+        z = torch.addcmul(a * a + 1, b, b).rsqrt()
+        along = z * z * torch.addcmul(torch.addcmul(gz, gx, a), gy, b)
+        return z * (gx - along * a), z * (gy - along * b)
 
     def radii(self, count, like):
-        return _even_steps_and_ratios(count, math.radians(88), 1.5 * self.limit(like.dtype), like, torch.tan)
+        return _even_steps_and_ratios(count, math.radians(88), self.end(like.dtype), like, torch.tan)
 
 
 class Equidistant(Chart):
     """theta (cos phi, sin phi), theta = atan2(hypot(x, y), z): every ray but the exact backward one."""
 
-    def covers(self, x, y, z):
+    def margin(self, x, y, z):
         # closer to the backward direction the derivative pi / rho leaves the floating-point range
-        return (z > 0) | (x * x + y * y > torch.finfo(z.dtype).tiny ** 0.5)
+        floor = floor_of(z.dtype) / torch.finfo(z.dtype).eps
+        return torch.maximum(z, torch.addcmul(x * x - floor, y, y))
 
-    def to_plane(self, x, y, z):
-        scale = angle_per_radius(x * x + y * y, z)
+    def covers_all(self, nearest, extent, dtype):
+        return True
+
+    def to_plane(self, x, y, z, order=2):
+        scale = angle_per_radius(x * x + y * y, z, order)
         return x * scale, y * scale
 
-    def on_plane(self, a, b):
-        return a * a + b * b < math.pi**2
+    def pull_point(self, x, y, z, ga, gb):
+        rho2 = torch.addcmul(x * x, y, y)
+        along = torch.addcmul(ga * x, gb, y)
+        scale = angle_per_radius(rho2, z, 1)
+        per_square = 1 / torch.addcmul(rho2, z, z)
+        # twice the derivative of the scale by rho2; what cancels in it at the axis is multiplied by rho2
+        along_scale = along * (z * per_square - scale) / (rho2 + floor_of(z.dtype))
+        return torch.addcmul(ga * scale, x, along_scale), torch.addcmul(gb * scale, y, along_scale), -along * per_square
 
-    def to_ray(self, a, b):
-        theta2 = a * a + b * b
-        sinc = sinc_root(theta2)
-        return a * sinc, b * sinc, cos_root(theta2)
+    def on_plane(self, a, b):
+        return math.pi**2 - torch.addcmul(a * a, b, b)
+
+    def to_ray(self, a, b, order=2):
+        theta2 = torch.addcmul(a * a, b, b)
+        sinc = sinc_root(theta2, order)
+        return a * sinc, b * sinc, cos_root(theta2, order)
+
+    def pull_ray(self, a, b, gx, gy, gz):
+        theta2 = torch.addcmul(a * a, b, b)
+        sinc, cos = sinc_root(theta2, 1), cos_root(theta2, 1)
+        along = torch.addcmul(gx * a, gy, b) * (cos - sinc) / (theta2 + floor_of(a.dtype)) - gz * sinc
+        return torch.addcmul(gx * sinc, a, along), torch.addcmul(gy * sinc, b, along)
+
+    def end(self, dtype):
+        return math.pi
 
     def radii(self, count, like):
         return _even_steps_and_ratios(count, math.pi, math.pi, like, torch.positive)
@@ -119,31 +191,37 @@ def _half_turn(dtype: torch.dtype) -> float:
 class CylinderChart(Chart):
     """(longitude, height) = (atan2(x, z), y / hypot(x, z)). Every ray but straight up and down."""
 
-    def covers(self, x, y, z):
-        return y.abs() < Perspective.limit(y.dtype) * torch.maximum(x.abs(), z.abs())
+    def margin(self, x, y, z):
+        return Perspective().end(y.dtype) * torch.maximum(x.abs(), z.abs()) - y.abs()
 
-    def to_plane(self, x, y, z):
+    def covers_all(self, nearest, extent, dtype):
+        return Perspective().end(dtype) * nearest > extent
+
+    def to_plane(self, x, y, z, order=2):
         return torch.atan2(x, z), y * (x * x + z * z).rsqrt()
 
     def on_plane(self, a, b):
-        return (a.abs() < _half_turn(a.dtype)) & (b.abs() < Perspective.limit(b.dtype))
+        return torch.minimum(_half_turn(a.dtype) - a.abs(), Perspective().end(b.dtype) - b.abs())
 
-    def to_ray(self, a, b):
+    def to_ray(self, a, b, order=2):
         return unit(torch.sin(a), b, torch.cos(a))
 
 
 class SphereChart(Chart):
     """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))). Every ray but straight up and down."""
 
-    def covers(self, x, y, z):
-        return x * x + z * z > torch.finfo(y.dtype).tiny ** 0.5
+    def margin(self, x, y, z):
+        return x * x + z * z - floor_of(y.dtype)
 
-    def to_plane(self, x, y, z):
+    def covers_all(self, nearest, extent, dtype):
+        return True
+
+    def to_plane(self, x, y, z, order=2):
         return torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())
 
     def on_plane(self, a, b):
-        return (a.abs() < _half_turn(a.dtype)) & (b.abs() < math.pi / 2)
+        return torch.minimum(_half_turn(a.dtype) - a.abs(), math.pi / 2 - b.abs())
 
-    def to_ray(self, a, b):
+    def to_ray(self, a, b, order=2):
         across = torch.cos(b)
         return torch.sin(a) * across, torch.sin(b), torch.cos(a) * across

@@ -1,156 +1,221 @@
-"""The domain of a lens, tabulated: how far out it stays one-to-one, and where to start its inverse."""
+"""The domain of a lens: where it is one-to-one, and a table to start its inverse from. Made once per set of values."""
 
 from __future__ import annotations
 
-import copy
-import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from camtorch.azimuths import AZIMUTHS, Azimuths, azimuth, first_loss, radial_sense
+from camtorch.parameters import columns, may_look
+
 if TYPE_CHECKING:
     from camtorch.charts import Chart
-    from camtorch.lens import Lens
+    from camtorch.lens import Lens, Polynomial, Rational
 
-_AZIMUTHS = 256
-_RADII = 2048  # on one azimuth, which stands for all where the lens is radial
-_SMOOTH, _BULGE = 0.02, 0.001
-_COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
+Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
+
+_RADII = 512
+_PARTS = 256  # of the interval in which a fold is looked for; twice, then the secant
+_NODES = 1024  # of the table of an inverse
+_HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
+
+
+def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property:
+    """A table (C, ...) that is made when it is first asked for; that of some cameras is a part of the whole one."""
+
+    def table(self: Domain) -> Tensor:
+        if self.whole is not None:
+            return getattr(self.whole, make.__name__)[self.cameras]
+        with torch.no_grad():
+            return make(self)
+
+    table.__doc__ = make.__doc__
+    return cached_property(table)
 
 
 class Domain:
-    """The lens of each camera on azimuths and radii of the chart's plane. Graph-free.
+    """The lenses of cameras (C,), graph-free, and their domains.
 
-    On each azimuth the sense of the lens (positive where it is regular) is followed outwards over the radii. It is
-    lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
-    dips below zero between them. Up to there the sense changes its sign once at the most, so that its
-    value at the point itself tells exactly on which side of the fold the point lies.
-
-    A lens that is not radial mostly folds where its radial factor does: there its radii are dense.
+    A point (a, b) of the chart's plane is in the domain if its lens is regular all the way from the centre. A radial
+    lens is followed to the root. Of others it is known from bounds of their terms how far out they certainly are; the
+    azimuths are followed only when a point lies further out.
     """
 
-    def __init__(self, optics: Callable[[Sequence[Tensor]], tuple[Chart, Lens]], k: Sequence[Tensor], like: Tensor):
-        """optics, k: a model's chart and lens of graph-free coefficients. like: gives the dtype and device.
+    def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice = slice(None)):
+        """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points.
 
-        The tables have the shape (*B, azimuths, radii).
+        whole, cameras: the domain of which this is a part.
         """
-        self.optics, self.k = optics, k
-        chart, lens = optics(k)
-        self.lens = lens
-        fine = chart.radii(_RADII, like)
-        self.azimuths = 1 if lens.is_radial else _AZIMUTHS
-        self.radii = fine if lens.is_radial else _around(lens.radial_part(), chart, fine)
-        self.count = self.radii.shape[-1]
-        angles = torch.arange(self.azimuths, dtype=like.dtype, device=like.device) * (2 * math.pi / self.azimuths)
-        a, b = ((f(angles)[:, None] * self.radii.unsqueeze(-2)).flatten(-2) for f in (torch.cos, torch.sin))
-        (x, y), _, sense = lens.linearise(a, b)
-        shape = (self.azimuths, self.count)
-        lost = _first_loss(sense.unflatten(-1, shape))
-        self.limits = self._limits(lost)
-        self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
-        # where the limits of each camera begin, were they in one row
-        cameras = self.limits.shape[:-1]
-        self.row = torch.arange(math.prod(cameras), device=like.device).view(*cameras, 1) * self.azimuths
+        self.optics, self.k, self.whole, self.cameras = optics, k, whole, cameras
+        self.chart, self.lens = optics(columns(k))
 
-    def lanes(self, mask: Tensor) -> Domain:
-        """The domain of some points of planes (*B, N) by themselves, as planes (M,); it answers `contains` alone."""
-        domain = copy.copy(self)
-        domain.k = [c.expand_as(mask)[mask] for c in self.k]
-        domain.lens = self.optics(domain.k)[1]
-        domain.row = self.row.expand_as(mask)[mask]
-        return domain
+    def part(self, cameras: slice) -> Domain:
+        """The domain of some of the cameras."""
+        if cameras.stop - cameras.start == len(self.k):
+            return self
+        return Domain(self.optics, self.k[cameras], self, cameras)
 
-    def _limits(self, lost: Tensor) -> Tensor:
-        """(*B, azimuths): the radius, up to the next azimuth, before which the sense at the point itself decides."""
-        limit = _radius_at(self.radii.unsqueeze(-2), lost)
-        following = limit.roll(-1, -1)
-        nearer, further = torch.minimum(limit, following), torch.maximum(limit, following)
-        # Between two azimuths the fold moves smoothly, and may bulge: the sense tells where it lies. Or it ends there:
-        # then the nearer one is on the safe side.
-        smooth = ((lost - lost.roll(-1, -1)).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
-        return torch.where(smooth, further * (1 + _BULGE), nearer)
+    def with_tables(self, inner2: Tensor, limits2: Tensor, table: Tensor) -> Domain:
+        """The same domain with tables that were made elsewhere."""
+        self.__dict__.update(inner2=inner2, limits2=limits2, table=table)
+        return self
 
-    def contains(self, a: Tensor, b: Tensor, sense: Tensor) -> Tensor:
-        """Bool: plane points (*B, N) before the fold of their azimuth; `sense` is that of the lens at these points."""
-        # nearer to zero its reciprocal could leave the floating-point range
-        regular = sense > torch.finfo(a.dtype).tiny ** 0.25
-        limits = self.limits
-        if self.azimuths > 1:
-            index = self.row + self._azimuth(a, b, 0.0)
-            limits = torch.gather(limits.flatten(), 0, index.flatten()).view(index.shape)
-        return regular & (a * a + b * b < limits * limits)
+    @cached_property
+    def azimuths(self) -> Azimuths:
+        """Of all cameras, also where this is a part."""
+        with torch.no_grad():
+            return Azimuths(self.chart, self.lens, self.k)
 
-    def bracket(self, target: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The radii (*B, N) between which the lens reaches `target` on the azimuth of (a, b), and a guess between them.
+    @_per_camera
+    def inner2(self) -> Tensor:
+        """(C, 1): the squared radius up to which the lens is certainly regular; for a radial lens the fold itself."""
+        radii = self.chart.radii(_RADII, self.k)
+        if self.lens.is_radial:
+            inner = self._fold.to(self.k.dtype)
+        else:
+            lost = first_loss(self.lens.certify(radii.expand(len(self.k), -1)))
+            inner = radii[(lost - 1).floor().clamp(0, _RADII - 1).long()].unsqueeze(-1)
+        inside = 1 - 4 * torch.finfo(inner.dtype).eps
+        return (inner.clamp(max=self.chart.end(inner.dtype)) * inside) ** 2
 
-        Looked for before the fold only: a target that is not reached ends up next to it.
-        """
-        row = self._azimuth(a, b, 0.5) * self.count if self.azimuths > 1 else torch.zeros_like(target, dtype=torch.long)
-        table = self.reach.flatten(-2).expand(*target.shape[:-1], -1)
-        low = _last_not_above(table, row, self.count, target)
-        near, far = torch.gather(table, -1, row + low), torch.gather(table, -1, row + low + 1)
-        # next to the fold only its inner side is safe to start from
-        fraction = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
-        radii = self.radii.expand(*target.shape[:-1], -1)
-        lower, inner, upper = (torch.gather(radii, -1, (low + i).clamp(max=self.count - 1)) for i in range(3))
-        return lower, lower + fraction.clamp(0, 1) * (inner - lower), upper
+    @_per_camera
+    def limits2(self) -> Tensor:
+        """(C, azimuths): the squared radius, up to the next azimuth, before which the sense at the point decides."""
+        return self.azimuths.limits**2
 
-    def _azimuth(self, a: Tensor, b: Tensor, offset: float) -> Tensor:
-        """The index of the azimuth at or below that of the points; `offset` 0.5 gives the nearest one."""
-        turn = torch.atan2(b, a) * (self.azimuths / (2 * math.pi)) + offset
-        return turn.floor().long().remainder(self.azimuths)
+    @_per_camera
+    def _fold(self) -> Tensor:
+        """(C, 1): that of the radial factor of the first stage, in double precision where there is one."""
+        k = _precise(self.k)
+        return _fold(self.optics(columns(k))[1].radial, self.chart, k, self.chart.end(self.k.dtype))
 
+    @_per_camera
+    def table(self) -> Tensor:
+        """(C, 2 + 2 nodes): what `inverse` is made of."""
+        k = _precise(self.k)
+        return tabulate(self.optics(columns(k))[1].radial, self._fold, self.chart.usual_end(self.k.dtype)).to(
+            self.k.dtype
+        )
 
-def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> Tensor:
-    """The index, up to length - 2, of the last entry not above the target in the ascending row that begins at `row`."""
-    low, high = torch.zeros_like(row), torch.full_like(row, length - 1)
-    for _ in range((length - 1).bit_length()):
-        middle = (low + high) // 2
-        above = torch.gather(table, -1, row + middle) > target
-        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-    return low.clamp(max=length - 2)
+    @property
+    def inverse(self) -> RadialInverse | None:
+        """That of the radial factor of the first stage, if it has one."""
+        return RadialInverse(self.table) if self.lens.radial else None
+
+    def margin(self, a: Tensor, b: Tensor) -> Tensor:
+        """Positive for the plane points (C, N) in the domain."""
+        t = torch.addcmul(a * a, b, b)
+        inside = self.inner2 - t
+        if self.lens.is_radial or (may_look(inside) and bool(inside.amin() > 0)):
+            return inside
+        row = torch.arange(len(self.k), device=t.device, dtype=torch.int32).unsqueeze(-1) * AZIMUTHS
+        index = row + azimuth(a, b)
+        limits2 = self.limits2.flatten().index_select(0, index.flatten()).view(index.shape)
+        return torch.maximum(inside, torch.minimum(limits2 - t, regular(self.lens, a, b)))
 
 
-def _around(radial: Lens | None, chart: Chart, fine: Tensor) -> Tensor:
-    """(*B, radii): the chart's, and more of them the nearer to the fold of the radial part, if it has one."""
-    if radial is None:
-        return chart.radii(_COARSE + _CLOSE, fine)
-    fold = _radius_at(fine, _first_loss(radial.linearise(fine, torch.zeros_like(fine))[2]).unsqueeze(-1))
-    # without a fold on the chart, the middle of a chart does no harm
-    fold = torch.where(fold < torch.inf, fold, 1.0)
-    spread = 1 + 0.5 * torch.linspace(-1, 1, _CLOSE, dtype=fine.dtype, device=fine.device) ** 3
-    close = (fold * spread).clamp(max=fine[-1])
-    coarse = chart.radii(_COARSE, fine).expand(*close.shape[:-1], -1)
-    return torch.cat((coarse, close), -1).sort(-1).values
+def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
+    """Positive where the lens is regular at the point itself, and its inverse has a derivative."""
+    # nearer to zero the reciprocal could leave the floating-point range
+    return torch.nan_to_num(lens.sense(a, b), nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
 
 
-def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
-    """The radius at fractional node positions (*B, A) of radii (*B, 1 or A, S); infinite from S on."""
-    last = radii.shape[-1] - 1
-    index = position.floor().long().clamp(max=last).unsqueeze(-1)
-    radii = radii.expand(*index.shape[:-1], -1)
-    inner, outer = torch.gather(radii, -1, index), torch.gather(radii, -1, (index + 1).clamp(max=last))
-    between = inner + (position.unsqueeze(-1) - index) * (outer - inner)
-    return torch.where(position <= last, between.squeeze(-1), torch.inf)
+def _precise(k: Tensor) -> Tensor:
+    return k if k.device.type == "mps" else k.double()
 
 
-def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
-    """How far from the centre the lens sends each node, ascending; infinite past the fold."""
-    nodes = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
-    before = (nodes < lost.unsqueeze(-1)) & (reach < torch.inf)
-    return torch.cummax(torch.where(before, reach, torch.inf), -1).values
+def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float) -> Tensor:
+    """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end of the chart."""
+    nodes = chart.radii(2 * _RADII, k).clamp(max=end).expand(len(k), -1)
+    lost = first_loss(radial_sense(radial, nodes)).unsqueeze(-1)
+    some = lost < nodes.shape[-1]
+
+    def node(index: Tensor) -> Tensor:
+        return nodes.gather(-1, index.long().clamp(0, nodes.shape[-1] - 1))
+
+    low, high = node((lost - 1).floor()), node(lost.ceil())
+    # at a dip between nodes the upper end is the bottom of its parabola
+    at_dip = node(lost.floor()) + (lost - lost.floor()) * (high - node(lost.floor()))
+    high = torch.where(lost == lost.floor(), high, at_dip)
+    steps = torch.linspace(0, 1, _PARTS + 1, dtype=k.dtype, device=k.device)
+    for _ in range(2):
+        inner = low + (high - low) * steps
+        sense = radial_sense(radial, inner)
+        # the upper end counts as lost, whatever rounding says of it
+        first = (sense > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
+        low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
+    before, after = radial_sense(radial, low), radial_sense(radial, high)
+    crossing = (before > 0) & (after < 0)
+    fraction = torch.where(crossing, before / torch.where(crossing, before - after, 1.0), 0.0)
+    return torch.where(some, low + fraction * (high - low), end)
 
 
-def _first_loss(sense: Tensor) -> Tensor:
-    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where the sense is first lost; S where it never is."""
-    before, here, after = sense[..., :-2], sense[..., 1:-1], sense[..., 2:]
-    bend, tilt = before - 2 * here + after, before - after
-    bend_safe = torch.where(bend > 0, bend, 1.0)
-    dips = (bend > 0) & (tilt.abs() <= bend) & (here - tilt * tilt / (8 * bend_safe) <= 0)
-    offset = torch.where(dips & (here > 0), tilt / (2 * bend_safe), 0.0)
-    nodes = torch.arange(sense.shape[-1], dtype=sense.dtype, device=sense.device)
-    inner = torch.where(dips | ~(here > 0), nodes[1:-1] + offset, torch.inf)
-    ends = torch.where(sense[..., [0, -1]] > 0, torch.inf, nodes[[0, -1]])
-    return torch.cat((inner, ends), -1).amin(-1).clamp(max=sense.shape[-1])
+def tabulate(radial: Polynomial | Rational, fold: Tensor, usual_end: float) -> Tensor:
+    """(C, 2 + 2 nodes): the table of a `RadialInverse`, see there."""
+    end = fold.clamp(max=usual_end)
+    u = torch.linspace(0, 1, _NODES + 1, dtype=fold.dtype, device=fold.device)
+    square = _square(u, end * end)
+    factor = radial(square)
+    r2 = torch.cummax(square * factor * factor, -1).values
+    reach2 = r2[..., -1:]
+    # where the nodes' images lie, and what lies at nodes that are even there
+    at = _variable(r2, reach2).contiguous()
+    cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, _NODES - 1)
+    low, high = at.gather(-1, cell), at.gather(-1, cell + 1)
+    scale = factor.reciprocal()
+    before, step = scale.gather(-1, cell), scale.diff(dim=-1).gather(-1, cell)
+    values = before + ((u - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1) * step
+    wanted = _square(u, reach2)
+    for _ in range(2):
+        t = wanted * values * values
+        factor, slope = radial.derivatives(t, 1)
+        slope = factor + 2 * t * slope
+        correction = (values * factor - 1) / torch.where(slope > 0, slope, 1.0)
+        values = values - torch.maximum(torch.minimum(correction, step.abs()), -step.abs())
+    values = torch.cat((values[..., :-1], scale[..., -1:]), -1)
+    most2 = torch.where(fold > usual_end, torch.inf, reach2)
+    return torch.cat((reach2, most2, values[..., :-1], values.diff(dim=-1)), -1)
+
+
+def _square(u: Tensor, top2: Tensor) -> Tensor:
+    """The inverse of `_variable`."""
+    x = u * (2 - u) * (top2 / (top2 + _HALF_WAY))
+    return _HALF_WAY * x / (1 - x)
+
+
+def _variable(r2: Tensor, top2: Tensor) -> Tensor:
+    x = r2 / (r2 + _HALF_WAY) * ((top2 + _HALF_WAY) / top2)
+    return 1 - (1 - x).clamp(min=0).sqrt()
+
+
+def table_width() -> int:
+    """The number of columns of `tabulate`."""
+    return 2 + 2 * _NODES
+
+
+class RadialInverse:
+    """The factor by which the inverse of a radial factor scales a point, tabulated over the point's squared radius r2.
+
+    The table's variable is 1 - sqrt(1 - x), x = r2 / (r2 + 2) scaled to 1 at the fold: it takes the root singularity
+    at the fold out of the inverse, and is as analytic in r2 as that.
+    """
+
+    def __init__(self, table: Tensor):
+        """table: (C, 2 + 2 nodes): its last squared radius, the largest one that has a point, factors and steps."""
+        self.reach2, self.most2 = table[..., :1], table[..., 1:2]
+        self.values, self.steps = table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
+
+    def __call__(self, r2: Tensor) -> Tensor:
+        """The factor for (C, N), to about 1e-6."""
+        position = _variable(r2, self.reach2) * _NODES
+        node = position.to(torch.int32).clamp(max=_NODES - 1)
+        fraction = position - node
+        if len(self.values) > 1:
+            node = node + torch.arange(len(self.values), device=r2.device, dtype=torch.int32).unsqueeze(-1) * _NODES
+        node = node.flatten()
+        value, step = (w.flatten().index_select(0, node).view(r2.shape) for w in (self.values, self.steps))
+        return torch.addcmul(value, fraction, step)

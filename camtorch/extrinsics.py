@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from camtorch.analytic import cosc_root, sinc_root
-from camtorch.parameters import GeometryModule, as_batch, as_planes, as_real, is_concrete
+from camtorch.parameters import GeometryModule, as_batch, as_real, as_rows, columns, is_concrete
 
 
 class Extrinsics(GeometryModule):
@@ -44,9 +44,10 @@ class Extrinsics(GeometryModule):
     def forward(self, points_world: Tensor) -> Tensor:
         """World points (*B, *N, 3) to the camera frame, same shape."""
         parameters = (self.rotation, self.translation)
-        planes, restore = as_planes(points_world, "points_world", 3, self.batch_shape, parameters, "Extrinsics")
-        turned = rotate_planes(rotation_matrix(self.rotation), planes)
-        return restore(*(p + t for p, t in zip(turned, self.translation.unsqueeze(-1).unbind(-2), strict=True)))
+        rows, lead, restore = as_rows(points_world, "points_world", 3, self.batch_shape, parameters, "Extrinsics")
+        rotation, translation = (t.expand(*lead, 3).reshape(-1, 3) for t in parameters)
+        turned = rotate_planes(rotation_matrix(rotation), rows.unbind(-1))
+        return restore(torch.stack([p + t for p, t in zip(turned, columns(translation), strict=True)]))
 
     def matrix(self) -> Tensor:
         """The (*B, 4, 4) matrix [[R, t], [0, 1]]."""

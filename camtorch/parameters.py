@@ -72,13 +72,13 @@ class Memo:
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple, compute: Callable[[], object]):
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
-        if not all(is_concrete(t) and not _has_tangent(t) for t in inputs):
+        if not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
         if self._kept is not None:
             kept_inputs, kept_options, result = self._kept
-            if options == kept_options and all(map(_same, inputs, kept_inputs)):
+            if options == kept_options and all(map(same, inputs, kept_inputs)):
                 return result
-        if torch._C._functorch.peek_interpreter_stack() is not None:  # what a transform makes dies with it
+        if in_transform():  # what a transform makes dies with it
             return compute()
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
@@ -91,17 +91,24 @@ class Memo:
         return {"_kept": None}
 
 
-def _same(a: Tensor, b: Tensor) -> bool:
+def same(a: Tensor, b: Tensor) -> bool:
+    """Whether shape, dtype, device and all values agree."""
     return a.shape == b.shape and a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
 
 
-def _has_tangent(tensor: Tensor) -> bool:
+def has_tangent(tensor: Tensor) -> bool:
+    """Whether forward-mode derivatives pass through the tensor."""
     return forward_ad._current_level >= 0 and forward_ad.unpack_dual(tensor).tangent is not None
+
+
+def in_transform() -> bool:
+    """Whether a transform of torch.func is under way."""
+    return torch._C._functorch.peek_interpreter_stack() is not None
 
 
 def in_graph(tensor: Tensor) -> bool:
     """Whether derivatives, of either mode, or a transform pass through the tensor."""
-    return tensor.requires_grad or not is_concrete(tensor) or _has_tangent(tensor)
+    return tensor.requires_grad or not is_concrete(tensor) or has_tangent(tensor)
 
 
 def is_concrete(tensor: Tensor) -> bool:
@@ -109,6 +116,11 @@ def is_concrete(tensor: Tensor) -> bool:
     return not (
         torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor) or tensor.is_meta
     )
+
+
+def may_look(tensor: Tensor) -> bool:
+    """Whether the values may be looked at and that costs next to nothing, to take a shorter way with a whole block."""
+    return tensor.device.type == "cpu" and tensor.numel() > 0 and is_concrete(tensor)
 
 
 def as_real(value, name: str, owner: str) -> Tensor:
@@ -207,13 +219,13 @@ def as_values(values, name: str, owner: str, device: torch.device | None = None)
     return values
 
 
-def as_planes(
+def as_rows(
     values, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
-) -> tuple[tuple[Tensor, ...], Callable[..., Tensor]]:
-    """Split (*B, *N, size) into `size` contiguous planes (*B, N).
+) -> tuple[Tensor, torch.Size, Callable[[Tensor], Tensor]]:
+    """Bring (*B, *N, size) into rows (C, N, size), one for each camera.
 
-    Returns the planes, and a function that gives planes (*B, N) their shape back: one plane becomes
-    (*B, *N), several become (*B, *N, count), a view of planes side by side.
+    Returns the rows, in the dtype to compute in; the batch dims that C counts; and a function that gives results their
+    shape back: planes (C, N) become (*B, *N), and planes (count, C, N) become a view (*B, *N, count).
 
     Raises:
         TypeError: not real numbers. ValueError: the shape does not fit `batch`.
@@ -226,20 +238,20 @@ def as_planes(
     try:
         if len(lead) < len(batch) or values.ndim <= len(batch):
             raise RuntimeError
-        lead_out = torch.broadcast_shapes(lead, batch)
+        lead = torch.broadcast_shapes(lead, batch)
     except RuntimeError:
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}") from None
-    planes = (
-        values.to(working_dtype(values, *parameters)).movedim(-1, 0).reshape(size, *lead, math.prod(rest)).contiguous()
-    )
+    rows = values.to(working_dtype(values, *parameters))
+    if rows.shape[: len(lead)] != lead:
+        rows = rows.expand(*lead, *rest, size)
+    rows = rows.reshape(math.prod(lead), math.prod(rest), size)
 
-    def restore(*results: Tensor) -> Tensor:
-        shape = (*lead_out, *rest)
-        if len(results) == 1:
-            return results[0].expand(*lead_out, -1).reshape(shape)
-        return torch.stack([r.expand(*lead_out, -1).reshape(shape) for r in results]).movedim(0, -1)
+    def restore(planes: Tensor) -> Tensor:
+        if planes.ndim == 2:
+            return planes.reshape((*lead, *rest))
+        return planes.reshape((len(planes), *lead, *rest)).movedim(0, -1)
 
-    return planes.unbind(0), restore
+    return rows, lead, restore
 
 
 def columns(parameters: Tensor) -> tuple[Tensor, ...]:

@@ -1,33 +1,242 @@
-"""The inverse of a lens: graph-free solvers, and one function that gives their result its derivatives."""
+"""The inverse of a lens: graph-free, for all points at once, and by another way for the few that this leaves open."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from camtorch.parameters import is_concrete
+from camtorch.azimuths import azimuth
+from camtorch.charts import floor_of
+from camtorch.domain import regular
+from camtorch.parameters import may_look
 
 if TYPE_CHECKING:
     from camtorch.domain import Domain
+    from camtorch.lens import Jacobian, Lens
 
 Planes2 = tuple[Tensor, Tensor]
+
+# Steps of Newton's method that most points need, by whether they can be counted while they are made
+_STEPS = {torch.float32: 1, torch.float64: 2}
+_PLANAR_STEPS = {torch.float32: 2, torch.float64: 3}
+_MOST_STEPS = 5
 
 _RADIAL_STEPS = 6  # of third order, from one interval of the table: 1e-2, 1e-6, 1e-18, with a reserve for wild lenses
 _START_ROUNDS = 6
 _CLOSE = 0.1
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
-# Nearly all points need 4 or 5 steps. The rest lie next to a fold, or so far out that a prism dominates, or have no
-# solution; a traced graph is unrolled, cannot set them apart, and has to do with fewer.
-_FIRST_STEPS, _LATE_STEPS, _TRACED_STEPS = 6, 54, 20
+_FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
 
 
-def invert(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
-    """The plane point that the lens of `domain` sends to (u, v), both (*B, N), or one near it if there is none."""
+class Found(NamedTuple):
+    """Planes (C, N): a point of the chart's plane, positive where it is the solution, positive where one may exist."""
+
+    a: Tensor
+    b: Tensor
+    solved: Tensor
+    possible: Tensor
+
+
+def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
+    """The point that the lens sends to (u, v), from a table and a few steps of Newton's method.
+
+    What is solved is the solution in the domain, to rounding: the last step was so short that the next one would be
+    nothing. What is not, and yet possible, is left to `search`.
+    """
     return (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v)
+
+
+def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
+    """Newton's method for the factor s that scales (u, v): s R(r2 s^2) = 1. It does not know of an axis."""
+    radial, table = domain.lens.radial, domain.inverse
+    r2 = torch.addcmul(u * u, v, v)
+    possible = table.most2 * (1 + 8 * torch.finfo(u.dtype).eps) - r2
+    r2 = torch.minimum(r2, table.most2)
+    scale = table(r2)
+    for count in range(1, _MOST_STEPS + 1):
+        t = r2 * scale * scale
+        factor, slope = radial.derivatives(t, 1)
+        step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
+        scale = scale + step
+        settled = _short(u) * scale - step.abs()
+        if count >= _STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
+            break
+    # a ray's rounding must not carry it across the fold
+    inside = domain.inner2 * (1 - 32 * torch.finfo(u.dtype).eps) - r2 * scale * scale
+    return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
+
+
+def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
+    """Newton's method in the plane, from the inverse of the radial factor."""
+    a, b = domain.lens.start(u, v)
+    if domain.inverse is not None:
+        # a stage may have sent a pixel far off the picture out of the floating-point range
+        scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
+        a, b = a * scale, b * scale
+    short2 = _short(u) ** 2
+    for count in range(1, _MOST_STEPS + 1):
+        value, jacobian = domain.lens.linearise(a, b)
+        da, db = newton_step(jacobian, u - value[0], v - value[1])
+        a, b = a + da, b + db
+        t = torch.addcmul(a * a, b, b)
+        settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
+        if count >= _PLANAR_STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
+            break
+    return Found(a, b, torch.minimum(settled, domain.inner2 - t), torch.ones_like(a))
+
+
+def _short(like: Tensor) -> float:
+    # the next step is about its square
+    return torch.finfo(like.dtype).eps ** 0.5 / 8
+
+
+def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes2:
+    """The step that a regular Jacobian sends to (du, dv); some finite one where it is singular."""
+    ua, ub, va, vb = jacobian
+    determinant = torch.addcmul(ua * vb, ub, va, value=-1)
+    # 1 / determinant, and 0 for 0
+    reciprocal = determinant / (determinant * determinant + floor_of(du.dtype))
+    da, db = torch.addcmul(vb * du, ub, dv, value=-1), torch.addcmul(ua * dv, va, du, value=-1)
+    return da * reciprocal, db * reciprocal
+
+
+# -- the points that are left open
+
+
+def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The point in the domain that the lens sends to (u, v), and whether there is one: planes (M,) of single points.
+
+    camera: (M,) the index of each point's camera. Takes many steps, and finds what lies next to a fold as well.
+    """
+    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
+    (some,) = (torch.hypot(u, v) <= domain.azimuths.furthest()[camera]).nonzero(as_tuple=True)
+    if len(some):
+        a[some], b[some], found[some] = _Search(domain, camera[some])(u[some], v[some])
+    return a, b, found
+
+
+class _Search:
+    """The lenses of single points (M,), and the inverse by bracketing and damped steps."""
+
+    def __init__(self, domain: Domain, camera: Tensor):
+        self.domain, self.camera, self.azimuths = domain, camera, domain.azimuths
+        # a single camera serves all points
+        k = domain.k[0].unsqueeze(-1) if len(domain.k) == 1 else domain.k[camera].mT
+        self.chart, self.lens = domain.optics(k.unbind(0))
+
+    def __call__(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        a, b = self.radial(u, v) if self.lens.is_radial else self.planar(u, v)
+        (x, y), jacobian = self.lens.linearise(a, b)
+        valid = self.contains(a, b)
+        stretch = torch.maximum(jacobian[0].abs() + jacobian[1].abs(), jacobian[2].abs() + jacobian[3].abs())
+        stretch = stretch * torch.maximum(a.abs(), b.abs())
+        for _ in range(2):  # what rounding left
+            da, db = newton_step(jacobian, u - x, v - y)
+            a, b = torch.where(valid, a + da, 0.0), torch.where(valid, b + db, 0.0)
+            x, y = self.lens(a, b)
+        # next to a fold the polished solution may lie on its other side: what counts is where its ray is seen
+        ray = self.chart.to_ray(a, b, order=1)
+        covered = self.chart.margin(*ray) > 0
+        seen = self.chart.to_plane(
+            *(torch.where(covered, w, axis) for w, axis in zip(ray, (0, 0, 1), strict=True)), order=1
+        )
+        x, y = self.lens(*seen)
+        miss = torch.maximum((x - u).abs(), (y - v).abs())
+        valid = valid & covered & self.contains(*seen) & (miss <= rounding(u, v, stretch))
+        return torch.where(valid, a, 0.0), torch.where(valid, b, 0.0), valid
+
+    def contains(self, a: Tensor, b: Tensor) -> Tensor:
+        """Bool: what `Domain.margin` says of single points."""
+        t = torch.addcmul(a * a, b, b)
+        inside = t < self.domain.inner2[self.camera, 0]
+        if self.lens.is_radial:
+            return inside
+        before = t < self.domain.limits2[self.camera, azimuth(a, b)]
+        return inside | (before & (regular(self.lens, a, b) > 0))
+
+    def radial(self, u: Tensor, v: Tensor) -> Planes2:
+        """Steps of Cauchy's method inside a bracket.
+
+        They go to the root of the local parabola: of third order, and at the fold too, where Newton's method crawls.
+        """
+        target = (u * u + v * v).sqrt()
+        lower, rho, upper = self.azimuths.bracket(self.camera, target, u, v)
+        for _ in range(_RADIAL_STEPS):
+            t = rho * rho
+            value, first, second = self.lens.radial.derivatives(t, 2)
+            slope = value + 2 * t * first
+            bend = rho * (6 * first + 4 * t * second)
+            error = target - rho * value
+            denominator = slope.abs() + (slope * slope + 2 * bend * error).clamp(min=0).sqrt()
+            step = 2 * error / torch.where(denominator > 0, denominator, 1.0)
+            rho = torch.minimum(torch.maximum(rho + torch.where(slope < 0, -step, step), lower), upper)
+        # at the fold itself the root of a rounded fold may lie beyond the rounded limit
+        rho = torch.minimum(rho, self.domain.inner2[self.camera, 0].sqrt() * (1 - 32 * torch.finfo(u.dtype).eps))
+        scale = self.lens.radial(rho * rho)
+        return u / scale, v / scale
+
+    def planar(self, u: Tensor, v: Tensor) -> Planes2:
+        """Newton's method; the few that need many steps go on by themselves."""
+        a, b, active = self._newton(u, v, *self._start(u, v), _FIRST_STEPS)
+        (late,) = active.nonzero(as_tuple=True)
+        if len(late):
+            alone = _Search(self.domain, self.camera[late])
+            a[late], b[late], _ = alone._newton(u[late], v[late], a[late], b[late], _LATE_STEPS)
+        return a, b
+
+    def _newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Each step is shortened until it comes nearer and stays in the domain.
+
+        Nearer in Deuflhard's sense: the next step by the same Jacobian is shorter. Where a lens stretches one direction
+        far more than the other, the residual itself would reject every good step.
+
+        Returns the points, and which of them would still move.
+        """
+        value, jacobian = self.lens.linearise(a, b)
+        enough = rounding(u, v) / 8
+        length = torch.ones_like(u)
+        for step_number in range(steps + 1):
+            miss = u - value[0], v - value[1]
+            active = (torch.maximum(miss[0].abs(), miss[1].abs()) > enough) & (length > _GIVE_UP)
+            if step_number == steps or not bool(active.any()):
+                break
+            step = newton_step(jacobian, *miss)
+            trial = a + length * step[0], b + length * step[1]
+            trial_value, trial_jacobian = self.lens.linearise(*trial)
+            ahead = newton_step(jacobian, u - trial_value[0], v - trial_value[1])
+            nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < step[0] * step[0] + step[1] * step[1]
+            good = active & nearer & self.contains(*trial)
+            old, new = (a, b, *value, *jacobian), (*trial, *trial_value, *trial_jacobian)
+            a, b, x, y, *jacobian = (torch.where(good, n, o) for n, o in zip(new, old, strict=True))
+            value = x, y
+            length = torch.where(good, (length * 4).clamp(max=1), length / 4)
+        return a, b, active
+
+    def _start(self, u: Tensor, v: Tensor) -> Planes2:
+        """The best of some points that the lens sends as far out as (u, v), each on another azimuth.
+
+        The azimuth is followed by the secant method: it is nearly that of (u, v), unless a prism dominates.
+        """
+        target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
+        a, b, best = torch.zeros_like(u), torch.zeros_like(v), target * target
+        angle, step, last_off = wanted, torch.zeros_like(u), torch.zeros_like(u)
+        for _ in range(_START_ROUNDS):
+            c, s = torch.cos(angle), torch.sin(angle)
+            rho = self.azimuths.bracket(self.camera, target, c, s)[1]
+            x, y = self.lens(rho * c, rho * s)
+            error = (u - x) ** 2 + (v - y) ** 2
+            better = error < best
+            a, b, best = (torch.where(better, n, o) for n, o in ((rho * c, a), (rho * s, b), (error, best)))
+            if bool((best <= _CLOSE**2 * target * target).all()):
+                break
+            off = torch.atan2(x * v - y * u, x * u + y * v)
+            slope = torch.where(step != 0, (last_off - off) / torch.where(step != 0, step, 1.0), 1.0)
+            step, last_off = (off / slope.clamp(_SLOWEST_TURN, 2.0)).clamp(-1.0, 1.0), off
+            angle = angle + step
+        return a, b
 
 
 def rounding(u: Tensor, v: Tensor, stretch: Tensor | float = 0.0) -> Tensor:
@@ -35,116 +244,18 @@ def rounding(u: Tensor, v: Tensor, stretch: Tensor | float = 0.0) -> Tensor:
     return 32 * torch.finfo(u.dtype).eps * (1 + torch.maximum(u.abs(), v.abs()) + stretch)
 
 
-def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
-    """Steps of Cauchy's method inside a bracket.
+def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
+    """Give a graph-free solution of lens(solution) = target its derivatives, exact up to the order of `steps`.
 
-    They go to the root of the local parabola: of third order, and at the fold too, where Newton's method crawls.
+    Steps of the chord method x <- x - J^-1 (f(x) - y) with the constant Jacobian of the solution. If parameters and
+    target move by d, the solution is off by O(d^2) after one step and by O(d^3) after two: its Taylor series agrees
+    with that of the implicit function up to that order. The Jacobian itself never enters the graph.
     """
-    factor = domain.lens.stages[0].radial
-    target = (u * u + v * v).sqrt()
-    lower, rho, upper = domain.bracket(target, u, v)
-    for _ in range(_RADIAL_STEPS):
-        t = rho * rho
-        value, first, second = factor.derivatives(t, 2)
-        slope = value + 2 * t * first
-        bend = rho * (6 * first + 4 * t * second)
-        error = target - rho * value
-        denominator = slope.abs() + (slope * slope + 2 * bend * error).clamp(min=0).sqrt()
-        step = 2 * error / torch.where(denominator > 0, denominator, 1.0)
-        rho = torch.minimum(torch.maximum(rho + torch.where(slope < 0, -step, step), lower), upper)
-    scale = factor(rho * rho)
-    return u / scale, v / scale
-
-
-def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
-    """Newton's method for all points; for the few that need many steps, by themselves."""
-    u, v, a, b = torch.broadcast_tensors(u, v, *_planar_start(domain, u, v))
-    if not is_concrete(a):
-        return _newton(domain, u, v, a, b, _TRACED_STEPS)[:2]
-    a, b, active = _newton(domain, u, v, a, b, _FIRST_STEPS)
-    if bool(active.any()):
-        late = _newton(domain.lanes(active), *(plane[active] for plane in (u, v, a, b)), _LATE_STEPS)
-        a, b = (plane.masked_scatter(active, solved) for plane, solved in zip((a, b), late[:2], strict=True))
-    return a, b
-
-
-def _newton(domain: Domain, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Newton's method in the plane, each step shortened until it comes nearer and stays in the domain.
-
-    Nearer in Deuflhard's sense: the next step by the same Jacobian is shorter. Where a lens stretches one direction
-    far more than the other, the residual itself would reject every good step.
-
-    Returns the points, and which of them would still move.
-    """
-    lens = domain.lens
-    value, jacobian, _ = lens.linearise(a, b)
-    enough = rounding(u, v) / 8
-    length = torch.ones_like(u)
-    for step_number in range(steps + 1):
-        miss = u - value[0], v - value[1]
-        active = (torch.maximum(miss[0].abs(), miss[1].abs()) > enough) & (length > _GIVE_UP)
-        if step_number == steps or (is_concrete(active) and not bool(active.any())):
-            break
-        step = _newton_step(jacobian, *miss)
-        trial = a + length * step[0], b + length * step[1]
-        trial_value, trial_jacobian, sense = lens.linearise(*trial)
-        ahead = _newton_step(jacobian, u - trial_value[0], v - trial_value[1])
-        nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < step[0] * step[0] + step[1] * step[1]
-        good = active & nearer & domain.contains(*trial, sense)
-        old, new = (a, b, *value, *jacobian), (*trial, *trial_value, *trial_jacobian)
-        a, b, x, y, *jacobian = (torch.where(good, n, o) for n, o in zip(new, old, strict=True))
-        value = x, y
-        length = torch.where(good, (length * 4).clamp(max=1), length / 4)
-    return a, b, active
-
-
-def _newton_step(jacobian, du: Tensor, dv: Tensor) -> Planes2:
-    ua, ub, va, vb = jacobian
-    determinant = ua * vb - ub * va
-    scale = 1 / torch.where(determinant != 0, determinant, 1.0)
-    return (vb * du - ub * dv) * scale, (ua * dv - va * du) * scale
-
-
-def _planar_start(domain: Domain, u: Tensor, v: Tensor) -> Planes2:
-    """The best of some points that the lens sends as far out as (u, v), each on another azimuth.
-
-    The azimuth is followed by the secant method: it is nearly that of (u, v), unless a prism dominates.
-    """
-    target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
-    a, b, best = torch.zeros_like(u), torch.zeros_like(v), target * target
-    azimuth, step, last_off = wanted, torch.zeros_like(u), torch.zeros_like(u)
-    for _ in range(_START_ROUNDS):
-        c, s = torch.cos(azimuth), torch.sin(azimuth)
-        rho = domain.bracket(target, c, s)[1]
-        x, y = domain.lens(rho * c, rho * s)
-        error = (u - x) ** 2 + (v - y) ** 2
-        better = error < best
-        a, b, best = torch.where(better, rho * c, a), torch.where(better, rho * s, b), torch.where(better, error, best)
-        if is_concrete(best) and bool((best <= _CLOSE**2 * target * target).all()):
-            break
-        off = torch.atan2(x * v - y * u, x * u + y * v)
-        slope = torch.where(step != 0, (last_off - off) / torch.where(step != 0, step, 1.0), 1.0)
-        step, last_off = (off / slope.clamp(_SLOWEST_TURN, 2.0)).clamp(-1.0, 1.0), off
-        azimuth = azimuth + step
-    return a, b
-
-
-def attach(
-    function: Callable[[Tensor, Tensor], Planes2],
-    solution: Planes2,
-    inverse_jacobian: tuple[Tensor, Tensor, Tensor, Tensor],
-    target: Planes2,
-) -> Planes2:
-    """Give a graph-free solution of function(solution) = target its exact first and second derivatives.
-
-    Two steps of the chord method x <- x - J^-1 (f(x) - y) with the constant Jacobian of the solution. If
-    parameters and target move by d, the solution is off by O(d^2) after one step and by O(d^3) after two:
-    its Taylor series agrees with that of the implicit function up to second order. The Jacobian itself never
-    enters the graph. On the values the steps polish what rounding left.
-    """
-    (a, b), (au, av, bu, bv), (u, v) = solution, inverse_jacobian, target
-    for _ in range(2):
-        x, y = function(a, b)
-        du, dv = u - x, v - y
-        a, b = a + au * du + av * dv, b + bu * du + bv * dv
+    a, b = solution
+    with torch.no_grad():
+        jacobian = [w.detach() for w in lens.linearise(a, b)[1]]
+    for _ in range(steps):
+        x, y = lens(a, b)
+        da, db = newton_step(jacobian, target[0] - x, target[1] - y)
+        a, b = a + da, b + db
     return a, b

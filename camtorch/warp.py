@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotate_planes
-from camtorch.parameters import GeometryModule, Memo, as_planes, as_real, as_values, in_graph
+from camtorch.parameters import GeometryModule, Memo, as_real, as_rows, as_values, in_graph
 from camtorch.sampling import MODES, PADDINGS, sample
 
 _OUTSIDE = -9.0  # a sampling position that no picture reaches, not even with its interpolation margin
@@ -228,8 +228,9 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
     """Apply a rotation, if there is one, to (*B, *N, 3); `name` is what an error calls them."""
     if rotation is None:
         return rays
-    planes, restore = as_planes(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
-    return restore(*rotate_planes(rotation, planes))
+    rows, lead, restore = as_rows(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
+    rotation = rotation.to(rows.dtype).expand(*lead, 3, 3).reshape(-1, 3, 3)
+    return restore(torch.stack(rotate_planes(rotation, rows.unbind(-1))))
 
 
 def _checked_mode(mode: str) -> str:

@@ -100,7 +100,7 @@ def test_a_batch_gets_a_target_each():
 def test_gradients_reach_the_camera():
     camera = ct.KannalaBrandt([200.0, 200.0, 320.0, 240.0], image_size=(480, 640))
     v, u = torch.meshgrid(torch.arange(480.0), torch.arange(640.0), indexing="ij")
-    ct.Dewarp(camera, image_size=(48, 64))((u * v)[None, None] / 1e5).sum().backward()
+    ct.Dewarp(camera, image_size=(48, 64))((u * v * (u + v))[None, None] / 1e8).sum().backward()
     assert (camera.intrinsics.grad != 0).all()
     assert (camera.distortion.grad != 0).all()
 

@@ -300,7 +300,7 @@ def before_fold(camera, rays, samples, azimuths):
     """(samples, azimuths): before the determinant, by autograd and sampled densely, is first not positive."""
     chart, lens = optics(camera)
     if not lens.stages:
-        return chart.covers(*rays.unbind(-1)).view(samples, azimuths)
+        return (chart.margin(*rays.unbind(-1)) > 0).view(samples, azimuths)
     a, b = chart.to_plane(*(rays / rays.abs().amax(-1, keepdim=True)).unbind(-1))
     tangents = [(torch.ones_like(a), torch.zeros_like(a)), (torch.zeros_like(a), torch.ones_like(a))]
     before = torch.ones(samples, azimuths, dtype=torch.bool)

@@ -37,7 +37,8 @@ class BrownConrady(Camera):
     def counts_text(cls):
         return "n = 4, 5, 8, 12 or 14 (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]])"
 
-    def optics(self, k):
+    @staticmethod
+    def optics(k):
         k1, k2, p1, p2, *more = k
         numerator = [k1, k2, *more[:1]]
         radial = Rational(numerator, more[1:4]) if len(more) > 1 else Polynomial(numerator)

@@ -19,5 +19,6 @@ class Equirectangular(Camera):
     def __init__(self, intrinsics, *, image_size=None):
         super().__init__(intrinsics, image_size=image_size)
 
-    def optics(self, k):
+    @staticmethod
+    def optics(k):
         return SphereChart(), Lens()

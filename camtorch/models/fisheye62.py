@@ -27,5 +27,6 @@ class Fisheye62(Camera):
     odd_in_x = frozenset({"p0"})
     odd_in_y = frozenset({"p1"})
 
-    def optics(self, k):
+    @staticmethod
+    def optics(k):
         return Equidistant(), Lens(Planar(Polynomial(k[:6])), Planar(tangential=k[6:]))

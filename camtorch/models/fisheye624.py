@@ -27,7 +27,8 @@ class Fisheye624(Camera):
     odd_in_x = frozenset({"p0", "s0", "s1"})
     odd_in_y = frozenset({"p1", "s2", "s3"})
 
-    def optics(self, k):
+    @staticmethod
+    def optics(k):
         return Equidistant(), Lens(Planar(Polynomial(k[:6])), Planar(tangential=k[6:8], prism=k[8:]))
 
 

@@ -38,7 +38,8 @@ class KannalaBrandt(Camera):
     def counts_text(cls):
         return "n >= 1 (k1 k2 ...)"
 
-    def optics(self, k):
+    @staticmethod
+    def optics(k):
         return Equidistant(), Lens(Planar(Polynomial(k)))
 
     @classmethod

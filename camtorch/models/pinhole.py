@@ -16,5 +16,6 @@ class Pinhole(Camera):
     def __init__(self, intrinsics, *, image_size=None):
         super().__init__(intrinsics, image_size=image_size)
 
-    def optics(self, k):
+    @staticmethod
+    def optics(k):
         return Perspective(), Lens()

@@ -1,0 +1,149 @@
+"""Both directions between rays and pixels, on planes (C, N), as formulas that a graph can be recorded of."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.charts import floor_of
+from camtorch.parameters import may_look
+from camtorch.solve import Found, attach
+
+if TYPE_CHECKING:
+    from camtorch.charts import Chart
+    from camtorch.domain import Domain
+    from camtorch.lens import Lens
+
+Planes2 = tuple[Tensor, Tensor]
+Planes3 = tuple[Tensor, Tensor, Tensor]
+
+INVALID_PIXEL = -1.0  # outside every picture, so that `contains` is False for it as well
+# Between these sizes the formulas need no scaling
+_SMALL, _LARGE = 1e-3, 1e6
+
+
+class Ray(NamedTuple):
+    """A ray with its largest component near 1: the point times `shrink`, or the axis where `mask` is 0.
+
+    shrink, mask: None where they are all 1.
+    """
+
+    x: Tensor
+    y: Tensor
+    z: Tensor
+    shrink: Tensor | None
+    mask: Tensor | None
+
+
+class Pixels(NamedTuple):
+    """What a projection gives: the pixel, and a mask of 0 and 1, or None where all are valid."""
+
+    u: Tensor
+    v: Tensor
+    mask: Tensor | None
+
+
+def indicator(margin: Tensor) -> Tensor:
+    """1 where the margin is positive, 0 elsewhere. Of the same dtype: on a CPU that is five times as fast as bool."""
+    return margin.detach().nan_to_num(-1.0).relu().sign()
+
+
+def to_mask(margin: Tensor | None) -> Tensor | None:
+    """The indicator of a margin; None if a look at it shows that it is positive everywhere."""
+    if margin is None or (may_look(margin) and bool(margin.amin() > 0)):
+        return None
+    return indicator(margin)
+
+
+def replace(mask: Tensor | None, plane: Tensor, value: float) -> Tensor:
+    """The plane where the mask is 1, and the value where it is 0."""
+    if mask is None:
+        return plane
+    return plane * mask if value == 0 else torch.lerp(plane.new_full((1, 1), value), plane, mask)
+
+
+def to_ray(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> Ray:
+    """Points as rays that the chart covers."""
+    shrink = margin = None
+    if may_look(x):
+        bounds = [float(bound) for plane in (x, y, z) for bound in plane.detach().aminmax()]
+        extent, near = max(map(abs, bounds)), bounds[4]
+        if extent < _LARGE and near > _SMALL and chart.covers_all(near, extent, x.dtype):
+            return Ray(x, y, z, None, None)
+    sides = [plane.detach().abs() for plane in (x, y, z)]
+    size = torch.maximum(torch.maximum(*sides[:2]), sides[2])
+    if not (may_look(size) and float(size.amin()) > _SMALL and float(size.amax()) < _LARGE):
+        # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
+        known = (size > floor_of(size.dtype)) & (size < torch.inf)
+        # a constant: the projection does not depend on the distance, so this has no part in its derivative
+        shrink = _power_of_two(torch.where(known, size, 1.0)).reciprocal()
+        x, y, z = (torch.where(known, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+        margin = known.to(size.dtype) - 0.5
+    covered = chart.margin(x.detach(), y.detach(), z.detach())
+    mask = to_mask(covered if margin is None else torch.minimum(covered, margin))
+    return Ray(replace(mask, x, 0.0), replace(mask, y, 0.0), replace(mask, z, 1.0), shrink, mask)
+
+
+def _power_of_two(size: Tensor) -> Tensor:
+    """The largest one not above: to divide by it costs no bit."""
+    exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
+    return (size.view(integer) & exponent).view(size.dtype)
+
+
+def both(*masks: Tensor | None) -> Tensor | None:
+    """Where all masks are 1."""
+    some = [mask for mask in masks if mask is not None]
+    product = None
+    for mask in some:
+        product = mask if product is None else product * mask
+    return product
+
+
+def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int) -> Pixels:
+    """Where the lens sends a ray on its own plane, the centre if it sends it nowhere.
+
+    lens: it may carry a graph. domain: that of the same lens, without one.
+    """
+    a, b = chart.to_plane(ray.x, ray.y, ray.z, order)
+    mask = ray.mask
+    if lens.stages:
+        mask = both(mask, to_mask(domain.margin(a.detach(), b.detach())))
+        a, b = lens(replace(mask, a, 0.0), replace(mask, b, 0.0))
+    return Pixels(a, b, mask)
+
+
+def to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> Pixels:
+    """Pixels on the plane of the lens; the centre where they are no numbers, or so large that a square overflows."""
+    focal_x, focal_y, centre_x, centre_y = intrinsics
+    p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
+    far = torch.maximum(p.detach().abs(), q.detach().abs())
+    limit = torch.finfo(far.dtype).max ** 0.25
+    if may_look(far) and float(far.amax()) < limit:
+        return Pixels(p, q, None)
+    known = far < limit
+    mask = known.to(far.dtype)
+    p, q = ((torch.where(known, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
+    return Pixels(p, q, mask)
+
+
+def clean(mask: Tensor | None, found: Found) -> Planes2:
+    """The solved points; the centre for the others, which may have run away."""
+    if mask is None:
+        return found.a, found.b
+    return tuple((plane * mask).nan_to_num(0.0, 0.0, 0.0) for plane in (found.a, found.b))
+
+
+def rays_of(solution: Planes2, target: Planes2, mask: Tensor | None, chart: Chart, lens: Lens, order: int) -> Planes3:
+    """The rays of plane points, with the derivatives up to `order` of lens(point) = target; the axis where masked.
+
+    Order 0 leaves the graph of the lens out.
+    """
+    a, b = solution
+    if not lens.stages:
+        a, b = (replace(mask, w, 0.0) for w in target)
+    elif order:
+        a, b = attach(lens, solution, tuple(replace(mask, w, 0.0) for w in target), order)
+    x, y, z = chart.to_ray(a, b, order)
+    return tuple(replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
