@@ -37,9 +37,10 @@ class Azimuths:
         self.count = 1 if lens.is_radial else AZIMUTHS
         self.radii = fine if lens.is_radial else _around(lens.radial, chart, fine)
         a, b = (c[:, None] * self.radii.unsqueeze(-2) for c in _directions(self.count, like))
-        x, y = lens(a.flatten(-2), b.flatten(-2))
+        at = lens.at(a.flatten(-2), b.flatten(-2))
+        x, y = at.value
         shape = (self.count, self.radii.shape[-1])
-        lost = first_loss(lens.sense(a.flatten(-2), b.flatten(-2)).unflatten(-1, shape))
+        lost = first_loss(at.sense.unflatten(-1, shape))
         self.limits = self._limits(lost)
         self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
 

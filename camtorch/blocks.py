@@ -6,7 +6,7 @@ a third to a quarter of the time that whole arrays take, whose temporaries are f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -36,6 +36,10 @@ class _Block(NamedTuple):
     intrinsics: tuple[Tensor, ...]
     domain: Domain
     usable: Tensor | None
+
+    @property
+    def here(self) -> tuple[slice, slice]:
+        return self.cameras, self.points
 
 
 def _blocks(given: Cameras, rows: Tensor) -> Iterator[_Block]:
@@ -67,30 +71,35 @@ def _planes(rows: Tensor) -> tuple[Tensor, ...]:
     return tuple(plane if plane.stride(-1) == 1 else plane - 0 for plane in rows.unbind(-1))
 
 
-def _mask(valid: Tensor, like: Tensor) -> Tensor | None:
-    return None if bool(valid.all()) else valid.to(like.dtype)
-
-
 class Project(Function):
     """Rows of points (C, N, 3), intrinsics (C, 4), distortion (C, n) -> pixels (2, C, N), valid (C, N)."""
 
     @staticmethod
-    def forward(ctx, points, intrinsics, distortion, cameras: Cameras, again: Callable):
-        """again: the same as formulas, for derivatives of derivatives."""
-        pixels = points.new_empty(2, *points.shape[:2])
-        valid = torch.empty(points.shape[:2], dtype=torch.bool, device=points.device)
+    def forward(ctx, points, intrinsics, distortion, cameras: Cameras, again: Callable, keeps: bool):
+        """again: the same as formulas, for derivatives of derivatives. keeps: whether there will be a backward."""
+        shape = points.shape[:2]
+        pixels = points.new_empty(2, *shape)
+        valid = torch.ones(shape, dtype=torch.bool, device=points.device)
+        scales = points.new_empty(shape if keeps and cameras.domain.chart.has_scale else (0, 0))
+        ctx.plain = []
         for block in _blocks(cameras, points):
-            here = block.cameras, block.points
-            chart, lens = block.domain.chart, block.domain.lens
+            here, chart = block.here, block.domain.chart
             ray = mapping.to_ray(chart, *_planes(points[here]))
-            a, b, mask = mapping.see(ray, chart, lens, block.domain, 1)
-            mask = mapping.both(mask, block.usable)
-            focal_x, focal_y, centre_x, centre_y = block.intrinsics
-            pixels[0][here] = mapping.replace(mask, focal_x * a + centre_x, mapping.INVALID_PIXEL)
-            pixels[1][here] = mapping.replace(mask, focal_y * b + centre_y, mapping.INVALID_PIXEL)
-            valid[here] = True if mask is None else mask > 0
-        ctx.save_for_backward(points, intrinsics, distortion, valid)
-        ctx.cameras, ctx.again = cameras, again
+            scale = chart.scale(ray.x, ray.y, ray.z, 1)
+            a, b, mask = mapping.see(ray, chart, block.domain.lens, block.domain, 1, scale)
+            mask = mapping.both(ray.mask, mask, block.usable)
+            for plane, m, focal, centre in zip(pixels, (a, b), block.intrinsics[:2], block.intrinsics[2:], strict=True):
+                torch.add(focal * m, centre, out=plane[here])
+                if mask is not None:
+                    plane[here] = mapping.replace(mask, plane[here], mapping.INVALID_PIXEL)
+            if mask is not None:
+                valid[here] = mask > 0
+            if scales.numel():
+                scales[here] = scale
+            ctx.plain.append(mask is None and ray.shrink is None)
+        if keeps:
+            ctx.save_for_backward(points, intrinsics, distortion, valid, scales)
+            ctx.cameras, ctx.again = cameras, again
         ctx.mark_non_differentiable(valid)
         ctx.set_materialize_grads(False)
         return pixels, valid
@@ -98,59 +107,59 @@ class Project(Function):
     @staticmethod
     def backward(ctx, by_pixels, _):
         if by_pixels is None:
-            return (None,) * 5
-        *inputs, valid = ctx.saved_tensors
-        points = inputs[0]
+            return (None,) * 6
+        *inputs, valid, scales = ctx.saved_tensors
         if torch.is_grad_enabled():
             return _by_formulas(ctx.again, inputs, ctx.needs_input_grad, by_pixels)
+        points = inputs[0]
         sums = _Sums(ctx.cameras, ctx.needs_input_grad, points)
         by_points = torch.empty_like(points) if ctx.needs_input_grad[0] else None
-        for block in _blocks(ctx.cameras, points):
-            here = block.cameras, block.points
-            chart, lens = block.domain.chart, block.domain.lens
-            x, y, z, shrink, _ = mapping.to_ray(chart, *_planes(points[here]))
-            mask = _mask(valid[here], points)
-            x, y, z = (mapping.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
-            gu, gv = (mapping.replace(mask, by_pixels[i][here], 0.0) for i in (0, 1))
-            a, b = chart.to_plane(x, y, z, 1)
-            trace = lens.trace(a, b)
-            sums.add_intrinsics(block, gu * trace.value[0], gv * trace.value[1], gu, gv)
-            (ga, gb), by_lens = trace.pull(gu * block.intrinsics[0], gv * block.intrinsics[1], sums.wants_lens)
+        for block, plain in zip(_blocks(ctx.cameras, points), ctx.plain, strict=True):
+            here, chart = block.here, block.domain.chart
+            x, y, z = _planes(points[here])
+            shrink = mask = None
+            gu, gv = by_pixels[0][here], by_pixels[1][here]
+            if not plain:
+                x, y, z, shrink, _ = mapping.to_ray(chart, x, y, z)
+                mask = valid[here].to(x.dtype)
+                x, y, z = (mapping.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+                gu, gv = mapping.replace(mask, gu, 0.0), mapping.replace(mask, gv, 0.0)
+            scale = mapping.replace(mask, scales[here], 1.0) if scales.numel() else None
+            at = block.domain.lens.at(*chart.to_plane(x, y, z, 1, scale))
+            sums.add_intrinsics(block, gu, gv, *at.value)
+            (ga, gb), by_lens = at.pull(gu * block.intrinsics[0], gv * block.intrinsics[1], sums.wants_lens)
             sums.add_lens(block, by_lens)
             if by_points is not None:
-                for i, w in enumerate(chart.pull_point(x, y, z, ga, gb)):
+                for i, w in enumerate(chart.pull_point(x, y, z, ga, gb, scale)):
                     by_points[here][..., i] = w if shrink is None else w * shrink
-        return by_points, *sums.result(), None, None
+        return by_points, *sums.result(), None, None, None
 
 
 class Unproject(Function):
     """Rows of pixels (C, N, 2), intrinsics (C, 4), distortion (C, n) -> rays (3, C, N), valid (C, N)."""
 
     @staticmethod
-    def forward(ctx, pixels, intrinsics, distortion, cameras: Cameras, again: Callable):
-        """again: the same as formulas, for derivatives of derivatives."""
+    def forward(ctx, pixels, intrinsics, distortion, cameras: Cameras, again: Callable, keeps: bool):
+        """again: the same as formulas, for derivatives of derivatives. keeps: whether there will be a backward."""
         shape = pixels.shape[:2]
-        rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape)
-        valid = torch.empty(shape, dtype=torch.bool, device=pixels.device)
+        rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
+        valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
         left_open: list[tuple[Tensor, ...]] = []
         for block in _blocks(cameras, pixels):
-            here = block.cameras, block.points
-            results = (t[(slice(None), *here)] for t in (rays, solution))
-            left = _unproject_block(block, pixels[here], *results, valid[here])
+            left = _unproject_block(block, pixels, rays, solution, valid)
             if left is not None:
-                camera, point, *target = left
-                left_open.append((camera + block.cameras.start, point + block.points.start, *target))
+                left_open.append(left)
         if left_open:
             camera, point, *target = (torch.cat(parts) for parts in zip(*left_open, strict=True))
             a, b, found = search(cameras.domain, camera, *target)
             (some,) = found.nonzero(as_tuple=True)
             here, a, b = (camera[some], point[some]), a[some], b[some]
-            for planes, results in ((solution, (a, b)), (rays, cameras.domain.chart.to_ray(a, b, 1))):
-                for plane, result in zip(planes, results, strict=True):
-                    plane[here] = result
+            _write(rays, here, cameras.domain.chart.to_ray(a, b, 1))
+            _write(solution, here, (a, b))
             valid[here] = True
-        ctx.save_for_backward(pixels, intrinsics, distortion, valid, solution)
-        ctx.cameras, ctx.again = cameras, again
+        if keeps:
+            ctx.save_for_backward(pixels, intrinsics, distortion, valid, solution)
+            ctx.cameras, ctx.again = cameras, again
         ctx.mark_non_differentiable(valid)
         ctx.set_materialize_grads(False)
         return rays, valid
@@ -158,36 +167,36 @@ class Unproject(Function):
     @staticmethod
     def backward(ctx, by_rays, _):
         if by_rays is None:
-            return (None,) * 5
+            return (None,) * 6
         *inputs, valid, solution = ctx.saved_tensors
         if torch.is_grad_enabled():
             return _by_formulas(ctx.again, inputs, ctx.needs_input_grad, by_rays)
         sums = _Sums(ctx.cameras, ctx.needs_input_grad, inputs[0])
         by_pixels = torch.empty_like(inputs[0]) if ctx.needs_input_grad[0] else None
         for block in _blocks(ctx.cameras, inputs[0]):
-            here = block.cameras, block.points
-            mask = _mask(valid[here], by_rays)
+            here = block.here
+            mask = None if bool(valid[here].all()) else valid[here].to(by_rays.dtype)
             a, b = solution[0][here], solution[1][here]
             gx, gy, gz = (mapping.replace(mask, by_rays[i][here], 0.0) for i in range(3))
             ga, gb = block.domain.chart.pull_ray(a, b, gx, gy, gz)
-            trace = block.domain.lens.trace(a, b)
-            if trace.steps:
-                ua, ub, va, vb = trace.jacobian
+            at = block.domain.lens.at(a, b)
+            if at.stages:
+                ua, ub, va, vb = at.jacobian
                 ga, gb = newton_step((ua, va, ub, vb), ga, gb)
                 if sums.wants_lens:
-                    sums.add_lens(block, trace.pull(-ga, -gb)[1])
+                    sums.add_lens(block, at.pull(-ga, -gb)[1])
             focal_x, focal_y, _, _ = block.intrinsics
             ga, gb = ga / focal_x, gb / focal_y
-            sums.add_intrinsics(block, -ga * trace.value[0], -gb * trace.value[1], -ga, -gb)
+            sums.add_intrinsics(block, -ga, -gb, *at.value)
             if by_pixels is not None:
                 by_pixels[here][..., 0], by_pixels[here][..., 1] = ga, gb
-        return by_pixels, *sums.result(), None, None
+        return by_pixels, *sums.result(), None, None, None
 
 
-def _unproject_block(block: _Block, pixels: Tensor, rays: Tensor, solution: Tensor, valid: Tensor):
+def _unproject_block(block: _Block, pixels: Tensor, rays: Tensor, solution: Tensor | None, valid: Tensor):
     """Write rays, solutions and validity; returns the places and targets of the points that are left open, if any."""
     chart = block.domain.chart
-    p, q, known = mapping.to_target(*_planes(pixels), block.intrinsics)
+    p, q, known = mapping.to_target(*_planes(pixels[block.here]), block.intrinsics)
     known = mapping.both(known, block.usable)
     p, q = mapping.replace(known, p, 0.0), mapping.replace(known, q, 0.0)
     left = None
@@ -198,16 +207,28 @@ def _unproject_block(block: _Block, pixels: Tensor, rays: Tensor, solution: Tens
         if solved is not None:
             camera, point = (mapping.indicator(found.possible) > solved).nonzero(as_tuple=True)
             if len(camera):
-                left = camera, point, p[camera, point], q[camera, point]
+                left = (
+                    camera + block.cameras.start,
+                    point + block.points.start,
+                    p[camera, point],
+                    q[camera, point],
+                )
     else:
         solved = mapping.to_mask(chart.on_plane(p, q))
         a, b = mapping.replace(solved, p, 0.0), mapping.replace(solved, q, 0.0)
     mask = mapping.both(known, solved)
-    for i, (w, axis) in enumerate(zip(chart.to_ray(a, b, 1), (0.0, 0.0, 1.0), strict=True)):
-        rays[i] = mapping.replace(mask, w, axis)
-    solution[0], solution[1] = a, b
-    valid[:] = True if mask is None else mask > 0
+    x, y, z = chart.to_ray(a, b, 1)
+    _write(rays, block.here, (mapping.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0))))
+    _write(solution, block.here, (a, b))
+    if mask is not None:
+        valid[block.here] = mask > 0
     return left
+
+
+def _write(planes: Tensor | None, here: tuple, results: Iterable[Tensor]) -> None:
+    if planes is not None:
+        for plane, result in zip(planes, results, strict=True):
+            plane[here] = result
 
 
 class _Sums:
@@ -220,9 +241,10 @@ class _Sums:
         self.intrinsics = like.new_zeros(count, 4)
         self.lens = [like.new_zeros(count, 1) for _ in cameras.domain.lens.parameters] if self.wants_lens else []
 
-    def add_intrinsics(self, block: _Block, *planes: Tensor) -> None:
+    def add_intrinsics(self, block: _Block, gu: Tensor, gv: Tensor, x: Tensor, y: Tensor) -> None:
+        """gu, gv: the cotangents of pixels. x, y: the points on the plane of the lens."""
         if self.wants_intrinsics:
-            for i, plane in enumerate(planes):
+            for i, plane in enumerate((gu * x, gv * y, gu, gv)):
                 self.intrinsics[block.cameras, i] += plane.sum(-1)
 
     def add_lens(self, block: _Block, sums: list[Tensor]) -> None:
@@ -246,4 +268,4 @@ def _by_formulas(again: Callable, inputs: list[Tensor], needs_input_grad: tuple[
     wanted = [t for t, needed in zip(inputs, needs_input_grad, strict=False) if needed]
     result, _ = again(*inputs)
     gradients = iter(torch.autograd.grad(result, wanted, cotangent, create_graph=True, materialize_grads=True))
-    return *(next(gradients) if needed else None for needed in needs_input_grad[:3]), None, None
+    return *(next(gradients) if needed else None for needed in needs_input_grad[:3]), None, None, None

@@ -193,7 +193,8 @@ class Camera(Picture):
         )
         inputs = rows, intrinsics, distortion
         if not in_transform() and all(is_concrete(t) and not has_tangent(t) for t in inputs):
-            results = blockwise.apply(*inputs, self._cameras(intrinsics, distortion), by_formulas)
+            keeps = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+            results = blockwise.apply(*inputs, self._cameras(intrinsics, distortion), by_formulas, keeps)
         else:
             # what is compiled has no derivatives of derivatives
             results = by_formulas(*inputs, order=1 if torch.compiler.is_compiling() else 2)

@@ -37,6 +37,9 @@ class Chart:
     what it was made from, to first order: on a CPU autograd takes twice as long for the same.
     """
 
+    has_scale = True
+    """Whether the plane point is (x, y) times a `scale`."""
+
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Positive for the rays that this chart has a point for."""
         raise NotImplementedError
@@ -45,11 +48,19 @@ class Chart:
         """Whether rays with z >= nearest > 0 and no component larger than `extent` are certainly covered."""
         raise NotImplementedError
 
-    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
-        """The plane point of covered rays; the derivatives of that order shall be exact, on the axis too."""
-        raise NotImplementedError
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor | None:
+        """The factor by which (x, y) become the plane point, where that is all the chart does; see `to_plane`."""
+        return None
 
-    def pull_point(self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor) -> Planes3:
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
+        """The plane point of covered rays; the derivatives of that order shall be exact, on the axis too.
+
+        scale: that of these rays, where there is one and it is known already.
+        """
+        scale = self.scale(x, y, z, order) if scale is None else scale
+        return x * scale, y * scale
+
+    def pull_point(self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None) -> Planes3:
         """The cotangent of a covered ray, of the cotangent of its plane point."""
         return _pull(lambda *ray: self.to_plane(*ray, order=1), (x, y, z), (ga, gb))
 
@@ -113,14 +124,12 @@ class Perspective(Chart):
     def covers_all(self, nearest, extent, dtype):
         return self.end(dtype) * nearest > extent
 
-    def to_plane(self, x, y, z, order=2):
-        reciprocal = z.reciprocal()
-        return x * reciprocal, y * reciprocal
+    def scale(self, x, y, z, order=2):
+        return z.reciprocal()
 
-    def pull_point(self, x, y, z, ga, gb):
-        reciprocal = z.reciprocal()
-        gx, gy = ga * reciprocal, gb * reciprocal
-        return gx, gy, -torch.addcmul(gx * x, gy, y) * reciprocal
+    def pull_point(self, x, y, z, ga, gb, scale):
+        gx, gy = ga * scale, gb * scale
+        return gx, gy, torch.addcmul(gx * x, gy, y) * -scale
 
     def on_plane(self, a, b):
         return self.end(a.dtype) - torch.maximum(a.abs(), b.abs())
@@ -149,18 +158,16 @@ class Equidistant(Chart):
     def covers_all(self, nearest, extent, dtype):
         return True
 
-    def to_plane(self, x, y, z, order=2):
-        scale = angle_per_radius(x * x + y * y, z, order)
-        return x * scale, y * scale
+    def scale(self, x, y, z, order=2):
+        return angle_per_radius(torch.addcmul(x * x, y, y), z, order)
 
-    def pull_point(self, x, y, z, ga, gb):
+    def pull_point(self, x, y, z, ga, gb, scale):
         rho2 = torch.addcmul(x * x, y, y)
         along = torch.addcmul(ga * x, gb, y)
-        scale = angle_per_radius(rho2, z, 1)
-        per_square = 1 / torch.addcmul(rho2, z, z)
-        # twice the derivative of the scale by rho2; what cancels in it at the axis is multiplied by rho2
-        along_scale = along * (z * per_square - scale) / (rho2 + floor_of(z.dtype))
-        return torch.addcmul(ga * scale, x, along_scale), torch.addcmul(gb * scale, y, along_scale), -along * per_square
+        gz = -along / torch.addcmul(rho2, z, z)
+        # along times twice the derivative of the scale by rho2; what cancels at the axis is multiplied by rho2
+        outwards = torch.addcmul(gz * z, along, scale) / -(rho2 + floor_of(z.dtype))
+        return torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz
 
     def on_plane(self, a, b):
         return math.pi**2 - torch.addcmul(a * a, b, b)
@@ -191,13 +198,15 @@ def _half_turn(dtype: torch.dtype) -> float:
 class CylinderChart(Chart):
     """(longitude, height) = (atan2(x, z), y / hypot(x, z)). Every ray but straight up and down."""
 
+    has_scale = False
+
     def margin(self, x, y, z):
         return Perspective().end(y.dtype) * torch.maximum(x.abs(), z.abs()) - y.abs()
 
     def covers_all(self, nearest, extent, dtype):
         return Perspective().end(dtype) * nearest > extent
 
-    def to_plane(self, x, y, z, order=2):
+    def to_plane(self, x, y, z, order=2, scale=None):
         return torch.atan2(x, z), y * (x * x + z * z).rsqrt()
 
     def on_plane(self, a, b):
@@ -210,13 +219,15 @@ class CylinderChart(Chart):
 class SphereChart(Chart):
     """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))). Every ray but straight up and down."""
 
+    has_scale = False
+
     def margin(self, x, y, z):
         return x * x + z * z - floor_of(y.dtype)
 
     def covers_all(self, nearest, extent, dtype):
         return True
 
-    def to_plane(self, x, y, z, order=2):
+    def to_plane(self, x, y, z, order=2, scale=None):
         return torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())
 
     def on_plane(self, a, b):

@@ -106,9 +106,8 @@ class Domain:
         """That of the radial factor of the first stage, if it has one."""
         return RadialInverse(self.table) if self.lens.radial else None
 
-    def margin(self, a: Tensor, b: Tensor) -> Tensor:
-        """Positive for the plane points (C, N) in the domain."""
-        t = torch.addcmul(a * a, b, b)
+    def margin(self, a: Tensor, b: Tensor, t: Tensor) -> Tensor:
+        """Positive for the plane points (C, N) in the domain; t = a^2 + b^2."""
         inside = self.inner2 - t
         if self.lens.is_radial or (may_look(inside) and bool(inside.amin() > 0)):
             return inside
@@ -121,7 +120,7 @@ class Domain:
 def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
     """Positive where the lens is regular at the point itself, and its inverse has a derivative."""
     # nearer to zero the reciprocal could leave the floating-point range
-    return torch.nan_to_num(lens.sense(a, b), nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
+    return torch.nan_to_num(lens.at(a, b).sense, nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
 
 
 def _precise(k: Tensor) -> Tensor:

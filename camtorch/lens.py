@@ -1,8 +1,8 @@
 """Lenses: planar maps close to the identity, as a chain of stages with exact derivatives.
 
 A stage is built from coefficient columns that broadcast against planes of points. `Planar` holds everything that is
-polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor. Both know their Jacobian, how a
-cotangent passes back through them, and how far out they are certainly regular.
+polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor. What a stage is at points is in
+`local`; here is how far out it is certainly regular, and where its inverse starts.
 """
 
 from __future__ import annotations
@@ -14,12 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-Planes2 = tuple[Tensor, Tensor]
-Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
-
-
-def _total(plane: Tensor) -> Tensor:
-    return plane.sum(-1, keepdim=True)
+from camtorch.local import LensAt, PlanarAt, Planes2, TiltAt, total
 
 
 class Polynomial:
@@ -41,18 +36,20 @@ class Polynomial:
                     taylor[i] = taylor[i - 1]
                 else:
                     taylor[i] = torch.addcmul(taylor[i - 1], taylor[i], t)
-            taylor[0] = taylor[0] * t + c
+            # two columns in one operation would leave the vectorised loop
+            is_plane = isinstance(c, Tensor) and taylor[0] is not self.parameters[-1]
+            taylor[0] = torch.addcmul(c, taylor[0], t) if is_plane else taylor[0] * t + c
         return tuple(
             torch.zeros_like(t) if isinstance(x, float) else x if i < 2 else math.factorial(i) * x
             for i, x in enumerate(taylor)
         )
 
     def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient."""
+        """The sums over the points of dR/dc weight, for each coefficient c."""
         sums = []
         for _ in self.parameters:
             weight = weight * t
-            sums.append(_total(weight))
+            sums.append(total(weight))
         return sums
 
 
@@ -108,70 +105,9 @@ class Planar:
         """All coefficients, in the order in which `pull` gives their cotangents."""
         return *(self.radial.parameters if self.radial else ()), *self.tangential, *self.prism
 
-    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
-        t = a * a + b * b
-        return self._value(a, b, t, self.radial(t) if self.radial else None)
-
-    def _value(self, a: Tensor, b: Tensor, t: Tensor, factor: Tensor | None) -> Planes2:
-        u, v = (a, b) if factor is None else (a * factor, b * factor)
-        if self.tangential:
-            px, py = self.tangential
-            twice_dot = torch.addcmul(a * (2 * px), b, 2 * py)
-            u, v = torch.addcmul(u, a, twice_dot), torch.addcmul(v, b, twice_dot)
-        for i, w in enumerate((u, v)):
-            even = [self.tangential[i]] if self.tangential else []
-            if self.prism:
-                even = [self.prism[2 * i] + sum(even), self.prism[2 * i + 1]]
-            if even:
-                w = torch.addcmul(w, t, even[0] if len(even) == 1 else even[1] * t + even[0])
-            u, v = (w, v) if i == 0 else (u, w)
-        return u, v
-
-    def linearise(self, a: Tensor, b: Tensor) -> tuple[Planes2, Jacobian]:
-        """The value and its derivatives."""
-        t = a * a + b * b
-        if self.radial:
-            factor, slope = self.radial.derivatives(t, 1)
-            twice = 2 * slope
-            along_a, along_b = twice * a, twice * b
-            ua, ub, vb = torch.addcmul(factor, along_a, a), along_a * b, torch.addcmul(factor, along_b, b)
-        else:
-            factor, ub = None, torch.zeros_like(t)
-            ua = vb = torch.ones_like(t)
-        va = ub
-        if self.tangential:
-            px, py = (2 * p for p in self.tangential)
-            along_x, along_y = px * a, py * b
-            both = along_x + along_y
-            ua, vb = torch.add(ua + both, along_x, alpha=2), torch.add(vb + both, along_y, alpha=2)
-            ub = va = torch.addcmul(torch.addcmul(ub, b, px), a, py)
-        if self.prism:
-            s0, s1, s2, s3 = self.prism
-            gx, gy = (4 * s1) * t + 2 * s0, (4 * s3) * t + 2 * s2
-            ua, ub = torch.addcmul(ua, gx, a), torch.addcmul(ub, gx, b)
-            va, vb = torch.addcmul(va, gy, a), torch.addcmul(vb, gy, b)
-        return self._value(a, b, t, factor), (ua, ub, va, vb)
-
-    def sense(self, a: Tensor, b: Tensor, jacobian: Jacobian) -> Tensor:
-        """Positive where the map is defined, regular and not turned over, given its Jacobian there."""
-        sense = _sense(*jacobian)
-        if isinstance(self.radial, Rational):
-            sense = torch.minimum(sense, self.radial.denominator(a * a + b * b))
-        return sense
-
-    def pull(self, a: Tensor, b: Tensor, gu: Tensor, gv: Tensor) -> list[Tensor]:
-        """The cotangents of the parameters, summed over the points, of the cotangents gu, gv of the value."""
-        t = a * a + b * b
-        along = torch.addcmul(gu * a, gv, b)
-        sums = self.radial.pull(t, along) if self.radial else []
-        if self.tangential or self.prism:
-            gu, gv = gu * t, gv * t
-            even = _total(gu), _total(gv)
-        if self.tangential:
-            sums += [even[0] + 2 * _total(along * a), even[1] + 2 * _total(along * b)]
-        if self.prism:
-            sums += [even[0], _total(gu * t), even[1], _total(gv * t)]
-        return sums
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> PlanarAt:
+        """The stage at points; see `PlanarAt`."""
+        return PlanarAt(self, a, b, order, t)
 
     def certify(self, radius: Tensor) -> Planes2:
         """A lower bound of the eigenvalues of the Jacobian's symmetric part at that radius, and an upper bound of how
@@ -195,13 +131,8 @@ class Planar:
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
         """A point near the one that a stage without a radial factor sends to (u, v)."""
-        x, y = self(u, v)
+        x, y = self.at(u, v, order=0).value
         return 2 * u - x, 2 * v - y
-
-
-def _sense(ua: Tensor, ub: Tensor, va: Tensor, vb: Tensor) -> Tensor:
-    # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
-    return torch.minimum(ua * vb - ub * va, ua + vb)
 
 
 class Tilt:
@@ -217,40 +148,9 @@ class Tilt:
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
         self.parameters = (cy, sy * sx, -sy * cx, torch.zeros_like(cx), cx, sx, sy, -cy * sx, cy * cx)
 
-    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
-        _, _, r02, _, _, r12, _, _, _ = self.parameters
-        u, v, _ = self._seen(a, b)
-        return u - r02, v - r12
-
-    def _seen(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = self.parameters
-        reciprocal = 1 / (r20 * a + r21 * b + r22)
-        scale = r22 * reciprocal
-        return scale * (r00 * a + r01 * b + r02), scale * (r10 * a + r11 * b + r12), reciprocal
-
-    def linearise(self, a: Tensor, b: Tensor) -> tuple[Planes2, Jacobian]:
-        """The value and its derivatives."""
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = self.parameters
-        u, v, reciprocal = self._seen(a, b)
-        ua, ub = (r22 * r00 - u * r20) * reciprocal, (r22 * r01 - u * r21) * reciprocal
-        va, vb = (r22 * r10 - v * r20) * reciprocal, (r22 * r11 - v * r21) * reciprocal
-        return (u - r02, v - r12), (ua, ub, va, vb)
-
-    def sense(self, a: Tensor, b: Tensor, jacobian: Jacobian) -> Tensor:
-        """Positive where the map is defined, regular and not turned over, given its Jacobian there."""
-        *_, r20, r21, r22 = self.parameters
-        return torch.minimum(_sense(*jacobian), r20 * a + r21 * b + r22)
-
-    def pull(self, a: Tensor, b: Tensor, gu: Tensor, gv: Tensor) -> list[Tensor]:
-        """The cotangents of the nine entries of R, summed over the points."""
-        *_, r22 = self.parameters
-        u, v, reciprocal = self._seen(a, b)
-        gx, gy = gu * reciprocal, gv * reciprocal
-        depth = -(gx * u + gy * v)
-        sums = [_total(w * c) for w in (r22 * gx, r22 * gy, depth) for c in (a, b, torch.ones_like(a))]
-        sums[2], sums[5] = sums[2] - _total(gu), sums[5] - _total(gv)
-        sums[8] = sums[8] + _total(gu * u + gv * v) / r22
-        return sums
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> TiltAt:
+        """The stage at points."""
+        return TiltAt(self, a, b)
 
     def certify(self, radius: Tensor) -> Planes2:
         """See `Planar.certify`; here the bound is one of the sense itself."""
@@ -294,23 +194,11 @@ class Lens:
         return tuple(p for stage in self.stages for p in stage.parameters)
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
-        for stage in self.stages:
-            a, b = stage(a, b)
-        return a, b
+        return self.at(a, b, order=0).value
 
-    def trace(self, a: Tensor, b: Tensor) -> Trace:
-        """The lens at one point, with all its stages' derivatives."""
-        return Trace(self.stages, a, b)
-
-    def linearise(self, a: Tensor, b: Tensor) -> tuple[Planes2, Jacobian]:
-        """The value and the derivatives of the chain."""
-        trace = self.trace(a, b)
-        return trace.value, trace.jacobian
-
-    def sense(self, a: Tensor, b: Tensor) -> Tensor:
-        """The smallest sense of the stages: positive where the lens is defined, regular and not turned over."""
-        senses = [stage.sense(*point, jacobian) for stage, point, jacobian in self.trace(a, b).steps]
-        return torch.stack(senses).amin(0) if len(senses) > 1 else senses[0]
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> LensAt:
+        """The lens at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
+        return LensAt(self.stages, a, b, order, t)
 
     def certify(self, radius: Tensor) -> Tensor:
         """(*B, S) ascending radii: positive where the sense is positive on the whole circle."""
@@ -327,33 +215,3 @@ class Lens:
         for stage in reversed(self.stages[1:]):
             u, v = stage.start(u, v)
         return u, v
-
-
-class Trace:
-    """The stages of a lens at one point: each with the point that reaches it, and its Jacobian there."""
-
-    def __init__(self, stages: Sequence[Planar | Tilt], a: Tensor, b: Tensor):
-        self.steps: list[tuple[Planar | Tilt, Planes2, Jacobian]] = []
-        self.value = a, b
-        for stage in stages:
-            point = self.value
-            self.value, jacobian = stage.linearise(*point)
-            self.steps.append((stage, point, jacobian))
-
-    @property
-    def jacobian(self) -> Jacobian:
-        """Of the whole chain."""
-        chained = self.steps[0][2]
-        for _, _, (ua, ub, va, vb) in self.steps[1:]:
-            pa, pb, qa, qb = chained
-            chained = ua * pa + ub * qa, ua * pb + ub * qb, va * pa + vb * qa, va * pb + vb * qb
-        return chained
-
-    def pull(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
-        """The cotangents of the point and of the parameters, these summed over the points."""
-        sums: list[Tensor] = []
-        for stage, point, (ua, ub, va, vb) in reversed(self.steps):
-            if want_parameters:
-                sums = stage.pull(*point, gu, gv) + sums
-            gu, gv = torch.addcmul(ua * gu, va, gv), torch.addcmul(ub * gu, vb, gv)
-        return (gu, gv), sums

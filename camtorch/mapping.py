@@ -58,7 +58,7 @@ def to_mask(margin: Tensor | None) -> Tensor | None:
 
 
 def replace(mask: Tensor | None, plane: Tensor, value: float) -> Tensor:
-    """The plane where the mask is 1, and the value where it is 0."""
+    """The plane where the mask is 1, and the value where it is 0. Needs finite numbers in both places."""
     if mask is None:
         return plane
     return plane * mask if value == 0 else torch.lerp(plane.new_full((1, 1), value), plane, mask)
@@ -101,16 +101,19 @@ def both(*masks: Tensor | None) -> Tensor | None:
     return product
 
 
-def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int) -> Pixels:
+def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int, scale: Tensor | None = None) -> Pixels:
     """Where the lens sends a ray on its own plane, the centre if it sends it nowhere.
 
-    lens: it may carry a graph. domain: that of the same lens, without one.
+    lens: it may carry a graph. domain: that of the same lens, without one. scale: the chart's, if it is known.
     """
-    a, b = chart.to_plane(ray.x, ray.y, ray.z, order)
+    a, b = chart.to_plane(ray.x, ray.y, ray.z, order, scale)
     mask = ray.mask
     if lens.stages:
-        mask = both(mask, to_mask(domain.margin(a.detach(), b.detach())))
-        a, b = lens(replace(mask, a, 0.0), replace(mask, b, 0.0))
+        t = torch.addcmul(a * a, b, b)
+        inside = to_mask(domain.margin(a.detach(), b.detach(), t.detach()))
+        a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
+        a, b = lens.at(a, b, 0, t).value
+        mask = both(mask, inside)
     return Pixels(a, b, mask)
 
 

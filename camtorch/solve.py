@@ -14,7 +14,8 @@ from camtorch.parameters import may_look
 
 if TYPE_CHECKING:
     from camtorch.domain import Domain
-    from camtorch.lens import Jacobian, Lens
+    from camtorch.lens import Lens
+    from camtorch.local import Jacobian
 
 Planes2 = tuple[Tensor, Tensor]
 
@@ -78,8 +79,8 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
         a, b = a * scale, b * scale
     short2 = _short(u) ** 2
     for count in range(1, _MOST_STEPS + 1):
-        value, jacobian = domain.lens.linearise(a, b)
-        da, db = newton_step(jacobian, u - value[0], v - value[1])
+        at = domain.lens.at(a, b)
+        da, db = newton_step(at.jacobian, u - at.value[0], v - at.value[1])
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
         settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
@@ -129,7 +130,8 @@ class _Search:
 
     def __call__(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, b = self.radial(u, v) if self.lens.is_radial else self.planar(u, v)
-        (x, y), jacobian = self.lens.linearise(a, b)
+        at = self.lens.at(a, b)
+        (x, y), jacobian = at.value, at.jacobian
         valid = self.contains(a, b)
         stretch = torch.maximum(jacobian[0].abs() + jacobian[1].abs(), jacobian[2].abs() + jacobian[3].abs())
         stretch = stretch * torch.maximum(a.abs(), b.abs())
@@ -195,7 +197,8 @@ class _Search:
 
         Returns the points, and which of them would still move.
         """
-        value, jacobian = self.lens.linearise(a, b)
+        at = self.lens.at(a, b)
+        value, jacobian = at.value, at.jacobian
         enough = rounding(u, v) / 8
         length = torch.ones_like(u)
         for step_number in range(steps + 1):
@@ -205,7 +208,8 @@ class _Search:
                 break
             step = newton_step(jacobian, *miss)
             trial = a + length * step[0], b + length * step[1]
-            trial_value, trial_jacobian = self.lens.linearise(*trial)
+            at = self.lens.at(*trial)
+            trial_value, trial_jacobian = at.value, at.jacobian
             ahead = newton_step(jacobian, u - trial_value[0], v - trial_value[1])
             nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < step[0] * step[0] + step[1] * step[1]
             good = active & nearer & self.contains(*trial)
@@ -253,7 +257,7 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
     """
     a, b = solution
     with torch.no_grad():
-        jacobian = [w.detach() for w in lens.linearise(a, b)[1]]
+        jacobian = [w.detach() for w in lens.at(a, b).jacobian]
     for _ in range(steps):
         x, y = lens(a, b)
         da, db = newton_step(jacobian, target[0] - x, target[1] - y)

@@ -1,0 +1,196 @@
+"""A lens at points: its value, its Jacobian, and how cotangents pass back, of what they have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from camtorch.lens import Planar, Tilt
+
+Planes2 = tuple[Tensor, Tensor]
+Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
+
+
+def total(plane: Tensor) -> Tensor:
+    """(*B, N) -> (*B, 1)."""
+    return plane.sum(-1, keepdim=True)
+
+
+def _sense(jacobian: Jacobian) -> Tensor:
+    ua, ub, va, vb = jacobian
+    # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
+    return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
+
+
+class PlanarAt:
+    """A `Planar` stage at points m = (a, b)."""
+
+    def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
+        """order: 1 if any derivative will be asked for. t: |m|^2, if it is known."""
+        self.stage, self.a, self.b = stage, a, b
+        self.t = torch.addcmul(a * a, b, b) if t is None else t
+        if stage.radial:
+            self.factor, *slope = stage.radial.derivatives(self.t, order)
+            self.slope = slope[0] if order else None
+        if stage.tangential:
+            px, py = stage.tangential
+            self.twice_dot = torch.addcmul(a * (2 * px), b, 2 * py)
+
+    @property
+    def value(self) -> Planes2:
+        stage = self.stage
+        value = [self.a * self.factor, self.b * self.factor] if stage.radial else [self.a, self.b]
+        for i, m in enumerate((self.a, self.b)):
+            even = stage.tangential[i] if stage.tangential else 0
+            if stage.tangential:
+                value[i] = torch.addcmul(value[i], m, self.twice_dot)
+            if stage.prism:
+                even = (even + stage.prism[2 * i]) + stage.prism[2 * i + 1] * self.t
+            if stage.tangential or stage.prism:
+                value[i] = torch.addcmul(value[i], even, self.t)
+        return value[0], value[1]
+
+    @property
+    def jacobian(self) -> Jacobian:
+        stage, a, b, t = self.stage, self.a, self.b, self.t
+        if stage.radial:
+            twice = 2 * self.slope
+            along_a, along_b = twice * a, twice * b
+            ua, vb = torch.addcmul(self.factor, along_a, a), torch.addcmul(self.factor, along_b, b)
+            ub = va = along_a * b
+        else:
+            ua = vb = torch.ones_like(t)
+            ub = va = torch.zeros_like(t)
+        if stage.tangential:
+            px, py = (2 * p for p in stage.tangential)
+            # the gradient of (p . m) t: its Jacobian is symmetric
+            ua = torch.addcmul(ua + self.twice_dot, a, 2 * px)
+            vb = torch.addcmul(vb + self.twice_dot, b, 2 * py)
+            ub = va = torch.addcmul(torch.addcmul(ub, b, px), a, py)
+        if stage.prism:
+            s0, s1, s2, s3 = stage.prism
+            gx, gy = (4 * s1) * t + 2 * s0, (4 * s3) * t + 2 * s2
+            ua, ub = torch.addcmul(ua, gx, a), torch.addcmul(ub, gx, b)
+            va, vb = torch.addcmul(va, gy, a), torch.addcmul(vb, gy, b)
+        return ua, ub, va, vb
+
+    @property
+    def sense(self) -> Tensor:
+        """Positive where the map is defined, regular and not turned over."""
+        sense = _sense(self.jacobian)
+        denominator = getattr(self.stage.radial, "denominator", None)
+        return sense if denominator is None else torch.minimum(sense, denominator(self.t))
+
+    def pull(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of the point and of the parameters, these summed over the points."""
+        stage, a, b, t = self.stage, self.a, self.b, self.t
+        along = torch.addcmul(gu * a, gv, b)
+        ga, gb = (gu * self.factor, gv * self.factor) if stage.radial else (gu, gv)
+        # what goes along m
+        outwards = along * self.slope * 2 if stage.radial else torch.zeros_like(t)
+        if stage.tangential:
+            px, py = (2 * p for p in stage.tangential)
+            outwards = torch.addcmul(torch.addcmul(outwards, gu, px), gv, py)
+            ga = torch.addcmul(torch.addcmul(ga, gu, self.twice_dot), along, px)
+            gb = torch.addcmul(torch.addcmul(gb, gv, self.twice_dot), along, py)
+        if stage.prism:
+            s0, s1, s2, s3 = stage.prism
+            outwards = torch.addcmul(outwards, gu, (4 * s1) * t + 2 * s0)
+            outwards = torch.addcmul(outwards, gv, (4 * s3) * t + 2 * s2)
+        point = torch.addcmul(ga, a, outwards), torch.addcmul(gb, b, outwards)
+        if not want_parameters:
+            return point, []
+        sums = stage.radial.pull(t, along) if stage.radial else []
+        if stage.tangential or stage.prism:
+            gu, gv = gu * t, gv * t
+            even = total(gu), total(gv)
+        if stage.tangential:
+            sums += [even[0] + 2 * total(along * a), even[1] + 2 * total(along * b)]
+        if stage.prism:
+            sums += [even[0], total(gu * t), even[1], total(gv * t)]
+        return point, sums
+
+
+class TiltAt:
+    """A `Tilt` stage at points."""
+
+    def __init__(self, stage: Tilt, a: Tensor, b: Tensor):
+        self.stage, self.a, self.b = stage, a, b
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = stage.parameters
+        self.depth = r20 * a + r21 * b + r22
+        self.reciprocal = 1 / self.depth
+        scale = r22 * self.reciprocal
+        self.u, self.v = scale * (r00 * a + r01 * b + r02), scale * (r10 * a + r11 * b + r12)
+
+    @property
+    def value(self) -> Planes2:
+        _, _, r02, _, _, r12, _, _, _ = self.stage.parameters
+        return self.u - r02, self.v - r12
+
+    @property
+    def jacobian(self) -> Jacobian:
+        r00, r01, _, r10, r11, _, r20, r21, r22 = self.stage.parameters
+        ua, ub = r22 * r00 - self.u * r20, r22 * r01 - self.u * r21
+        va, vb = r22 * r10 - self.v * r20, r22 * r11 - self.v * r21
+        return tuple(w * self.reciprocal for w in (ua, ub, va, vb))
+
+    @property
+    def sense(self) -> Tensor:
+        """Positive where the map is defined, regular and not turned over."""
+        return torch.minimum(_sense(self.jacobian), self.depth)
+
+    def pull(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of the point and of the nine entries of R, these summed over the points."""
+        ua, ub, va, vb = self.jacobian
+        point = torch.addcmul(ua * gu, va, gv), torch.addcmul(ub * gu, vb, gv)
+        if not want_parameters:
+            return point, []
+        r22 = self.stage.parameters[-1]
+        gx, gy = gu * self.reciprocal, gv * self.reciprocal
+        by_depth = -(gx * self.u + gy * self.v)
+        sums = [total(w * c) for w in (r22 * gx, r22 * gy, by_depth) for c in (self.a, self.b, torch.ones_like(self.a))]
+        sums[2], sums[5] = sums[2] - total(gu), sums[5] - total(gv)
+        sums[8] = sums[8] + total(gu * self.u + gv * self.v) / r22
+        return point, sums
+
+
+class LensAt:
+    """A chain of stages at points."""
+
+    def __init__(self, stages: Sequence[Planar | Tilt], a: Tensor, b: Tensor, order: int, t: Tensor | None):
+        self.stages: list[PlanarAt | TiltAt] = []
+        self.value = a, b
+        for stage in stages:
+            here = stage.at(*self.value, order, None if self.stages else t)
+            self.stages.append(here)
+            self.value = here.value
+
+    @property
+    def jacobian(self) -> Jacobian:
+        """Of the whole chain."""
+        chained = self.stages[0].jacobian
+        for stage in self.stages[1:]:
+            ua, ub, va, vb = stage.jacobian
+            pa, pb, qa, qb = chained
+            chained = ua * pa + ub * qa, ua * pb + ub * qb, va * pa + vb * qa, va * pb + vb * qb
+        return chained
+
+    @property
+    def sense(self) -> Tensor:
+        """The smallest of the stages: positive where the lens is defined, regular and not turned over."""
+        least = self.stages[0].sense
+        for stage in self.stages[1:]:
+            least = torch.minimum(least, stage.sense)
+        return least
+
+    def pull(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of the point and of the parameters, these summed over the points."""
+        sums: list[Tensor] = []
+        for stage in reversed(self.stages):
+            (gu, gv), here = stage.pull(gu, gv, want_parameters)
+            sums = here + sums
+        return (gu, gv), sums
