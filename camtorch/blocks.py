@@ -205,7 +205,7 @@ def _unproject_block(block: _Block, pixels: Tensor, rays: Tensor, solution: Tens
         solved = mapping.to_mask(found.solved)
         a, b = mapping.clean(solved, found)
         if solved is not None:
-            camera, point = (mapping.indicator(found.possible) > solved).nonzero(as_tuple=True)
+            camera, point = ((found.possible > 0) & ~(solved > 0)).nonzero(as_tuple=True)
             if len(camera):
                 left = (
                     camera + block.cameras.start,

@@ -13,7 +13,7 @@ from camtorch.blocks import Cameras, Project, Unproject
 from camtorch.charts import Chart
 from camtorch.domain import Domain
 from camtorch.lens import Lens
-from camtorch.opaque import search_open, tables
+from camtorch.opaque import finish, positive, tables, to_planes, without_keeping
 from camtorch.parameters import (
     Memo,
     as_batch,
@@ -138,16 +138,19 @@ class Camera(Picture):
 
     def _project_by_formulas(self, points: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
         intrinsics, distortion, domain, usable = self._traced(points, intrinsics, distortion)
-        chart, lens = self.optics(columns(distortion))
-        ray = mapping.to_ray(chart, *(plane.contiguous() for plane in points.unbind(-1)))
-        a, b, mask = mapping.see(ray, chart, lens, domain, order)
-        mask = mapping.both(mask, usable)
-        focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
-        pixels = (
-            mapping.replace(mask, w, mapping.INVALID_PIXEL) for w in (focal_x * a + centre_x, focal_y * b + centre_y)
-        )
-        pixels = torch.stack(tuple(pixels))
-        return pixels, _valid(mask, pixels[0])
+        chart = domain.chart
+
+        def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
+            ray = mapping.to_ray(chart, x, y, z)
+            a, b, mask = mapping.see(ray, chart, self.optics(columns(distortion))[1], domain, order)
+            mask = mapping.both(mask, usable)
+            focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
+            pixels = focal_x * a + centre_x, focal_y * b + centre_y
+            pixels = torch.stack([mapping.replace(mask, w, mapping.INVALID_PIXEL) for w in pixels])
+            return pixels, torch.ones_like(pixels[0]) if mask is None else mask.expand_as(pixels[0])
+
+        pixels, mask = without_keeping(evaluate, *to_planes(points), intrinsics, distortion)
+        return pixels, positive(mask)
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -164,24 +167,29 @@ class Camera(Picture):
 
     def _unproject_by_formulas(self, pixels: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
         intrinsics, distortion, domain, usable = self._traced(pixels, intrinsics, distortion)
-        chart, lens = self.optics(columns(distortion))
-        target = mapping.to_target(*(plane.contiguous() for plane in pixels.unbind(-1)), columns(intrinsics))
-        mask = mapping.both(target.mask, usable)
-        p, q = (mapping.replace(mask, w, 0.0) for w in target[:2])
-        p_0, q_0 = p.detach(), q.detach()
-        if lens.stages:
-            found = invert(domain, p_0, q_0)
-            a, b, solved = search_open(self._model, domain.k, p_0, q_0, *found)
-            solved = mapping.to_mask(solved)
-            solution = mapping.clean(solved, found._replace(a=a, b=b))
+        chart = domain.chart
+        u, v = to_planes(pixels)
+        p, q, mask = mapping.to_target(u.detach(), v.detach(), columns(intrinsics.detach()))
+        mask = mapping.both(mask, usable)
+        p, q = mapping.replace(mask, p, 0.0), mapping.replace(mask, q, 0.0)
+        if domain.lens.stages:
+            found = finish(self._model, domain.k, p, q, invert(domain, p, q))
+            solved = mapping.to_mask(found.solved)
+            solution = mapping.clean(solved, found)
         else:
-            solved = mapping.to_mask(chart.on_plane(p_0, q_0))
-            solution = p_0, q_0
+            solved = mapping.to_mask(chart.on_plane(p, q))
+            solution = mapping.replace(solved, p, 0.0), mapping.replace(solved, q, 0.0)
         mask = mapping.both(mask, solved)
+
+        def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
+            target = mapping.to_target(u, v, columns(intrinsics))
+            lens = self.optics(columns(distortion))[1]
+            return torch.stack(mapping.rays_of(solution, target[:2], mask, chart, lens, order))
+
         if torch.compiler.is_compiling() and not any(t.requires_grad for t in (pixels, intrinsics, distortion)):
             order = 0
-        rays = torch.stack(mapping.rays_of(solution, (p, q), mask, chart, lens, order))
-        return rays, _valid(mask, rays[0])
+        rays = without_keeping(evaluate, u, v, intrinsics, distortion)
+        return rays, positive(torch.ones_like(p) if mask is None else mask.expand_as(p))
 
     # -- how both are evaluated
 
@@ -223,14 +231,14 @@ class Camera(Picture):
             cameras = self._cameras(intrinsics, distortion)
             domain, usable = cameras.domain, cameras.usable
         else:
-            mask = _usable(intrinsics.detach(), distortion.detach())
-            usable = mask.to(rows.dtype)
-            k = torch.where(mask, distortion.detach(), 0.0)
+            finite = _usable(intrinsics.detach(), distortion.detach())
+            usable = finite.to(rows.dtype)
+            k = torch.where(finite, distortion.detach(), 0.0)
             domain = Domain(self.optics, k)
             if domain.lens.stages:
                 domain.with_tables(*tables(self._model, k))
         if usable is not None:
-            intrinsics, distortion = torch.where(usable > 0, intrinsics, 1.0), torch.where(usable > 0, distortion, 0.0)
+            intrinsics, distortion = (torch.where(usable > 0, t, w) for t, w in ((intrinsics, 1.0), (distortion, 0.0)))
         return intrinsics, distortion, domain, usable
 
     @property
@@ -300,7 +308,3 @@ def _usable(intrinsics: Tensor, distortion: Tensor) -> Tensor:
     """Bool (C, 1): finite, and with focal lengths that are positive."""
     finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
     return (finite & (intrinsics[..., :2] > 0).all(-1)).unsqueeze(-1)
-
-
-def _valid(mask: Tensor | None, like: Tensor) -> Tensor:
-    return torch.ones_like(like, dtype=torch.bool) if mask is None else (mask > 0).expand_as(like)

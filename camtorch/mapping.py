@@ -38,7 +38,7 @@ class Ray(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """What a projection gives: the pixel, and a mask of 0 and 1, or None where all are valid."""
+    """Pixels, and the mask of those that count, or None where all do."""
 
     u: Tensor
     v: Tensor
@@ -46,8 +46,15 @@ class Pixels(NamedTuple):
 
 
 def indicator(margin: Tensor) -> Tensor:
-    """1 where the margin is positive, 0 elsewhere. Of the same dtype: on a CPU that is five times as fast as bool."""
-    return margin.detach().nan_to_num(-1.0).relu().sign()
+    """The mask of where a margin is positive: 1 and 0 of the same dtype.
+
+    On a CPU comparing, selecting and combining numbers takes a fifth of the time that it takes with bools, and
+    compiled code writes bools one by one.
+    """
+    margin = margin.detach()
+    if torch.compiler.is_compiling():
+        return (margin > 0).to(margin.dtype)
+    return margin.nan_to_num(-1.0).relu().sign()
 
 
 def to_mask(margin: Tensor | None) -> Tensor | None:
@@ -61,44 +68,58 @@ def replace(mask: Tensor | None, plane: Tensor, value: float) -> Tensor:
     """The plane where the mask is 1, and the value where it is 0. Needs finite numbers in both places."""
     if mask is None:
         return plane
+    if torch.compiler.is_compiling():
+        return torch.where(mask > 0, plane, value)
     return plane * mask if value == 0 else torch.lerp(plane.new_full((1, 1), value), plane, mask)
+
+
+def both(*masks: Tensor | None) -> Tensor | None:
+    """Where all masks are 1."""
+    product = None
+    for mask in masks:
+        if mask is not None:
+            product = mask if product is None else product * mask
+    return product
 
 
 def to_ray(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> Ray:
     """Points as rays that the chart covers."""
-    shrink = margin = None
+    shrink = valid = None
     if may_look(x):
         bounds = [float(bound) for plane in (x, y, z) for bound in plane.detach().aminmax()]
         extent, near = max(map(abs, bounds)), bounds[4]
         if extent < _LARGE and near > _SMALL and chart.covers_all(near, extent, x.dtype):
             return Ray(x, y, z, None, None)
-    sides = [plane.detach().abs() for plane in (x, y, z)]
-    size = torch.maximum(torch.maximum(*sides[:2]), sides[2])
+    x_0, y_0, z_0 = (plane.detach() for plane in (x, y, z))
+    size = torch.maximum(torch.maximum(x_0.abs(), y_0.abs()), z_0.abs())
     if not (may_look(size) and float(size.amin()) > _SMALL and float(size.amax()) < _LARGE):
         # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
-        known = (size > floor_of(size.dtype)) & (size < torch.inf)
+        valid = ((size > floor_of(size.dtype)) & (size < torch.inf)).to(size.dtype)
         # a constant: the projection does not depend on the distance, so this has no part in its derivative
-        shrink = _power_of_two(torch.where(known, size, 1.0)).reciprocal()
-        x, y, z = (torch.where(known, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
-        margin = known.to(size.dtype) - 0.5
-    covered = chart.margin(x.detach(), y.detach(), z.detach())
-    mask = to_mask(covered if margin is None else torch.minimum(covered, margin))
+        shrink = as_kept(_power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
+        x_0, y_0, z_0 = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x_0, 0.0), (y_0, 0.0), (z_0, 1.0)))
+        x, y, z = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+    mask = both(valid, to_mask(chart.margin(x_0, y_0, z_0)))
+    mask = as_kept(mask)
     return Ray(replace(mask, x, 0.0), replace(mask, y, 0.0), replace(mask, z, 1.0), shrink, mask)
+
+
+def as_kept(plane: Tensor | None) -> Tensor | None:
+    """The plane, for inductor to compute once: it repeats the whole expression of what is used twice while it compiles.
+
+    That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
+    """
+    if plane is None or not torch.compiler.is_compiling():
+        return plane
+    return torch.as_strided(plane, plane.shape, plane.stride())
 
 
 def _power_of_two(size: Tensor) -> Tensor:
     """The largest one not above: to divide by it costs no bit."""
+    if torch.compiler.is_compiling():  # which leaves its vectors for bits
+        return size
     exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
     return (size.view(integer) & exponent).view(size.dtype)
-
-
-def both(*masks: Tensor | None) -> Tensor | None:
-    """Where all masks are 1."""
-    some = [mask for mask in masks if mask is not None]
-    product = None
-    for mask in some:
-        product = mask if product is None else product * mask
-    return product
 
 
 def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int, scale: Tensor | None = None) -> Pixels:
@@ -110,7 +131,7 @@ def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int, scale: T
     mask = ray.mask
     if lens.stages:
         t = torch.addcmul(a * a, b, b)
-        inside = to_mask(domain.margin(a.detach(), b.detach(), t.detach()))
+        inside = as_kept(to_mask(domain.margin(a.detach(), b.detach(), t.detach())))
         a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
         a, b = lens.at(a, b, 0, t).value
         mask = both(mask, inside)
@@ -125,17 +146,17 @@ def to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> Pixels:
     limit = torch.finfo(far.dtype).max ** 0.25
     if may_look(far) and float(far.amax()) < limit:
         return Pixels(p, q, None)
-    known = far < limit
-    mask = known.to(far.dtype)
-    p, q = ((torch.where(known, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
+    mask = (far < limit).to(far.dtype)
+    p, q = ((torch.where(mask > 0, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
     return Pixels(p, q, mask)
 
 
 def clean(mask: Tensor | None, found: Found) -> Planes2:
     """The solved points; the centre for the others, which may have run away."""
-    if mask is None:
-        return found.a, found.b
-    return tuple((plane * mask).nan_to_num(0.0, 0.0, 0.0) for plane in (found.a, found.b))
+    planes = replace(mask, found.a, 0.0), replace(mask, found.b, 0.0)
+    if mask is None or torch.compiler.is_compiling():
+        return planes
+    return planes[0].nan_to_num(0.0, 0.0, 0.0), planes[1].nan_to_num(0.0, 0.0, 0.0)
 
 
 def rays_of(solution: Planes2, target: Planes2, mask: Tensor | None, chart: Chart, lens: Lens, order: int) -> Planes3:

@@ -5,13 +5,19 @@ As operators of their own they keep compiled graphs small, and look at values in
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from camtorch.azimuths import AZIMUTHS
 from camtorch.domain import Domain, Optics, table_width
 from camtorch.parameters import columns, same
-from camtorch.solve import search
+from camtorch.solve import Found, search
+
+Result = TypeVar("Result")
 
 MODELS: dict[str, Optics] = {}
 """The optics of every class of cameras, by its full name: operators take no functions."""
@@ -53,18 +59,33 @@ def _(model, k):
     return tuple(k.new_empty(len(k), width) for width in widths)
 
 
-@torch.library.custom_op("camtorch::search", mutates_args=())
-def search_open(
+@torch.library.custom_op("camtorch::search_", mutates_args=("a", "b", "solved"))
+def search_in_place(
     model: str, k: Tensor, u: Tensor, v: Tensor, a: Tensor, b: Tensor, solved: Tensor, possible: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(a, b, solved) of `Found`, and what `search` finds of the points (C, N) that are not solved, but possible."""
-    a, b, solved = a.clone(), b.clone(), solved.clone()
+) -> None:
+    """Write into (a, b, solved) of `Found` what `search` finds of the points (C, N) not solved, but possible."""
+    if not solved.numel() or bool(solved.amin() > 0):
+        return
     camera, point = (~(solved > 0) & (possible > 0)).nonzero(as_tuple=True)
     if len(camera):
         found_a, found_b, found = search(_domain(model, k), camera, u[camera, point], v[camera, point])
         a[camera, point], b[camera, point] = found_a, found_b
         solved[camera, point] = torch.where(found, 1.0, -1.0).to(solved.dtype)
-    return a, b, solved
+
+
+@torch.library.custom_op("camtorch::search", mutates_args=())
+def search_open(
+    model: str, k: Tensor, u: Tensor, v: Tensor, a: Tensor, b: Tensor, solved: Tensor, possible: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`search_in_place` into copies: vmap has no rule for what writes."""
+    results = a.clone(), b.clone(), solved.clone()
+    search_in_place(model, k, u, v, *results, possible)
+    return results
+
+
+@search_in_place.register_fake
+def _(model, k, u, v, a, b, solved, possible):
+    pass
 
 
 @search_open.register_fake
@@ -90,3 +111,68 @@ def _(info, in_dims, model, k, *planes):
     if cameras:
         return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
     return tuple(r.unflatten(1, (info.batch_size, -1)) for r in results), (1, 1, 1)
+
+
+@torch.library.custom_op("camtorch::to_planes", mutates_args=())
+def _to_planes(rows: Tensor) -> Tensor:
+    planes = rows.new_empty(rows.shape[-1], *rows.shape[:-1])
+    for plane, interleaved in zip(planes, rows.unbind(-1), strict=True):
+        torch.sub(interleaved, 0, out=plane)  # twice as fast as a copy, and bit for bit the same
+    return planes
+
+
+@_to_planes.register_fake
+def _(rows):
+    return rows.new_empty(rows.shape[-1], *rows.shape[:-1])
+
+
+@torch.library.custom_op("camtorch::to_rows", mutates_args=())
+def _to_rows(planes: Tensor) -> Tensor:
+    return torch.stack(planes.unbind(0), -1)
+
+
+@_to_rows.register_fake
+def _(planes):
+    return planes.new_empty(*planes.shape[1:], len(planes))
+
+
+_to_planes.register_autograd(lambda ctx, cotangent: _to_rows(cotangent))
+_to_rows.register_autograd(lambda ctx, cotangent: _to_planes(cotangent))
+
+
+def to_planes(rows: Tensor) -> tuple[Tensor, ...]:
+    """(C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
+    interleaved = torch.compiler.is_compiling() and rows.device.type == "cpu" and rows.stride(-2) != 1
+    return (_to_planes(rows) if interleaved else rows.movedim(-1, 0)).unbind(0)
+
+
+@torch.library.custom_op("camtorch::positive", mutates_args=())
+def _positive(mask: Tensor) -> Tensor:
+    return mask > 0
+
+
+@_positive.register_fake
+def _(mask):
+    return torch.empty_like(mask, dtype=torch.bool)
+
+
+def positive(mask: Tensor) -> Tensor:
+    """The mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
+    compiled = torch.compiler.is_compiling() and mask.device.type == "cpu"
+    return _positive(mask.detach()) if compiled else mask > 0
+
+
+def finish(model: str, k: Tensor, u: Tensor, v: Tensor, found: Found) -> Found:
+    """What was found, and what `search` finds of the rest."""
+    if torch.compiler.is_compiling():
+        search_in_place(model, k, u, v, *found)
+        return found
+    a, b, solved = search_open(model, k, u, v, *found)
+    return Found(a, b, solved, found.possible)
+
+
+def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
+    """`function(*inputs)`; where it is compiled, backward computes it again from the inputs instead of keeping planes."""
+    if torch.compiler.is_compiling() and torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+        return checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
+    return function(*inputs)
