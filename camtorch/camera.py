@@ -195,10 +195,7 @@ class Camera(Picture):
 
     def _map(self, blockwise, by_formulas, rows: Tensor, lead: torch.Size, restore) -> tuple[Tensor, Tensor]:
         """Rows (C, N, size) by blocks, or by formulas that are traced: compiled, or by a transform of torch.func."""
-        count = rows.shape[0]
-        intrinsics, distortion = (
-            t.to(rows.dtype).expand(*lead, t.shape[-1]).reshape(count, t.shape[-1]) for t in self._tensors
-        )
+        intrinsics, distortion = (_per_row(t, lead, rows) for t in self._tensors)
         inputs = rows, intrinsics, distortion
         if not in_transform() and all(is_concrete(t) and not has_tangent(t) for t in inputs):
             keeps = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
@@ -250,7 +247,8 @@ class Camera(Picture):
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the parameters."""
-        return torch.broadcast_shapes(self.intrinsics.shape[:-1], self.distortion.shape[:-1])
+        shapes = self.intrinsics.shape[:-1], self.distortion.shape[:-1]
+        return shapes[0] if shapes[0] == shapes[1] else torch.broadcast_shapes(*shapes)
 
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name for it)
@@ -308,3 +306,13 @@ def _usable(intrinsics: Tensor, distortion: Tensor) -> Tensor:
     """Bool (C, 1): finite, and with focal lengths that are positive."""
     finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
     return (finite & (intrinsics[..., :2] > 0).all(-1)).unsqueeze(-1)
+
+
+def _per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
+    """(*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
+    if parameters.dtype != rows.dtype:
+        parameters = parameters.to(rows.dtype)
+    if not lead:
+        return parameters.unsqueeze(0)
+    count = parameters.shape[-1]
+    return parameters.expand(*lead, count).reshape(len(rows), count)

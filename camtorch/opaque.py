@@ -172,7 +172,7 @@ def finish(model: str, k: Tensor, u: Tensor, v: Tensor, found: Found) -> Found:
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
-    """`function(*inputs)`; where it is compiled, backward computes it again from the inputs instead of keeping planes."""
+    """`function(*inputs)`; where that is compiled, backward computes it again from the inputs, which alone are kept."""
     if torch.compiler.is_compiling() and torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         return checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
     return function(*inputs)

@@ -120,7 +120,7 @@ def is_concrete(tensor: Tensor) -> bool:
 
 def may_look(tensor: Tensor) -> bool:
     """Whether the values may be looked at and that costs next to nothing, to take a shorter way with a whole block."""
-    return tensor.device.type == "cpu" and tensor.numel() > 0 and is_concrete(tensor)
+    return tensor.is_cpu and is_concrete(tensor) and tensor.numel() > 0
 
 
 def as_real(value, name: str, owner: str) -> Tensor:
@@ -238,7 +238,7 @@ def as_rows(
     try:
         if len(lead) < len(batch) or values.ndim <= len(batch):
             raise RuntimeError
-        lead = torch.broadcast_shapes(lead, batch)
+        lead = lead if lead == batch else torch.broadcast_shapes(lead, batch)
     except RuntimeError:
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}") from None
     rows = values.to(working_dtype(values, *parameters))

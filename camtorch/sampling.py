@@ -8,6 +8,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch.memory import empty
+from camtorch.parameters import in_graph, in_transform, is_concrete
+
 # Between two pixel centres the interpolation is a polynomial; as many nodes determine it
 _NODES = {"nearest": (), "bilinear": (0.0, 1.0), "bicubic": (0.0, 1 / 3, 2 / 3, 1.0)}
 MODES = tuple(_NODES)
@@ -28,14 +31,46 @@ def sample(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor
         and stay in their range, bool is true from one half on.
     """
     dtype = images.dtype
+    if not dtype.is_floating_point:
+        images, grid = images.detach(), grid.detach()
+    plain = images.is_cpu and not any(in_graph(t) for t in (images, grid)) and not in_transform()
+    if plain or not dtype.is_floating_point:
+        return (_sample_in_parts if plain else _sample_part)(images, grid, mode, padding_mode)
+    wide = torch.promote_types(dtype, torch.float32)
+    images, grid = images.to(wide), grid.to(wide)
+    if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
+        return F.grid_sample(images, grid, mode, padding_mode, align_corners=False).to(dtype)
+    return _Sample.apply(images, grid, mode, padding_mode).to(dtype)
+
+
+def _sample_in_parts(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
+    """As many pictures at a time as there are threads, or rows of one picture: grid_sample has one thread for each.
+
+    What a part needs beside its result, such as uint8 pictures as floats, stays in the cache.
+    """
+    (count, channels), (height, width), threads = images.shape[:2], grid.shape[1:3], torch.get_num_threads()
+    result = empty((count, channels, height, width), images)
+    whole = count // threads * threads
+    for start in range(0, whole, threads):
+        part = slice(start, start + threads)
+        result[part] = _sample_part(images[part], grid[part], mode, padding_mode)
+    tile = max(height // threads, 1)
+    rows = tile * (height // tile)
+    for i in range(whole, count):
+        tiles = grid[i, :rows].unflatten(0, (-1, tile))
+        sampled = _sample_part(images[i].expand(len(tiles), -1, -1, -1), tiles, mode, padding_mode)
+        result[i, :, :rows].unflatten(1, (-1, tile)).copy_(sampled.movedim(0, 1))
+        if rows < height:
+            result[i, :, rows:] = _sample_part(images[i : i + 1], grid[i : i + 1, rows:], mode, padding_mode)[0]
+    return result
+
+
+def _sample_part(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
+    dtype = images.dtype
     # wide enough that every value, a class id too, is exact
     wide = torch.float64 if not dtype.is_floating_point and dtype.itemsize > 2 else torch.float32
     images = images.to(torch.promote_types(dtype, wide) if dtype.is_floating_point else wide)
-    grid = grid.to(images.dtype)
-    if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
-        result = F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
-    else:
-        result = _Sample.apply(images, grid, mode, padding_mode)
+    result = F.grid_sample(images, grid.to(images.dtype), mode, padding_mode, align_corners=False)
     if dtype == torch.bool:
         return result >= 0.5
     if not dtype.is_floating_point:
@@ -53,6 +88,8 @@ class _Sample(torch.autograd.Function):
 
     @staticmethod
     def forward(images, grid, mode, padding_mode):
+        if images.is_cpu and is_concrete(images) and is_concrete(grid):
+            return _sample_in_parts(images, grid, mode, padding_mode)
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
 
     @staticmethod
