@@ -16,7 +16,6 @@ from torch.autograd import Function
 
 from camtorch import mapping
 from camtorch.domain import Domain
-from camtorch.memory import empty
 from camtorch.parameters import columns
 from camtorch.solve import invert, newton_step, search
 
@@ -69,13 +68,6 @@ def _planes(rows: Tensor) -> tuple[Tensor, ...]:
     return tuple(plane if plane.stride(-1) == 1 else plane - 0 for plane in rows.unbind(-1))
 
 
-def _empty_like(rows: Tensor) -> Tensor:
-    """Memory for the cotangent of rows (C, N, size), interleaved or in planes as they are."""
-    if rows.stride(-1) == 1:
-        return empty(rows.shape, rows)
-    return empty((rows.shape[-1], *rows.shape[:-1]), rows).movedim(0, -1)
-
-
 class Project(Function):
     """Rows of points (C, N, 3), intrinsics (C, 4), distortion (C, n) -> pixels (2, C, N), valid (C, N)."""
 
@@ -83,9 +75,9 @@ class Project(Function):
     def forward(ctx, points, intrinsics, distortion, cameras: Cameras, again: Callable, keeps: bool):
         """again: the same as formulas, for derivatives of derivatives. keeps: whether there will be a backward."""
         shape = points.shape[:2]
-        pixels = empty((2, *shape), points)
+        pixels = points.new_empty(2, *shape)
         valid = torch.ones(shape, dtype=torch.bool, device=points.device)
-        scales = empty(shape if keeps and cameras.domain.chart.has_scale else (0, 0), points)
+        scales = points.new_empty(shape if keeps and cameras.domain.chart.has_scale else (0, 0))
         ctx.plain = []
         for block in _blocks(cameras, points):
             here, chart = block.here, block.domain.chart
@@ -118,7 +110,7 @@ class Project(Function):
             return _by_formulas(ctx.again, inputs, ctx.needs_input_grad, by_pixels)
         points = inputs[0]
         sums = _Sums(ctx.cameras, ctx.needs_input_grad, points)
-        by_points = _empty_like(points) if ctx.needs_input_grad[0] else None
+        by_points = torch.empty_like(points) if ctx.needs_input_grad[0] else None
         for block, plain in zip(_blocks(ctx.cameras, points), ctx.plain, strict=True):
             here, chart = block.here, block.domain.chart
             x, y, z = _planes(points[here])
@@ -147,7 +139,7 @@ class Unproject(Function):
     def forward(ctx, pixels, intrinsics, distortion, cameras: Cameras, again: Callable, keeps: bool):
         """again: the same as formulas, for derivatives of derivatives. keeps: whether there will be a backward."""
         shape = pixels.shape[:2]
-        rays, solution = empty((3, *shape), pixels), empty((2, *shape), pixels) if keeps else None
+        rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
         left_open: list[tuple[Tensor, ...]] = []
         for block in _blocks(cameras, pixels):
@@ -177,7 +169,7 @@ class Unproject(Function):
         if torch.is_grad_enabled():
             return _by_formulas(ctx.again, inputs, ctx.needs_input_grad, by_rays)
         sums = _Sums(ctx.cameras, ctx.needs_input_grad, inputs[0])
-        by_pixels = _empty_like(inputs[0]) if ctx.needs_input_grad[0] else None
+        by_pixels = torch.empty_like(inputs[0]) if ctx.needs_input_grad[0] else None
         for block in _blocks(ctx.cameras, inputs[0]):
             here = block.here
             mask = None if bool(valid[here].all()) else valid[here].to(by_rays.dtype)

@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.memory import empty
 from camtorch.parameters import in_graph, in_transform, is_concrete
 
 # Between two pixel centres the interpolation is a polynomial; as many nodes determine it
@@ -44,25 +43,35 @@ def sample(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor
 
 
 def _sample_in_parts(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
-    """As many pictures at a time as there are threads, or rows of one picture: grid_sample has one thread for each.
+    """`_sample_part` with work for every thread, of which grid_sample gives one to each picture.
 
-    What a part needs beside its result, such as uint8 pictures as floats, stays in the cache.
+    Pictures that need another dtype go in parts, so that their copies stay in the cache; a part of fewer pictures than
+    threads goes picture by picture, in tiles of rows.
     """
-    (count, channels), (height, width), threads = images.shape[:2], grid.shape[1:3], torch.get_num_threads()
-    result = empty((count, channels, height, width), images)
-    whole = count // threads * threads
-    for start in range(0, whole, threads):
-        part = slice(start, start + threads)
-        result[part] = _sample_part(images[part], grid[part], mode, padding_mode)
-    tile = max(height // threads, 1)
-    rows = tile * (height // tile)
-    for i in range(whole, count):
-        tiles = grid[i, :rows].unflatten(0, (-1, tile))
-        sampled = _sample_part(images[i].expand(len(tiles), -1, -1, -1), tiles, mode, padding_mode)
-        result[i, :, :rows].unflatten(1, (-1, tile)).copy_(sampled.movedim(0, 1))
-        if rows < height:
-            result[i, :, rows:] = _sample_part(images[i : i + 1], grid[i : i + 1, rows:], mode, padding_mode)[0]
+    threads = torch.get_num_threads()
+    step = len(images) if images.dtype in (torch.float32, torch.float64) and len(images) >= threads else threads
+    if step == len(images):
+        return _sample_part(images, grid, mode, padding_mode)
+    result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
+    for parts in zip(*(t.split(step) for t in (result, images, grid)), strict=True):
+        if len(parts[0]) == step:
+            parts[0].copy_(_sample_part(*parts[1:], mode, padding_mode))
+        else:
+            for picture in zip(*parts, strict=True):
+                _sample_tiles(*picture, threads, mode, padding_mode)
     return result
+
+
+def _sample_tiles(result: Tensor, image: Tensor, grid: Tensor, count: int, mode: str, padding_mode: str) -> None:
+    """One picture (C, H, W) by tiles of rows that share it, and what rows are left over."""
+    height = len(grid) // count
+    tiles = count * height
+    if tiles:
+        images = image.expand(count, *image.shape)
+        sampled = _sample_part(images, grid[:tiles].unflatten(0, (count, height)), mode, padding_mode)
+        result[:, :tiles].unflatten(1, (count, height)).copy_(sampled.movedim(0, 1))
+    if tiles < len(grid):
+        result[:, tiles:] = _sample_part(image.unsqueeze(0), grid[tiles:].unsqueeze(0), mode, padding_mode)[0]
 
 
 def _sample_part(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotate_planes
-from camtorch.parameters import GeometryModule, Memo, as_real, as_rows, as_values, in_graph
+from camtorch.parameters import (
+    GeometryModule,
+    Memo,
+    as_real,
+    as_rows,
+    as_values,
+    in_graph,
+    in_transform,
+    is_concrete,
+    may_look,
+)
 from camtorch.sampling import MODES, PADDINGS, sample
 
 _OUTSIDE = -9.0  # a sampling position that no picture reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
+_STRIP = 1 << 19  # pixels
 _EDGE_SAMPLES = 64  # per box edge: a 500 px edge bent to a radius of 300 px is then enclosed to 0.03 px
 
 
@@ -105,7 +118,7 @@ class Warp(GeometryModule):
                 f"but the source camera's image_size is {self.source.image_size}"
             )
         mode = self.mode if mode is None else _checked_mode(mode)
-        grid, mapped, _ = self._sampling()
+        grid, mapped = self._sampling()
         if grid.shape[0] == 1:
             grid = grid.expand(images.shape[0], -1, -1, -1)
         elif images.shape[0] == 1:
@@ -123,33 +136,56 @@ class Warp(GeometryModule):
 
     def valid_mask(self) -> Tensor:
         """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its picture."""
-        return self._sampling()[2].unsqueeze(1).clone()
+        grid, mapped = self._sampling()
+        pixels = (grid.detach() + 1) * grid.new_tensor(self.source.image_size[::-1]) / 2 - 0.5
+        return (mapped & self.source.contains(pixels)).unsqueeze(1)
 
-    def _sampling(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The grid, where a ray was mapped at all, and where onto the source's picture."""
+    def _sampling(self) -> tuple[Tensor, Tensor]:
+        """The grid, and where a ray was mapped at all."""
         inputs = [t for t in self._inputs() if t is not None]
-        learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-        if learns:
-            return self._compute_sampling()
+        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+            return self._positions(self.target.pixel_grid())
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
-        return self._memo(inputs, (*cameras, self.rotation is None), self._compute_sampling)
+        return self._memo(inputs, (*cameras, self.rotation is None), self._tabulate)
 
     def _inputs(self) -> tuple[Tensor | None, ...]:
         s, t = self.source, self.target
         return s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation
 
-    def _compute_sampling(self) -> tuple[Tensor, Tensor, Tensor]:
-        rays, has_ray = self.target.rays()
+    def _tabulate(self) -> tuple[Tensor, Tensor]:
+        """`_positions` of all pixels, by strips: what is between the pixels and the result stays in the cache."""
+        pixels = self.target.pixel_grid()
+        count = math.prod(self.batch_shape)
+        rows = max(_STRIP // (count * pixels.shape[1]), 1)
+        strips = pixels.split(rows)
+        if len(strips) == 1 or not is_concrete(pixels) or in_transform():
+            return self._positions(pixels)
+        grid = mapped = None
+        for i, strip in enumerate(strips):
+            here = slice(i * rows, i * rows + len(strip))
+            part, seen = self._positions(strip)
+            if grid is None:
+                grid, mapped = (t.new_empty(count, len(pixels), *t.shape[2:]) for t in (part, seen))
+            grid[:, here], mapped[:, here] = part, seen
+        return grid, mapped
+
+    def _positions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the source sees target pixels (h, W', 2): sampling positions (B or 1, h, W', 2), and whether it does."""
+        rays, has_ray = self.target.unproject(pixels.expand(*self.target.batch_shape, *pixels.shape))
         if rays.ndim == 3:
             rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
         rotation = None if self.rotation is None else self.rotation.mT
-        pixels, mapped = self.source.project(turn(rotation, rays, "rays"))
+        seen, mapped = self.source.project(turn(rotation, rays, "rays"))
         mapped = mapped & has_ray
-        height, width = self.source.image_size
-        scale = pixels.new_tensor([2 / width, 2 / height])
-        grid = (pixels + 0.5) * scale - 1
-        grid = torch.where(mapped.unsqueeze(-1), grid.clamp(-_FAR, _FAR), _OUTSIDE)
-        return grid, mapped, mapped & self.source.contains(pixels)
+        position = torch.stack(
+            [
+                (plane * (2 / size) + (1 / size - 1)).clamp(-_FAR, _FAR)
+                for plane, size in zip(seen.unbind(-1), self.source.image_size[::-1], strict=True)
+            ]
+        )
+        if not (may_look(mapped) and bool(mapped.all())):
+            position = torch.where(mapped, position, _OUTSIDE)
+        return position.movedim(0, -1), mapped
 
     # -- labels
 
