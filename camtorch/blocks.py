@@ -1,7 +1,7 @@
 """Both directions block by block, without a graph: temporaries stay in the cache, and backward recomputes them.
 
-What is kept for backward is what came in, which of it is valid, and of an inverse its solution. A CPU does a block in
-a third to a quarter of the time that whole arrays take, whose temporaries are fetched from memory and cost page faults.
+What is kept for backward is what came in, which of it is valid, and what is dear to compute again: the scale of a
+chart, the solution of an inverse.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from camtorch.picture import Picture
 from camtorch.solve import invert
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    pass
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
@@ -68,8 +68,7 @@ class Camera(Picture):
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
-        cls._model = f"{cls.__module__}.{cls.__qualname__}"
-        opaque.MODELS[cls._model] = cls.optics
+        cls._model = opaque.register(cls)
         if "key" in cls.__dict__:
             MODELS[cls.key] = cls
 
@@ -243,44 +242,6 @@ class Camera(Picture):
         return self.intrinsics, self.distortion
 
     # -- the picture
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """*B, the batch dims of the parameters."""
-        shapes = self.intrinsics.shape[:-1], self.distortion.shape[:-1]
-        return shapes[0] if shapes[0] == shapes[1] else torch.broadcast_shapes(*shapes)
-
-    @property
-    def K(self) -> Tensor:  # noqa: N802 (the field's name for it)
-        """The (*B, 3, 3) camera matrix."""
-        fx, fy, cx, cy = self.intrinsics.expand(*self.batch_shape, 4).unbind(-1)
-        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-        return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
-
-    @classmethod
-    def from_matrix(cls, K, distortion=None, *, image_size=None, ignore_skew: bool = False) -> Self:  # noqa: N803
-        """A camera from its (*B, 3, 3) matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
-
-        Raises:
-            ValueError: not such a matrix, or a skew (its K[0, 1]) that is not zero and not to be ignored.
-        """
-        K = as_real(K, "K", cls.__name__)  # noqa: N806
-        if K.shape[-2:] != (3, 3):
-            raise ValueError(f"{cls.__name__}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
-        if is_concrete(K):
-            bottom = K[..., 2, :].detach()
-            if bool((bottom != bottom.new_tensor([0, 0, 1])).any()) or bool((K[..., 1, 0] != 0).any()):
-                raise ValueError(f"{cls.__name__}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
-            skew = K[..., 0, 1].detach()
-            if not ignore_skew and bool((skew != 0).any()):
-                raise ValueError(
-                    f"{cls.__name__}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
-                    "ignore_skew=True drops it"
-                )
-        intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
-        if distortion is None:
-            return cls(intrinsics, image_size=image_size)
-        return cls(intrinsics, distortion, image_size=image_size)
 
     def rays(self) -> tuple[Tensor, Tensor]:
         """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W)."""

@@ -34,7 +34,7 @@ class Chart:
     The axis (0, 0, 1) is covered by every chart and lies at (0, 0).
 
     Margins are positive where something holds. Methods named `pull` turn the cotangents of a result into those of
-    what it was made from, to first order: on a CPU autograd takes twice as long for the same.
+    what it was made from, to first order, with less work than autograd has.
     """
 
     has_scale = True

@@ -22,6 +22,16 @@ Result = TypeVar("Result")
 MODELS: dict[str, Optics] = {}
 """The optics of every class of cameras, by its full name: operators take no functions."""
 
+
+def register(camera_class: type) -> str:
+    """The name under which operators find the optics of a class."""
+    name, count = f"{camera_class.__module__}.{camera_class.__qualname__}", 2
+    while name in MODELS:  # a class of the same name, made by a function that was called again
+        name, count = f"{camera_class.__module__}.{camera_class.__qualname__}#{count}", count + 1
+    MODELS[name] = camera_class.optics
+    return name
+
+
 _KEPT = 8
 _domains: list[tuple[str, Tensor, Domain]] = []
 

@@ -170,7 +170,7 @@ class Warp(GeometryModule):
         return grid, mapped
 
     def _positions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the source sees target pixels (h, W', 2): sampling positions (B or 1, h, W', 2), and whether it does."""
+        """Where the source sees target pixels (h, W', 2), as sampling positions (B or 1, h, W', 2), and if at all."""
         rays, has_ray = self.target.unproject(pixels.expand(*self.target.batch_shape, *pixels.shape))
         if rays.ndim == 3:
             rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)

@@ -1,0 +1,167 @@
+"""Evaluation in parts: blocks of points, strips of a map, parts and tiles of pictures change nothing; memory kept."""
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from cameras import KEYS, fan, make, one, pixel_lattice, spread
+from torch.autograd import gradcheck
+
+import camtorch as ct
+from camtorch import blocks, opaque, sampling, warp
+from camtorch.charts import Perspective
+from camtorch.solve import invert
+
+every_model = pytest.mark.parametrize("key", KEYS)
+
+
+def batch_of(key, count):
+    single = spread(key)
+    scale = 1 + 0.05 * torch.arange(count, dtype=torch.float64)[:, None]
+    return make(key, single.intrinsics.detach() * scale, single.distortion.detach() * scale, image_size=(480, 640))
+
+
+def awkward_points(key, count):
+    """Valid ones, and in between what is behind, beyond the fold, at the origin, huge, tiny, or no number."""
+    points = fan(88 if isinstance(one(key).optics(spread(key).distortion.unbind(-1))[0], Perspective) else 170)
+    bad = [[0, 0, 0], [math.nan, 1, 1], [0, 0, -1], [1e-3, 0, -1], [math.inf, 0, 1], [1e200, 1e199, 1e200]]
+    bad += [[1e-80, 2e-80, 3e-80], [0, 0, 1], [0, 0, 1e-5], [3, 4, 1e-3]]
+    points = torch.cat((points, torch.tensor(bad, dtype=torch.float64)))
+    generator = torch.Generator().manual_seed(0)
+    return points[torch.randint(len(points), (count,), generator=generator)]
+
+
+def everything(camera, method, values):
+    values = values.clone().requires_grad_()
+    result, valid = getattr(camera, method)(values)
+    weights = torch.linspace(-1, 2, result.numel(), dtype=result.dtype).view_as(result)
+    leaves = [values, *(p for p in camera.parameters() if p.numel())]
+    return result.detach(), valid, *torch.autograd.grad((result * weights).sum(), leaves)
+
+
+@every_model
+@pytest.mark.parametrize("method", ["project", "unproject"])
+@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize("block", [7, 64, 500])
+def test_blocks_change_nothing(key, method, cameras, block, monkeypatch):
+    camera = batch_of(key, cameras)
+    values = awkward_points(key, 2 * 101).view(1, -1, 3).expand(cameras, -1, -1)
+    if method == "unproject":
+        values = torch.cat((pixel_lattice(camera, 9, 11), torch.tensor([[math.nan, 1], [1e9, 3]]).double()))
+        values = values.expand(cameras, -1, -1)
+    whole = everything(camera, method, values)
+    monkeypatch.setattr(blocks, "_BLOCK", block)
+    for result, expected in zip(everything(camera, method, values), whole, strict=True):
+        torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
+
+
+@every_model
+@pytest.mark.parametrize("method", ["project", "unproject"])
+def test_planes_and_triples_are_the_same(key, method):
+    camera = one(key)
+    values = awkward_points(key, 200) if method == "project" else pixel_lattice(camera)
+    planes = values.T.contiguous().T
+    for result, expected in zip(everything(camera, method, planes), everything(camera, method, values), strict=True):
+        torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
+
+
+@every_model
+@pytest.mark.parametrize(("method", "limit"), [("project", 32), ("unproject", 40)])
+def test_bytes_kept_for_backward(key, method, limit):
+    """Of a float32 point: what came in, whether it is valid, and a plane or two."""
+    camera = one(key).float()
+    count = 10_000
+    points = (torch.rand(count, 3) + torch.tensor([-0.5, -0.5, 1.0])).requires_grad_()
+    values = points if method == "project" else camera.project(points)[0].detach().contiguous().requires_grad_()
+    kept = {}
+
+    def pack(tensor):
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        result, _ = getattr(camera, method)(values)
+    assert result.requires_grad
+    assert sum(kept.values()) <= limit * count
+    with torch.no_grad(), torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        kept.clear()
+        getattr(camera, method)(values)
+    assert not kept
+
+
+def nothing_solved(domain, u, v):
+    return invert(domain, u, v)._replace(solved=-torch.ones_like(u))
+
+
+@pytest.mark.parametrize("key", [key for key in KEYS if one(key).distortion_names])
+def test_search_alone_agrees_with_newton(key, monkeypatch):
+    """All pixels by the search, none by the table: the same rays and derivatives."""
+    camera = one(key)
+    pixels = pixel_lattice(camera)
+    expected = everything(camera, "unproject", pixels)
+    monkeypatch.setattr(blocks, "invert", nothing_solved)
+    for result, reference in zip(everything(camera, "unproject", pixels), expected, strict=True):
+        torch.testing.assert_close(result, reference, rtol=1e-9, atol=1e-11)
+
+
+def test_gradcheck_over_several_blocks(monkeypatch):
+    monkeypatch.setattr(blocks, "_BLOCK", 4)
+    camera = spread("fisheye624")
+    leaves = [t.detach().clone().requires_grad_() for t in (camera.intrinsics, camera.distortion)]
+    points = (fan(60, 3, 3) * 1.7).requires_grad_()
+    assert gradcheck(lambda p, i, k: ct.Fisheye624(i, k).project(p)[0], (points, *leaves))
+
+
+def test_two_classes_of_one_name_keep_their_own_lens():
+    def build(factor):
+        class Mine(ct.KannalaBrandt):
+            @staticmethod
+            def optics(k):
+                return ct.KannalaBrandt.optics([factor * c for c in k])
+
+        return Mine
+
+    first, second = build(1.0), build(3.0)
+    points = torch.tensor([[0.5, 0.2, 1.0]])
+    for model in (first, second, first):
+        camera = model([300.0, 300, 320, 240], [0.05, 0.0, 0.0, 0.0])
+        compiled = torch.compile(camera.unproject, backend="eager", fullgraph=True)
+        pixels = camera.project(points)[0].detach()
+        torch.testing.assert_close(compiled(pixels)[0], camera.unproject(pixels)[0])
+    assert opaque.MODELS[first._model] is not opaque.MODELS[second._model]
+
+
+# -- pictures
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 2, 4, 5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.uint8, torch.bool])
+def test_parts_of_pictures_change_nothing(threads, count, dtype, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    generator = torch.Generator().manual_seed(0)
+    images = (255 * torch.rand(count, 3, 11, 13, generator=generator)).to(dtype)
+    grid = 2.4 * torch.rand(count, 7, 5, 2, generator=generator) - 1.2
+    for mode in ("bilinear", "nearest", "bicubic"):
+        result = sampling.sample(images, grid, mode, "zeros")
+        wide = images.double() if dtype == torch.float64 else images.float()
+        expected = F.grid_sample(wide, grid.to(wide.dtype), mode, "zeros", align_corners=False)
+        if dtype == torch.uint8:
+            expected = expected.round().clamp(0, 255)
+        assert result.dtype == dtype
+        assert torch.equal(result, expected >= 0.5 if dtype == torch.bool else expected.to(dtype))
+
+
+@pytest.mark.parametrize("cameras", [None, 3])
+def test_strips_of_a_map_change_nothing(cameras, monkeypatch):
+    source = batch_of("brown_conrady", cameras) if cameras else spread("brown_conrady")
+    target = ct.Cylindrical([15.0, 12.0, 30.5, 20.25], image_size=(41, 63))
+    for one_camera in (source, target):
+        one_camera.requires_grad_(False)
+    whole = ct.Warp(source, target)
+    monkeypatch.setattr(warp, "_STRIP", 7 * 63)
+    strips = ct.Warp(source, target)
+    assert torch.equal(strips.grid(), whole.grid())
+    assert torch.equal(strips.valid_mask(), whole.valid_mask())
+    assert (whole.grid() == -9).any()
