@@ -87,8 +87,10 @@ def to_ray(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> Ray:
     shrink = valid = None
     if may_look(x):
         bounds = [float(bound) for plane in (x, y, z) for bound in plane.detach().aminmax()]
-        extent, near = max(map(abs, bounds)), bounds[4]
-        if extent < _LARGE and near > _SMALL and chart.covers_all(near, extent, x.dtype):
+        near = bounds[4]
+        # NaN fails every comparison, and max() may pass over it
+        tame = near > _SMALL and all(abs(bound) < _LARGE for bound in bounds)
+        if tame and chart.covers_all(near, max(map(abs, bounds)), x.dtype):
             return Ray(x, y, z, None, None)
     x_0, y_0, z_0 = (plane.detach() for plane in (x, y, z))
     size = torch.maximum(torch.maximum(x_0.abs(), y_0.abs()), z_0.abs())

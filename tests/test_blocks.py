@@ -43,10 +43,10 @@ def everything(camera, method, values):
 @every_model
 @pytest.mark.parametrize("method", ["project", "unproject"])
 @pytest.mark.parametrize("cameras", [1, 3])
-@pytest.mark.parametrize("block", [7, 64, 500])
+@pytest.mark.parametrize("block", [20, 500])
 def test_blocks_change_nothing(key, method, cameras, block, monkeypatch):
     camera = batch_of(key, cameras)
-    values = awkward_points(key, 2 * 101).view(1, -1, 3).expand(cameras, -1, -1)
+    values = awkward_points(key, 101).view(1, -1, 3).expand(cameras, -1, -1)
     if method == "unproject":
         values = torch.cat((pixel_lattice(camera, 9, 11), torch.tensor([[math.nan, 1], [1e9, 3]]).double()))
         values = values.expand(cameras, -1, -1)

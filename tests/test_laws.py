@@ -265,6 +265,24 @@ def test_bad_points(key, dtype):
 
 
 @every_model
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e30])
+def test_one_bad_number_among_good_ones(key, number):
+    """Nothing else in the batch draws attention to it."""
+    camera = one(key)
+    for method, values in (("project", near_and_far_rays() + 1.0), ("unproject", pixel_lattice(camera, 3, 4))):
+        expected, valid = getattr(camera, method)(values)
+        for column in range(values.shape[-1]):
+            broken = values.clone()
+            broken[1, column] = number
+            result, still_valid = getattr(camera, method)(broken)
+            assert result.isfinite().all()
+            assert math.isfinite(number) or not still_valid[1]
+            others = torch.arange(len(values)) != 1
+            assert torch.equal(still_valid[others], valid[others])
+            torch.testing.assert_close(result[others], expected[others], rtol=1e-13, atol=1e-13)
+
+
+@every_model
 @both_precisions
 def test_bad_pixels(key, dtype):
     camera = one(key).to(dtype)
