@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.lens import Planar, Rational
+from camtorch.lens import Planar
 
 if TYPE_CHECKING:
     from camtorch.charts import Chart
-    from camtorch.lens import Lens, Polynomial
+    from camtorch.lens import Lens, Polynomial, Rational
 
 AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # on one azimuth, which stands for all where the lens is radial
@@ -32,8 +32,9 @@ class Azimuths:
 
     def __init__(self, chart: Chart, lens: Lens, like: Tensor):
         """The tables of cameras (C,): limits (C, azimuths), reach (C, azimuths, radii); like gives dtype and device."""
-        self.has_poles = isinstance(lens.radial, Rational)
         fine = chart.radii(_RADII, like)
+        denominator = getattr(lens.radial, "denominator", None)
+        self.has_pole = None if denominator is None else ~(denominator(fine * fine) > 0).all(-1)
         self.count = 1 if lens.is_radial else AZIMUTHS
         self.radii = fine if lens.is_radial else _around(lens.radial, chart, fine)
         a, b = (c[:, None] * self.radii.unsqueeze(-2) for c in _directions(self.count, like))
@@ -58,7 +59,7 @@ class Azimuths:
         """(C,): how far from the centre the lens sends any point before the fold, with what nodes may miss."""
         furthest = 1.02 * torch.where(self.reach < torch.inf, self.reach, 0.0).flatten(1).amax(-1)
         # before a pole there is no end to it
-        return torch.full_like(furthest, torch.inf) if self.has_poles else furthest
+        return furthest if self.has_pole is None else torch.where(self.has_pole, torch.inf, furthest)
 
     def bracket(self, camera: Tensor, target: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The radii (M,) between which the lens of each point's camera reaches `target` on the azimuth of (a, b), and a

@@ -120,7 +120,8 @@ class Project(Function):
                 x, y, z, shrink, _ = mapping.to_ray(chart, x, y, z)
                 mask = valid[here].to(x.dtype)
                 x, y, z = (mapping.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
-                gu, gv = mapping.replace(mask, gu, 0.0), mapping.replace(mask, gv, 0.0)
+                # what comes back of an invalid point need not be finite
+                gu, gv = (torch.where(valid[here], g, 0.0) for g in (gu, gv))
             scale = mapping.replace(mask, scales[here], 1.0) if scales.numel() else None
             at = block.domain.lens.at(*chart.to_plane(x, y, z, 1, scale))
             sums.add_intrinsics(block, gu, gv, *at.value)
@@ -172,9 +173,11 @@ class Unproject(Function):
         by_pixels = torch.empty_like(inputs[0]) if ctx.needs_input_grad[0] else None
         for block in _blocks(ctx.cameras, inputs[0]):
             here = block.here
-            mask = None if bool(valid[here].all()) else valid[here].to(by_rays.dtype)
             a, b = solution[0][here], solution[1][here]
-            gx, gy, gz = (mapping.replace(mask, by_rays[i][here], 0.0) for i in range(3))
+            gx, gy, gz = (by_rays[i][here] for i in range(3))
+            if not bool(valid[here].all()):
+                # what comes back of an invalid pixel need not be finite
+                gx, gy, gz = (torch.where(valid[here], g, 0.0) for g in (gx, gy, gz))
             ga, gb = block.domain.chart.pull_ray(a, b, gx, gy, gz)
             at = block.domain.lens.at(a, b)
             if at.stages:

@@ -211,7 +211,7 @@ class RadialInverse:
     def __call__(self, r2: Tensor) -> Tensor:
         """The factor for (C, N), to about 1e-6."""
         position = _variable(r2, self.reach2) * _NODES
-        node = position.to(torch.int32).clamp(max=_NODES - 1)
+        node = position.to(torch.int32).clamp(0, _NODES - 1)  # NaN becomes some integer
         fraction = position - node
         if len(self.values) > 1:
             node = node + torch.arange(len(self.values), device=r2.device, dtype=torch.int32).unsqueeze(-1) * _NODES

@@ -68,7 +68,7 @@ def replace(mask: Tensor | None, plane: Tensor, value: float) -> Tensor:
     """The plane where the mask is 1, and the value where it is 0. Needs finite numbers in both places."""
     if mask is None:
         return plane
-    if torch.compiler.is_compiling():
+    if plane.requires_grad or not may_look(plane):  # a cotangent need not be finite
         return torch.where(mask > 0, plane, value)
     return plane * mask if value == 0 else torch.lerp(plane.new_full((1, 1), value), plane, mask)
 

@@ -80,13 +80,17 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
     short2 = _short(u) ** 2
     for count in range(1, _MOST_STEPS + 1):
         at = domain.lens.at(a, b)
-        da, db = newton_step(at.jacobian, u - at.value[0], v - at.value[1])
+        jacobian = at.jacobian
+        da, db = newton_step(jacobian, u - at.value[0], v - at.value[1])
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
         settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
         if count >= _PLANAR_STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
             break
-    return Found(a, b, torch.minimum(settled, domain.inner2 - t), torch.ones_like(a))
+    # further out than pictures reach a determinant may overflow, and a step seem short
+    inside = domain.inner2.clamp(max=domain.chart.usual_end(u.dtype) ** 2) - t
+    solved = torch.minimum(torch.minimum(settled, inside), _reciprocal(jacobian).abs())
+    return Found(a, b, solved, torch.ones_like(a))
 
 
 def _short(like: Tensor) -> float:
@@ -97,11 +101,16 @@ def _short(like: Tensor) -> float:
 def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes2:
     """The step that a regular Jacobian sends to (du, dv); some finite one where it is singular."""
     ua, ub, va, vb = jacobian
-    determinant = torch.addcmul(ua * vb, ub, va, value=-1)
-    # 1 / determinant, and 0 for 0
-    reciprocal = determinant / (determinant * determinant + floor_of(du.dtype))
+    reciprocal = _reciprocal(jacobian)
     da, db = torch.addcmul(vb * du, ub, dv, value=-1), torch.addcmul(ua * dv, va, du, value=-1)
     return da * reciprocal, db * reciprocal
+
+
+def _reciprocal(jacobian: Jacobian) -> Tensor:
+    """1 / determinant; 0 for 0, and for what is out of the floating-point range."""
+    ua, ub, va, vb = jacobian
+    determinant = torch.addcmul(ua * vb, ub, va, value=-1)
+    return (determinant + floor_of(determinant.dtype) / determinant).reciprocal()
 
 
 # -- the points that are left open

@@ -156,7 +156,7 @@ class Warp(GeometryModule):
         """`_positions` of all pixels, by strips: what is between the pixels and the result stays in the cache."""
         pixels = self.target.pixel_grid()
         count = math.prod(self.batch_shape)
-        rows = max(_STRIP // (count * pixels.shape[1]), 1)
+        rows = max(_STRIP // max(count * pixels.shape[1], 1), 1)
         strips = pixels.split(rows)
         if len(strips) == 1 or not is_concrete(pixels) or in_transform():
             return self._positions(pixels)

@@ -165,3 +165,9 @@ def test_strips_of_a_map_change_nothing(cameras, monkeypatch):
     assert torch.equal(strips.grid(), whole.grid())
     assert torch.equal(strips.valid_mask(), whole.valid_mask())
     assert (whole.grid() == -9).any()
+
+
+def test_no_cameras_make_no_pictures():
+    source = ct.Pinhole(torch.ones(0, 4), image_size=(8, 8)).requires_grad_(False)
+    nothing = ct.Warp(source, ct.Pinhole([4.0, 4, 4, 4], image_size=(8, 8)).requires_grad_(False))
+    assert nothing(torch.rand(0, 1, 8, 8)).shape == (0, 1, 8, 8)

@@ -283,6 +283,58 @@ def test_one_bad_number_among_good_ones(key, number):
 
 
 @every_model
+@pytest.mark.parametrize("again", [False, True])
+def test_cotangents_of_invalid_rows_may_be_anything(key, again):
+    """The root of a pixel of -1, or of the radius of the axis: an invalid row is left out later, not before."""
+    camera = one(key)
+    points = torch.tensor([[0.1, 0.2, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    pixels = torch.cat((pixel_lattice(camera)[412:413], torch.full((1, 2), math.nan, dtype=torch.float64)))
+
+    def of_points(points):
+        return camera.project(points)[0].sqrt().sum(-1)
+
+    def of_pixels(pixels):
+        rays, _ = camera.unproject(pixels)
+        return torch.atan2(rays[:, :2].square().sum(-1).sqrt(), rays[:, 2])
+
+    for function, values in ((of_points, points), (of_pixels, pixels)):
+        leaf = values.clone().requires_grad_()
+        leaves = [leaf, *(p for p in camera.parameters() if p.numel())]
+        gradients = torch.autograd.grad(function(leaf)[0], leaves, create_graph=again)
+        assert all(g.isfinite().all() for g in gradients)
+        assert torch.func.grad(lambda v, function=function: function(v)[0])(values).isfinite().all()
+
+
+@pytest.mark.parametrize("coefficient", [1e12, 1e30])
+def test_one_exploded_lens_leaves_the_others_alone(coefficient):
+    lenses = torch.tensor([[-0.3, 0.1, 0, 0, 0], [0, 0, 0, 0, coefficient]])
+    camera = ct.BrownConrady(torch.tensor([[280.0, 280, 320, 240]] * 2), lenses)
+    pixels = 500 * torch.rand(2, 50, 2)
+    rays, valid = camera.unproject(pixels)
+    assert rays.isfinite().all()
+    alone, still = ct.BrownConrady([280.0, 280, 320, 240], lenses[0]).unproject(pixels[0])
+    assert torch.equal(valid[0], still)
+    torch.testing.assert_close(rays[0], alone)
+
+
+@every_model
+@both_precisions
+def test_pixels_far_beyond_every_picture(key, dtype):
+    """Valid only with the ray that projects there, at any distance."""
+    for camera in (one(key).to(dtype), spread(key, dtype)):
+        angle = torch.linspace(0, 2 * math.pi, 25, dtype=dtype)[:, None]
+        ring = torch.cat((angle.cos(), angle.sin()), -1)
+        for distance in 10.0 ** torch.arange(3, 19):
+            pixels = camera.intrinsics[2:].detach() + distance * ring
+            rays, valid = camera.unproject(pixels)
+            again, reachable = camera.project(rays)
+            # next to a pole the ray's own rounding moves the pixel a long way
+            stretch = vmap(jacrev(lambda ray, camera=camera: camera.project(ray)[0]))(rays.detach()).norm(dim=(-1, -2))
+            limit = 100 * torch.finfo(dtype).eps * (distance + stretch)
+            assert ((again - pixels).norm(dim=-1) < limit)[valid & reachable].all(), distance
+
+
+@every_model
 @both_precisions
 def test_bad_pixels(key, dtype):
     camera = one(key).to(dtype)
