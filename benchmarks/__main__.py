@@ -77,7 +77,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--threads", type=_positive, default=2, help="of torch and of OpenCV (default: 2)")
     parser.add_argument("--repeats", type=_positive, metavar="R", help="rounds that medians are taken of (default: 9)")
     parser.add_argument(
-        "--no-compile", dest="compile", action="store_false", help="without torch.compile, which takes minutes a model"
+        "--no-compile",
+        dest="compile",
+        action="store_false",
+        help="without torch.compile, which takes about a minute a model",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the machine and every figure to this file")
     parser.add_argument("--quick", action="store_true", help="small inputs, nothing compiled: does everything work?")
