@@ -181,7 +181,7 @@ def grid_sample(task: Task) -> dict[str, Run]:
         return {}
     still = task.dewarp.grid().expand(task.batch, -1, -1, -1)
     grid = task.fresh().grid().requires_grad_()
-    sample = lambda x, where: F.grid_sample(x, where, align_corners=False)  # noqa: E731
+    sample = lambda x, where: F.grid_sample(x, where, align_corners=False)
     return {
         CACHED: lambda: sample(task.images, still),
         TO_IMAGES: gradients(lambda x: sample(x, still), task.images),

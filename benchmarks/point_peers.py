@@ -94,14 +94,14 @@ def compilations(ours: Contestant) -> list[Contestant]:
 def opencv(key: str) -> list[Contestant]:
     """`cv2.fisheye`, or `cv2` for the perspective cameras; in float32, as its callers' points are."""
     intrinsics, coefficients, still = matrix(), np.array(COEFFICIENTS[key]), np.zeros(3)
-    as_array = lambda x: x.cpu().numpy()[None]  # noqa: E731
+    as_array = lambda x: x.cpu().numpy()[None]
     if key == "kannala_brandt":
-        project = lambda p: cv2.fisheye.projectPoints(p, still, still, intrinsics, coefficients)  # noqa: E731
-        unproject = lambda p: cv2.fisheye.undistortPoints(p, intrinsics, coefficients)  # noqa: E731
+        project = lambda p: cv2.fisheye.projectPoints(p, still, still, intrinsics, coefficients)
+        unproject = lambda p: cv2.fisheye.undistortPoints(p, intrinsics, coefficients)
     elif key in ("brown_conrady", "pinhole"):
         coefficients = coefficients if coefficients.size else None
-        project = lambda p: cv2.projectPoints(p, still, still, intrinsics, coefficients)  # noqa: E731
-        unproject = lambda p: cv2.undistortPoints(p, intrinsics, coefficients)  # noqa: E731
+        project = lambda p: cv2.projectPoints(p, still, still, intrinsics, coefficients)
+        unproject = lambda p: cv2.undistortPoints(p, intrinsics, coefficients)
     else:
         return []
     return [
@@ -115,12 +115,12 @@ def opencv(key: str) -> list[Contestant]:
 
 def kornia(key: str, device: torch.device) -> list[Contestant]:
     """kornia's functions, eager, as they are documented."""
-    leaf = lambda values: torch.tensor(values, dtype=torch.float32, device=device).requires_grad_()  # noqa: E731
-    ahead = lambda points: points[:, :2] / points[:, 2:]  # noqa: E731
+    leaf = lambda values: torch.tensor(values, dtype=torch.float32, device=device).requires_grad_()
+    ahead = lambda points: points[:, :2] / points[:, 2:]
     if key == "kannala_brandt":
         flat = leaf((*INTRINSICS, *COEFFICIENTS[key]))
-        project = lambda x: kannala_brandt.distort_points_kannala_brandt(x, flat)  # noqa: E731
-        unproject = lambda x: kannala_brandt.undistort_points_kannala_brandt(x, flat)  # noqa: E731
+        project = lambda x: kannala_brandt.distort_points_kannala_brandt(x, flat)
+        unproject = lambda x: kannala_brandt.undistort_points_kannala_brandt(x, flat)
         directions = Direction(project, ahead, learns=(flat,)), Direction(unproject, answer=on_plane, learns=(flat,))
     elif key == "brown_conrady":
         intrinsics, coefficients = leaf(matrix()[None].tolist()), leaf([COEFFICIENTS[key]])
@@ -162,8 +162,8 @@ def on_plane(pixels: Tensor) -> Tensor:
 
 def floor(device: torch.device) -> list[Contestant]:
     """What no camera can beat: to move a point's bytes, and one transcendental function."""
-    angle = lambda planes: torch.atan2(planes[0], planes[1])  # noqa: E731
-    rows = lambda x: x.T.contiguous()  # noqa: E731
+    angle = lambda planes: torch.atan2(planes[0], planes[1])
+    rows = lambda x: x.T.contiguous()
     copy = Direction(lambda run: run(), lambda x: _cold_copy(len(x), device), learns=None)
     clone, atan2 = Direction(torch.clone, learns=None), Direction(angle, rows, learns=None)
     return [Contestant(name, d, d) for name, d in zip(FLOOR, (copy, clone, atan2), strict=True)]

@@ -69,7 +69,7 @@ def relative(records: Sequence[Record], contestant: str) -> list[Record]:
 def markdown(lines: Sequence[Sequence[str]]) -> str:
     """Lines of cells, the first of them the heading, as a table that reads well unrendered too."""
     widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]
-    text = lambda i, cell: cell.ljust(widths[i]) if i < 2 else cell.rjust(widths[i])  # noqa: E731
+    text = lambda i, cell: cell.ljust(widths[i]) if i < 2 else cell.rjust(widths[i])
     rule = ["-" * w if i < 2 else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
     padded = [[text(i, cell) for i, cell in enumerate(line)] for line in lines]
     return "\n".join(f"| {' | '.join(line)} |" for line in [padded[0], rule, *padded[1:]])

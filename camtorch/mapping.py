@@ -48,8 +48,7 @@ class Pixels(NamedTuple):
 def indicator(margin: Tensor) -> Tensor:
     """The mask of where a margin is positive: 1 and 0 of the same dtype.
 
-    On a CPU comparing, selecting and combining numbers takes a fifth of the time that it takes with bools, and
-    compiled code writes bools one by one.
+    On a CPU selecting by numbers is several times as fast as by bools, and compiled code writes bools one by one.
     """
     margin = margin.detach()
     if torch.compiler.is_compiling():

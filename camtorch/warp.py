@@ -153,7 +153,7 @@ class Warp(GeometryModule):
         return s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation
 
     def _tabulate(self) -> tuple[Tensor, Tensor]:
-        """`_positions` of all pixels, by strips: what is between the pixels and the result stays in the cache."""
+        """`_positions` of all pixels, by strips: the memory for what is in between is used again for each."""
         pixels = self.target.pixel_grid()
         count = math.prod(self.batch_shape)
         rows = max(_STRIP // max(count * pixels.shape[1], 1), 1)
