@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from camtorch.camera import Camera
+from camtorch.extrinsics import as_rotation, turn
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
 from camtorch.parameters import as_image_size
-from camtorch.warp import Warp, as_rotation, turn
+from camtorch.warp import Warp
 
 _WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold
 # projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for
@@ -33,7 +34,7 @@ class Dewarp(Warp):
             what the picture's middle row and column show, and never more than 120 degrees in perspective.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
-        mode, padding_mode: see `Warp`.
+        options: mode, padding_mode, fill, antialias and tolerance of `Warp`.
 
     The target has square pixels, is chosen once, and does not learn. It is finite for every camera, also where the
     lens folds inside the picture or sees past 90 degrees.
@@ -50,8 +51,7 @@ class Dewarp(Warp):
         fov: float | None = None,
         image_size: tuple[int, int] | None = None,
         rotation: Tensor | None = None,
-        mode: str = "bilinear",
-        padding_mode: str = "zeros",
+        **options,
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
@@ -71,7 +71,7 @@ class Dewarp(Warp):
             else:
                 intrinsics = _fitted(camera, projection, size, rotation)
         target = model(nn.Parameter(intrinsics, requires_grad=False), image_size=size)
-        super().__init__(camera, target, rotation, mode=mode, padding_mode=padding_mode)
+        super().__init__(camera, target, rotation, **options)
 
 
 def _plane_width(projection: str, fov: float) -> float:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch.analytic import cosc_root, sinc_root
-from camtorch.parameters import GeometryModule, as_batch, as_real, as_rows, columns, is_concrete
+from camtorch.parameters import GeometryModule, as_batch, as_real, as_rows, columns, in_graph, is_concrete
 
 
 class Extrinsics(GeometryModule):
@@ -149,3 +149,23 @@ def check_rotation(matrix: Tensor, name: str, owner: str) -> None:
             f"{owner}: {name} must hold rotation matrices; R R^T misses the identity by {error.max().item():.2g} "
             f"and det R = {torch.linalg.det(values).tolist()}"
         )
+
+
+def as_rotation(rotation, owner: str) -> Tensor | None:
+    """A checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
+    if rotation is None:
+        return None
+    rotation = as_real(rotation, "rotation", owner)
+    if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
+        raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
+    check_rotation(rotation, "rotation", owner)
+    return rotation if isinstance(rotation, nn.Parameter) or in_graph(rotation) else rotation.detach().clone()
+
+
+def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
+    """Apply a rotation, if there is one, to (*B, *N, 3); `name` is what an error calls them."""
+    if rotation is None:
+        return rays
+    rows, lead, restore = as_rows(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
+    rotation = rotation.to(rows.dtype).expand(*lead, 3, 3).reshape(-1, 3, 3)
+    return restore(torch.stack(rotate_planes(rotation, rows.unbind(-1))))

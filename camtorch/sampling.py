@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -42,6 +43,17 @@ def sample(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor
     return _Sample.apply(images, grid, mode, padding_mode).to(dtype)
 
 
+def as_fill(fill, owner: str) -> tuple[float, ...]:
+    """One value or one for each channel, as a tuple."""
+    try:
+        values = tuple(map(float, fill)) if isinstance(fill, Iterable) else (float(fill),)
+    except (TypeError, ValueError):
+        raise TypeError(f"{owner}: fill must be a number or one for each channel; got {fill!r}") from None
+    if not values or not all(map(math.isfinite, values)):
+        raise ValueError(f"{owner}: fill must be finite; got {fill!r}")
+    return values
+
+
 def _sample_in_parts(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
     """`_sample_part` with work for every thread, of which grid_sample gives one to each picture.
 
@@ -76,18 +88,26 @@ def _sample_tiles(result: Tensor, image: Tensor, grid: Tensor, count: int, mode:
 
 def _sample_part(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
     dtype = images.dtype
-    # wide enough that every value, a class id too, is exact
-    wide = torch.float64 if not dtype.is_floating_point and dtype.itemsize > 2 else torch.float32
-    images = images.to(torch.promote_types(dtype, wide) if dtype.is_floating_point else wide)
-    result = F.grid_sample(images, grid.to(images.dtype), mode, padding_mode, align_corners=False)
-    if dtype == torch.bool:
-        return result >= 0.5
-    if not dtype.is_floating_point:
+    images = widen(images)
+    return narrow(F.grid_sample(images, grid.to(images.dtype), mode, padding_mode, align_corners=False), dtype)
+
+
+def widen(images: Tensor) -> Tensor:
+    """In a floating-point dtype in which every value, a class id too, is exact."""
+    wide = torch.float64 if not images.is_floating_point() and images.dtype.itemsize > 2 else torch.float32
+    return images.to(torch.promote_types(images.dtype, wide) if images.is_floating_point() else wide)
+
+
+def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """What `widen` gave, back in its dtype: integers are rounded and stay in range, bool is true from one half on."""
+    if dtype == torch.bool and values.is_floating_point():
+        return values >= 0.5
+    if not dtype.is_floating_point and values.is_floating_point():
         low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
         # the largest int64 is no float64: the next one would wrap around
         high = high if int(float(high)) == high else math.nextafter(float(high), 0.0)
-        result = result.round().clamp(low, high)
-    return result.to(dtype)
+        values = values.round().clamp(low, high)
+    return values.to(dtype)
 
 
 class _Sample(torch.autograd.Function):

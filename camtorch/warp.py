@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
+from camtorch import minify
 from camtorch.camera import Camera
-from camtorch.extrinsics import check_rotation, rotate_planes
+from camtorch.extrinsics import as_rotation, turn
 from camtorch.parameters import (
     GeometryModule,
     Memo,
-    as_real,
-    as_rows,
     as_values,
-    in_graph,
     in_transform,
     is_concrete,
     may_look,
 )
-from camtorch.sampling import MODES, PADDINGS, sample
+from camtorch.positions import OUTSIDE, in_strips, on_lattice
+from camtorch.sampling import MODES, PADDINGS, as_fill, narrow, sample, widen
 
-_OUTSIDE = -9.0  # a sampling position that no picture reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
-_STRIP = 1 << 19  # pixels
 _EDGE_SAMPLES = 64  # per box edge: a 500 px edge bent to a radius of 300 px is then enclosed to 0.03 px
 
 
@@ -41,13 +39,19 @@ class Warp(GeometryModule):
         rotation: (3, 3) or (B, 3, 3) rotation matrix; may require grad. None is no rotation.
         mode: "bilinear", "nearest" (masks, labels) or "bicubic".
         padding_mode: "zeros", "border" or "reflection", for pixels that the source sees outside its
-            picture. A pixel without a ray, or whose ray the source cannot map, is always zero.
+            picture. A pixel without a ray, or whose ray the source cannot map, always takes `fill`.
+        fill: the value of pixels that show nothing, blended in at the rim of "zeros"; one, or one for each channel.
+        antialias: where the picture shrinks, a pixel takes the mean of what it covers ("nearest" does not).
+        tolerance: pixels of the source by which sampling positions may be off, as far as fourth differences tell. From
+            0.01 on they come from a lattice, several times as fast. Zero is exact; so are labels always, warps
+            with a graph, and those on a GPU.
 
     The sampling grid is kept while nothing that it depends on can learn or has changed.
 
     Raises:
         ValueError: a mode that does not exist, cameras without image_size, a rotation of another shape or that is
-            none, batch dims that do not fit. TypeError: source or target is not a Camera.
+            none, batch dims that do not fit, a fill or a tolerance that is none.
+        TypeError: source or target is not a Camera.
     """
 
     def __init__(
@@ -58,6 +62,9 @@ class Warp(GeometryModule):
         *,
         mode: str = "bilinear",
         padding_mode: str = "zeros",
+        fill: float | Sequence[float] = 0.0,
+        antialias: bool = False,
+        tolerance: float = 0.0,
     ):
         super().__init__()
         for name, camera in (("source", source), ("target", target)):
@@ -68,7 +75,10 @@ class Warp(GeometryModule):
         if padding_mode not in PADDINGS:
             raise ValueError(f"Warp: padding_mode must be one of {PADDINGS}; got {padding_mode!r}")
         self.source, self.target = source, target
+        if not 0 <= tolerance < float("inf"):
+            raise ValueError(f"Warp: tolerance must be a number of pixels, zero or more; got {tolerance!r}")
         self.mode, self.padding_mode = _checked_mode(mode), padding_mode
+        self.fill, self.antialias, self.tolerance = as_fill(fill, "Warp"), bool(antialias), float(tolerance)
         self._set_rotation(as_rotation(rotation, "Warp"))
         shapes = [source.batch_shape, target.batch_shape, () if rotation is None else self.rotation.shape[:-2]]
         try:
@@ -118,17 +128,34 @@ class Warp(GeometryModule):
                 f"but the source camera's image_size is {self.source.image_size}"
             )
         mode = self.mode if mode is None else _checked_mode(mode)
-        grid, mapped = self._sampling()
+        grid, mapped, scale = self._sampling()
         if grid.shape[0] == 1:
             grid = grid.expand(images.shape[0], -1, -1, -1)
         elif images.shape[0] == 1:
             images = images.expand(grid.shape[0], -1, -1, -1)
         elif images.shape[0] != grid.shape[0]:
             raise ValueError(f"Warp: {images.shape[0]} images do not fit {grid.shape[0]} cameras")
-        result = sample(images, grid, mode, self.padding_mode)
-        if self.padding_mode != "zeros":
+        dtype, minifies = images.dtype, scale is not None and mode != "nearest"
+        if minifies or any(self.fill):
+            images = widen(images)
+        if minifies:
+            result = minify.sample_minified(images, grid, scale, mode, self.padding_mode)
+        else:
+            result = sample(images, grid, mode, self.padding_mode)
+        if any(self.fill):
+            result = self._filled(result, images, grid, mapped, mode)
+        elif self.padding_mode != "zeros":
             result = torch.where(mapped.unsqueeze(1), result, 0)
-        return result
+        return narrow(result, dtype)
+
+    def _filled(self, result: Tensor, images: Tensor, grid: Tensor, mapped: Tensor, mode: str) -> Tensor:
+        fill = result.new_tensor(self.fill)[:, None, None]
+        if len(fill) not in (1, result.shape[1]):
+            raise ValueError(f"Warp: fill has {len(fill)} values, but the images have {result.shape[1]} channels")
+        if self.padding_mode != "zeros":
+            return torch.where(mapped.unsqueeze(1), result, fill)
+        shown = sample(torch.ones_like(images[:1, :1]).expand(len(grid), -1, -1, -1), grid, mode, "zeros")
+        return result + fill * (1 - shown)
 
     def grid(self) -> Tensor:
         """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
@@ -136,42 +163,44 @@ class Warp(GeometryModule):
 
     def valid_mask(self) -> Tensor:
         """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its picture."""
-        grid, mapped = self._sampling()
+        grid, mapped, _ = self._sampling()
         pixels = (grid.detach() + 1) * grid.new_tensor(self.source.image_size[::-1]) / 2 - 0.5
         return (mapped & self.source.contains(pixels)).unsqueeze(1)
 
-    def _sampling(self) -> tuple[Tensor, Tensor]:
-        """The grid, and where a ray was mapped at all."""
+    def _sampling(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """The grid, where a ray was mapped at all, and with antialias the local scale."""
         inputs = [t for t in self._inputs() if t is not None]
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            return self._positions(self.target.pixel_grid())
+            return self._with_scale(*self._positions(self.target.pixel_grid()))
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
-        return self._memo(inputs, (*cameras, self.rotation is None), self._tabulate)
+        options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
+        return self._memo(inputs, options, lambda: self._with_scale(*self._tabulate()))
+
+    def _with_scale(self, grid: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        scale = minify.local_scale(grid.detach(), mapped, self.source.image_size) if self.antialias else None
+        return grid, mapped, scale
 
     def _inputs(self) -> tuple[Tensor | None, ...]:
         s, t = self.source, self.target
         return s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation
 
     def _tabulate(self) -> tuple[Tensor, Tensor]:
-        """`_positions` of all pixels, by strips: the memory for what is in between is used again for each."""
+        """`_positions` of all pixels."""
         pixels = self.target.pixel_grid()
-        count = math.prod(self.batch_shape)
-        rows = max(_STRIP // max(count * pixels.shape[1], 1), 1)
-        strips = pixels.split(rows)
-        if len(strips) == 1 or not is_concrete(pixels) or in_transform():
+        if in_transform() or not is_concrete(pixels):
             return self._positions(pixels)
-        grid = mapped = None
-        for i, strip in enumerate(strips):
-            here = slice(i * rows, i * rows + len(strip))
-            part, seen = self._positions(strip)
-            if grid is None:
-                grid, mapped = (t.new_empty(count, len(pixels), *t.shape[2:]) for t in (part, seen))
-            grid[:, here], mapped[:, here] = part, seen
-        return grid, mapped
+        if self.tolerance and pixels.is_cpu:
+            sizes = self.target.image_size, self.source.image_size
+            found = on_lattice(self._positions, *sizes, self.tolerance, pixels)
+            if found is not None:
+                return found
+        return in_strips(self._positions, pixels, math.prod(self.batch_shape))
 
     def _positions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the source sees target pixels (h, W', 2), as sampling positions (B or 1, h, W', 2), and if at all."""
-        rays, has_ray = self.target.unproject(pixels.expand(*self.target.batch_shape, *pixels.shape))
+        """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `positions.Exact`."""
+        if pixels.ndim == 3:
+            pixels = pixels.expand(*self.target.batch_shape, *pixels.shape)
+        rays, has_ray = self.target.unproject(pixels)
         if rays.ndim == 3:
             rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
         rotation = None if self.rotation is None else self.rotation.mT
@@ -184,7 +213,7 @@ class Warp(GeometryModule):
             ]
         )
         if not (may_look(mapped) and bool(mapped.all())):
-            position = torch.where(mapped, position, _OUTSIDE)
+            position = torch.where(mapped, position, OUTSIDE)
         return position.movedim(0, -1), mapped
 
     # -- labels
@@ -242,31 +271,18 @@ class Warp(GeometryModule):
     def inverse(self) -> Warp:
         """The warp from target to source. What lay outside the picture, or between its pixels, stays lost."""
         rotation = None if self.rotation is None else self.rotation.mT
-        return Warp(self.target, self.source, rotation, mode=self.mode, padding_mode=self.padding_mode)
+        return Warp(self.target, self.source, rotation, **self.options)
+
+    @property
+    def options(self) -> dict:
+        """What another Warp takes to sample in the same way."""
+        names = "mode", "padding_mode", "fill", "antialias", "tolerance"
+        return {name: getattr(self, name) for name in names}
 
     def extra_repr(self) -> str:
         """The options."""
-        return f"mode={self.mode!r}, padding_mode={self.padding_mode!r}, rotation={self.rotation is not None}"
-
-
-def as_rotation(rotation, owner: str) -> Tensor | None:
-    """A checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
-    if rotation is None:
-        return None
-    rotation = as_real(rotation, "rotation", owner)
-    if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
-        raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
-    check_rotation(rotation, "rotation", owner)
-    return rotation if isinstance(rotation, nn.Parameter) or in_graph(rotation) else rotation.detach().clone()
-
-
-def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
-    """Apply a rotation, if there is one, to (*B, *N, 3); `name` is what an error calls them."""
-    if rotation is None:
-        return rays
-    rows, lead, restore = as_rows(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
-    rotation = rotation.to(rows.dtype).expand(*lead, 3, 3).reshape(-1, 3, 3)
-    return restore(torch.stack(rotate_planes(rotation, rows.unbind(-1))))
+        options = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
+        return f"{options}, rotation={self.rotation is not None}"
 
 
 def _checked_mode(mode: str) -> str:
