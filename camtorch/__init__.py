@@ -1,6 +1,6 @@
 """Cameras as layers for PyTorch: learnable camera models, exact in both directions, and every warp between them."""
 
-from camtorch import io
+from camtorch import augment, io
 from camtorch.camera import MODELS, Camera
 from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
@@ -34,5 +34,6 @@ __all__ = [
     "KannalaBrandt",
     "Pinhole",
     "Warp",
+    "augment",
     "io",
 ]

@@ -72,12 +72,10 @@ class Warp(GeometryModule):
                 raise TypeError(f"Warp: {name} must be a Camera; got {type(camera).__name__}")
             if camera.image_size is None:
                 raise ValueError(f"Warp: the {name} camera needs an image_size=(height, width)")
-        if padding_mode not in PADDINGS:
-            raise ValueError(f"Warp: padding_mode must be one of {PADDINGS}; got {padding_mode!r}")
         self.source, self.target = source, target
         if not 0 <= tolerance < float("inf"):
             raise ValueError(f"Warp: tolerance must be a number of pixels, zero or more; got {tolerance!r}")
-        self.mode, self.padding_mode = _checked_mode(mode), padding_mode
+        self.mode, self.padding_mode = _checked(mode, MODES, "mode"), _checked(padding_mode, PADDINGS, "padding_mode")
         self.fill, self.antialias, self.tolerance = as_fill(fill, "Warp"), bool(antialias), float(tolerance)
         self._set_rotation(as_rotation(rotation, "Warp"))
         shapes = [source.batch_shape, target.batch_shape, () if rotation is None else self.rotation.shape[:-2]]
@@ -100,12 +98,21 @@ class Warp(GeometryModule):
 
     # -- pictures
 
-    def forward(self, images: Tensor, *, mode: str | None = None) -> Tensor:
+    def forward(
+        self,
+        images: Tensor,
+        *,
+        mode: str | None = None,
+        padding_mode: str | None = None,
+        fill: float | Sequence[float] | None = None,
+    ) -> Tensor:
         """Warp pictures.
 
         Args:
             images: (B, C, H, W) of the source's image_size, floating point, integer or bool.
             mode: instead of the warp's own, for example "nearest" for a mask.
+            padding_mode: likewise.
+            fill: likewise.
 
         Returns:
             (B, C, H', W') of the target's image_size and of the same dtype. Half precision is sampled in float32;
@@ -127,7 +134,9 @@ class Warp(GeometryModule):
                 f"Warp: images are {tuple(images.shape[-2:])} (height, width), "
                 f"but the source camera's image_size is {self.source.image_size}"
             )
-        mode = self.mode if mode is None else _checked_mode(mode)
+        mode = self.mode if mode is None else _checked(mode, MODES, "mode")
+        padding_mode = self.padding_mode if padding_mode is None else _checked(padding_mode, PADDINGS, "padding_mode")
+        fill = self.fill if fill is None else as_fill(fill, "Warp")
         grid, mapped, scale = self._sampling()
         if grid.shape[0] == 1:
             grid = grid.expand(images.shape[0], -1, -1, -1)
@@ -136,26 +145,22 @@ class Warp(GeometryModule):
         elif images.shape[0] != grid.shape[0]:
             raise ValueError(f"Warp: {images.shape[0]} images do not fit {grid.shape[0]} cameras")
         dtype, minifies = images.dtype, scale is not None and mode != "nearest"
-        if minifies or any(self.fill):
+        if minifies or any(fill):
             images = widen(images)
         if minifies:
-            result = minify.sample_minified(images, grid, scale, mode, self.padding_mode)
+            result = minify.sample_minified(images, grid, scale, mode, padding_mode)
         else:
-            result = sample(images, grid, mode, self.padding_mode)
-        if any(self.fill):
-            result = self._filled(result, images, grid, mapped, mode)
-        elif self.padding_mode != "zeros":
-            result = torch.where(mapped.unsqueeze(1), result, 0)
+            result = sample(images, grid, mode, padding_mode)
+        if any(fill) or padding_mode != "zeros":
+            value = result.new_tensor(fill)[:, None, None]
+            if len(value) not in (1, result.shape[1]):
+                raise ValueError(f"Warp: fill has {len(value)} values, but the images have {result.shape[1]} channels")
+            if padding_mode == "zeros":
+                ones = torch.ones_like(images[:1, :1]).expand(len(grid), -1, -1, -1)
+                result = result + value * (1 - sample(ones, grid, mode, "zeros"))
+            else:
+                result = torch.where(mapped.unsqueeze(1), result, value)
         return narrow(result, dtype)
-
-    def _filled(self, result: Tensor, images: Tensor, grid: Tensor, mapped: Tensor, mode: str) -> Tensor:
-        fill = result.new_tensor(self.fill)[:, None, None]
-        if len(fill) not in (1, result.shape[1]):
-            raise ValueError(f"Warp: fill has {len(fill)} values, but the images have {result.shape[1]} channels")
-        if self.padding_mode != "zeros":
-            return torch.where(mapped.unsqueeze(1), result, fill)
-        shown = sample(torch.ones_like(images[:1, :1]).expand(len(grid), -1, -1, -1), grid, mode, "zeros")
-        return result + fill * (1 - shown)
 
     def grid(self) -> Tensor:
         """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
@@ -285,7 +290,7 @@ class Warp(GeometryModule):
         return f"{options}, rotation={self.rotation is not None}"
 
 
-def _checked_mode(mode: str) -> str:
-    if mode not in MODES:
-        raise ValueError(f"Warp: mode must be one of {MODES}; got {mode!r}")
-    return mode
+def _checked(value: str, allowed: tuple[str, ...], name: str) -> str:
+    if value not in allowed:
+        raise ValueError(f"Warp: {name} must be one of {allowed}; got {value!r}")
+    return value

@@ -1,0 +1,27 @@
+"""Augmentations that move image, masks, landmarks, boxes, gaze and head pose together, by changing the camera.
+
+`camtorch.augment.kornia`, `.torchvision` and `.numpy` are the same for those libraries' pipelines.
+"""
+
+from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import collate
+from camtorch.augment.change import Change
+from camtorch.augment.face import FaceNormalizer
+from camtorch.augment.fields import from_pitch_yaw, to_pitch_yaw
+from camtorch.augment.presets import PRESETS, Preset
+from camtorch.augment.random import RandomCamera, RandomLens, RandomMount, mount_rotation
+
+__all__ = [
+    "PRESETS",
+    "Augmentation",
+    "Change",
+    "FaceNormalizer",
+    "Preset",
+    "RandomCamera",
+    "RandomLens",
+    "RandomMount",
+    "collate",
+    "from_pitch_yaw",
+    "mount_rotation",
+    "to_pitch_yaw",
+]

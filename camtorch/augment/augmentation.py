@@ -1,0 +1,224 @@
+"""Sample in, sample out: what every augmentation does with the fields of a sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.cameras import collate, expanded, kind, rows_of
+from camtorch.augment.change import Change, Part
+from camtorch.augment.mover import Mover, Sample
+from camtorch.augment.ranges import Range, draw
+from camtorch.camera import Camera
+from camtorch.parameters import may_look
+
+
+class Augmentation(Mover):
+    """A random change of cameras, `sample -> sample`: every field moves by the same warps.
+
+    A sample is a dict, or keyword arguments, of any of these fields, of a batch or (without B) of a single sample;
+    a name may go on after an underscore, as in `gaze_left` or `mask_iris`. Masks, points and boxes whose number differs
+    between samples come as a list of tensors, one for each sample.
+
+    * `image` (B, C, H, W); `mask` (B, C, H, W) or (B, H, W), of any dtype, moved by the nearest value; `depth` along z
+      and `distance` along the ray, likewise.
+    * `keypoints` (B, N, 2) and `polygons` (B, M, K, 2) in pixels, `boxes` (B, M, 4) as x1 y1 x2 y2. Count and order
+      stay; beside them comes `keypoints_valid` and so on, bool: it lies on the new picture (and was valid before, if
+      the sample says so).
+    * `points` (B, N, 3) of the camera frame; `landmarks` are keypoints or points by their last dim.
+    * `gaze`, `directions` (B, *N, 3): turned by R, nothing else. `pitch_yaw` (B, *N, 2): a gaze in the angles of
+      ETH-XGaze.
+    * `head_pose`, `pose` (B, 4, 4) camera from head; or `rvec` (B, 3) and `tvec` (B, 3), as of OpenCV.
+    * `camera`: the camera of the picture, one for all, a batch, or a list of single ones of any models. What comes out
+      is the camera of the new picture, for which all 3D fields hold.
+
+    `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
+    Everything else stays as it is; unknown names that hold real numbers are refused, as they might be geometry.
+
+    Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere would not be exact:
+    near things shift against far ones, which no warp of a picture can do, so no augmentation does it.
+    """
+
+    ranges: dict[str, Range]
+
+    def __init__(
+        self,
+        *,
+        camera: Camera | None = None,
+        p: float = 1.0,
+        same_on_batch: bool = False,
+        fields: Mapping[str, str] | None = None,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+        fill: float | Sequence[float] = 0.0,
+        mask_fill: float = 0.0,
+        valid_mask: bool = False,
+        antialias: bool = False,
+        tolerance: float = 0.01,
+    ):
+        super().__init__(camera, fields, mask_fill, valid_mask)
+        if not 0 <= p <= 1:
+            raise ValueError(f"{self._name}: p must be a probability in [0, 1]; got {p!r}")
+        self.p, self.same_on_batch = float(p), bool(same_on_batch)
+        self.options = {
+            "mode": mode,
+            "padding_mode": padding_mode,
+            "fill": fill,
+            "antialias": antialias,
+            "tolerance": tolerance,
+        }
+        self.ranges = {}
+        self.last: Change | None = None
+        """The change of the last call: its `source`, `target` and `rotation`."""
+
+    # -- drawing
+
+    def draw(self, count: int, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Draw for `count` samples, without applying anything.
+
+        Args:
+            count: B.
+            generator: by default torch's own, which DataLoader seeds differently in every worker.
+
+        Returns:
+            `apply` (B,) bool, and for each range a float64 tensor (B,) or (B, size) of that name and unit.
+        """
+        return draw(self.ranges, count, self.p, self.same_on_batch, generator)
+
+    def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
+        """What a draw does to pictures of `camera` (the augmentation's own if None): a pure function of both."""
+        camera = self.camera if camera is None else camera
+        if camera is None:
+            raise ValueError(f"{self._name}: no camera; give one here, in the sample, or as {self._name}(camera=...)")
+        draw = self._checked_draw(draw)
+        applied = draw["apply"]
+        count = len(applied)
+        if isinstance(camera, (list, tuple)):
+            groups: dict[tuple, list[int]] = {}
+            for i, one in enumerate(camera):
+                groups.setdefault((*kind(one), bool(applied[i])), []).append(i)
+            members = [(torch.tensor(rows), collate([camera[i] for i in rows])) for rows in groups.values()]
+        elif not (may_look(applied) or count == 0):
+            # traced: all rows move, and a gate chooses
+            return Change(count, [self._part(None, camera, draw)], gate=None if self.p == 1 else applied)
+        elif bool(applied.all()):
+            return Change(count, [self._part(None, camera, draw)])
+        else:
+            members = [((applied == value).nonzero()[:, 0], camera) for value in (True, False)]
+            members = [(rows, rows_of(camera, rows)) for rows, camera in members if len(rows)]
+        parts = []
+        for rows, source in members:
+            if applied[rows[0]]:
+                parts.append(self._part(rows, source, {name: value[rows] for name, value in draw.items()}))
+            else:
+                parts.append(Part(rows, None, source))
+        sizes = {(part.warp.target if part.warp else part.camera).image_size for part in parts}
+        if len(sizes) > 1:
+            raise ValueError(
+                f"{self._name}: samples of one batch would come out in the sizes {sorted(sizes)}; with p < 1 the "
+                "image_size must be that of the pictures"
+            )
+        return Change(count, parts, listed=isinstance(camera, (list, tuple)))
+
+    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        missing = [name for name in ("apply", *self.ranges) if name not in draw]
+        if missing:
+            raise ValueError(
+                f"{self._name}: the draw lacks {', '.join(missing)}; it has {', '.join(draw) or 'nothing'}"
+            )
+        count = len(draw["apply"])
+        for name, interval in self.ranges.items():
+            shape = (count,) if interval.size is None else (count, interval.size)
+            if tuple(draw[name].shape) != shape:
+                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(draw[name].shape)}")
+        return {name: draw[name] for name in ("apply", *self.ranges)}
+
+    def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+        values = {name: value for name, value in draw.items() if name != "apply"}
+        if tuple(source.batch_shape) == (1,):
+            source = expanded(source, len(draw["apply"]))
+        if not source.batch_shape and _one_for_all(values):
+            # one map serves the whole batch
+            values = {name: value[0] for name, value in values.items()}
+        like = {
+            "dtype": torch.promote_types(source.intrinsics.dtype, torch.float32),
+            "device": source.intrinsics.device,
+        }
+        return self._planned(rows, source, {name: value.to(**like) for name, value in values.items()})
+
+    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor]) -> Part:
+        """The part of a batch with these cameras and drawn values, of the cameras' dtype and on their device."""
+        raise NotImplementedError
+
+    # -- applying
+
+    def forward(
+        self,
+        sample: Mapping[str, object] | None = None,
+        *,
+        draw: Mapping[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+        **fields,
+    ) -> Sample:
+        """Augment a sample, a dict, or keyword arguments, or both.
+
+        Args:
+            sample: the fields; see the class.
+            draw: of `draw`, to be applied again.
+            generator: to draw from.
+            fields: more fields.
+
+        Returns:
+            A new dict with all fields moved, and their validity, `camera` and `rotation`.
+
+        Raises:
+            ValueError: no camera, fields of wrong shapes, pictures that are not of the camera's image_size, an unknown
+                field that might be geometry, a draw of another size. TypeError: a field that is no tensor.
+        """
+        sample = {**(sample or {}), **fields}
+        named, batched, count, camera = self._batch(sample)
+        drawn = self.draw(count, generator) if draw is None else draw
+        if len(drawn["apply"]) != count:
+            raise ValueError(f"{self._name}: the draw is for {len(drawn['apply'])} samples, here are {count}")
+        change = self.change(camera, drawn)
+        if not torch.compiler.is_compiling():
+            self.last = change
+        return self._moved(sample, named, batched, change)
+
+    def inverse(
+        self,
+        sample: Mapping[str, object] | None = None,
+        *,
+        draw: Mapping[str, Tensor] | None = None,
+        camera: Camera | Sequence[Camera] | None = None,
+        **fields,
+    ) -> Sample:
+        """Move a sample back: by the last call's change, or by that of a `draw` and the `camera` before it.
+
+        What left the picture stays lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
+        """
+        sample = {**(sample or {}), **fields}
+        if draw is None and self.last is None:
+            raise ValueError(f"{self._name}: nothing to invert; call it first, or give draw= and camera=")
+        change = (self.last if draw is None else self.change(camera, draw)).inverse()
+        named, batched, count, _ = self._batch({**sample, "camera": change.source})
+        if count != change.count:
+            raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
+        return self._moved(sample, named, batched, change)
+
+    def __getstate__(self):
+        return {**self.__dict__, "last": None}
+
+    def extra_repr(self) -> str:
+        """What is drawn from, and the options."""
+        parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
+        options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options}
+        return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
+
+
+def _one_for_all(values: Mapping[str, Tensor]) -> bool:
+    if not all(may_look(value) for value in values.values()):
+        return False
+    return all(bool((value == value[:1]).all()) for value in values.values())

@@ -1,0 +1,214 @@
+"""What one draw does to a batch: from which camera to which, how far turned, and whether at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.cameras import expanded, joined, kind, remade, rows_of, singles
+from camtorch.camera import Camera
+from camtorch.sampling import narrow, widen
+from camtorch.warp import Warp
+
+
+@dataclass
+class Part:
+    """Rows of a batch that move by one warp, or stay as they are."""
+
+    rows: Tensor | None
+    """(n,) int64, or None for all."""
+    warp: Warp | None
+    """None: nothing happens to these rows."""
+    camera: Camera
+    """Before the change; the warp's source."""
+    shades: tuple[Warp, Warp] | None = None
+    """How red and blue move, where they do not move as green."""
+    light: Tensor | None = None
+    """(n or 1, 1, H', W'): what the lens lets through."""
+
+    def take(self, index: Tensor) -> Part:
+        """These rows of the part, as all there is."""
+        camera = rows_of(self.camera, index)
+        if self.warp is None:
+            return Part(None, None, camera)
+        rotation = self.warp.rotation
+        if rotation is not None and rotation.ndim == 3:
+            rotation = rotation[index]
+        warp = Warp(camera, rows_of(self.warp.target, index), rotation, **self.warp.options)
+        light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
+        return Part(None, warp, camera, light=light)
+
+
+class Change:
+    """What a draw does to a batch of `count` samples; made by an augmentation's `change`.
+
+    Args:
+        count: how many samples.
+        parts: every sample is in one of them.
+        listed: cameras come as a list, for they may be of several models.
+        gate: (count,) bool, where values may not be looked at: which rows of the only part move.
+    """
+
+    def __init__(self, count: int, parts: Sequence[Part], *, listed: bool = False, gate: Tensor | None = None):
+        self.count, self.parts, self.listed, self.gate = count, list(parts), listed, gate
+        rows = [part.rows for part in self.parts]
+        self._order = None if len(rows) == 1 and rows[0] is None else torch.cat(rows).argsort()
+
+    @property
+    def source(self) -> Camera | list[Camera]:
+        """The cameras before: a batch, or a list of single ones."""
+        return self._cameras([part.camera for part in self.parts])
+
+    @property
+    def target(self) -> Camera | list[Camera]:
+        """The cameras after."""
+        after = [part.camera if part.warp is None else part.warp.target for part in self.parts]
+        if self.gate is not None:
+            source, target = (expanded(c, self.count) for c in (self.parts[0].camera, after[0]))
+            pairs = [(getattr(target, n), getattr(source, n)) for n in ("intrinsics", "distortion")]
+            numbers = [torch.where(self.gate.to(t.device).unsqueeze(-1), t, s) for t, s in pairs]
+            return remade(target, *numbers, target.image_size)
+        return self._cameras(after)
+
+    def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
+        counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]
+        batches = [expanded(camera, n) for camera, n in zip(cameras, counts, strict=True)]
+        if not self.listed and len({kind(c) for c in batches}) == 1:
+            return batches[0] if self._order is None else joined(batches, self._order)
+        alone = [single for camera in batches for single in singles(camera)]
+        return alone if self._order is None else [alone[i] for i in self._order.tolist()]
+
+    @property
+    def rotation(self) -> Tensor:
+        """(count, 3, 3): `ray_after = R ray_before`."""
+
+        def turned(part: Part, n: int) -> Tensor:
+            eye = torch.eye(3, dtype=part.camera.intrinsics.dtype, device=part.camera.intrinsics.device)
+            none = part.warp is None or part.warp.rotation is None
+            return (eye if none else part.warp.rotation).expand(n, 3, 3)
+
+        parts = [turned(part, self.count if part.rows is None else len(part.rows)) for part in self.parts]
+        rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
+        if self.gate is not None:
+            eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+            rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, eye)
+        return rotation
+
+    def row(self, i: int) -> Change:
+        """The change of one sample."""
+        for part in self.parts:
+            where = [i] if part.rows is None else (part.rows == i).nonzero()[:, 0].tolist()
+            if where:
+                return Change(1, [part.take(torch.tensor(where))])
+        raise IndexError(f"a change of {self.count} samples has no row {i}")
+
+    def inverse(self) -> Change:
+        """The change back. What left the picture stays lost, and the light of the lens stays as it is."""
+        parts = [
+            part
+            if part.warp is None
+            else replace(part, warp=part.warp.inverse(), camera=part.warp.target, shades=None, light=None)
+            for part in self.parts
+        ]
+        return Change(self.count, parts, listed=self.listed, gate=self.gate)
+
+    def each(self, value: Tensor, move: Callable, stay: Callable):
+        """`move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves."""
+
+        def of(part: Part):
+            rows = value if part.rows is None else value[part.rows.to(value.device)]
+            return stay(part.camera, rows) if part.warp is None else move(part, rows)
+
+        results = [of(part) for part in self.parts]
+        if self.gate is not None:
+            moved, kept = results[0], stay(self.parts[0].camera, value)
+            return _both(lambda pair: _gated(self.gate, *pair), moved, kept)
+        if self._order is None:
+            return results[0]
+        return _both(lambda pieces: torch.cat(pieces)[self._order.to(pieces[0].device)], *results)
+
+    # -- what moves
+
+    def images(self, images: Tensor) -> Tensor:
+        """Pictures (count, C, H, W), with the colours and the light of the lens."""
+
+        def move(part: Part, rows: Tensor) -> Tensor:
+            if part.shades is not None and rows.shape[1] == 3:
+                warps = part.shades[0], part.warp, part.shades[1]
+                moved = torch.cat([warp(rows[:, i : i + 1]) for i, warp in enumerate(warps)], 1)
+            else:
+                moved = part.warp(rows)
+            return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
+
+        return self.each(images, move, lambda camera, rows: rows)
+
+    def labels(self, masks: Tensor, fill: float = 0.0) -> Tensor:
+        """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
+
+        def move(part: Part, rows: Tensor) -> Tensor:
+            return part.warp(rows, mode="nearest", padding_mode="zeros", fill=fill)
+
+        return self.each(masks, move, lambda camera, rows: rows)
+
+    def valid_mask(self) -> Tensor:
+        """(count, 1, H', W') bool: where the pictures show something."""
+        size = self.parts[0].camera.image_size
+        everywhere = torch.ones(self.count, 1, *size, dtype=torch.bool, device=self.parts[0].camera.intrinsics.device)
+        return self.each(
+            everywhere,
+            lambda part, rows: part.warp.valid_mask().expand(len(rows), -1, -1, -1),
+            lambda camera, rows: rows,
+        )
+
+    def points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (count, *N, 2), and valid (count, *N): on the picture."""
+        return self.each(pixels, lambda part, rows: part.warp.transform_points(rows), _where_they_are)
+
+    def boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
+        """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
+
+        def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
+            height, width = camera.image_size
+            x1, y1, x2, y2 = rows.unbind(-1)
+            return rows, (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
+
+        return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
+
+    def rays(self, rays: Tensor) -> Tensor:
+        """Directions and points (count, *N, 3) of the camera frame: they turn, their lengths stay."""
+        return self.each(rays, lambda part, rows: part.warp.transform_rays(rows), lambda camera, rows: rows)
+
+    def depth(self, depth: Tensor) -> Tensor:
+        """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known."""
+
+        def move(part: Part, rows: Tensor) -> Tensor:
+            before, after = (_forward(camera, rows) for camera in (part.warp.source, part.warp.target))
+            distance = torch.where(before.abs() > 1e-6, rows / before, 0.0)
+            return part.warp(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
+
+        return self.each(depth, move, lambda camera, rows: rows)
+
+
+def _forward(camera: Camera, like: Tensor) -> Tensor:
+    """(n or 1, 1, H, W): the z of every pixel's ray, 0 without one."""
+    rays, valid = camera.rays()
+    z = (rays[..., 2] * valid).to(like)
+    return z.reshape(-1, 1, *z.shape[-2:])
+
+
+def _where_they_are(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    return pixels, camera.contains(pixels)
+
+
+def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
+    return torch.where(gate.to(moved.device).reshape(-1, *[1] * (moved.ndim - 1)), moved, kept.to(moved.dtype))
+
+
+def _both(function: Callable, *results):
+    """`function` of the results, or of the first and of the second ones where each is a pair."""
+    if isinstance(results[0], tuple):
+        return tuple(function(pieces) for pieces in zip(*results, strict=True))
+    return function(results)

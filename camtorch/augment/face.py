@@ -1,0 +1,158 @@
+"""The data normalisation of gaze estimation, for any lens."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.cameras import remade
+from camtorch.augment.change import Change, Part
+from camtorch.augment.mover import Mover, Sample
+from camtorch.camera import Camera
+from camtorch.extrinsics import rotation_matrix
+from camtorch.models import Pinhole
+from camtorch.parameters import as_image_size
+from camtorch.warp import Warp
+
+
+class FaceNormalizer(Mover):
+    """A virtual pinhole camera in the same place that looks at the face, upright with it, and as from one distance.
+
+    With c the face's centre and h the x axis of the head, both seen by the camera: z = c / |c|, y = z x h (unit),
+    x = y x z, and R holds x, y, z as rows. The focal length is `focal` |c| / `distance`, so that the face is as large
+    as if it were at `distance`; with S = diag(1, 1, distance / |c|) this is the published homography
+    W = C S R K^-1, and it holds for every lens. Gaze and poses are turned by R and never scaled: that is the modified
+    normalisation of Zhang, Sugano, Bulling: Revisiting Data Normalization for Appearance-Based Gaze Estimation, ETRA
+    2018, as of ETH-XGaze. 3D points keep their true distances; `scale` brings them to the normalised ones.
+
+    Args:
+        camera: of samples that do not bring one.
+        focal: of the virtual camera at `distance`, in pixels.
+        distance: of the face in the normalised picture, in the unit of the poses.
+        image_size: (height, width) of the normalised picture.
+        axis: (x, y) pixel in which the face's centre comes to lie; (width / 2, height / 2) by default, as published.
+        mode, padding_mode, fill, antialias, tolerance: of pictures; see `Warp`.
+        fields, mask_fill, valid_mask: see `Augmentation`.
+
+    The defaults are those of ETH-XGaze: focal length 960, 224 x 224 pixels, 600 millimetres; poses in metres take
+    `distance=0.6`.
+
+    A sample has the fields of an `Augmentation`, among them `head_pose` (B, 4, 4), or `rvec` and `tvec`, camera from
+    head, with the head's x axis from its right eye to its left, as the picture's x axis when the face looks into the
+    camera. The face's centre is `face_center` (B, 3) if the sample has it, else the origin of the head.
+    Beside the moved fields come `scale` (B,), distance / |c|, `camera` and `rotation`.
+    """
+
+    def __init__(
+        self,
+        *,
+        camera: Camera | None = None,
+        focal: float = 960.0,
+        distance: float = 600.0,
+        image_size: tuple[int, int] = (224, 224),
+        axis: tuple[float, float] | None = None,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+        fill=0.0,
+        antialias: bool = False,
+        tolerance: float = 0.01,
+        fields: Mapping[str, str] | None = None,
+        mask_fill: float = 0.0,
+        valid_mask: bool = False,
+    ):
+        super().__init__(camera, fields, mask_fill, valid_mask)
+        for name, value in (("focal", focal), ("distance", distance)):
+            if not 0 < value < float("inf"):
+                raise ValueError(f"{self._name}: {name} must be positive; got {value!r}")
+        self.focal, self.distance = float(focal), float(distance)
+        self.image_size = as_image_size(image_size, self._name)
+        height, width = self.image_size
+        self.axis = (width / 2, height / 2) if axis is None else tuple(map(float, axis))
+        self.options = {
+            "mode": mode,
+            "padding_mode": padding_mode,
+            "fill": fill,
+            "antialias": antialias,
+            "tolerance": tolerance,
+        }
+
+    def change(self, camera: Camera, head_rotation: Tensor, face_centre: Tensor) -> Change:
+        """From `camera` to the virtual one.
+
+        Args:
+            camera: without batch dims, or with (B,).
+            head_rotation: (B, 3, 3), camera from head.
+            face_centre: (B, 3), in the camera's frame.
+
+        Raises:
+            ValueError: a face in the camera, or seen along the head's x axis.
+        """
+        like = {
+            "dtype": torch.promote_types(camera.intrinsics.dtype, torch.float32),
+            "device": camera.intrinsics.device,
+        }
+        centre, across = face_centre.to(**like), head_rotation[..., 0].to(**like)
+        distance = centre.norm(dim=-1, keepdim=True)
+        forward = centre / distance
+        down = torch.linalg.cross(forward, across)
+        size = down.norm(dim=-1, keepdim=True)
+        if not torch.compiler.is_compiling() and not bool((torch.isfinite(size) & (size > 1e-6)).all()):
+            raise ValueError(
+                f"{self._name}: a face's centre is the camera's, not finite, or seen along the head's x axis"
+            )
+        down = down / size
+        rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
+        focal = (self.focal / self.distance * distance).expand(-1, 2)
+        intrinsics = torch.cat((focal, focal.new_tensor(self.axis).expand(len(focal), 2)), -1)
+        target = remade(Pinhole([1.0, 1.0, 0.0, 0.0]), intrinsics, intrinsics[..., :0], self.image_size)
+        return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
+
+    def forward(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
+        """Normalise a sample, a dict or keyword arguments.
+
+        Raises:
+            ValueError: no head pose, and as `Augmentation`.
+        """
+        sample = {**(sample or {}), **fields}
+        named, batched, _, camera = self._batch(sample)
+        if not isinstance(camera, Camera):
+            raise TypeError(f"{self._name}: camera must be a Camera; got {type(camera).__name__}")
+        kinds = {name: value for name, (_, value) in named.items()}
+        if "head_pose" in kinds:
+            head, centre = kinds["head_pose"][..., :3, :3], kinds["head_pose"][..., :3, 3]
+        elif "rvec" in kinds and ("tvec" in kinds or "face_center" in kinds):
+            head, centre = rotation_matrix(kinds["rvec"]), kinds.get("tvec")
+        else:
+            raise ValueError(f"{self._name}: the sample needs head_pose, or rvec and tvec; it has {', '.join(sample)}")
+        centre = kinds.get("face_center", centre)
+        change = self.change(camera, head, centre)
+        moved = self._moved(sample, named, batched, change)
+        scale = self.distance / centre.norm(dim=-1)
+        moved["scale"] = scale if batched else scale.squeeze(0)
+        moved["source_camera"] = camera
+        return moved
+
+    def inverse(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
+        """Move what was predicted on a normalised sample back to the frame and the picture of its source camera.
+
+        The sample has `camera`, `rotation` and `source_camera` as they came out, and any other fields: gaze, keypoints,
+        3D points, pictures.
+        """
+        sample = {**(sample or {}), **fields}
+        missing = [name for name in ("camera", "rotation", "source_camera") if name not in sample]
+        if missing:
+            raise ValueError(f"{self._name}: to go back, the sample needs {', '.join(missing)} as they came out")
+        normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
+        named, batched, count, _ = self._batch({**sample, "camera": normal})
+        rotation = rotation if rotation.ndim == 3 else rotation.unsqueeze(0)
+        warp = Warp(source, normal, rotation.to(normal.intrinsics), **self.options)
+        moved = self._moved(sample, named, batched, Change(count, [Part(None, warp, source)]).inverse())
+        del moved["rotation"]
+        return moved
+
+    def extra_repr(self) -> str:
+        """The virtual camera, and the options."""
+        options = {"focal": self.focal, "distance": self.distance, "image_size": self.image_size, **self.options}
+        return ", ".join(f"{name}={value!r}" for name, value in options.items())

@@ -1,0 +1,85 @@
+"""Other lenses like a given one: coefficients moved by what they do to the picture, as far as it stays invertible."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.cameras import remade
+from camtorch.camera import Camera
+from camtorch.parameters import in_transform, is_concrete
+
+DRAWN = 16
+"""How many coefficients have a draw of their own; more take turns."""
+_SMALL = 0.1  # decentering, prism and tilt, whose pictures are lopsided, move less than radial terms: as in real lenses
+_STEP = 1e-4
+_HALVINGS = 4
+_SIDE = 9
+
+
+@torch.no_grad()
+def jittered(camera: Camera, amounts: Tensor) -> Tensor:
+    """Distortion coefficients (*B, n) of lenses like that of `camera`.
+
+    Every coefficient moves until it has moved the picture's rim by its amount, together at most by the largest amount.
+    Where the new lens could not be inverted at a pixel at which the old one can, its coefficients move half as far,
+    or a quarter, and so on, or stay.
+
+    Args:
+        camera: with image_size, and without batch dims or with those of the amounts.
+        amounts: (*B, 16), shares of the distance from the picture's centre to its corner, signed.
+    """
+    base = camera.distortion.expand(*camera.batch_shape, -1)
+    count = base.shape[-1]
+    if count == 0:
+        return base.expand(*amounts.shape[:-1], 0)
+    columns = torch.arange(count, device=amounts.device) % DRAWN
+    odd = camera.odd_in_x | camera.odd_in_y
+    lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=amounts.device)
+    share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
+    step = amounts[..., columns] * share * _sensitivity(camera).to(amounts)
+    lattice = _lattice(camera)
+    wanted = camera.unproject(lattice.expand(*camera.batch_shape, *lattice.shape))[1]
+    result = base.expand_as(step)
+    left = torch.ones(step.shape[:-1], dtype=torch.bool, device=step.device)
+    for halving in range(_HALVINGS):
+        candidate = base + step / 2**halving
+        numbers = (t.expand(*step.shape[:-1], -1) for t in (camera.intrinsics, candidate))
+        lens = remade(camera, *numbers, camera.image_size)
+        invertible = (lens.unproject(lattice.expand(*lens.batch_shape, *lattice.shape))[1] | ~wanted).all(-1)
+        result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
+        left = left & ~invertible
+        if is_concrete(left) and not in_transform() and not bool(left.any()):
+            break
+    return result
+
+
+def _sensitivity(camera: Camera) -> Tensor:
+    """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner."""
+    pixels = _lattice(camera)
+    camera = remade(camera, camera.intrinsics.double(), camera.distortion.double(), camera.image_size)
+    batch, count = camera.batch_shape, camera.distortion.shape[-1]
+    rays, seen = camera.unproject(pixels.double().expand(*batch, *pixels.shape))
+    rays = rays.unsqueeze(-3).expand(*batch, count, *pixels.shape[:-1], 3)
+    ends = []
+    for sign in (-1, 1):
+        change = sign * _STEP * torch.eye(count, dtype=torch.float64, device=rays.device)
+        distortion = camera.distortion.expand(*batch, count).unsqueeze(-2) + change
+        intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, count, 4)
+        ends.append(remade(camera, intrinsics, distortion, camera.image_size).project(rays))
+    (before, valid), (after, also) = ends
+    moved = (after - before).norm(dim=-1) / (2 * _STEP)
+    most = torch.where(valid & also & seen.unsqueeze(-2), moved, 0.0).amax(-1)
+    height, width = camera.image_size
+    corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
+    return torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
+
+
+def _lattice(camera: Camera) -> Tensor:
+    """(81, 2): pixels over the whole picture, its outer edges included."""
+    height, width = camera.image_size
+    like = {"dtype": torch.promote_types(camera.intrinsics.dtype, torch.float32), "device": camera.intrinsics.device}
+    v = torch.linspace(-0.5, height - 0.5, _SIDE, **like)
+    u = torch.linspace(-0.5, width - 0.5, _SIDE, **like)
+    v, u = torch.meshgrid(v, u, indexing="ij")
+    return torch.stack((u, v), -1).reshape(-1, 2)

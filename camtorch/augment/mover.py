@@ -1,0 +1,145 @@
+"""Moving a sample: all of its fields, checked at the door, by one change of cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+from camtorch.augment import fields as field_kinds
+from camtorch.augment.cameras import singles
+from camtorch.augment.change import Change
+from camtorch.augment.fields import KEEP, KINDS
+from camtorch.camera import Camera
+
+Sample = dict[str, object]
+
+
+class Mover(nn.Module):
+    """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
+
+    def __init__(self, camera: Camera | None, fields: Mapping[str, str] | None, mask_fill: float, valid_mask: bool):
+        super().__init__()
+        self._name = type(self).__name__
+        if camera is not None and not isinstance(camera, Camera):
+            raise TypeError(f"{self._name}: camera must be a Camera; got {type(camera).__name__}")
+        self.camera = camera
+        self.fields = dict(fields or {})
+        wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
+        if wrong:
+            raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
+        self.mask_fill, self.valid_mask = float(mask_fill), bool(valid_mask)
+
+    # -- moving
+
+    def _sorted(self, sample: Sample) -> dict[str, tuple[str, object]]:
+        """Name -> (kind, value) of the fields that move."""
+        named = {}
+        for name, value in sample.items():
+            if name in field_kinds.OWN or value is None:
+                continue
+            found = field_kinds.kind_of(name, value, self.fields, self._name)
+            if found is not None:
+                if not isinstance(value, (list, tuple)):
+                    value = field_kinds.as_tensor(value, name, found, self._name)
+                named[name] = (found, value)
+        return named
+
+    def _batch(self, sample: Sample) -> tuple[dict, bool, int, Camera | list[Camera]]:
+        """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras."""
+        camera = sample.get("camera")
+        camera = self.camera if camera is None else camera
+        if camera is None:
+            raise ValueError(f"{self._name}: no camera; give one as sample['camera'] or {self._name}(camera=...)")
+        named = self._sorted(sample)
+        if not named:
+            raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
+        batched = field_kinds.is_batch(named, camera)
+        count = None
+        for name, (found, value) in named.items():
+            if isinstance(value, (list, tuple)):
+                items = [field_kinds.as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
+                for i, item in enumerate(items):
+                    field_kinds.check(found, f"{name}[{i}]", item, False, self._name)
+                value, n = items, len(items)
+            else:
+                field_kinds.check(found, name, value, batched, self._name)
+                value = value if batched else value.unsqueeze(0)
+                n = len(value)
+            named[name] = (found, value)
+            if count is not None and n != count:
+                raise ValueError(f"{self._name}: {name} is of {n} samples, other fields are of {count}")
+            count = n
+        self._check_cameras(camera, count, named)
+        return named, batched, count, camera
+
+    def _check_cameras(self, camera, count: int, named: Mapping) -> None:
+        cameras = list(camera) if isinstance(camera, (list, tuple)) else [camera]
+        if isinstance(camera, (list, tuple)) and len(cameras) != count:
+            raise ValueError(f"{self._name}: {len(cameras)} cameras for {count} samples")
+        for i, one in enumerate(cameras):
+            name = f"camera[{i}]" if isinstance(camera, (list, tuple)) else "camera"
+            if not isinstance(one, Camera):
+                raise TypeError(f"{self._name}: {name} must be a Camera; got {type(one).__name__}")
+            if one.image_size is None:
+                raise ValueError(f"{self._name}: {name} needs an image_size=(height, width)")
+            shape = tuple(one.batch_shape)
+            if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
+                raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
+            for field, (found, value) in named.items():
+                pictures = value if isinstance(value, list) else [value]
+                if found in ("image", "mask", "depth", "distance"):
+                    for picture in pictures:
+                        if tuple(picture.shape[-2:]) != one.image_size:
+                            raise ValueError(
+                                f"{self._name}: {field} is {tuple(picture.shape[-2:])} (height, width), but the "
+                                f"image_size of {name} is {one.image_size}. camera.resize, .crop and .pad give the camera of an "
+                                "edited picture"
+                            )
+
+    def _moved(self, sample: Sample, named: Mapping, batched: bool, change: Change) -> Sample:
+        """The sample after a change; `named` holds its fields as a batch."""
+        moved = dict(sample)
+        options = {"mask_fill": self.mask_fill}
+
+        def put(name: str, value) -> None:
+            moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
+
+        for name, (found, value) in named.items():
+            if isinstance(value, list):
+                results = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
+                result, valid = ([r[j] for r in results] for j in (0, 1))
+                put(name, [r.squeeze(0) for r in result])
+                valid = None if not valid or valid[0] is None else [v.squeeze(0) for v in valid]
+            else:
+                result, valid = self._one(change, found, value, options)
+                put(name, result)
+            if valid is not None:
+                self._put_valid(put, sample, f"{name}_valid", valid, batched)
+        if self.valid_mask and any(found == "image" for found, _ in named.values()):
+            self._put_valid(put, {}, "image_valid", change.valid_mask(), batched)
+        if "image_valid" in sample and not self.valid_mask:
+            before = sample["image_valid"] if batched else sample["image_valid"].unsqueeze(0)
+            put("image_valid", change.labels(before))
+        if "rotation" not in named:
+            put("rotation", change.rotation)
+        target = change.target
+        if isinstance(target, Camera) and not batched:
+            target = singles(target)[0]
+        moved["camera"] = target
+        return moved
+
+    @staticmethod
+    def _one(change: Change, found: str, value: Tensor, options: Mapping) -> tuple[Tensor, Tensor | None]:
+        result = field_kinds.moves(found, value)(change, value, options)
+        result, valid = result if isinstance(result, tuple) else (result, None)
+        # geometry is computed in float32 at least; what came in half precision goes out in it
+        return result.to(value.dtype) if value.is_floating_point() else result, valid
+
+    @staticmethod
+    def _put_valid(put, sample: Sample, name: str, valid, batched: bool) -> None:
+        before = sample.get(name)
+        if isinstance(valid, list):
+            put(name, valid if before is None else [v & b for v, b in zip(valid, before, strict=True)])
+        else:
+            put(name, valid if before is None else valid & (before if batched else before.unsqueeze(0)))

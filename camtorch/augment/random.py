@@ -1,0 +1,264 @@
+"""Random mounts, lenses, and cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import remade
+from camtorch.augment.change import Part
+from camtorch.augment.jitter import DRAWN, jittered
+from camtorch.augment.presets import PRESETS
+from camtorch.augment.ranges import as_range
+from camtorch.camera import MODELS, Camera
+from camtorch.parameters import as_image_size
+from camtorch.warp import Warp
+
+
+class RandomCamera(Augmentation):
+    """Another camera in the same place: turned, with another lens, cropped, and of another size.
+
+    Convention: ranges are (low, high), or a number x for x to either side of doing nothing. Degrees, because people
+    think of mounts and lenses in degrees; everything else in camtorch is in radians.
+
+    Args:
+        like: whose lens the new camera has. None: the sample's own camera. A Camera. The name of a preset, see
+            `PRESETS`. A key of `ct.MODELS`, for that model with zero coefficients; it needs `fov`.
+        camera: of samples that do not bring one.
+        yaw: degrees by which the camera turns to its right.
+        pitch: degrees by which it then looks up.
+        roll: degrees by which it then leans to its right, clockwise: what it sees turns counterclockwise.
+        zoom: factor on the focal lengths.
+        fov: horizontal field of view of the new camera in degrees, from one outer edge of the picture to the other if
+            the axis is in the middle. None: that of the lens, whatever the size of the picture.
+        focal: factor on the focal lengths, for lenses made alike.
+        centre: how far the principal point moves, as a part of the picture's width and height.
+        distortion: by what part of the distance from the centre to the corner all coefficients together may move
+            the picture's rim; see `jitter.jittered`, which also keeps the lens invertible over the picture.
+        crop: part of the picture's width and height that is kept, at a random place, and enlarged to the full size.
+        chromatic: lateral chromatic aberration: by what factor less one red and blue, each for itself, are larger than
+            green. Shown by pictures of three channels, taken as red, green, blue.
+        vignetting: the part of the light that is lost in the picture's farthest corner; it grows with the square of
+            the distance from the principal point.
+        image_size: (height, width) to come out; the sample's by default. Fields of view are those in width.
+        p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
+        fields: name -> kind, for fields of other names; "keep" leaves one as it is.
+        mode, padding_mode, fill, antialias, tolerance: of pictures; see `Warp`.
+        mask_fill: the value of masks where nothing is seen.
+        valid_mask: whether `image_valid` (B, 1, H, W) comes out: where the picture shows something.
+
+    Raises:
+        ValueError: ranges in the wrong order or out of bounds, an unknown name (the text lists those there are).
+    """
+
+    def __init__(
+        self,
+        like: Camera | str | None = None,
+        *,
+        yaw=(-10.0, 10.0),
+        pitch=(-10.0, 10.0),
+        roll=(-10.0, 10.0),
+        zoom=(1.0, 1.0),
+        fov=None,
+        focal=(0.95, 1.05),
+        centre=(-0.02, 0.02),
+        distortion=(-0.02, 0.02),
+        crop=(0.9, 1.0),
+        chromatic=None,
+        vignetting=None,
+        image_size: tuple[int, int] | None = None,
+        **options,
+    ):
+        super().__init__(**options)
+        self.image_size = as_image_size(image_size, self._name)
+        self.like = _as_like(like, self._name)
+        if self.like is not None and self.like.image_size is None and fov is None:
+            raise ValueError(f"{self._name}: like={like!r} says nothing of the field of view; give fov=(low, high)")
+        tiny, huge = 1e-3, 1e3
+        limits = {
+            "yaw": (yaw, {"least": -180, "most": 180}),
+            "pitch": (pitch, {"least": -180, "most": 180}),
+            "roll": (roll, {"least": -180, "most": 180}),
+            "zoom": (zoom, {"least": tiny, "most": huge, "around": 1}),
+            "fov": (_pair(fov), {"least": tiny, "most": 360}),
+            "focal": (focal, {"least": tiny, "most": huge, "around": 1}),
+            "centre": (centre, {"least": -1, "most": 1, "size": 2}),
+            "distortion": (distortion, {"least": -1, "most": 1, "size": DRAWN}),
+            "crop": (_pair(crop), {"least": tiny, "most": 1}),
+            "place": (None if crop is None else (0, 1), {"size": 2}),
+            "chromatic": (chromatic, {"least": -0.5, "most": 0.5, "size": 2}),
+            "vignetting": (_pair(vignetting), {"least": 0, "most": 1}),
+        }
+        self.ranges = {n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None}
+
+    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor]) -> Part:
+        target = self._target(source, values)
+        rotation = mount_rotation(*(values[name] for name in ("yaw", "pitch", "roll"))) if "yaw" in values else None
+        warp = Warp(source, target, rotation, **self.options)
+        shades = None
+        if "chromatic" in values:
+            shades = tuple(
+                Warp(source, _scaled(target, 1 + values["chromatic"][..., i]), rotation, **self.options) for i in (0, 1)
+            )
+        light = _light(target, values["vignetting"]) if "vignetting" in values else None
+        return Part(rows, warp, source, shades, light)
+
+    def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
+        base = source if self.like is None else self.like
+        size = self.image_size or source.image_size
+        height, width = size
+        like = values.get("focal", next(iter(values.values())))
+        intrinsics = _fitted(base.intrinsics.to(like), base.image_size, size)
+        distortion = base.distortion.to(like)
+        factor = torch.ones_like(like if like.ndim == 0 or like.ndim == 1 else like[..., 0])
+        for name in ("focal", "zoom"):
+            factor = factor * values.get(name, 1.0)
+        fx, fy, cx, cy = intrinsics.unbind(-1)
+        if "fov" in values:
+            wide = width / _plane_width(base, distortion, values["fov"])
+            fx, fy = wide, wide * fy / fx
+        fx, fy = fx * factor, fy * factor
+        if "centre" in values:
+            cx, cy = cx + values["centre"][..., 0] * width, cy + values["centre"][..., 1] * height
+        fx, fy, cx, cy = torch.broadcast_tensors(fx, fy, cx, cy)
+        target = remade(base, torch.stack((fx, fy, cx, cy), -1), distortion, size)
+        if "distortion" in values and distortion.shape[-1]:
+            step = jittered(_detached(target), values["distortion"]) - distortion.detach()
+            target = remade(base, target.intrinsics, distortion + step, size)
+        if "crop" in values:
+            target = _cropped(target, values["crop"], values["place"])
+        return target
+
+
+class RandomMount(RandomCamera):
+    """The camera turned and rolled where it stands, and zoomed: any lens keeps its coefficients.
+
+    Args are those of `RandomCamera`: yaw, pitch, roll in degrees, zoom, and all options. On a pinhole camera this is
+    the homography K' R K^-1.
+    """
+
+    def __init__(self, *, yaw=(-10.0, 10.0), pitch=(-10.0, 10.0), roll=(-10.0, 10.0), zoom=(1.0, 1.0), **options):
+        none = dict.fromkeys(("focal", "centre", "distortion", "crop"))
+        super().__init__(yaw=yaw, pitch=pitch, roll=roll, zoom=zoom, **none, **options)
+
+
+class RandomLens(RandomCamera):
+    """Another lens before the camera, which stays where it looks.
+
+    Args are those of `RandomCamera`: like, fov, focal, centre, distortion, chromatic, vignetting, and all options. From
+    pinhole data, `RandomLens("kannala_brandt", fov=(120, 140))` makes a fisheye's.
+    """
+
+    def __init__(
+        self,
+        like: Camera | str | None = None,
+        *,
+        fov=None,
+        focal=(0.9, 1.1),
+        centre=(-0.03, 0.03),
+        distortion=(-0.05, 0.05),
+        **options,
+    ):
+        none = dict.fromkeys(("yaw", "pitch", "roll", "zoom", "crop"))
+        super().__init__(like, fov=fov, focal=focal, centre=centre, distortion=distortion, **none, **options)
+
+
+def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
+    """(*B, 3, 3), `ray_after = R ray_before`, of a camera that turns right, then looks up, then leans right.
+
+    Args:
+        yaw: (*B,) degrees, about the camera's y axis; pitch about its new x axis, roll about its new z axis.
+        pitch: likewise.
+        roll: likewise.
+    """
+    a, b, c = (torch.deg2rad(angle) for angle in (yaw, pitch, roll))
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+
+    def matrix(*entries: Tensor) -> Tensor:
+        return torch.stack(entries, -1).unflatten(-1, (3, 3))
+
+    turn = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
+    look = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
+    lean = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
+    # of the turned camera's axes as seen by the old one, transposed; sums, which autocast leaves in their precision
+    axes = (((turn[..., None] * look[..., None, :, :]).sum(-2))[..., None] * lean[..., None, :, :]).sum(-2)
+    return axes.mT
+
+
+def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
+    if like is None or isinstance(like, Camera):
+        if like is not None and like.batch_shape:
+            raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
+        return like
+    if isinstance(like, str) and like in PRESETS:
+        return PRESETS[like].camera()
+    if isinstance(like, str) and like in MODELS:
+        ideal = MODELS[like]([1.0, 1.0, 0.0, 0.0])
+        return remade(ideal, ideal.intrinsics, ideal.distortion, None)
+    raise ValueError(
+        f"{owner}: like must be a Camera, a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
+        f"got {like!r}"
+    )
+
+
+def _pair(value):
+    """A single number of these means just that number."""
+    return (value, value) if isinstance(value, (int, float)) else value
+
+
+def _detached(camera: Camera) -> Camera:
+    return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), camera.image_size)
+
+
+def _scaled(camera: Camera, factor: Tensor) -> Camera:
+    """The camera with focal lengths times a factor (*B,)."""
+    scale = torch.stack((factor, factor, torch.ones_like(factor), torch.ones_like(factor)), -1)
+    return remade(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
+
+
+def _fitted(intrinsics: Tensor, old: tuple[int, int] | None, new: tuple[int, int]) -> Tensor:
+    """Intrinsics (*B, 4) of the picture scaled to a new width, and cropped or padded evenly to the new height."""
+    fx, fy, cx, cy = intrinsics.unbind(-1)
+    if old is None:
+        return torch.stack((fx, fy, cx + (new[1] - 1) / 2, cy + (new[0] - 1) / 2), -1)
+    scale = new[1] / old[1]
+    middle = (cy - (old[0] - 1) / 2) * scale + (new[0] - 1) / 2
+    return torch.stack((fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, middle), -1)
+
+
+def _plane_width(base: Camera, distortion: Tensor, fov: Tensor) -> Tensor:
+    """(*B,): how wide a field of view in degrees is on the plane of unit focal length."""
+    half = torch.deg2rad(fov) / 2
+    rays = torch.stack((half.sin(), torch.zeros_like(half), half.cos()), -1)
+    rays = torch.stack((rays * rays.new_tensor([-1.0, 1.0, 1.0]), rays), -2)
+    plane = remade(base, rays.new_tensor([1.0, 1.0, 0.0, 0.0]), distortion, None)
+    if distortion.ndim > 1:
+        ends, valid = plane.project(rays.expand(*distortion.shape[:-1], 2, 3))
+    else:
+        ends, valid = plane.project(rays)
+    if not torch.compiler.is_compiling() and not bool(valid.all()):
+        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
+    return ends[..., 1, 0] - ends[..., 0, 0]
+
+
+def _cropped(camera: Camera, share: Tensor, place: Tensor) -> Camera:
+    """The camera of a part of the picture, `share` (*B,) of each side at `place` (*B, 2), enlarged to the full size."""
+    height, width = camera.image_size
+    fx, fy, cx, cy = camera.intrinsics.unbind(-1)
+    left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
+    cx, cy = (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
+    return remade(camera, torch.stack((fx / share, fy / share, cx, cy), -1), camera.distortion, camera.image_size)
+
+
+def _light(camera: Camera, loss: Tensor) -> Tensor:
+    """(B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance."""
+    height, width = camera.image_size
+    cx, cy = camera.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
+    grid = camera.pixel_grid()
+    square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
+    reach = [torch.maximum(c, side - 1 - c) for c, side in ((cx, width), (cy, height))]
+    farthest = (reach[0] ** 2 + reach[1] ** 2).clamp(min=1e-12)
+    return (1 - loss.reshape(-1, 1, 1) * square / farthest).unsqueeze(1)
