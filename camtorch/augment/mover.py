@@ -87,15 +87,13 @@ class Mover(nn.Module):
             if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
                 raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
             for field, (found, value) in named.items():
-                pictures = value if isinstance(value, list) else [value]
-                if found in ("image", "mask", "depth", "distance"):
-                    for picture in pictures:
-                        if tuple(picture.shape[-2:]) != one.image_size:
-                            raise ValueError(
-                                f"{self._name}: {field} is {tuple(picture.shape[-2:])} (height, width), but the "
-                                f"image_size of {name} is {one.image_size}. camera.resize, .crop and .pad give the camera of an "
-                                "edited picture"
-                            )
+                for picture in value if isinstance(value, list) else [value]:
+                    size = tuple(picture.shape[-2:])
+                    if found in ("image", "mask", "depth", "distance") and size != one.image_size:
+                        raise ValueError(
+                            f"{self._name}: {field} is {size} (height, width), but the image_size of {name} is "
+                            f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
+                        )
 
     def _moved(self, sample: Sample, named: Mapping, batched: bool, change: Change) -> Sample:
         """The sample after a change; `named` holds its fields as a batch."""
@@ -116,11 +114,13 @@ class Mover(nn.Module):
                 put(name, result)
             if valid is not None:
                 self._put_valid(put, sample, f"{name}_valid", valid, batched)
+        before = sample.get("image_valid")
+        if before is not None:
+            before = change.labels(before if batched else before.unsqueeze(0))
         if self.valid_mask and any(found == "image" for found, _ in named.values()):
-            self._put_valid(put, {}, "image_valid", change.valid_mask(), batched)
-        if "image_valid" in sample and not self.valid_mask:
-            before = sample["image_valid"] if batched else sample["image_valid"].unsqueeze(0)
-            put("image_valid", change.labels(before))
+            before = change.valid_mask() if before is None else before & change.valid_mask()
+        if before is not None:
+            put("image_valid", before)
         if "rotation" not in named:
             put("rotation", change.rotation)
         target = change.target
