@@ -36,7 +36,7 @@ _KEPT = 8
 _domains: list[tuple[str, Tensor, Domain]] = []
 
 
-def _domain(model: str, k: Tensor) -> Domain:
+def domain_of(model: str, k: Tensor) -> Domain:
     """The domain of these values: one of the last ones, or a new one."""
     for name, values, domain in _domains:
         if name == model and same(values, k):
@@ -52,7 +52,7 @@ def _domain(model: str, k: Tensor) -> Domain:
 @torch.library.custom_op("camtorch::tables", mutates_args=())
 def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`Domain.inner2`, `limits2` and `table` of coefficients (C, n); without columns where the lens needs none."""
-    domain = _domain(model, k)
+    domain = domain_of(model, k)
     empty = k.new_empty(len(k), 0)
     # clones: who gets them may write into them
     return (
@@ -78,7 +78,7 @@ def search_in_place(
         return
     camera, point = (~(solved > 0) & (possible > 0)).nonzero(as_tuple=True)
     if len(camera):
-        found_a, found_b, found = search(_domain(model, k), camera, u[camera, point], v[camera, point])
+        found_a, found_b, found = search(domain_of(model, k), camera, u[camera, point], v[camera, point])
         a[camera, point], b[camera, point] = found_a, found_b
         solved[camera, point] = torch.where(found, 1.0, -1.0).to(solved.dtype)
 

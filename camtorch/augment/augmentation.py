@@ -136,20 +136,20 @@ class Augmentation(Mover):
         return {name: draw[name] for name in ("apply", *self.ranges)}
 
     def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+        count = len(draw["apply"])
         values = {name: value for name, value in draw.items() if name != "apply"}
         if tuple(source.batch_shape) == (1,):
-            source = expanded(source, len(draw["apply"]))
-        if not source.batch_shape and _one_for_all(values):
-            # one map serves the whole batch
+            source = expanded(source, count)
+        batched = bool(source.batch_shape) or not _one_for_all(values)
+        if not batched:  # one map serves the whole batch
             values = {name: value[0] for name, value in values.items()}
-        like = {
-            "dtype": torch.promote_types(source.intrinsics.dtype, torch.float32),
-            "device": source.intrinsics.device,
-        }
-        return self._planned(rows, source, {name: value.to(**like) for name, value in values.items()})
+        dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
+        like = {"dtype": dtype, "device": source.intrinsics.device}
+        values = {name: value.to(**like) for name, value in values.items()}
+        return self._planned(rows, source, values, torch.ones((count,) if batched else (), **like))
 
-    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor]) -> Part:
-        """The part of a batch with these cameras and drawn values, of the cameras' dtype and on their device."""
+    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor], ones: Tensor) -> Part:
+        """The part of a batch with these cameras and drawn values, of the dtype, device and batch dims of `ones`."""
         raise NotImplementedError
 
     # -- applying
@@ -219,6 +219,7 @@ class Augmentation(Mover):
 
 
 def _one_for_all(values: Mapping[str, Tensor]) -> bool:
+    """Whether all samples draw the same. Of none, nothing can be said."""
     if not all(may_look(value) for value in values.values()):
         return False
     return all(bool((value == value[:1]).all()) for value in values.values())

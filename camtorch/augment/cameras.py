@@ -18,6 +18,11 @@ def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: t
     return type(camera)(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
 
 
+def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
+    """A camera of the same numbers that does not learn."""
+    return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
+
+
 def kind(camera: Camera) -> tuple:
     """What cameras must have in common to be rows of one batch."""
     return type(camera), camera.distortion.shape[-1], camera.image_size

@@ -18,7 +18,7 @@ _SIDE = 9
 
 
 @torch.no_grad()
-def jittered(camera: Camera, amounts: Tensor) -> Tensor:
+def jittered(camera: Camera, amounts: Tensor, sensitivity: Tensor) -> Tensor:
     """Distortion coefficients (*B, n) of lenses like that of `camera`.
 
     Every coefficient moves until it has moved the picture's rim by its amount, together at most by the largest amount.
@@ -28,6 +28,7 @@ def jittered(camera: Camera, amounts: Tensor) -> Tensor:
     Args:
         camera: with image_size, and without batch dims or with those of the amounts.
         amounts: (*B, 16), shares of the distance from the picture's centre to its corner, signed.
+        sensitivity: (n,) or (*B, n), of `sensitivity`.
     """
     base = camera.distortion.expand(*camera.batch_shape, -1)
     count = base.shape[-1]
@@ -37,7 +38,7 @@ def jittered(camera: Camera, amounts: Tensor) -> Tensor:
     odd = camera.odd_in_x | camera.odd_in_y
     lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=amounts.device)
     share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
-    step = amounts[..., columns] * share * _sensitivity(camera).to(amounts)
+    step = amounts[..., columns] * share * sensitivity.to(amounts)
     lattice = _lattice(camera)
     wanted = camera.unproject(lattice.expand(*camera.batch_shape, *lattice.shape))[1]
     result = base.expand_as(step)
@@ -54,7 +55,8 @@ def jittered(camera: Camera, amounts: Tensor) -> Tensor:
     return result
 
 
-def _sensitivity(camera: Camera) -> Tensor:
+@torch.no_grad()
+def sensitivity(camera: Camera) -> Tensor:
     """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner."""
     pixels = _lattice(camera)
     camera = remade(camera, camera.intrinsics.double(), camera.distortion.double(), camera.image_size)

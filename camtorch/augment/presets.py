@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from camtorch.augment.cameras import remade
+from camtorch.augment.cameras import frozen
 from camtorch.camera import MODELS, Camera
 
 
@@ -24,7 +24,7 @@ class Preset:
     def camera(self) -> Camera:
         """The camera, in float32, with nothing to learn."""
         model = MODELS[self.model](torch.tensor(self.intrinsics), torch.tensor(self.distortion))
-        return remade(model, model.intrinsics, model.distortion, self.image_size)
+        return frozen(model, self.image_size)
 
 
 PRESETS = {

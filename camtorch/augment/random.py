@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import remade
+from camtorch.augment.cameras import frozen, remade
 from camtorch.augment.change import Part
-from camtorch.augment.jitter import DRAWN, jittered
+from camtorch.augment.jitter import DRAWN, jittered, sensitivity
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import as_range
 from camtorch.camera import MODELS, Camera
-from camtorch.parameters import as_image_size
+from camtorch.parameters import Memo, as_image_size, is_concrete
 from camtorch.warp import Warp
 
 
@@ -73,6 +73,7 @@ class RandomCamera(Augmentation):
         **options,
     ):
         super().__init__(**options)
+        self._memo = Memo()
         self.image_size = as_image_size(image_size, self._name)
         self.like = _as_like(like, self._name)
         if self.like is not None and self.like.image_size is None and fov is None:
@@ -94,8 +95,8 @@ class RandomCamera(Augmentation):
         }
         self.ranges = {n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None}
 
-    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor]) -> Part:
-        target = self._target(source, values)
+    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor], ones: Tensor) -> Part:
+        target = self._target(source, values, ones)
         rotation = mount_rotation(*(values[name] for name in ("yaw", "pitch", "roll"))) if "yaw" in values else None
         warp = Warp(source, target, rotation, **self.options)
         shades = None
@@ -106,28 +107,24 @@ class RandomCamera(Augmentation):
         light = _light(target, values["vignetting"]) if "vignetting" in values else None
         return Part(rows, warp, source, shades, light)
 
-    def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
+    def _target(self, source: Camera, values: Mapping[str, Tensor], ones: Tensor) -> Camera:
         base = source if self.like is None else self.like
         size = self.image_size or source.image_size
-        height, width = size
-        like = values.get("focal", next(iter(values.values())))
-        intrinsics = _fitted(base.intrinsics.to(like), base.image_size, size)
-        distortion = base.distortion.to(like)
-        factor = torch.ones_like(like if like.ndim == 0 or like.ndim == 1 else like[..., 0])
-        for name in ("focal", "zoom"):
-            factor = factor * values.get(name, 1.0)
-        fx, fy, cx, cy = intrinsics.unbind(-1)
-        if "fov" in values:
-            wide = width / _plane_width(base, distortion, values["fov"])
-            fx, fy = wide, wide * fy / fx
+        base = remade(base, base.intrinsics.to(ones), base.distortion.to(ones), base.image_size)
+        fx, fy, cx, cy = _sized(base, size, values.get("fov")).unbind(-1)
+        factor = ones * values.get("focal", 1.0) * values.get("zoom", 1.0)
         fx, fy = fx * factor, fy * factor
         if "centre" in values:
-            cx, cy = cx + values["centre"][..., 0] * width, cy + values["centre"][..., 1] * height
-        fx, fy, cx, cy = torch.broadcast_tensors(fx, fy, cx, cy)
-        target = remade(base, torch.stack((fx, fy, cx, cy), -1), distortion, size)
-        if "distortion" in values and distortion.shape[-1]:
-            step = jittered(_detached(target), values["distortion"]) - distortion.detach()
-            target = remade(base, target.intrinsics, distortion + step, size)
+            cx, cy = cx + values["centre"][..., 0] * size[1], cy + values["centre"][..., 1] * size[0]
+        intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
+        target = remade(base, intrinsics, base.distortion, size)
+        if "distortion" in values and base.distortion.shape[-1]:
+            usual = self.ranges["fov"].middle if "fov" in self.ranges else None
+            nominal = remade(base, _sized(base, size, usual and ones.new_tensor(usual)), base.distortion, size)
+            inputs = nominal.intrinsics, nominal.distortion
+            known = self._memo(inputs, (type(base), size), lambda: sensitivity(frozen(nominal, size)))
+            step = jittered(frozen(target, size), values["distortion"], known) - base.distortion.detach()
+            target = remade(base, intrinsics, base.distortion + step, size)
         if "crop" in values:
             target = _cropped(target, values["crop"], values["place"])
         return target
@@ -197,7 +194,7 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
         return PRESETS[like].camera()
     if isinstance(like, str) and like in MODELS:
         ideal = MODELS[like]([1.0, 1.0, 0.0, 0.0])
-        return remade(ideal, ideal.intrinsics, ideal.distortion, None)
+        return frozen(ideal, None)
     raise ValueError(
         f"{owner}: like must be a Camera, a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
         f"got {like!r}"
@@ -209,37 +206,38 @@ def _pair(value):
     return (value, value) if isinstance(value, (int, float)) else value
 
 
-def _detached(camera: Camera) -> Camera:
-    return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), camera.image_size)
-
-
 def _scaled(camera: Camera, factor: Tensor) -> Camera:
     """The camera with focal lengths times a factor (*B,)."""
     scale = torch.stack((factor, factor, torch.ones_like(factor), torch.ones_like(factor)), -1)
     return remade(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
 
 
-def _fitted(intrinsics: Tensor, old: tuple[int, int] | None, new: tuple[int, int]) -> Tensor:
-    """Intrinsics (*B, 4) of the picture scaled to a new width, and cropped or padded evenly to the new height."""
-    fx, fy, cx, cy = intrinsics.unbind(-1)
-    if old is None:
-        return torch.stack((fx, fy, cx + (new[1] - 1) / 2, cy + (new[0] - 1) / 2), -1)
-    scale = new[1] / old[1]
-    middle = (cy - (old[0] - 1) / 2) * scale + (new[0] - 1) / 2
-    return torch.stack((fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, middle), -1)
+def _sized(base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
+    """Intrinsics (*B, 4) of a lens before a picture of another size, showing as much in width or a fov in degrees.
+
+    The old picture is scaled to the new width, and cropped or padded evenly to the new height.
+    """
+    (height, width), (fx, fy, cx, cy) = size, base.intrinsics.unbind(-1)
+    if base.image_size is None:
+        cx, cy = cx + (width - 1) / 2, cy + (height - 1) / 2
+    elif base.image_size != size:
+        scale = width / base.image_size[1]
+        fx, fy, cx = fx * scale, fy * scale, (cx + 0.5) * scale - 0.5
+        cy = (cy - (base.image_size[0] - 1) / 2) * scale + (height - 1) / 2
+    if fov is not None:
+        focal = width / _plane_width(base, fov)
+        fx, fy = focal, focal * fy / fx
+    return torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
 
 
-def _plane_width(base: Camera, distortion: Tensor, fov: Tensor) -> Tensor:
+def _plane_width(base: Camera, fov: Tensor) -> Tensor:
     """(*B,): how wide a field of view in degrees is on the plane of unit focal length."""
     half = torch.deg2rad(fov) / 2
-    rays = torch.stack((half.sin(), torch.zeros_like(half), half.cos()), -1)
-    rays = torch.stack((rays * rays.new_tensor([-1.0, 1.0, 1.0]), rays), -2)
-    plane = remade(base, rays.new_tensor([1.0, 1.0, 0.0, 0.0]), distortion, None)
-    if distortion.ndim > 1:
-        ends, valid = plane.project(rays.expand(*distortion.shape[:-1], 2, 3))
-    else:
-        ends, valid = plane.project(rays)
-    if not torch.compiler.is_compiling() and not bool(valid.all()):
+    right = torch.stack((half.sin(), torch.zeros_like(half), half.cos()), -1)
+    rays = torch.stack((right * right.new_tensor([-1.0, 1.0, 1.0]), right), -2)
+    plane = remade(base, right.new_tensor([1.0, 1.0, 0.0, 0.0]), base.distortion, None)
+    ends, valid = plane.project(rays.expand(*torch.broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3))))
+    if is_concrete(valid) and not bool(valid.all()):
         raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
     return ends[..., 1, 0] - ends[..., 0, 0]
 

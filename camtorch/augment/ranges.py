@@ -18,6 +18,11 @@ class Range:
     high: float
     size: int | None = None
 
+    @property
+    def middle(self) -> float:
+        """Between both ends."""
+        return (self.low + self.high) / 2
+
     def __str__(self) -> str:
         return f"({self.low:g}, {self.high:g})"
 
