@@ -21,6 +21,8 @@ Result = TypeVar("Result")
 
 MODELS: dict[str, Optics] = {}
 """The optics of every class of cameras, by its full name: operators take no functions."""
+CLASSES: dict[str, type] = {}
+"""The classes."""
 
 
 def register(camera_class: type) -> str:
@@ -28,7 +30,7 @@ def register(camera_class: type) -> str:
     name, count = f"{camera_class.__module__}.{camera_class.__qualname__}", 2
     while name in MODELS:  # a class of the same name, made by a function that was called again
         name, count = f"{camera_class.__module__}.{camera_class.__qualname__}#{count}", count + 1
-    MODELS[name] = camera_class.optics
+    MODELS[name], CLASSES[name] = camera_class.optics, camera_class
     return name
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from camtorch import minify
+from camtorch import compiled, minify
 from camtorch.camera import Camera
 from camtorch.extrinsics import as_rotation, turn
 from camtorch.parameters import (
@@ -192,6 +192,8 @@ class Warp(GeometryModule):
     def _tabulate(self) -> tuple[Tensor, Tensor]:
         """`_positions` of all pixels."""
         pixels = self.target.pixel_grid()
+        if torch.compiler.is_compiling() and self.tolerance and pixels.is_cpu:
+            return compiled.positions(self)
         if in_transform() or not is_concrete(pixels):
             return self._positions(pixels)
         if self.tolerance and pixels.is_cpu:
@@ -252,14 +254,15 @@ class Warp(GeometryModule):
             raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
         if not boxes.is_floating_point():
             boxes = boxes.to(self.source.intrinsics.dtype)
-        x1, y1, x2, y2 = (side.unsqueeze(-1) for side in boxes.unbind(-1))
-        along = torch.linspace(0, 1, _EDGE_SAMPLES + 1, dtype=boxes.dtype, device=boxes.device)[:-1]
-        x, y = x1 + (x2 - x1) * along, y1 + (y2 - y1) * along
-        x_back, y_back = x2 + (x1 - x2) * along, y2 + (y1 - y2) * along
-        outline_x = torch.cat((x, x2.expand_as(x), x_back, x1.expand_as(x)), -1)
-        outline_y = torch.cat((y1.expand_as(y), y, y2.expand_as(y), y_back), -1)
-        moved, mapped = self._move(torch.stack((outline_x, outline_y), -1))
-        mapped = mapped & torch.isfinite(boxes).all(-1, keepdim=True)
+        x1, y1, x2, y2 = boxes.unbind(-1)
+        return self.enclose(torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2)))
+
+    def enclose(self, corners: Tensor) -> tuple[Tensor, Tensor]:
+        """As `transform_boxes`, of closed polygons (B, *N, K, 2), or (*N, K, 2)."""
+        along = torch.linspace(0, 1, _EDGE_SAMPLES + 1, dtype=corners.dtype, device=corners.device)[:-1, None]
+        start, end = corners.unsqueeze(-2), corners.roll(-1, -2).unsqueeze(-2)
+        moved, mapped = self._move((start + (end - start) * along).flatten(-3, -2))
+        mapped = mapped & torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
         some = mapped.any(-1, keepdim=True)
         low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
         high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.augment.cameras import collate, expanded, kind, rows_of
 from camtorch.augment.change import Change, Part
-from camtorch.augment.mover import Mover, Sample
+from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
 from camtorch.augment.ranges import Range, draw
 from camtorch.camera import Camera
 from camtorch.parameters import may_look
@@ -154,6 +154,7 @@ class Augmentation(Mover):
 
     # -- applying
 
+    @without_graph_in_workers
     def forward(
         self,
         sample: Mapping[str, object] | None = None,
@@ -187,6 +188,7 @@ class Augmentation(Mover):
             self.last = change
         return self._moved(sample, named, batched, change)
 
+    @without_graph_in_workers
     def inverse(
         self,
         sample: Mapping[str, object] | None = None,

@@ -132,24 +132,26 @@ class Change:
 
     # -- what moves
 
-    def images(self, images: Tensor) -> Tensor:
-        """Pictures (count, C, H, W), with the colours and the light of the lens."""
+    def images(self, images: Tensor, **options) -> Tensor:
+        """Pictures (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
             if part.shades is not None and rows.shape[1] == 3:
                 warps = part.shades[0], part.warp, part.shades[1]
-                moved = torch.cat([warp(rows[:, i : i + 1]) for i, warp in enumerate(warps)], 1)
+                fills = [{"fill": value} for value in part.warp.fill] if len(part.warp.fill) == 3 else [{}] * 3
+                triples = enumerate(zip(warps, fills, strict=True))
+                moved = torch.cat([warp(rows[:, i : i + 1], **fill, **options) for i, (warp, fill) in triples], 1)
             else:
-                moved = part.warp(rows)
+                moved = part.warp(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
 
         return self.each(images, move, lambda camera, rows: rows)
 
-    def labels(self, masks: Tensor, fill: float = 0.0) -> Tensor:
+    def labels(self, masks: Tensor, fill: float = 0.0, mode: str = "nearest") -> Tensor:
         """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
-            return part.warp(rows, mode="nearest", padding_mode="zeros", fill=fill)
+            return part.warp(rows, mode=mode, padding_mode="zeros", fill=fill)
 
         return self.each(masks, move, lambda camera, rows: rows)
 
@@ -176,6 +178,19 @@ class Change:
             return rows, (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
 
         return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
+
+    def quadrilaterals(self, corners: Tensor) -> tuple[Tensor, Tensor]:
+        """Quadrilaterals (count, *N, 4, 2): the corners of the boxes that enclose them, and valid (count, *N)."""
+
+        def move(part: Part, rows: Tensor) -> tuple[Tensor, Tensor]:
+            enclosing, valid = part.warp.enclose(rows)
+            x1, y1, x2, y2 = enclosing.unbind(-1)
+            return torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2)), valid
+
+        def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
+            return rows, torch.ones_like(rows[..., 0, 0], dtype=torch.bool)
+
+        return self.each(corners, move, stay)
 
     def rays(self, rays: Tensor) -> Tensor:
         """Directions and points (count, *N, 3) of the camera frame: they turn, their lengths stay."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.augment.cameras import remade
 from camtorch.augment.change import Change, Part
-from camtorch.augment.mover import Mover, Sample
+from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.extrinsics import rotation_matrix
 from camtorch.models import Pinhole
@@ -109,6 +109,7 @@ class FaceNormalizer(Mover):
         target = remade(Pinhole([1.0, 1.0, 0.0, 0.0]), intrinsics, intrinsics[..., :0], self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
+    @without_graph_in_workers
     def forward(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
         """Normalise a sample, a dict or keyword arguments.
 
@@ -134,6 +135,7 @@ class FaceNormalizer(Mover):
         moved["source_camera"] = camera
         return moved
 
+    @without_graph_in_workers
     def inverse(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
         """Move what was predicted on a normalised sample back to the frame and the picture of its source camera.
 

@@ -105,7 +105,7 @@ KINDS = {
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _rays),
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation),
 }
-_ALIASES = {"images": "image", "masks": "mask", "point": "points", "face_center": "points"}
+_ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "draw", "generator")
 
 

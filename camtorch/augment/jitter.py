@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from camtorch.augment.cameras import remade
+from camtorch.augment.cameras import frozen, remade
 from camtorch.camera import Camera
-from camtorch.parameters import in_transform, is_concrete
+from camtorch.opaque import CLASSES
+from camtorch.parameters import same
 
 DRAWN = 16
 """How many coefficients have a draw of their own; more take turns."""
@@ -17,8 +20,7 @@ _HALVINGS = 4
 _SIDE = 9
 
 
-@torch.no_grad()
-def jittered(camera: Camera, amounts: Tensor, sensitivity: Tensor) -> Tensor:
+def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     """Distortion coefficients (*B, n) of lenses like that of `camera`.
 
     Every coefficient moves until it has moved the picture's rim by its amount, together at most by the largest amount.
@@ -28,8 +30,17 @@ def jittered(camera: Camera, amounts: Tensor, sensitivity: Tensor) -> Tensor:
     Args:
         camera: with image_size, and without batch dims or with those of the amounts.
         amounts: (*B, 16), shares of the distance from the picture's centre to its corner, signed.
-        sensitivity: (n,) or (*B, n), of `sensitivity`.
+        nominal: (4,) or (*B, 4), intrinsics of the same lens before anything was drawn: what a coefficient does to the
+            rim is measured there.
     """
+    with torch.no_grad():
+        if torch.compiler.is_compiling():
+            numbers = camera.intrinsics, camera.distortion
+            return _opaque_jittered(camera._model, *numbers, list(camera.image_size), amounts, nominal)
+        return _jittered(camera, amounts, nominal)
+
+
+def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     base = camera.distortion.expand(*camera.batch_shape, -1)
     count = base.shape[-1]
     if count == 0:
@@ -38,7 +49,7 @@ def jittered(camera: Camera, amounts: Tensor, sensitivity: Tensor) -> Tensor:
     odd = camera.odd_in_x | camera.odd_in_y
     lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=amounts.device)
     share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
-    step = amounts[..., columns] * share * sensitivity.to(amounts)
+    step = amounts[..., columns] * share * _sensitivity(camera, nominal).to(amounts)
     lattice = _lattice(camera)
     wanted = camera.unproject(lattice.expand(*camera.batch_shape, *lattice.shape))[1]
     result = base.expand_as(step)
@@ -50,14 +61,45 @@ def jittered(camera: Camera, amounts: Tensor, sensitivity: Tensor) -> Tensor:
         invertible = (lens.unproject(lattice.expand(*lens.batch_shape, *lattice.shape))[1] | ~wanted).all(-1)
         result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
         left = left & ~invertible
-        if is_concrete(left) and not in_transform() and not bool(left.any()):
+        if not bool(left.any()):
             break
     return result
 
 
-@torch.no_grad()
-def sensitivity(camera: Camera) -> Tensor:
-    """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner."""
+@torch.library.custom_op("camtorch::jittered", mutates_args=())
+def _opaque_jittered(
+    model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
+) -> Tensor:
+    camera = frozen(CLASSES[model](intrinsics.detach(), distortion.detach()), tuple(size))
+    return _jittered(camera, amounts, nominal).clone()
+
+
+@_opaque_jittered.register_fake
+def _(model, intrinsics, distortion, size, amounts, nominal):
+    return amounts.new_empty(*amounts.shape[:-1], distortion.shape[-1])
+
+
+_KEPT = 8
+_known: list[tuple[tuple, tuple[Tensor, Tensor], Tensor]] = []
+
+
+def _sensitivity(camera: Camera, nominal: Tensor) -> Tensor:
+    """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner.
+
+    The last results are kept: mostly the lens is always the same one.
+    """
+    options, inputs = (type(camera), camera.image_size), (nominal, camera.distortion)
+    for known_options, known_inputs, result in _known:
+        if known_options == options and all(map(same, known_inputs, inputs)):
+            return result
+    result = _measured(remade(camera, nominal.detach(), camera.distortion.detach(), camera.image_size))
+    _known.insert(0, (options, tuple(t.detach().clone() for t in inputs), result))
+    del _known[_KEPT:]
+    return result
+
+
+def _measured(camera: Camera) -> Tensor:
+    """`_sensitivity` at the camera's own intrinsics."""
     pixels = _lattice(camera)
     camera = remade(camera, camera.intrinsics.double(), camera.distortion.double(), camera.image_size)
     batch, count = camera.batch_shape, camera.distortion.shape[-1]

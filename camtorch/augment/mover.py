@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 
+import torch
 from torch import Tensor, nn
+from torch.utils.data import get_worker_info
 
 from camtorch.augment import fields as field_kinds
 from camtorch.augment.cameras import singles
@@ -13,6 +16,19 @@ from camtorch.augment.fields import KEEP, KINDS
 from camtorch.camera import Camera
 
 Sample = dict[str, object]
+
+
+def without_graph_in_workers(method: Callable) -> Callable:
+    """A method that records no graph in a DataLoader's worker: pictures made by a learnable camera could not leave it."""
+
+    @functools.wraps(method)
+    def wrapped(*args, **kwargs):
+        if torch.compiler.is_compiling() or get_worker_info() is None:
+            return method(*args, **kwargs)
+        with torch.no_grad():
+            return method(*args, **kwargs)
+
+    return wrapped
 
 
 class Mover(nn.Module):

@@ -10,11 +10,11 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import frozen, remade
 from camtorch.augment.change import Part
-from camtorch.augment.jitter import DRAWN, jittered, sensitivity
+from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import as_range
 from camtorch.camera import MODELS, Camera
-from camtorch.parameters import Memo, as_image_size, is_concrete
+from camtorch.parameters import as_image_size, is_concrete
 from camtorch.warp import Warp
 
 
@@ -73,7 +73,6 @@ class RandomCamera(Augmentation):
         **options,
     ):
         super().__init__(**options)
-        self._memo = Memo()
         self.image_size = as_image_size(image_size, self._name)
         self.like = _as_like(like, self._name)
         if self.like is not None and self.like.image_size is None and fov is None:
@@ -119,11 +118,9 @@ class RandomCamera(Augmentation):
         intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
         target = remade(base, intrinsics, base.distortion, size)
         if "distortion" in values and base.distortion.shape[-1]:
-            usual = self.ranges["fov"].middle if "fov" in self.ranges else None
-            nominal = remade(base, _sized(base, size, usual and ones.new_tensor(usual)), base.distortion, size)
-            inputs = nominal.intrinsics, nominal.distortion
-            known = self._memo(inputs, (type(base), size), lambda: sensitivity(frozen(nominal, size)))
-            step = jittered(frozen(target, size), values["distortion"], known) - base.distortion.detach()
+            usual = ones.new_tensor(self.ranges["fov"].middle) if "fov" in values else None
+            nominal = _sized(base, size, usual)
+            step = jittered(frozen(target, size), values["distortion"], nominal) - base.distortion.detach()
             target = remade(base, intrinsics, base.distortion + step, size)
         if "crop" in values:
             target = _cropped(target, values["crop"], values["place"])

@@ -1,0 +1,219 @@
+"""Augmentations for numpy arrays, called as those of albumentations are: one sample of keyword arguments.
+
+    transform = camtorch.augment.numpy.Transform(camtorch.augment.RandomMount(yaw=20))
+    out = transform(image=image, mask=mask, keypoints=points, bboxes=boxes, gaze=gaze, camera=camera)
+
+The module is imported by name: `import camtorch.augment.numpy`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from camtorch.augment import fields as field_kinds
+from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import singles
+from camtorch.augment.change import Change
+from camtorch.augment.face import FaceNormalizer
+from camtorch.augment.mover import Sample
+from camtorch.camera import Camera
+
+_OWNER = "numpy.Transform"
+_PICTURES = ("image", "mask", "depth", "distance")
+_SEEN = "image_valid"
+
+
+class Transform:
+    """An augmentation, or a `FaceNormalizer`, of one sample of numpy arrays.
+
+    The fields are those of `Augmentation`, without their batch dim, and pictures have their channels last:
+
+    * `image` (H, W, C) or (H, W), of any real dtype, usually uint8, uint16 or float32; `mask`, `depth`, `distance`
+      likewise. `images` and `masks` are lists of such, or arrays (N, H, W) or (N, H, W, C). Three channels are red,
+      green, blue, which matters to chromatic aberration only.
+    * `keypoints` (N, 2); `bboxes` or `boxes` (M, 4) as x1 y1 x2 y2; both in pixels with the centre of the top-left one
+      at (0, 0). Boxes between pixel edges, albumentations' "pascal_voc", are these plus 0.5.
+    * `gaze` (3,), `head_pose` (4, 4), `rvec` (3,), `tvec` (3,), `points` (N, 3), and all other fields.
+    * `camera`: the camera of the pictures, unless the augmentation has one.
+
+    Whatever is no field is passed on as it is. All arrays come out with the layout and the dtype that they came in
+    with, but coordinates of whole numbers come out in float32. Beside them come `keypoints_valid` (N,), `bboxes_valid`
+    (M,) and so on, bool, the new `camera`, and `rotation` (3, 3). Nothing is ever dropped or sorted: what left the
+    picture has a False there. There is no `bbox_params` or `keypoint_params`.
+
+    Numbers are drawn from torch's generator, `torch.manual_seed`, which DataLoader seeds differently in each of its
+    workers, and not from numpy's. The same seed draws the same in every front end. Nothing is differentiated.
+
+    Args:
+        augmentation: what to do.
+
+    Raises:
+        TypeError: it is no augmentation.
+    """
+
+    def __init__(self, augmentation: Augmentation | FaceNormalizer):
+        if not isinstance(augmentation, (Augmentation, FaceNormalizer)):
+            raise TypeError(
+                f"{_OWNER}: augmentation must be an augmentation of camtorch; got {type(augmentation).__name__}"
+            )
+        self.augmentation = augmentation
+
+    def __call__(
+        self,
+        sample: Mapping[str, object] | None = None,
+        *,
+        draw: Mapping[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+        **fields,
+    ) -> Sample:
+        """Augment a sample, keyword arguments, or a dict, or both.
+
+        Args:
+            sample: fields; see the class.
+            draw: of `augmentation.draw(1)`, to be applied again.
+            generator: to draw from instead of torch's own.
+            fields: more fields.
+
+        Returns:
+            A new dict.
+
+        Raises:
+            ValueError: arrays of wrong shapes, and what the augmentation raises. TypeError: a field that is no array of
+                real numbers.
+        """
+        options = {"draw": draw, "generator": generator}
+        return self._moved(self.augmentation.forward, sample, fields, options)
+
+    def inverse(
+        self,
+        sample: Mapping[str, object] | None = None,
+        *,
+        draw: Mapping[str, Tensor] | None = None,
+        camera: Camera | None = None,
+        **fields,
+    ) -> Sample:
+        """Move a sample back, see `Augmentation.inverse`: by the last call's change, or by `draw` and its `camera`."""
+        options = {} if draw is None else {"draw": draw, "camera": camera}
+        if draw is None and camera is not None:
+            fields["camera"] = camera
+        return self._moved(self.augmentation.inverse, sample, fields, options)
+
+    @property
+    def last(self) -> Change | None:
+        """The change of the last call: its `source`, `target` and `rotation`."""
+        return getattr(self.augmentation, "last", None)
+
+    def __repr__(self) -> str:
+        return f"Transform({self.augmentation!r})"
+
+    def _moved(self, move: Callable, sample: Mapping | None, fields: Mapping, options: Mapping) -> Sample:
+        if sample is not None and not isinstance(sample, Mapping):
+            raise TypeError(
+                f"{_OWNER}: the fields go in by name, as in transform(image=...); got {type(sample).__name__}"
+            )
+        sample = {**(sample or {}), **fields}
+        inside, entries = {}, {}
+        for name, value in sample.items():
+            tensors, restore = entries[name] = self._entry(name, value, sample)
+            inside.update({name: value} if restore is None else tensors)
+        with torch.no_grad():
+            moved = move(inside, **{key: value for key, value in options.items() if value is not None})
+        camera = moved["camera"]
+        if isinstance(camera, Camera) and camera.batch_shape:
+            camera = moved["camera"] = singles(camera)[0]
+        result = {}
+        for name, (tensors, restore) in entries.items():
+            if restore is not None:
+                result[name] = restore([moved.pop(key)[0] for key in tensors], camera.image_size)
+            elif name in moved:
+                result[name] = moved.pop(name)
+        for name, value in moved.items():
+            value = value[0].cpu().numpy() if isinstance(value, Tensor) else value
+            result[name] = value[0] if name == _SEEN else value
+        return result
+
+    def _entry(self, name: str, value, sample: Mapping) -> tuple[dict[str, Tensor], Callable | None]:
+        """A field as the augmentation takes it, tensors with a batch dim of one, and how it gets its layout back.
+
+        The latter is a function of what became of the tensors, and of the new image_size; None for what is passed on.
+        """
+        if name in field_kinds.OWN or value is None:
+            return {}, None
+        if name == _SEEN or (name.endswith("_valid") and name.removesuffix("_valid") in sample):
+            valid = _tensor(np.asarray(value, dtype=bool))
+            if name == _SEEN:
+                return {name: valid[None, None]}, lambda moved, size: moved[0][0].cpu().numpy()
+            return {name: valid[None]}, lambda moved, size: moved[0].cpu().numpy()
+        kind = field_kinds.kind_of(name, value, self.augmentation.fields, _OWNER)
+        if kind is None:
+            return {}, None
+        if kind not in _PICTURES:
+            value = _checked(name, _numbers(value, kind))
+            tensor = _tensor(value)
+            field_kinds.check(kind, name, tensor, False, _OWNER)
+            return {name: tensor[None]}, lambda moved, size: moved[0].cpu().numpy().astype(value.dtype, copy=False)
+        camera = sample.get("camera")
+        size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
+        many = isinstance(value, (list, tuple))
+        if not many and name not in ("images", "masks"):
+            return {name: as_tensor(name, value, size)}, lambda moved, size: as_array(moved[0], value)
+        # names that begin with their kind are known to the augmentation
+        tensors = {f"{kind}_{name}[{i}]": as_tensor(f"{name}[{i}]", one, size) for i, one in enumerate(value)}
+
+        def restore(moved: list[Tensor], size: tuple[int, int]):
+            arrays = [as_array(picture, one) for picture, one in zip(moved, value, strict=True)]
+            if many:
+                return arrays
+            return np.stack(arrays) if arrays else np.zeros((0, *size, *value.shape[3:]), value.dtype)
+
+        return tensors, restore
+
+
+def _numbers(value, kind: str):
+    """Coordinates of floating point; a list of numbers is taken for an array."""
+    if isinstance(value, (list, tuple)):
+        try:
+            value = np.asarray(value, np.float32)
+        except (TypeError, ValueError):
+            return value
+        last = field_kinds.KINDS[kind].last
+        value = value if value.size or not last else value.reshape(0, last[0])
+    return value.astype(np.float32) if isinstance(value, np.ndarray) and value.dtype.kind in "iub" else value
+
+
+def as_tensor(name: str, value, size: tuple[int, int] | None) -> Tensor:
+    """(1, C, H, W) of an array (H, W, C) or (H, W)."""
+    shape = _checked(name, value).shape
+    if len(shape) not in (2, 3):
+        raise ValueError(f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}")
+    if size == shape[1:] and size != shape[:2]:
+        raise ValueError(
+            f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}, which has its channels first: "
+            "np.moveaxis(image, 0, -1) puts them last"
+        )
+    return _tensor(np.moveaxis(value, -1, 0) if len(shape) == 3 else value[None])[None]
+
+
+def as_array(picture: Tensor, like: np.ndarray) -> np.ndarray:
+    """A picture (C, H, W) in the layout and the dtype of an array."""
+    array = picture.detach().cpu().numpy()
+    array = np.ascontiguousarray(np.moveaxis(array, 0, -1)) if like.ndim == 3 else array[0]
+    return array.astype(like.dtype, copy=False)
+
+
+def _checked(name: str, value) -> np.ndarray:
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
+        what = f"dtype {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
+        raise TypeError(f"{_OWNER}: {name} must be a numpy array of real numbers; got {what}")
+    return value
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    # torch takes neither other byte orders nor negative strides, nor long doubles, and warns of read-only arrays
+    dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64
+    array = np.ascontiguousarray(array, dtype)
+    return torch.from_numpy(array if array.flags.writeable else array.copy())

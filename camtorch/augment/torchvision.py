@@ -1,0 +1,206 @@
+"""Augmentations as a transform of torchvision.transforms.v2, for samples of tv_tensors.
+
+    transform = camtorch.augment.torchvision.Transform(camtorch.augment.RandomMount(yaw=20), camera)
+    image, target = transform(image, target)
+
+The module is imported by name: `import camtorch.augment.torchvision`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import singles
+from camtorch.augment.change import Change
+from camtorch.augment.mover import without_graph_in_workers
+from camtorch.augment.numpy import as_array, as_tensor
+from camtorch.camera import Camera
+
+try:
+    import PIL.Image
+    from torchvision import tv_tensors
+    from torchvision.transforms import v2
+except Exception as error:  # a binary that does not match fails with a RuntimeError
+    raise ImportError(
+        "camtorch.augment.torchvision needs a torchvision that was built for the installed torch "
+        f"{torch.__version__}; importing it failed with {type(error).__name__}: {error}"
+    ) from error
+
+_OWNER = "torchvision.Transform"
+# since torchvision 0.23
+_KEYPOINTS = (tv_tensors.KeyPoints,) if hasattr(tv_tensors, "KeyPoints") else ()
+
+
+class Transform(v2.Transform):
+    """A transform of v2: one draw for all that a sample holds, a dict or any other nest.
+
+    * `Image` (..., C, H, W), `Video` (..., T, C, H, W), PIL images, and by v2's rule the first plain tensor
+      of a sample without any of these.
+    * `Mask` (..., H, W), by the nearest value.
+    * `KeyPoints` (..., 2), for torchvision as for camtorch in pixels whose centres are whole numbers. One that has no
+      place on the new camera becomes (-1, -1); `last.points` also tells which lie on the picture.
+    * `BoundingBoxes` of every format without rotation, whose coordinates are torchvision's, between pixel edges. The
+      new ones enclose all of what the old ones did, with whole numbers too, and are not clamped:
+      `v2.ClampBoundingBoxes` and `v2.SanitizeBoundingBoxes` follow where wanted. One that has no place on the new
+      camera becomes (-1, -1, -1, -1) in XYXY, which has no area.
+    * A `Camera` in the sample is the sample's camera, and comes out as that of the new picture.
+
+    Formats and dtypes stay; canvas_size becomes that of the new camera. All else stays as it is, also
+    3D labels in plain tensors: `last.rotation` (1, 3, 3), or `last.rays`, turns them.
+
+    Args:
+        augmentation: what to do.
+        camera: of samples that hold none; by default the augmentation's.
+
+    Raises:
+        TypeError: it is no augmentation; a camera that is none.
+        ValueError: no camera, or one with batch dims; pictures, boxes or points that are not of the camera's
+            image_size; rotated boxes; PIL images of palettes or single bits.
+    """
+
+    _transformed_types = (torch.Tensor, PIL.Image.Image, Camera)
+
+    def __init__(self, augmentation: Augmentation, camera: Camera | None = None):
+        super().__init__()
+        if not isinstance(augmentation, Augmentation):
+            raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
+        if camera is not None and not isinstance(camera, Camera):
+            raise TypeError(f"{_OWNER}: camera must be a Camera; got {type(camera).__name__}")
+        self.augmentation = augmentation
+        self.camera = camera
+
+    @property
+    def last(self) -> Change | None:
+        """The change of the last call: its `source`, `target` and `rotation`."""
+        return self.augmentation.last
+
+    @without_graph_in_workers
+    def make_params(self, flat_inputs: list[Any]) -> dict[str, Any]:
+        """Draw once for all inputs of a sample.
+
+        Returns:
+            `change`, and `camera`, the new one.
+        """
+        cameras = [one for one in flat_inputs if isinstance(one, Camera)]
+        if len(cameras) > 1:
+            raise ValueError(f"{_OWNER}: a sample has one camera; here are {len(cameras)}")
+        camera = cameras[0] if cameras else self.augmentation.camera if self.camera is None else self.camera
+        if camera is None:
+            raise ValueError(f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation")
+        if camera.image_size is None or camera.batch_shape:
+            raise ValueError(
+                f"{_OWNER}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} "
+                f"and batch dims {tuple(camera.batch_shape)}"
+            )
+        for one in flat_inputs:
+            size = _size(one)
+            if size not in (None, camera.image_size):
+                raise ValueError(
+                    f"{_OWNER}: {type(one).__name__} is {size} (height, width), but the camera's image_size is "
+                    f"{camera.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
+                )
+        change = self.augmentation.change(camera, self.augmentation.draw(1))
+        self.augmentation.last = change
+        return {"change": change, "camera": singles(change.target)[0]}
+
+    @without_graph_in_workers
+    def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
+        """Move one input of a sample by the `params` of `make_params`."""
+        change, camera = params["change"], params["camera"]
+        if change.parts[0].warp is None:
+            return inpt
+        if isinstance(inpt, Camera):
+            return camera
+        if isinstance(inpt, PIL.Image.Image):
+            return _pil(change, inpt)
+        plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
+        if isinstance(inpt, tv_tensors.Mask):
+            return tv_tensors.wrap(_labels(change, plain, self.augmentation.mask_fill), like=inpt)
+        if isinstance(inpt, _KEYPOINTS):
+            return tv_tensors.wrap(_points(change, plain), like=inpt, canvas_size=camera.image_size)
+        if isinstance(inpt, tv_tensors.BoundingBoxes):
+            boxes = _boxes(change, plain, inpt.format.value)
+            return tv_tensors.wrap(boxes, like=inpt, canvas_size=camera.image_size)
+        if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
+            return tv_tensors.wrap(_pictures(change, plain), like=inpt)
+        return inpt if isinstance(inpt, tv_tensors.TVTensor) else _pictures(change, plain)
+
+
+def _size(inpt: Any) -> tuple[int, int] | None:
+    """(height, width) of the picture that an input is, or lies on."""
+    if isinstance(inpt, PIL.Image.Image):
+        return inpt.size[::-1]
+    if isinstance(inpt, (*_KEYPOINTS, tv_tensors.BoundingBoxes)):
+        return tuple(inpt.canvas_size)
+    if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video, tv_tensors.Mask)):
+        return tuple(inpt.shape[-2:])
+    return None if isinstance(inpt, (Camera, tv_tensors.TVTensor)) else tuple(inpt.shape[-2:])
+
+
+def _pictures(change: Change, pictures: Tensor) -> Tensor:
+    """Pictures (..., C, H, W), or (H, W), all of one sample."""
+    frames = pictures.reshape(-1, *pictures.shape[-3:]) if pictures.ndim > 2 else pictures[None, None]
+    spread = Change(len(frames), [replace(part, rows=None) for part in change.parts])
+    moved = spread.images(frames)
+    return moved.reshape(*pictures.shape[:-2], *moved.shape[-2:])
+
+
+def _pil(change: Change, image: PIL.Image.Image) -> PIL.Image.Image:
+    if image.mode in ("1", "P", "PA"):
+        raise ValueError(
+            f"{_OWNER}: values between those of a PIL image of mode {image.mode!r} mean nothing; "
+            "image.convert('RGB') makes it a picture, tv_tensors.Mask(image) labels"
+        )
+    array = np.asarray(image)
+    moved = as_array(change.images(as_tensor("image", array))[0], array)
+    return PIL.Image.frombytes(image.mode, moved.shape[1::-1], moved.tobytes())
+
+
+def _labels(change: Change, masks: Tensor, fill: float) -> Tensor:
+    moved = change.labels(masks.reshape(1, math.prod(masks.shape[:-2]), *masks.shape[-2:]), fill)
+    return moved.reshape(*masks.shape[:-2], *moved.shape[-2:])
+
+
+def _points(change: Change, points: Tensor) -> Tensor:
+    """Pixels (..., 2)."""
+    moved = change.points(_wide(points).reshape(1, math.prod(points.shape[:-1]), 2))[0].reshape(points.shape)
+    return (moved if points.is_floating_point() else moved.round()).to(points.dtype)
+
+
+def _boxes(change: Change, boxes: Tensor, form: str) -> Tensor:
+    """Boxes (M, 4) between pixel edges, of one of torchvision's formats."""
+    one, two = _wide(boxes).chunk(2, -1)
+    if form == "XYXY":
+        low, high = one, two
+    elif form == "XYWH":
+        low, high = one, one + two
+    elif form == "CXCYWH":
+        low, high = one - two / 2, one + two / 2
+    else:
+        raise ValueError(
+            f"{_OWNER}: boxes of the format {form} turn with no lens; v2.ConvertBoundingBoxFormat('XYXY') encloses them"
+        )
+    whole = not boxes.is_floating_point()
+    if whole:  # as torchvision reads them
+        low, high = low.trunc(), high.trunc()
+    moved = change.boxes((torch.cat((low, high), -1) - 0.5)[None])[0][0]
+    lost = (moved == -1).all(-1, keepdim=True)
+    low, high = torch.where(lost, moved, moved + 0.5).chunk(2, -1)
+    if whole:
+        # rounding errors are no reason for another pixel
+        low, high = (low + 1e-3).floor(), (high - 1e-3).ceil()
+        if form == "CXCYWH":  # whose centres are whole numbers too
+            high = high + (high - low) % 2
+    pairs = {"XYXY": (low, high), "XYWH": (low, high - low), "CXCYWH": ((low + high) / 2, high - low)}
+    return torch.cat(pairs[form], -1).to(boxes.dtype)
+
+
+def _wide(values: Tensor) -> Tensor:
+    return values if values.dtype == torch.float64 else values.float()

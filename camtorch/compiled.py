@@ -1,0 +1,61 @@
+"""What compiled code calls instead of tracing it: the map of a warp with a tolerance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from camtorch.opaque import CLASSES
+
+if TYPE_CHECKING:
+    from camtorch.warp import Warp
+
+
+def positions(warp: Warp) -> tuple[Tensor, Tensor]:
+    """`positions.Exact` of all pixels of a warp that does not learn, as one operator."""
+    cameras = [n for c in (warp.source, warp.target) for n in (c._model, c.intrinsics, c.distortion)]
+    sizes = [*warp.source.image_size, *warp.target.image_size]
+    planes, mapped = _positions(*cameras, warp.rotation, sizes, warp.tolerance)
+    return planes.movedim(1, -1), mapped
+
+
+@torch.library.custom_op("camtorch::positions", mutates_args=())
+def _positions(
+    source_model: str,
+    source_intrinsics: Tensor,
+    source_distortion: Tensor,
+    target_model: str,
+    target_intrinsics: Tensor,
+    target_distortion: Tensor,
+    rotation: Tensor | None,
+    sizes: Sequence[int],
+    tolerance: float,
+) -> tuple[Tensor, Tensor]:
+    """The map of a compiled warp with a tolerance: its planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
+    from camtorch.warp import Warp
+
+    cameras = []
+    for model, intrinsics, distortion, size in (
+        (source_model, source_intrinsics, source_distortion, sizes[:2]),
+        (target_model, target_intrinsics, target_distortion, sizes[2:]),
+    ):
+        numbers = [intrinsics, distortion] if distortion.shape[-1] else [intrinsics]
+        camera = CLASSES[model](*(t.detach() for t in numbers), image_size=tuple(size))
+        cameras.append(camera.requires_grad_(False))
+    grid, mapped = Warp(*cameras, rotation, tolerance=tolerance)._tabulate()
+    return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
+
+
+@_positions.register_fake
+def _(_, source, source_distortion, __, target, target_distortion, rotation, sizes, tolerance):
+    shapes = [t.shape[:-1] for t in (source, source_distortion, target, target_distortion)]
+    shapes += [] if rotation is None else [rotation.shape[:-2]]
+    count = math.prod(torch.broadcast_shapes(*shapes))
+    dtype = torch.promote_types(source.dtype, target.dtype)
+    dtype = dtype if rotation is None else torch.promote_types(dtype, rotation.dtype)
+    planes = source.new_empty(count, 2, *sizes[2:], dtype=dtype)
+    return planes, source.new_empty(count, *sizes[2:], dtype=torch.bool)
