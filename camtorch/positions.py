@@ -61,15 +61,15 @@ def on_lattice(
     v, u = torch.meshgrid(*steps, indexing="ij")
     nodes, mapped = exact(torch.stack((u, v), -1))
     nodes = nodes.movedim(-1, 1)  # (B, 2, rows + 3, columns + 3)
-    some, every, open_cells = _open_cells(nodes, mapped, source, tolerance)
+    some, open_cells = _open_cells(nodes, mapped, source, tolerance)
     most = int(open_cells.sum((1, 2)).max()) if open_cells.numel() else 0
     if most > rows * columns / 2:
         return None
     planes = _interpolated(nodes, rows, columns)  # (B, 2, 8 rows, 8 columns)
-    whole = bool(every.all())
-    seen = torch.ones_like(planes[:, 0], dtype=torch.bool) if whole else _per_pixel(some)
-    if not whole:
-        planes = torch.where(seen.unsqueeze(1), planes, OUTSIDE)
+    blocks = planes.unflatten(2, (rows, _STEP)).unflatten(4, (columns, _STEP))
+    camera, i, j = (~some).nonzero(as_tuple=True)
+    blocks[camera, :, i, :, j] = OUTSIDE
+    seen = some[:, :, None, :, None].expand(-1, -1, _STEP, -1, _STEP).flatten(3, 4).flatten(1, 2)
     if most:
         # as many cells of every camera as the one with the most has: more of them exact does no harm
         cells = open_cells.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
@@ -79,7 +79,6 @@ def on_lattice(
         pixels = torch.stack(torch.broadcast_tensors(across, down), -1)  # (B, cells, 8, 8, 2)
         positions, known = exact(pixels.flatten(2, 3))
         camera = torch.arange(len(cells), device=like.device)[:, None]
-        blocks = planes.unflatten(2, (rows, _STEP)).unflatten(4, (columns, _STEP))
         blocks[camera, :, i, :, j] = positions.unflatten(2, (_STEP, _STEP)).movedim(-1, 2)
         seen.unflatten(1, (rows, _STEP)).unflatten(3, (columns, _STEP))[camera, i, :, j] = known.unflatten(
             2, (_STEP, -1)
@@ -88,7 +87,7 @@ def on_lattice(
 
 
 def _open_cells(nodes: Tensor, mapped: Tensor, source: tuple[int, int], tolerance: float) -> tuple[Tensor, ...]:
-    """Bool (B, rows, columns) each: some and all nodes of a cell are mapped; the cell wants exact positions."""
+    """Bool (B, rows, columns) each: some nodes of a cell are mapped; the cell wants exact positions."""
     share = F.avg_pool2d(mapped.unsqueeze(1).to(nodes.dtype), 4, stride=1).squeeze(1)
     some, every = share > 0, share == 1
     missed = _CUBIC * (_fourth_difference(nodes, -1) + _fourth_difference(nodes, -2))
@@ -96,7 +95,7 @@ def _open_cells(nodes: Tensor, mapped: Tensor, source: tuple[int, int], toleranc
     high = F.max_pool2d(nodes, 4, stride=1)
     low = -F.max_pool2d(-nodes, 4, stride=1)
     sampled = ((high > -1 - _MARGIN) & (low < 1 + _MARGIN)).all(1)
-    return some, every, some & (~every | (sampled & (missed * half > tolerance).any(1)))
+    return some, some & (~every | (sampled & (missed * half > tolerance).any(1)))
 
 
 def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
@@ -133,8 +132,3 @@ def _weights(like: Tensor) -> Tensor:
     before, at, after, beyond = t + 1, t, t - 1, t - 2
     terms = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
     return torch.stack(terms, -1).to(like.dtype)
-
-
-def _per_pixel(cells: Tensor) -> Tensor:
-    """(B, rows, columns) to (B, 8 rows, 8 columns)."""
-    return cells.repeat_interleave(_STEP, 1).repeat_interleave(_STEP, 2)

@@ -89,6 +89,7 @@ class Warp(GeometryModule):
                 f"got {', '.join(str(tuple(s)) for s in shapes)}"
             )
         self._memo = Memo()
+        self._pinned: tuple[Tensor, Tensor, Tensor | None] | None = None
 
     def _set_rotation(self, rotation: Tensor | None) -> None:
         if isinstance(rotation, nn.Parameter):
@@ -174,12 +175,19 @@ class Warp(GeometryModule):
 
     def _sampling(self) -> tuple[Tensor, Tensor, Tensor | None]:
         """The grid, where a ray was mapped at all, and with antialias the local scale."""
+        if self._pinned is not None:
+            return self._pinned
         inputs = [t for t in self._inputs() if t is not None]
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self._with_scale(*self._positions(self.target.pixel_grid()))
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
         options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
         return self._memo(inputs, options, lambda: self._with_scale(*self._tabulate()))
+
+    def pin(self) -> Warp:
+        """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
+        self._pinned = self._sampling()
+        return self
 
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         scale = minify.local_scale(grid.detach(), mapped, self.source.image_size) if self.antialias else None

@@ -56,7 +56,7 @@ class Augmentation(Mover):
         mask_fill: float = 0.0,
         valid_mask: bool = False,
         antialias: bool = False,
-        tolerance: float = 0.01,
+        tolerance: float = 0.001,
     ):
         super().__init__(camera, fields, mask_fill, valid_mask)
         if not 0 <= p <= 1:

@@ -14,6 +14,10 @@ from camtorch.sampling import narrow, widen
 from camtorch.warp import Warp
 
 
+def _same(value: Tensor) -> Tensor:
+    return value
+
+
 @dataclass
 class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
@@ -55,6 +59,7 @@ class Change:
     def __init__(self, count: int, parts: Sequence[Part], *, listed: bool = False, gate: Tensor | None = None):
         self.count, self.parts, self.listed, self.gate = count, list(parts), listed, gate
         rows = [part.rows for part in self.parts]
+        self._inverse: Change | None = None
         self._order = None if len(rows) == 1 and rows[0] is None else torch.cat(rows).argsort()
 
     @property
@@ -107,13 +112,16 @@ class Change:
 
     def inverse(self) -> Change:
         """The change back. What left the picture stays lost, and the light of the lens stays as it is."""
+        if self._inverse is not None:  # with the maps that it has made
+            return self._inverse
         parts = [
             part
             if part.warp is None
             else replace(part, warp=part.warp.inverse(), camera=part.warp.target, shades=None, light=None)
             for part in self.parts
         ]
-        return Change(self.count, parts, listed=self.listed, gate=self.gate)
+        self._inverse = Change(self.count, parts, listed=self.listed, gate=self.gate)
+        return self._inverse
 
     def each(self, value: Tensor, move: Callable, stay: Callable):
         """`move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves."""
@@ -140,9 +148,9 @@ class Change:
                 warps = part.shades[0], part.warp, part.shades[1]
                 fills = [{"fill": value} for value in part.warp.fill] if len(part.warp.fill) == 3 else [{}] * 3
                 triples = enumerate(zip(warps, fills, strict=True))
-                moved = torch.cat([warp(rows[:, i : i + 1], **fill, **options) for i, (warp, fill) in triples], 1)
+                moved = torch.cat([warp.pin()(rows[:, i : i + 1], **fill, **options) for i, (warp, fill) in triples], 1)
             else:
-                moved = part.warp(rows, **options)
+                moved = part.warp.pin()(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
 
         return self.each(images, move, lambda camera, rows: rows)
@@ -151,7 +159,7 @@ class Change:
         """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
-            return part.warp(rows, mode=mode, padding_mode="zeros", fill=fill)
+            return part.warp.pin()(rows, mode=mode, padding_mode="zeros", fill=fill)
 
         return self.each(masks, move, lambda camera, rows: rows)
 
@@ -161,7 +169,7 @@ class Change:
         everywhere = torch.ones(self.count, 1, *size, dtype=torch.bool, device=self.parts[0].camera.intrinsics.device)
         return self.each(
             everywhere,
-            lambda part, rows: part.warp.valid_mask().expand(len(rows), -1, -1, -1),
+            lambda part, rows: part.warp.pin().valid_mask().expand(len(rows), -1, -1, -1),
             lambda camera, rows: rows,
         )
 
@@ -192,9 +200,14 @@ class Change:
 
         return self.each(corners, move, stay)
 
-    def rays(self, rays: Tensor) -> Tensor:
-        """Directions and points (count, *N, 3) of the camera frame: they turn, their lengths stay."""
-        return self.each(rays, lambda part, rows: part.warp.transform_rays(rows), lambda camera, rows: rows)
+    def rays(self, rays: Tensor, read: Callable = _same, write: Callable = _same) -> Tensor:
+        """Directions and points (count, *N, 3) of the camera frame: they turn, their lengths stay.
+
+        What has another form is read as rays, and written in its form again.
+        """
+        return self.each(
+            rays, lambda part, rows: write(part.warp.transform_rays(read(rows))), lambda camera, rows: rows
+        )
 
     def depth(self, depth: Tensor) -> Tensor:
         """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known."""
@@ -202,7 +215,7 @@ class Change:
         def move(part: Part, rows: Tensor) -> Tensor:
             before, after = (_forward(camera, rows) for camera in (part.warp.source, part.warp.target))
             distance = torch.where(before.abs() > 1e-6, rows / before, 0.0)
-            return part.warp(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
+            return part.warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
 
         return self.each(depth, move, lambda camera, rows: rows)
 

@@ -57,7 +57,7 @@ class FaceNormalizer(Mover):
         padding_mode: str = "zeros",
         fill=0.0,
         antialias: bool = False,
-        tolerance: float = 0.01,
+        tolerance: float = 0.001,
         fields: Mapping[str, str] | None = None,
         mask_fill: float = 0.0,
         valid_mask: bool = False,

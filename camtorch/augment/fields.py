@@ -67,20 +67,24 @@ def _rays(change: Change, rays: Tensor, options: Mapping) -> Tensor:
 
 
 def _pitch_yaw(change: Change, angles: Tensor, options: Mapping) -> Tensor:
-    return to_pitch_yaw(change.rays(from_pitch_yaw(angles)))
+    return change.rays(angles, from_pitch_yaw, to_pitch_yaw)
 
 
 def _pose(change: Change, pose: Tensor, options: Mapping) -> Tensor:
-    top = change.rays(pose[..., :3, :].mT).mT
+    top = change.rays(pose[..., :3, :], _columns, _columns)
     return torch.cat((top, pose[..., 3:, :].to(top)), -2)
 
 
+def _columns(matrix: Tensor) -> Tensor:
+    return matrix.mT
+
+
 def _rotation_vector(change: Change, rvec: Tensor, options: Mapping) -> Tensor:
-    return rotation_vector(change.rays(rotation_matrix(rvec).mT).mT)
+    return change.rays(rvec, lambda r: rotation_matrix(r).mT, lambda columns: rotation_vector(columns.mT))
 
 
 def _rotation(change: Change, rotation: Tensor, options: Mapping) -> Tensor:
-    return change.rays(rotation.mT).mT
+    return change.rays(rotation, _columns, _columns)
 
 
 _MANY = 16

@@ -19,7 +19,7 @@ Sample = dict[str, object]
 
 
 def without_graph_in_workers(method: Callable) -> Callable:
-    """A method that records no graph in a DataLoader's worker: pictures made by a learnable camera could not leave it."""
+    """A method that records no graph in a worker of a DataLoader, which tensors of a graph cannot leave."""
 
     @functools.wraps(method)
     def wrapped(*args, **kwargs):

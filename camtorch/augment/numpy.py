@@ -127,7 +127,7 @@ class Transform:
             camera = moved["camera"] = singles(camera)[0]
         result = {}
         for name, (tensors, restore) in entries.items():
-            if restore is not None:
+            if restore is not None and tensors.keys() <= moved.keys():
                 result[name] = restore([moved.pop(key)[0] for key in tensors], camera.image_size)
             elif name in moved:
                 result[name] = moved.pop(name)
@@ -185,8 +185,8 @@ def _numbers(value, kind: str):
     return value.astype(np.float32) if isinstance(value, np.ndarray) and value.dtype.kind in "iub" else value
 
 
-def as_tensor(name: str, value, size: tuple[int, int] | None) -> Tensor:
-    """(1, C, H, W) of an array (H, W, C) or (H, W)."""
+def as_tensor(name: str, value, size: tuple[int, int] | None = None) -> Tensor:
+    """(1, C, H, W) of an array (H, W, C) or (H, W), which should be of that size."""
     shape = _checked(name, value).shape
     if len(shape) not in (2, 3):
         raise ValueError(f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}")

@@ -33,14 +33,14 @@ PRESETS = {
         (480, 640),
         (535.915734, 535.915734, 342.283155, 235.570829),
         (-0.266373, -0.038589, 0.001783, -0.000281, 0.238392),
-        "a VGA camera, 62 degrees: OpenCV's sample data, left_intrinsics.yml",
+        "a VGA camera, 67 degrees: OpenCV's sample data, left_intrinsics.yml",
     ),
     "dms60": Preset(
         "brown_conrady",
         (800, 1280),
         (1064.3, 1065.1, 641.7, 396.4),
         (-0.3021, 0.1254, 0.00021, -0.00017, -0.0289),
-        "typical of an infrared driver camera of 62 degrees; not one calibrated camera",
+        "typical of an infrared driver camera of some 60 (68 with its barrel distortion) degrees; not one calibrated camera",
     ),
     "dms90": Preset(
         "brown_conrady",

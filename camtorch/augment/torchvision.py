@@ -19,7 +19,6 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import singles
 from camtorch.augment.change import Change
-from camtorch.augment.mover import without_graph_in_workers
 from camtorch.augment.numpy import as_array, as_tensor
 from camtorch.camera import Camera
 
@@ -53,7 +52,8 @@ class Transform(v2.Transform):
     * A `Camera` in the sample is the sample's camera, and comes out as that of the new picture.
 
     Formats and dtypes stay; canvas_size becomes that of the new camera. All else stays as it is, also
-    3D labels in plain tensors: `last.rotation` (1, 3, 3), or `last.rays`, turns them.
+    3D labels in plain tensors: `last.rotation` (1, 3, 3), or `last.rays`, turns them. Gradients
+    reach the inputs, not the cameras.
 
     Args:
         augmentation: what to do.
@@ -81,7 +81,6 @@ class Transform(v2.Transform):
         """The change of the last call: its `source`, `target` and `rotation`."""
         return self.augmentation.last
 
-    @without_graph_in_workers
     def make_params(self, flat_inputs: list[Any]) -> dict[str, Any]:
         """Draw once for all inputs of a sample.
 
@@ -106,18 +105,22 @@ class Transform(v2.Transform):
                     f"{_OWNER}: {type(one).__name__} is {size} (height, width), but the camera's image_size is "
                     f"{camera.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
                 )
-        change = self.augmentation.change(camera, self.augmentation.draw(1))
-        self.augmentation.last = change
-        return {"change": change, "camera": singles(change.target)[0]}
+        with torch.no_grad():
+            change = self.augmentation.change(camera, self.augmentation.draw(1))
+            self.augmentation.last = change
+            return {"change": change, "camera": singles(change.target)[0]}
 
-    @without_graph_in_workers
     def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
         """Move one input of a sample by the `params` of `make_params`."""
-        change, camera = params["change"], params["camera"]
-        if change.parts[0].warp is None:
-            return inpt
+        # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
+        with torch.set_grad_enabled(torch.is_grad_enabled() and getattr(inpt, "requires_grad", False)):
+            return self._moved(inpt, params["change"], params["camera"])
+
+    def _moved(self, inpt: Any, change: Change, camera: Camera) -> Any:
         if isinstance(inpt, Camera):
             return camera
+        if change.parts[0].warp is None:
+            return inpt
         if isinstance(inpt, PIL.Image.Image):
             return _pil(change, inpt)
         plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt

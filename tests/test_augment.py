@@ -1,0 +1,547 @@
+"""Laws of the augmentations: whatever the cameras, all fields of a sample move together."""
+
+import copy
+import itertools
+import math
+import pickle
+
+import kornia
+import pytest
+import torch
+from cameras import KEYS, spread
+
+import camtorch as ct
+from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
+
+SIZE = (240, 320)
+
+
+def source(key):
+    """A camera of any model, of about 75 degrees, with every coefficient away from zero."""
+    camera = spread(key, torch.float32).requires_grad_(False).resize(*SIZE)
+    camera.intrinsics[:2] *= 1.6
+    return camera
+
+
+def pinhole(dtype=torch.float32, focal=250.0, size=SIZE):
+    intrinsics = torch.tensor([focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
+    return ct.Pinhole(intrinsics, image_size=size).requires_grad_(False)
+
+
+def lattice(rows=4, columns=5, size=SIZE):
+    v, u = torch.meshgrid(
+        torch.linspace(45, size[0] - 46, rows), torch.linspace(45, size[1] - 46, columns), indexing="ij"
+    )
+    return torch.stack((u, v), -1).reshape(-1, 2)
+
+
+def discs(pixels, size=SIZE, radius=2.5, fine=5):
+    """(N, H, W): one picture of a bright disc for each pixel (N, 2), anti-aliased.
+
+    Small ones: where a lens bends, the centroid of a large disc lies beside its centre, by the square of the radius.
+    """
+    offsets = (torch.arange(fine) + 0.5) / fine - 0.5
+    v = (torch.arange(size[0])[:, None] + offsets).reshape(-1, 1)
+    u = (torch.arange(size[1])[:, None] + offsets).reshape(-1)
+    pictures = [((u - x) ** 2 + (v - y) ** 2 < radius**2).float() for x, y in pixels.tolist()]
+    return torch.nn.functional.avg_pool2d(torch.stack(pictures)[:, None], fine)[:, 0]
+
+
+def centroids(pictures):
+    """(N, 2) of pictures (N, H, W)."""
+    v, u = torch.meshgrid(*(torch.arange(float(side)) for side in pictures.shape[-2:]), indexing="ij")
+    mass = pictures.sum((-1, -2))
+    return torch.stack(((pictures * u).sum((-1, -2)) / mass, (pictures * v).sum((-1, -2)) / mass), -1)
+
+
+def inner(pixels, valid, size=SIZE, margin=12):
+    """Which moved points are so far from the rim that their disc is whole."""
+    u, v = pixels.unbind(-1)
+    return valid & (u > margin) & (u < size[1] - margin) & (v > margin) & (v < size[0] - margin)
+
+
+def likes():
+    return [*PRESETS, *(source(key) for key in KEYS)]
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("which", range(len(PRESETS) + len(KEYS)))
+def test_every_field_moves_together_between_any_two_models(key, which):
+    """Keypoints sit on the discs, 3D points project onto keypoints through the camera that comes out, gaze is R g."""
+    camera, like = source(key), likes()[which]
+    torch.manual_seed(which)
+    pixels = lattice()
+    rays, seen = camera.unproject(pixels)
+    points = rays * torch.linspace(0.4, 3, len(rays))[:, None]
+    pictures = discs(pixels)
+    gaze = torch.nn.functional.normalize(torch.randn(3), dim=-1)
+    # shows at least a third of a narrow picture: otherwise discs become too small to measure
+    augmentation = RandomCamera(like, fov=(60, 90), camera=camera, yaw=12, pitch=12, roll=25)
+    out = augmentation(image=pictures, keypoints=pixels, points=points, gaze=gaze)
+    target, keypoints = out["camera"], out["keypoints"]
+    use = inner(keypoints, out["keypoints_valid"] & seen)
+    assert use.sum() > 5
+    error = (centroids(out["image"])[use] - keypoints[use]).norm(dim=-1)
+    assert error.max() < 0.1
+    projected, valid = target.project(out["points"])
+    assert valid[use].all()
+    assert (projected - keypoints)[use].norm(dim=-1).max() < 1e-2
+    torch.testing.assert_close(out["gaze"], out["rotation"] @ gaze, atol=1e-6, rtol=0)
+    back = augmentation.inverse(out)
+    torch.testing.assert_close(back["keypoints"][use], pixels[use], atol=2e-3, rtol=0)
+    torch.testing.assert_close(back["gaze"], gaze, atol=1e-6, rtol=0)
+    torch.testing.assert_close(back["points"], points, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_boxes_enclose_warped_masks(preset):
+    camera = pinhole(focal=200.0)
+    boxes = torch.tensor([[40.0, 30, 120, 90], [150, 100, 280, 200], [60, 120, 140, 210]])
+    masks = torch.zeros(1, 3, *SIZE, dtype=torch.uint8)
+    for i, (x1, y1, x2, y2) in enumerate(boxes.int().tolist()):
+        masks[0, i, y1 : y2 + 1, x1 : x2 + 1] = 1
+    generator = torch.Generator().manual_seed(1)
+    augmentation = RandomCamera(preset, camera=camera, fov=(70, 85), tolerance=0)
+    out = augmentation(mask=masks, boxes=boxes[None], generator=generator, valid_mask=None)
+    assert out["boxes_valid"].all()
+    for mask, (x1, y1, x2, y2) in zip(out["mask"][0], out["boxes"][0].tolist(), strict=True):
+        rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+        extent = [columns[0], rows[0], columns[-1], rows[-1]]
+        clipped = [max(x1, 0), max(y1, 0), min(x2, SIZE[1] - 1), min(y2, SIZE[0] - 1)]
+        assert all(abs(a - b) < 1 for a, b in zip(map(float, extent), clipped, strict=True))
+
+
+def test_a_mount_of_a_pinhole_is_a_homography():
+    """kornia's warp_perspective is the witness, on a picture of the coordinates."""
+    camera = pinhole(torch.float64)
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
+    picture = torch.stack((u, v))[None].expand(4, -1, -1, -1)
+    augmentation = RandomMount(camera=camera, yaw=15, pitch=12, roll=40, zoom=(0.8, 1.3))
+    generator = torch.Generator().manual_seed(3)
+    out = augmentation(image=picture, keypoints=lattice().double().expand(4, -1, -1), generator=generator)
+    homography = out["camera"].K @ out["rotation"] @ torch.linalg.inv(camera.K)
+    witness = kornia.geometry.warp_perspective(picture, homography, SIZE, align_corners=True)
+    inside = kornia.geometry.warp_perspective(torch.ones_like(picture), homography, SIZE, align_corners=True) == 1
+    assert inside.float().mean() > 0.4
+    torch.testing.assert_close(out["image"][inside], witness[inside], atol=1e-3, rtol=0)
+    moved = kornia.geometry.transform_points(homography, lattice().double().expand(4, -1, -1))
+    torch.testing.assert_close(out["keypoints"], moved, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("angle", "moves"),
+    [("yaw", (-1, 0)), ("pitch", (0, 1)), ("roll", None)],
+)
+def test_signs_of_the_angles(angle, moves):
+    """Turning right moves the picture left, looking up moves it down, leaning right turns it counterclockwise."""
+    camera = pinhole()
+    none = dict.fromkeys(("yaw", "pitch", "roll"), (0, 0))
+    augmentation = RandomMount(camera=camera, **{**none, angle: (10, 10)})
+    centre = (torch.tensor(SIZE[::-1]) - 1) / 2
+    pixel = centre if moves else centre + torch.tensor([100.0, 0.0])
+    shift = augmentation(keypoints=pixel[None])["keypoints"][0] - pixel
+    if moves:
+        expected = torch.tensor(moves) * 250 * math.tan(math.radians(10))
+    else:
+        turned = torch.tensor([math.cos(math.radians(10)), -math.sin(math.radians(10))]) * 100
+        expected = turned - torch.tensor([100.0, 0.0])
+    torch.testing.assert_close(shift, expected.float(), atol=1e-3, rtol=0)
+
+
+def sample(count=3, camera=None):
+    generator = torch.Generator().manual_seed(5)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    pose = torch.eye(4).repeat(count, 1, 1)
+    pose[:, :3, :3] = ct.Extrinsics(rand(count, 3), torch.zeros(3)).matrix()[:, :3, :3].detach()
+    pose[:, :3, 3] = rand(count, 3) + torch.tensor([-0.5, -0.5, 1.0])
+    return {
+        "image": rand(count, 3, 60, 80),
+        "mask": (5 * rand(count, 60, 80)).long(),
+        "keypoints": rand(count, 7, 2) * torch.tensor([79.0, 59.0]),
+        "boxes": torch.tensor([[10.0, 10, 40, 30], [30, 20, 70, 50]]).repeat(count, 1, 1),
+        "polygons": rand(count, 2, 5, 2) * 50 + 5,
+        "points": rand(count, 4, 3) + torch.tensor([-0.5, -0.5, 1.0]),
+        "landmarks": rand(count, 4, 3),
+        "gaze": torch.nn.functional.normalize(rand(count, 2, 3) - 0.5, dim=-1),
+        "pitch_yaw": rand(count, 2) - 0.5,
+        "head_pose": pose,
+        "rvec": rand(count, 3),
+        "tvec": rand(count, 3),
+        "depth": rand(count, 1, 60, 80) + 1,
+        "label": torch.arange(count),
+        "name": [f"{i}.png" for i in range(count)],
+        "camera": pinhole(focal=60.0, size=(60, 80)) if camera is None else camera,
+    }
+
+
+AUGMENTATIONS = {
+    "mount": lambda **options: RandomMount(roll=30, zoom=(0.9, 1.2), **options),
+    "lens": lambda **options: RandomLens(**options),
+    "family": lambda **options: RandomLens("kannala_brandt", fov=(80, 110), **options),
+    "camera": lambda **options: RandomCamera("dms130", chromatic=0.004, vignetting=(0.2, 0.5), **options),
+}
+
+
+def equal(a, b):
+    """Whether two samples are the same, bit for bit."""
+    assert a.keys() == b.keys()
+    for name in a:
+        if isinstance(a[name], torch.Tensor):
+            assert torch.equal(a[name], b[name]), name
+        elif isinstance(a[name], ct.Camera):
+            assert type(a[name]) is type(b[name])
+            assert torch.equal(a[name].intrinsics, b[name].intrinsics)
+            assert torch.equal(a[name].distortion, b[name].distortion)
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_a_batch_is_its_samples(name):
+    augmentation, batch = AUGMENTATIONS[name](valid_mask=True), sample()
+    draw = augmentation.draw(3, torch.Generator().manual_seed(0))
+    out = augmentation(batch, draw=draw)
+    for i in range(3):
+        one = {k: v if k == "camera" else v[i] for k, v in batch.items()}
+        alone = augmentation(one, draw={k: v[i : i + 1] for k, v in draw.items()})
+        assert alone["camera"].batch_shape == ()
+        for field, value in alone.items():
+            if isinstance(value, torch.Tensor) and value.is_floating_point():
+                torch.testing.assert_close(
+                    value, out[field][i], atol=2e-3, rtol=1e-4, msg=lambda m, f=field: f"{f}: {m}"
+                )
+            elif isinstance(value, torch.Tensor):
+                assert value.shape == out[field][i].shape
+                assert (value != out[field][i]).float().mean() < 1e-3, field
+            elif field == "name":
+                assert value == out[field][i]
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_replay_is_bit_identical(name, tmp_path):
+    augmentation, batch = AUGMENTATIONS[name](p=0.6), sample(5)
+    draw = augmentation.draw(5, torch.Generator().manual_seed(1))
+    torch.save(draw, tmp_path / "draw.pt")
+    again = torch.load(tmp_path / "draw.pt", weights_only=True)
+    first = augmentation(batch, draw=draw)
+    equal(first, augmentation(batch, draw=again))
+    equal(first, copy.deepcopy(augmentation)(batch, draw=draw))
+    equal(first, pickle.loads(pickle.dumps(augmentation))(batch, draw=draw))
+    labels = {k: v for k, v in batch.items() if k in ("keypoints", "camera", "gaze")}
+    alone = augmentation(labels, draw=draw)
+    assert torch.equal(alone["keypoints"], first["keypoints"])
+    assert torch.equal(alone["gaze"], first["gaze"])
+
+
+def test_draws_come_from_the_generator():
+    augmentation = RandomCamera("webcam", p=0.5)
+    draws = [augmentation.draw(4, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1)]
+    assert all(torch.equal(a, b) for a, b in zip(draws[0].values(), draws[1].values(), strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(draws[0].values(), draws[2].values(), strict=True))
+    torch.manual_seed(7)
+    global_draw = augmentation.draw(4)
+    torch.manual_seed(7)
+    assert torch.equal(global_draw["yaw"], augmentation.draw(4)["yaw"])
+    for name, interval in augmentation.ranges.items():
+        values = augmentation.draw(200)[name]
+        assert interval.low <= values.min()
+        assert values.max() <= interval.high
+
+
+def test_same_on_batch():
+    augmentation = RandomCamera("dms90", same_on_batch=True)
+    batch = sample(3)
+    batch = {k: v[:1].expand_as(v) if isinstance(v, torch.Tensor) and k != "label" else v for k, v in batch.items()}
+    out = augmentation(batch)
+    assert out["camera"].batch_shape == (3,)
+    for name in ("image", "mask", "keypoints", "rotation", "boxes"):
+        assert torch.equal(out[name][:1].expand_as(out[name]), out[name])
+
+
+@pytest.mark.parametrize("name", ["mount", "family"])
+def test_skipped_samples_stay_bit_identical(name):
+    augmentation, batch = AUGMENTATIONS[name](p=0.5), sample(8)
+    draw = augmentation.draw(8, torch.Generator().manual_seed(2))
+    out = augmentation(batch, draw=draw)
+    skipped = ~draw["apply"]
+    assert 0 < skipped.sum() < 8
+    for field, value in batch.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(out[field][skipped], value[skipped]), field
+            if field in ("image", "keypoints") or (name == "mount" and field in ("gaze", "head_pose", "rvec")):
+                assert not torch.equal(out[field][~skipped], value[~skipped]), field
+    assert torch.equal(out["rotation"][skipped], torch.eye(3).expand(int(skipped.sum()), 3, 3))
+    if name == "family":  # of two models, so they come one by one
+        assert [c.key for c in out["camera"]] == ["kannala_brandt" if a else "pinhole" for a in draw["apply"]]
+    else:
+        assert torch.equal(out["camera"].intrinsics[skipped][0], batch["camera"].intrinsics)
+
+
+def test_p_of_zero_changes_nothing():
+    out = RandomMount(p=0)(sample())
+    for field, value in sample().items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(out[field], value)
+
+
+def test_every_sample_may_have_its_own_camera():
+    models = [
+        pinhole(focal=60.0, size=(60, 80)),
+        source("fisheye624").resize(60, 80),
+        source("brown_conrady").resize(60, 80),
+    ]
+    augmentation, batch = RandomMount(roll=20), sample(3, models)
+    draw = augmentation.draw(3)
+    out = augmentation(batch, draw=draw)
+    assert [type(c) for c in out["camera"]] == [type(c) for c in models]
+    for i, camera in enumerate(models):
+        alone = augmentation(
+            image=batch["image"][i],
+            keypoints=batch["keypoints"][i],
+            camera=camera,
+            draw={k: v[i : i + 1] for k, v in draw.items()},
+        )
+        torch.testing.assert_close(alone["keypoints"], out["keypoints"][i], atol=1e-3, rtol=0)
+        torch.testing.assert_close(alone["image"], out["image"][i], atol=2e-3, rtol=0)
+    stacked = ct.Pinhole(
+        torch.tensor([[60.0, 60, 39.5, 29.5], [70, 70, 39.5, 29.5], [80, 80, 39.5, 29.5]]), image_size=(60, 80)
+    )
+    out = augmentation({**batch, "camera": stacked.requires_grad_(False)}, draw=draw)
+    torch.testing.assert_close(out["camera"].intrinsics[:, 0] / stacked.intrinsics[:, 0], draw["zoom"].float())
+
+
+def test_lists_hold_as_many_labels_as_each_sample_has():
+    batch = sample(3)
+    batch["keypoints"] = [torch.rand(n, 2) * 50 for n in (3, 0, 5)]
+    batch["boxes"] = [torch.tensor([[5.0, 5, 30, 30]]).repeat(n, 1) for n in (0, 2, 1)]
+    batch["mask_parts"] = [torch.ones(n, 60, 80) for n in (1, 3, 2)]
+    augmentation = RandomCamera("dms60")
+    draw = augmentation.draw(3)
+    out = augmentation(batch, draw=draw)
+    assert [len(k) for k in out["keypoints"]] == [3, 0, 5] == [len(k) for k in out["keypoints_valid"]]
+    assert [len(b) for b in out["boxes"]] == [0, 2, 1]
+    assert [m.shape for m in out["mask_parts"]] == [(1, 60, 80), (3, 60, 80), (2, 60, 80)]
+    one = augmentation(
+        keypoints=batch["keypoints"][2], camera=batch["camera"], draw={k: v[2:] for k, v in draw.items()}
+    )
+    torch.testing.assert_close(one["keypoints"], out["keypoints"][2], atol=1e-3, rtol=0)
+
+
+def test_chains_carry_camera_rotation_and_validity_on():
+    batch = {k: v for k, v in sample().items() if k != "depth"}
+    first, second = RandomMount(yaw=25, valid_mask=True), RandomLens("kannala_brandt", fov=(70, 90), valid_mask=True)
+    half = first(batch)
+    out = second(half)
+    torch.testing.assert_close(out["rotation"], half["rotation"], atol=1e-6, rtol=0)
+    third = RandomMount()(out)
+    torch.testing.assert_close(
+        third["gaze"], torch.einsum("bij,bnj->bni", third["rotation"], batch["gaze"]), atol=1e-6, rtol=0
+    )
+    assert out["camera"].key == "kannala_brandt"
+    assert bool((out["keypoints_valid"] <= half["keypoints_valid"]).all())
+    lost = ~half["keypoints_valid"]
+    assert not out["keypoints_valid"][lost].any()
+    direct = ct.Warp(batch["camera"], out["camera"], out["rotation"]).valid_mask()
+    # nothing is valid twice that one warp would not see, but for the rim of the picture in between
+    assert (out["image_valid"] & ~direct).float().mean() < 0.01
+    projected, _ = out["camera"].project(out["points"])
+    straight, _ = ct.Warp(batch["camera"], out["camera"], out["rotation"]).transform_points(
+        batch["camera"].project(batch["points"])[0]
+    )
+    torch.testing.assert_close(projected, straight, atol=1e-3, rtol=0)
+
+
+def test_poses_turn_with_the_camera():
+    batch = sample()
+    out = RandomMount(roll=60)(batch)
+    rotation = out["rotation"]
+    expected = torch.eye(4).repeat(3, 1, 1)
+    expected[:, :3] = rotation @ batch["head_pose"][:, :3]
+    torch.testing.assert_close(out["head_pose"], expected, atol=1e-6, rtol=0)
+    before, after = (ct.Extrinsics(s["rvec"], s["tvec"]) for s in (batch, out))
+    head = torch.rand(3, 9, 3)
+    torch.testing.assert_close(after(head), torch.einsum("bij,bnj->bni", rotation, before(head)), atol=2e-6, rtol=0)
+    gaze = ct.augment.from_pitch_yaw(out["pitch_yaw"])
+    straight = torch.einsum("bij,bj->bi", rotation, ct.augment.from_pitch_yaw(batch["pitch_yaw"]))
+    torch.testing.assert_close(gaze, straight, atol=1e-6, rtol=0)
+    assert torch.equal(ct.augment.from_pitch_yaw(torch.zeros(2)), torch.tensor([0.0, 0.0, -1.0]))
+
+
+def test_depth_is_that_along_the_new_axis():
+    """A plane seen by a camera stays that plane when the camera turns."""
+    camera = pinhole(torch.float64, focal=60.0, size=(60, 80))
+    normal, height = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64), 2.0
+    rays, _ = camera.rays()
+    depth = height / (rays @ normal) * rays[..., 2]
+    out = RandomCamera("dms130", camera=camera, fov=(60, 70), yaw=8, pitch=8)(depth=depth[None], distance=depth[None])
+    target = ct.augment.cameras.singles(out["camera"])[0].double() if out["camera"].batch_shape else out["camera"]
+    rays, _ = target.rays()
+    turned = out["rotation"][0].double() @ normal
+    expected = height / (rays @ turned) * rays[..., 2]
+    known = out["depth"][0] != 0
+    assert known.float().mean() > 0.5
+    # the nearest pixel of the old picture lies up to 0.7 px aside
+    assert ((out["depth"][0] - expected).abs()[known] < 0.05).all()
+    wrong = (
+        (ct.Warp(camera, camera, out["rotation"][0].double())(depth[None, None])[0, 0] - expected).abs()[known].mean()
+    )
+    assert (out["depth"][0] - expected).abs()[known].mean() < wrong / 3
+
+
+def test_jittered_lenses_stay_invertible_and_bounded():
+    for key, amount in itertools.product(KEYS, (0.05, 1.0)):
+        camera = source(key)
+        change = RandomLens(camera=camera, focal=(1, 1), centre=(0, 0), distortion=amount).change(
+            None, RandomLens(focal=(1, 1), centre=(0, 0), distortion=amount).draw(16, torch.Generator().manual_seed(0))
+        )
+        edge = torch.cat((camera.pixel_grid()[[0, -1]].reshape(-1, 2), camera.pixel_grid()[:, [0, -1]].reshape(-1, 2)))
+        rays, seen = camera.unproject(edge)
+        target = change.target
+        still = target.unproject(edge.expand(16, -1, -1))[1]
+        assert (still | ~seen).all(), key
+        moved, valid = target.project(rays.expand(16, -1, -1))
+        if target.distortion.shape[-1] and amount < 1:
+            shift = (moved - edge).norm(dim=-1)[valid & seen].max() / math.hypot(SIZE[0] / 2, SIZE[1] / 2)
+            assert amount / 50 < shift < 1.5 * amount, key
+            assert (change.target.distortion.std(0) > 0).all()
+
+
+def test_a_family_has_the_field_of_view_that_is_asked_for():
+    for key, degrees in (
+        ("kannala_brandt", 130.0),
+        ("pinhole", 100.0),
+        ("equirectangular", 200.0),
+        ("fisheye62", 150.0),
+    ):
+        lens = RandomLens(key, fov=degrees, focal=None, centre=None, distortion=None, camera=pinhole())
+        target = lens.change(None, lens.draw(1)).target
+        ends = torch.tensor([[-0.5, (SIZE[0] - 1) / 2], [SIZE[1] - 0.5, (SIZE[0] - 1) / 2]])
+        left, right = target.unproject(ends.expand(1, -1, -1))[0][0]
+        across = math.degrees(math.atan2(-left[0], left[2]) + math.atan2(right[0], right[2]))
+        assert abs(across - degrees) < 1e-2, key
+
+
+def test_presets_show_what_they_say():
+    for name, degrees in (
+        ("webcam", 67),
+        ("dms60", 68),
+        ("dms90", 93),
+        ("dms130", 130),
+        ("tumvi195", 195),
+        ("aria", 150),
+    ):
+        camera = PRESETS[name].camera()
+        assert not any(p.requires_grad for p in camera.parameters())
+        width = camera.image_size[1]
+        _, _, _, cy = camera.intrinsics.tolist()
+        rays, valid = camera.unproject(torch.tensor([[u, cy] for u in range(width)]))
+        angles = torch.atan2(rays[:, 0], rays[:, 2])[valid].rad2deg()
+        assert abs(float(angles.max() - angles.min()) - degrees) < 3, name
+
+
+def test_output_size_and_light():
+    camera = pinhole()
+    out = RandomCamera(
+        "webcam", camera=camera, image_size=(60, 90), vignetting=0.6, centre=(0, 0), yaw=0, pitch=0, roll=0
+    )(image=torch.ones(1, 3, *SIZE), keypoints=lattice()[None])
+    assert out["image"].shape == (1, 3, 60, 90)
+    assert out["camera"].image_size == (60, 90)
+    light = out["image"][0, 0]
+    assert light[30, 45] > 0.98
+    inside = torch.nn.functional.max_pool2d((light == 0).float()[None], 5, 1, 2)[0] == 0
+    assert 0.35 < light[inside].min() < 0.7
+
+
+def test_chromatic_aberration_scales_red_and_blue():
+    camera = pinhole()
+    pixels = lattice()[[0, 4, 15, 19]]
+    pictures = discs(pixels)[:, None].expand(-1, 3, -1, -1)
+    lens = RandomLens(camera=camera, focal=None, centre=None, distortion=None, chromatic=(0.01, 0.02))
+    draw = lens.draw(4, torch.Generator().manual_seed(0))
+    out = lens(image=pictures, keypoints=pixels[:, None], draw=draw)
+    centre = (torch.tensor(SIZE[::-1]) - 1) / 2
+    green = centroids(out["image"][:, 1]) - centre
+    torch.testing.assert_close(green, pixels - centre, atol=0.02, rtol=0)
+    for channel, column in ((0, 0), (2, 1)):
+        shifted = centroids(out["image"][:, channel]) - centre
+        torch.testing.assert_close(shifted, green * (1 + draw["chromatic"][:, column, None].float()), atol=0.05, rtol=0)
+    grey = lens(image=pictures[:, :1], draw=draw)["image"]
+    torch.testing.assert_close(grey, out["image"][:, 1:2])
+
+
+def test_empty_batches():
+    for make in AUGMENTATIONS.values():
+        augmentation = make(image_size=(30, 40))
+        out = augmentation({k: v[:0] if isinstance(v, torch.Tensor) else v for k, v in sample().items()})
+        assert out["image"].shape == (0, 3, 30, 40)
+        assert out["keypoints_valid"].shape == (0, 7)
+        assert out["camera"].batch_shape == (0,)
+    out = RandomMount()({**sample(), "keypoints": torch.zeros(3, 0, 2), "boxes": torch.zeros(3, 0, 4)})
+    assert out["keypoints"].shape == (3, 0, 2)
+    assert out["boxes_valid"].shape == (3, 0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64, torch.uint8])
+def test_dtypes_stay(dtype):
+    batch = sample()
+    batch["image"] = (batch["image"] * 200).to(dtype)
+    batch["keypoints"] = batch["keypoints"].to(dtype)
+    out = RandomCamera("dms130", vignetting=0.3)(batch)
+    assert out["image"].dtype == dtype
+    assert out["keypoints"].dtype == (dtype if dtype.is_floating_point else torch.float32)
+    assert out["mask"].dtype == torch.int64
+    assert set(out["mask"].unique().tolist()) <= set(range(5))
+
+
+def test_gradients_reach_pictures_labels_and_a_learning_camera():
+    camera = ct.KannalaBrandt([60.0, 60, 39.5, 29.5], [0.02, -0.01, 0.003, -0.001], image_size=(60, 80))
+    batch = sample(2, camera)
+    batch["image"].requires_grad_()
+    batch["keypoints"].requires_grad_()
+    out = RandomCamera("dms130")(batch)
+    (out["image"].square().mean() + out["keypoints"][out["keypoints_valid"]].mean()).backward()
+    for tensor in (batch["image"], batch["keypoints"], camera.intrinsics, camera.distortion):
+        assert torch.isfinite(tensor.grad).all()
+        assert tensor.grad.abs().sum() > 0
+
+
+def test_autocast_moves_nothing():
+    batch, augmentation = sample(), RandomCamera("aria")
+    draw = augmentation.draw(3)
+    plain = augmentation(batch, draw=draw)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        cast = augmentation(batch, draw=draw)
+    for name in ("keypoints", "points", "gaze", "rotation", "head_pose"):
+        torch.testing.assert_close(cast[name], plain[name], atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(cast["image"], plain["image"], atol=1e-3, rtol=0)
+
+
+def test_compiled_in_one_graph():
+    augmentation, batch = RandomCamera("dms130"), sample(2)
+    batch = {k: batch[k] for k in ("image", "mask", "keypoints", "boxes", "gaze", "head_pose", "camera")}
+
+    def run(batch, draw):
+        out = augmentation(batch, draw=draw)
+        return {k: v for k, v in out.items() if isinstance(v, torch.Tensor)}
+
+    draw = augmentation.draw(2)
+    compiled = torch.compile(run, fullgraph=True, backend="eager")(batch, draw)
+    for name, value in run(batch, draw).items():
+        torch.testing.assert_close(compiled[name], value, atol=2e-3, rtol=1e-4)
+
+
+def test_padding_and_fill():
+    batch = sample()
+    mount = {"yaw": (40, 40), "pitch": (0, 0), "roll": (0, 0)}
+    black, grey = (RandomMount(**mount, fill=fill, mask_fill=9, valid_mask=True)(batch) for fill in (0.0, 0.5))
+    seen = black["image_valid"].expand_as(black["image"])
+    assert 0.1 < seen.float().mean() < 0.9
+    inside = torch.nn.functional.max_pool2d((~black["image_valid"]).float(), 7, 1, 3).expand_as(seen) == 0
+    torch.testing.assert_close(black["image"][inside], grey["image"][inside])
+    outside = torch.nn.functional.max_pool2d(seen.float(), 3, 1, 1) == 0
+    assert (grey["image"][outside] == 0.5).all()
+    assert (black["mask"][:, None].expand_as(seen)[~seen] == 9).all()
+    border = RandomMount(**mount, padding_mode="border")(batch)["image"]
+    assert (border[outside] > 0).any()
+    torch.testing.assert_close(border[inside], black["image"][inside])

@@ -1,0 +1,299 @@
+"""The augmentations for numpy arrays and for torchvision: the same as for tensors, in other layouts."""
+
+import importlib
+import pickle
+import sys
+
+import numpy as np
+import PIL.Image
+import pytest
+import torch
+from torchvision_stand_in import torchvision_of
+
+import camtorch as ct
+import camtorch.augment.numpy
+
+SIZE = (24, 32)
+
+
+def camera():
+    return ct.KannalaBrandt([18.0, 18.0, 15.0, 11.0], [0.01, -0.02, 0.0, 0.0], image_size=SIZE)
+
+
+def augmentation(**options):
+    return ct.augment.RandomCamera(yaw=12, pitch=8, roll=15, chromatic=0.02, vignetting=(0.1, 0.3), **options)
+
+
+def pictures(seed=0):
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    mask = np.zeros(SIZE, np.int64)
+    mask[9:17, 12:22] = 7
+    points = np.array([[15.0, 11.0], [3.5, 20.0], [31.4, 0.0], [-90.0, 5.0]], np.float32)
+    return image, mask, points, np.array([[11.5, 8.5, 21.5, 16.5]], np.float32)
+
+
+def expected(image, seed=3, **fields):
+    """What the augmentation gives for tensors."""
+    torch.manual_seed(seed)
+    with torch.no_grad():
+        return augmentation()(image=torch.from_numpy(np.moveaxis(image, -1, 0).copy()), camera=camera(), **fields)
+
+
+@pytest.fixture(params=["stand-in", "real"])
+def vision(request, monkeypatch):
+    """The front end, as it is with a stand-in and with torchvision, and its tv_tensors."""
+    with torchvision_of(request.param, monkeypatch) as tv_tensors:
+        yield importlib.import_module("camtorch.augment.torchvision"), tv_tensors
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", ">i2", "float32", "float64"])
+def test_arrays_come_out_as_they_went_in(dtype):
+    (image, mask, points, boxes), gaze, pose = pictures(), np.array([0.1, -0.2, -0.9]), np.eye(4, dtype=np.float32)
+    image = image.astype(dtype)
+    torch.manual_seed(3)
+    out = ct.augment.numpy.Transform(augmentation())(
+        image=image, mask=mask, keypoints=points, bboxes=boxes, gaze=gaze, head_pose=pose, camera=camera(), label="a"
+    )
+    native = image.astype(np.dtype(dtype).newbyteorder("="))
+    tensors = {"mask": mask, "keypoints": points, "boxes": boxes, "gaze": gaze, "head_pose": pose}
+    want = expected(native, **{name: torch.from_numpy(value) for name, value in tensors.items()})
+    assert out["image"].dtype == np.dtype(dtype)
+    assert out["image"].flags.c_contiguous
+    np.testing.assert_array_equal(out["image"], np.moveaxis(want["image"].numpy(), 0, -1))
+    for name in ("mask", "keypoints", "bboxes", "gaze", "head_pose", "keypoints_valid", "bboxes_valid", "rotation"):
+        value = want[name.replace("bboxes", "boxes")].numpy()
+        assert out[name].dtype == value.dtype
+        np.testing.assert_array_equal(out[name], value)
+    assert out["keypoints_valid"].tolist() == [True, True, False, False]
+    assert out["label"] == "a"
+    torch.testing.assert_close(out["camera"].intrinsics, want["camera"].intrinsics)
+    assert not out["camera"].batch_shape
+
+
+def test_layouts_lists_and_what_was_valid_before():
+    image, mask, _, _ = pictures()
+    grey = image[..., 0]
+    grey.flags.writeable = False
+    transform = ct.augment.numpy.Transform(augmentation(camera=camera(), valid_mask=True, image_size=(20, 30)))
+    out = transform(
+        {"image": grey[:, ::-1], "images": [image[..., ::-1], grey]},
+        masks=[mask, (mask > 0)[..., None]],
+        mask_parts=[],
+        keypoints=[(15, 11), (15, 11)],
+        keypoints_valid=np.array([False, True]),
+        bboxes=[],
+        depth=mask.astype(np.float32),
+    )
+    assert out["image"].shape == out["depth"].shape == out["image_valid"].shape == (20, 30)
+    assert out["image_valid"].dtype == bool
+    assert [one.shape for one in out["images"]] == [(20, 30, 3), (20, 30)]
+    assert [(one.shape, one.dtype.name) for one in out["masks"]] == [((20, 30), "int64"), ((20, 30, 1), "bool")]
+    np.testing.assert_array_equal(out["masks"][0] > 0, out["masks"][1][..., 0])
+    assert out["mask_parts"] == []
+    assert out["keypoints"].dtype == np.float32
+    assert out["keypoints_valid"].tolist() == [False, True]
+    assert out["bboxes"].shape == (0, 4)
+    draw = transform.augmentation.draw(1)
+    stacked = transform(masks=np.stack([mask, mask]), draw=draw)["masks"]
+    assert stacked.shape == (2, 20, 30)
+    np.testing.assert_array_equal(stacked[0], transform(mask=mask, draw=draw)["mask"])
+    empty = transform(masks=np.zeros((0, *SIZE), np.uint8), image=image)["masks"]
+    assert (empty.shape, empty.dtype) == ((0, 20, 30), np.uint8)
+
+
+def test_there_and_back():
+    image, _, points, _ = pictures()
+    transform = ct.augment.numpy.Transform(ct.augment.RandomMount(camera=camera()))
+    out = transform(image=image, keypoints=points[:2], gaze=[0.0, 0.6, -0.8])
+    back = transform.inverse(**out)
+    np.testing.assert_allclose(back["keypoints"], points[:2], atol=1e-3)
+    np.testing.assert_allclose(back["gaze"], [0.0, 0.6, -0.8], atol=1e-6)
+    np.testing.assert_allclose(back["rotation"], np.eye(3), atol=1e-6)
+    generator = torch.Generator().manual_seed(5)
+    draw = transform.augmentation.draw(1, torch.Generator().manual_seed(5))
+    moved = transform(keypoints=points, generator=generator)["keypoints"]
+    np.testing.assert_array_equal(moved, transform(keypoints=points, draw=draw)["keypoints"])
+    again = transform.inverse(keypoints=moved[:2], draw=draw, camera=camera())
+    np.testing.assert_allclose(again["keypoints"], points[:2], atol=1e-3)
+
+
+def test_faces_are_normalised():
+    image, _, points, _ = pictures()
+    transform = ct.augment.numpy.Transform(ct.augment.FaceNormalizer(focal=40, distance=0.6, image_size=(16, 16)))
+    fields = {"rvec": np.array([0.1, 0.2, 0.0]), "tvec": np.array([0.05, -0.02, 0.5])}
+    out = transform(image=image, keypoints=points[:1], camera=camera(), **fields)
+    assert out["image"].shape == (16, 16, 3)
+    assert out["scale"] == pytest.approx(0.6 / np.linalg.norm(fields["tvec"]), rel=1e-6)
+    np.testing.assert_allclose(out["tvec"], [0, 0, np.linalg.norm(fields["tvec"])], atol=1e-6)
+    back = transform.inverse(**{name: out[name] for name in ("keypoints", "camera", "rotation", "source_camera")})
+    np.testing.assert_allclose(back["keypoints"], points[:1], atol=1e-3)
+
+
+def test_errors_name_the_field_and_its_shape():
+    image, mask, points, _ = pictures()
+    transform = ct.augment.numpy.Transform(augmentation(camera=camera()))
+    cases = [
+        (
+            ValueError,
+            r"image must be .* got shape \(3, 24, 32\), which has its channels first",
+            {"image": image.T.swapaxes(1, 2)},
+        ),
+        (ValueError, r"image is \(23, 32\) .* image_size of camera is \(24, 32\)", {"image": image[1:]}),
+        (ValueError, r"masks\[1\] must be .* got shape \(32,\)", {"masks": [mask, mask[0]]}),
+        (ValueError, r"keypoints must be \(N, 2\).* got shape \(4, 1\)", {"keypoints": points[:, :1]}),
+        (ValueError, "'heat' holds real numbers", {"image": image, "heat": points}),
+        (TypeError, "image must be a numpy array .* got dtype object", {"image": image.astype(object)}),
+        (TypeError, "mask must be a numpy array .* got Tensor", {"mask": torch.from_numpy(mask)}),
+        (TypeError, "keypoints must be a numpy array .* got list", {"keypoints": [[1, 2], [3]]}),
+    ]
+    for error, text, fields in cases:
+        with pytest.raises(error, match=text):
+            transform(**fields)
+    with pytest.raises(TypeError, match=r"transform\(image=...\); got ndarray"):
+        transform(image)
+    with pytest.raises(TypeError, match="got str"):
+        ct.augment.numpy.Transform("RandomMount")
+
+
+def test_every_kind_of_a_sample_moves_by_one_draw(vision):
+    front_end, tv = vision
+    image, mask, points, boxes = pictures()
+    picture = torch.from_numpy(image).permute(2, 0, 1)
+    sample = {
+        "image": tv.Image(picture),
+        "nested": [tv.Mask(torch.from_numpy(mask).expand(2, -1, -1)), "text", torch.ones(3)],
+        "video": tv.Video(picture.expand(2, 4, -1, -1, -1)),
+        "points": tv.KeyPoints(torch.from_numpy(points).reshape(2, 2, 2), canvas_size=SIZE),
+        "boxes": tv.BoundingBoxes(torch.from_numpy(boxes) + 0.5, format=tv.BoundingBoxFormat.XYXY, canvas_size=SIZE),
+        "camera": camera(),
+    }
+    transform = front_end.Transform(augmentation())
+    torch.manual_seed(3)
+    with torch.no_grad():
+        out = transform(sample)
+    want = expected(
+        image, mask=torch.from_numpy(mask), keypoints=torch.from_numpy(points), boxes=torch.from_numpy(boxes)
+    )
+    assert [type(value) for value in out.values()] == [type(value) for value in sample.values()]
+    plain = {name: out[name].as_subclass(torch.Tensor) for name in ("image", "video", "points", "boxes")}
+    torch.testing.assert_close(plain["image"], want["image"], rtol=0, atol=0)
+    torch.testing.assert_close(plain["video"], want["image"].expand(2, 4, -1, -1, -1), rtol=0, atol=0)
+    assert type(out["nested"][0]) is tv.Mask
+    torch.testing.assert_close(out["nested"][0].as_subclass(torch.Tensor), want["mask"].expand(2, -1, -1))
+    assert out["nested"][1:] == sample["nested"][1:]
+    torch.testing.assert_close(plain["points"], want["keypoints"].reshape(2, 2, 2))
+    torch.testing.assert_close(plain["boxes"], want["boxes"] + 0.5)
+    torch.testing.assert_close(out["camera"].intrinsics, want["camera"].intrinsics)
+    torch.testing.assert_close(transform.last.rotation[0], want["rotation"])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.int64])
+@pytest.mark.parametrize("form", ["XYXY", "XYWH", "CXCYWH"])
+def test_boxes_enclose_their_masks_in_every_format(vision, form, dtype):
+    front_end, tv = vision
+    _, mask, _, _ = pictures()
+    edges = {"XYXY": [12, 9, 22, 17], "XYWH": [12, 9, 10, 8], "CXCYWH": [17, 13, 10, 8]}[form]
+    values = torch.tensor([edges, edges]).to(dtype)
+    boxes = tv.BoundingBoxes(values, format=tv.BoundingBoxFormat[form], canvas_size=SIZE)
+    transform = front_end.Transform(augmentation(image_size=(48, 60), tolerance=0), camera())
+    for seed in range(5):
+        torch.manual_seed(seed)
+        moved, labels = transform(boxes, tv.Mask(torch.from_numpy(mask)))
+        assert (moved.format.value, moved.dtype, tuple(moved.canvas_size)) == (form, dtype, (48, 60))
+        one, two = moved.as_subclass(torch.Tensor)[1].double().chunk(2)
+        low = one - two / 2 if form == "CXCYWH" else one
+        high = {"XYXY": two, "XYWH": one + two, "CXCYWH": one + two / 2}[form]
+        seen = (labels.as_subclass(torch.Tensor) == 7).nonzero().flip(-1)
+        # pixels are as wide as one, and labels keep to whole ones
+        slack = 1.1 if dtype.is_floating_point else 3.5
+        below, above = seen.amin(0) - low, high - seen.amax(0) - 1
+        assert (below > -0.55).all() and (below < slack).all(), below  # noqa: PT018
+        assert (above > -0.55).all() and (above < slack).all(), above  # noqa: PT018
+
+
+def test_half_a_turn_is_both_flips_of_torchvision(vision):
+    front_end, tv = vision
+    middle = ct.Pinhole([20.0, 20.0, 15.5, 11.5], image_size=SIZE)
+    transform = front_end.Transform(ct.augment.RandomMount(yaw=0, pitch=0, roll=(180, 180)), middle)
+    image, points = torch.rand(3, *SIZE), torch.tensor([[0.0, 0.0], [3.0, 5.0]])
+    boxes = tv.BoundingBoxes([[1.0, 2.0, 5.0, 8.0]], format=tv.BoundingBoxFormat.XYXY, canvas_size=SIZE)
+    with torch.no_grad():
+        turned, points, boxes = transform(tv.Image(image), tv.KeyPoints(points, canvas_size=SIZE), boxes)
+    torch.testing.assert_close(turned.as_subclass(torch.Tensor), image.flip(-1, -2), atol=1e-4, rtol=0)
+    torch.testing.assert_close(points.as_subclass(torch.Tensor), torch.tensor([[31.0, 23.0], [28.0, 18.0]]))
+    torch.testing.assert_close(boxes.as_subclass(torch.Tensor), torch.tensor([[27.0, 16.0, 31.0, 22.0]]))
+
+
+def test_what_has_no_place_keeps_its_row(vision):
+    front_end, tv = vision
+    wide = ct.KannalaBrandt([9.0, 9.0, 15.5, 11.5], image_size=SIZE)
+    transform = front_end.Transform(ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150)), wide)
+    image = torch.zeros(3, *SIZE)
+    values = torch.tensor([[14, 10, 3, 2]])
+    boxes = tv.BoundingBoxes(values, format=tv.BoundingBoxFormat.XYWH, canvas_size=SIZE)
+    points = tv.KeyPoints(torch.tensor([[15, 11], [16, 12]]), canvas_size=SIZE)
+    _, boxes, points = transform(image, boxes, points)
+    assert boxes.tolist() == [[-1, -1, 0, 0]]
+    assert points.tolist() == [[-1, -1], [-1, -1]]
+    none = tv.BoundingBoxes(torch.zeros(0, 4), format=tv.BoundingBoxFormat.XYXY, canvas_size=SIZE)
+    _, none, masks = transform(image, none, tv.Mask(torch.zeros(0, *SIZE, dtype=torch.bool)))
+    assert (none.shape, masks.shape) == ((0, 4), (0, *SIZE))
+
+
+def test_plain_tensors_and_pil_images(vision):
+    front_end, _ = vision
+    image = pictures()[0]
+    transform = front_end.Transform(augmentation(), camera())
+    want = expected(image)["image"]
+    plain = torch.from_numpy(image).permute(2, 0, 1)
+    torch.manual_seed(3)
+    moved, other = transform(plain, plain)
+    torch.testing.assert_close(moved, want, rtol=0, atol=0)
+    assert other is plain
+    torch.manual_seed(3)
+    picture, label = transform(PIL.Image.fromarray(image), 5)
+    assert (picture.mode, label) == ("RGB", 5)
+    np.testing.assert_array_equal(np.asarray(picture), want.permute(1, 2, 0).numpy())
+    for mode in ("L", "RGBA", "CMYK", "F", "I;16"):
+        source = PIL.Image.new(mode, SIZE[::-1], 9 if mode in ("L", "F", "I;16") else (9, 9, 9, 9))
+        picture = transform(source)
+        assert (picture.mode, picture.size) == (mode, source.size)
+        assert np.asarray(picture).max() > 5
+    assert not transform(plain.float()).requires_grad
+    assert transform(plain.float().requires_grad_()).requires_grad
+    copy = pickle.loads(pickle.dumps(front_end.Transform(augmentation(p=0), camera())))
+    assert copy(plain, 1)[0] is plain
+    assert copy.last.target.image_size == SIZE
+
+
+def test_errors_of_the_torchvision_front_end(vision):
+    front_end, tv = vision
+    transform = front_end.Transform(augmentation(), camera())
+    rotated = tv.BoundingBoxes(torch.ones(1, 5), format=tv.BoundingBoxFormat.XYWHR, canvas_size=SIZE)
+    cases = [
+        (rotated, "boxes of the format XYWHR"),
+        (
+            tv.KeyPoints(torch.ones(1, 2), canvas_size=(5, 6)),
+            r"KeyPoints is \(5, 6\) \(height, width\), but the camera's image_size is \(24, 32\)",
+        ),
+        (torch.ones(3, 7, 8), r"Tensor is \(7, 8\)"),
+        (PIL.Image.new("P", SIZE[::-1]), "mode 'P' mean nothing"),
+    ]
+    for value, text in cases:
+        with pytest.raises(ValueError, match=text):
+            transform(value)
+    with pytest.raises(ValueError, match="no camera"):
+        front_end.Transform(augmentation())(torch.ones(3, *SIZE))
+    with pytest.raises(ValueError, match=r"batch dims \(2,\)"):
+        front_end.Transform(augmentation(), ct.Pinhole(torch.ones(2, 4), image_size=SIZE))(torch.ones(3, *SIZE))
+    with pytest.raises(TypeError, match="got FaceNormalizer"):
+        front_end.Transform(ct.augment.FaceNormalizer(), camera())
+
+
+def test_a_torchvision_that_does_not_load_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchvision", None)
+    with pytest.raises(
+        ImportError, match=r"needs a torchvision that was built for the installed torch \d.* failed with"
+    ):
+        importlib.import_module("camtorch.augment.torchvision")

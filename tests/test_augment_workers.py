@@ -1,0 +1,146 @@
+"""Augmentations in the workers of a DataLoader, and a learnable camera in DistributedDataParallel."""
+
+import os
+import pickle
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.parallel import DistributedDataParallel
+from torch.utils.data import DataLoader, Dataset
+
+import camtorch as ct
+import camtorch.augment.numpy
+
+SIZE = (12, 16)
+COUNT = 8
+
+
+def camera(dtype=torch.float32):
+    # learnable, as a camera is unless somebody says otherwise
+    intrinsics = torch.tensor([9.0, 9.2, 7.4, 5.6], dtype=dtype)
+    return ct.KannalaBrandt(intrinsics, torch.tensor([0.02, -0.01, 0.004, -0.001], dtype=dtype), image_size=SIZE)
+
+
+def augmentation(**options):
+    return ct.augment.RandomCamera(yaw=8, pitch=8, roll=10, tolerance=0, **options)
+
+
+class Samples(Dataset):
+    """The same sample again and again."""
+
+    def __init__(self, arrays):
+        self.camera, self.augmentation = camera(), augmentation(p=0.9)
+        self.transform = ct.augment.numpy.Transform(self.augmentation) if arrays else self.augmentation
+        self.arrays = arrays
+
+    def __len__(self):
+        return COUNT
+
+    def __getitem__(self, index):
+        image, points = torch.linspace(0, 1, 12 * 16).reshape(1, *SIZE), torch.tensor([[7.0, 5.0], [2.0, 3.0]])
+        if self.arrays:
+            image, points = image[0].numpy(), points.numpy()
+        return self.transform(image=image, keypoints=points, gaze=np.float32([0, 0, -1]), camera=self.camera, id=index)
+
+
+def batches(context, arrays=False):
+    loader = DataLoader(
+        Samples(arrays),
+        batch_size=2,
+        num_workers=2 if context else 0,
+        multiprocessing_context=context,
+        generator=torch.Generator().manual_seed(7),
+    )
+    return list(loader)
+
+
+# with threads, Python 3.12 and later warn of every fork
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("arrays", [False, True])
+def test_workers_differ_and_runs_repeat(arrays):
+    if "fork" not in torch.multiprocessing.get_all_start_methods():
+        pytest.skip("this system cannot fork")
+    runs = [batches("fork", arrays), batches("fork", arrays), *([] if arrays else [batches("spawn")])]
+    for run in runs:
+        assert torch.cat([batch["id"] for batch in run]).tolist() == list(range(COUNT))
+        for batch, first in zip(run, runs[0], strict=True):
+            for name in ("image", "keypoints", "keypoints_valid", "gaze", "rotation"):
+                assert torch.equal(batch[name], first[name]), name
+            assert torch.equal(batch["camera"].intrinsics, first["camera"].intrinsics)
+            assert tuple(batch["camera"].batch_shape) == (2,)
+            assert batch["camera"].image_size == SIZE
+            assert not any(t.requires_grad for t in (batch["image"], batch["camera"].intrinsics))
+    turned = torch.cat([batch["rotation"] for batch in runs[0]])
+    moved = turned[(turned - torch.eye(3)).abs().amax((-1, -2)) > 1e-3]
+    # the first two batches are of different workers
+    assert len(moved) >= COUNT - 3
+    assert len(moved.flatten(1).unique(dim=0)) == len(moved)
+
+
+def test_collated_samples_move_on_in_the_main_process():
+    batch = batches(None)[0]
+    names = ("image", "keypoints", "keypoints_valid", "camera")
+    again = augmentation()({name: batch[name] for name in names})
+    assert again["image"].shape == (2, 1, *SIZE)
+    assert (batch["keypoints_valid"] | ~again["keypoints_valid"]).all()
+
+
+def test_an_augmentation_pickles_with_its_options():
+    for one in (augmentation(p=0.5, fill=0.3), ct.augment.RandomLens("dms90"), ct.augment.FaceNormalizer(focal=40)):
+        assert repr(pickle.loads(pickle.dumps(one))) == repr(one)
+    first = augmentation(camera=camera())
+    image, draw = torch.rand(1, *SIZE), first.draw(1)
+    before = first(image=image, draw=draw)
+    second = pickle.loads(pickle.dumps(first))
+    assert second.last is None
+    assert torch.equal(second(image=image, draw=draw)["image"], before["image"])
+    copy = pickle.loads(pickle.dumps(ct.augment.numpy.Transform(first)))
+    assert np.array_equal(copy(image=image[0].numpy(), draw=draw)["image"], before["image"][0].detach().numpy())
+
+
+class Learner(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.camera, self.augmentation = camera(torch.float64), augmentation()
+
+    def forward(self, images, keypoints, draw):
+        moved = self.augmentation(image=images, keypoints=keypoints, camera=self.camera, draw=draw)
+        return moved["image"], moved["keypoints"]
+
+
+def gradients(learner, rows):
+    """Those of all parameters, of a loss of the means over these rows of one batch."""
+    generator = torch.Generator().manual_seed(1)
+    images = torch.rand(COUNT, 1, *SIZE, dtype=torch.float64, generator=generator)
+    weights = torch.rand(COUNT, 1, *SIZE, dtype=torch.float64, generator=generator)
+    points = torch.tensor([7.0, 5.0]) + 4 * torch.rand(COUNT, 3, 2, dtype=torch.float64, generator=generator)
+    draw = augmentation().draw(COUNT, generator)
+    moved, keypoints = learner(images[rows], points[rows], {name: value[rows] for name, value in draw.items()})
+    ((moved * weights[rows]).sum((1, 2, 3)).mean() + keypoints.square().sum((1, 2)).mean()).backward()
+    return {name: parameter.grad for name, parameter in learner.named_parameters()}
+
+
+def work(rank, folder):
+    torch.set_num_threads(1)
+    if sys.platform == "linux":
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
+    torch.distributed.init_process_group("gloo", init_method=(folder / "meeting").as_uri(), rank=rank, world_size=2)
+    found = gradients(DistributedDataParallel(Learner()), slice(rank, None, 2))
+    torch.save(found, folder / f"gradients{rank}.pt")
+    torch.distributed.destroy_process_group()
+
+
+@pytest.mark.skipif(
+    not (torch.distributed.is_available() and torch.distributed.is_gloo_available()), reason="this torch has no gloo"
+)
+def test_two_processes_have_the_gradient_of_one(tmp_path):
+    torch.multiprocessing.spawn(work, (tmp_path,), nprocs=2)
+    whole = gradients(Learner(), slice(None))
+    assert set(whole) == {"camera.intrinsics", "camera.distortion"}
+    assert all(gradient.abs().min() > 1e-6 for gradient in whole.values())
+    for rank in (0, 1):
+        found = torch.load(tmp_path / f"gradients{rank}.pt", weights_only=True)
+        for name, gradient in whole.items():
+            torch.testing.assert_close(found[f"module.{name}"], gradient, rtol=1e-10, atol=1e-10)

@@ -1,0 +1,91 @@
+"""Stand-ins for the parts of torchvision that are used, for where its binary does not match torch."""
+
+import contextlib
+import enum
+import functools
+import importlib
+import sys
+import types
+
+import PIL.Image
+import pytest
+import torch
+from torch.utils._pytree import tree_flatten, tree_unflatten
+
+import camtorch as ct
+
+
+class TVTensor(torch.Tensor):
+    def __new__(cls, data, **meta):
+        return cls._with(torch.as_tensor(data).as_subclass(cls), meta)
+
+    @staticmethod
+    def _with(tensor, meta):
+        for name, value in meta.items():
+            setattr(tensor, name, value)
+        return tensor
+
+    @classmethod
+    def wrap(cls, tensor, like, **kwargs):
+        return cls._with(tensor.as_subclass(cls), {k: kwargs.get(k, v) for k, v in like.__dict__.items()})
+
+    @classmethod
+    def __torch_function__(cls, func, types, args=(), kwargs=None):
+        with torch._C.DisableTorchFunctionSubclass():
+            result = func(*args, **(kwargs or {}))
+        return result.as_subclass(torch.Tensor) if isinstance(result, TVTensor) else result
+
+
+def stand_in():
+    tv_tensors = types.ModuleType("torchvision.tv_tensors")
+    tv_tensors.TVTensor = TVTensor
+    for name in ("Image", "Video", "Mask", "KeyPoints", "BoundingBoxes"):
+        setattr(tv_tensors, name, type(name, (TVTensor,), {}))
+    names = ("XYXY", "XYWH", "CXCYWH", "XYWHR", "CXCYWHR", "XYXYXYXY")
+    tv_tensors.BoundingBoxFormat = enum.Enum("BoundingBoxFormat", {name: name for name in names})
+    tv_tensors.wrap = lambda wrappee, *, like, **kwargs: type(like).wrap(wrappee, like, **kwargs)
+
+    class Transform(torch.nn.Module):
+        _transformed_types = (torch.Tensor, PIL.Image.Image)
+
+        def forward(self, *inputs):
+            flat, spec = tree_flatten(inputs if len(inputs) > 1 else inputs[0])
+            pictures = (tv_tensors.Image, tv_tensors.Video, PIL.Image.Image)
+            plain, needed = not any(isinstance(one, pictures) for one in flat), []
+            for one in flat:
+                needs = isinstance(one, self._transformed_types)
+                if isinstance(one, torch.Tensor) and not isinstance(one, TVTensor):
+                    needs, plain = plain, False
+                needed.append(needs)
+            params = self.make_params([one for one, needs in zip(flat, needed, strict=True) if needs])
+            pairs = zip(flat, needed, strict=True)
+            return tree_unflatten([self.transform(one, params) if needs else one for one, needs in pairs], spec)
+
+    names = ("torchvision", "torchvision.transforms", "torchvision.transforms.v2")
+    torchvision, transforms, v2 = (types.ModuleType(name) for name in names)
+    v2.Transform, transforms.v2 = Transform, v2
+    torchvision.tv_tensors, torchvision.transforms = tv_tensors, transforms
+    return {module.__name__: module for module in (torchvision, transforms, v2, tv_tensors)}
+
+
+@functools.cache
+def why_not():
+    try:
+        importlib.import_module("torchvision.transforms.v2")
+    except Exception as error:
+        return f"torchvision cannot be imported: {type(error).__name__}: {error}"
+    return None
+
+
+@contextlib.contextmanager
+def torchvision_of(kind, monkeypatch):
+    """The tv_tensors of torchvision, "real", or of its stand-in; the front end may be imported meanwhile."""
+    if kind == "stand-in":
+        for name, module in stand_in().items():
+            monkeypatch.setitem(sys.modules, name, module)
+    elif why_not():
+        pytest.skip(why_not())
+    sys.modules.pop("camtorch.augment.torchvision", None)
+    yield sys.modules["torchvision.tv_tensors"]
+    sys.modules.pop("camtorch.augment.torchvision", None)
+    vars(ct.augment).pop("torchvision", None)
