@@ -186,7 +186,8 @@ class Warp(GeometryModule):
 
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
-        self._pinned = self._sampling()
+        if not in_transform():  # what a transform makes dies with it
+            self._pinned = self._sampling()
         return self
 
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

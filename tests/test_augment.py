@@ -423,21 +423,15 @@ def test_a_family_has_the_field_of_view_that_is_asked_for():
 
 
 def test_presets_show_what_they_say():
-    for name, degrees in (
-        ("webcam", 67),
-        ("dms60", 68),
-        ("dms90", 93),
-        ("dms130", 130),
-        ("tumvi195", 195),
-        ("aria", 150),
-    ):
+    across = {"webcam": 67, "dms60": 60, "dms90": 93, "dms130": 130, "surround190": 190, "tumvi": 154, "aria": 151}
+    for name, degrees in {**across, "aria_rgb": 115}.items():
         camera = PRESETS[name].camera()
         assert not any(p.requires_grad for p in camera.parameters())
         width = camera.image_size[1]
         _, _, _, cy = camera.intrinsics.tolist()
         rays, valid = camera.unproject(torch.tensor([[u, cy] for u in range(width)]))
         angles = torch.atan2(rays[:, 0], rays[:, 2])[valid].rad2deg()
-        assert abs(float(angles.max() - angles.min()) - degrees) < 3, name
+        assert abs(float(angles.max() - angles.min()) - degrees) < 1, name
 
 
 def test_output_size_and_light():

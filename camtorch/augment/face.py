@@ -25,7 +25,8 @@ class FaceNormalizer(Mover):
     as if it were at `distance`; with S = diag(1, 1, distance / |c|) this is the published homography
     W = C S R K^-1, and it holds for every lens. Gaze and poses are turned by R and never scaled: that is the modified
     normalisation of Zhang, Sugano, Bulling: Revisiting Data Normalization for Appearance-Based Gaze Estimation, ETRA
-    2018, as of ETH-XGaze. 3D points keep their true distances; `scale` brings them to the normalised ones.
+    2018, as of ETH-XGaze. 3D points turn and keep their true distances; their z times `scale` is
+    that of the published normalised space.
 
     Args:
         camera: of samples that do not bring one.
@@ -99,9 +100,7 @@ class FaceNormalizer(Mover):
         down = torch.linalg.cross(forward, across)
         size = down.norm(dim=-1, keepdim=True)
         if not torch.compiler.is_compiling() and not bool((torch.isfinite(size) & (size > 1e-6)).all()):
-            raise ValueError(
-                f"{self._name}: a face's centre is the camera's, not finite, or seen along the head's x axis"
-            )
+            raise ValueError(f"{self._name}: a face is at the camera, not finite, or seen along the head's x axis")
         down = down / size
         rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
         focal = (self.focal / self.distance * distance).expand(-1, 2)

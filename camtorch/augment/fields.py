@@ -110,7 +110,7 @@ KINDS = {
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation),
 }
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
-OWN = ("camera", "draw", "generator")
+OWN = ("camera", "draw", "generator", "scale")  # no field that moves; `scale` is of a FaceNormalizer
 
 
 def kind_of(name: str, value, own: Mapping[str, str], owner: str) -> str | None:

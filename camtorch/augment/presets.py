@@ -38,9 +38,9 @@ PRESETS = {
     "dms60": Preset(
         "brown_conrady",
         (800, 1280),
-        (1064.3, 1065.1, 641.7, 396.4),
+        (1215.6, 1216.5, 641.7, 396.4),
         (-0.3021, 0.1254, 0.00021, -0.00017, -0.0289),
-        "typical of an infrared driver camera of some 60 (68 with its barrel distortion) degrees; not one calibrated camera",
+        "typical of an infrared driver camera of 60 degrees; not one calibrated camera",
     ),
     "dms90": Preset(
         "brown_conrady",
@@ -58,17 +58,17 @@ PRESETS = {
     ),
     "surround190": Preset(
         "kannala_brandt",
-        (1280, 1920),
-        (561.8, 562.4, 957.3, 644.6),
+        (1280, 1750),
+        (561.8, 562.4, 872.3, 644.6),
         (-0.0237, 0.0041, -0.0029, 0.0006),
         "typical of a car's surround-view camera of 190 degrees; not one calibrated camera",
     ),
-    "tumvi195": Preset(
+    "tumvi": Preset(
         "kannala_brandt",
         (512, 512),
         (190.97847715128717, 190.9733070521226, 254.93170605935475, 256.8974428996504),
         (0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 0.00020293673591811182),
-        "a fisheye of 195 degrees: TUM-VI dataset, cam0 at 512 pixels (Schubert et al., 2018)",
+        "a fisheye of 195 degrees, 154 across the picture: TUM-VI dataset, cam0, 512 pixels (Schubert et al., 2018)",
     ),
     "aria": Preset(
         "fisheye624",
@@ -78,7 +78,7 @@ PRESETS = {
             *(-0.0254803095, 0.098208487, -0.0666850955, 0.00907425676, 0.00233879033, -0.000557322637),
             *(0.000256432715, -7.22393725e-06, -0.000471561449, -5.86048482e-05, -0.000441436045, -0.000137118463),
         ),
-        "Project Aria glasses, left SLAM camera, 150 degrees: online calibration in the tests of projectaria_tools",
+        "Project Aria glasses, left SLAM camera, 151 degrees: online calibration in the tests of projectaria_tools",
     ),
     "aria_rgb": Preset(
         "fisheye624",
@@ -88,6 +88,6 @@ PRESETS = {
             *(0.398863079, -0.417100458966, -0.1090692405, 1.59137166, -2.02959744, 0.738166502),
             *(0.000688098579, -0.000494212153, -0.000368309363, 0.000122299997, 0.000733995781, -1.33127664e-05),
         ),
-        "Project Aria glasses, RGB camera, 110 degrees: online calibration in the tests of projectaria_tools",
+        "Project Aria glasses, RGB camera, 115 degrees: online calibration in the tests of projectaria_tools",
     ),
 }

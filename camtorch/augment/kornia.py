@@ -1,0 +1,299 @@
+"""The augmentations as kornia's: in AugmentationSequential and VideoSequential, for every data key, beside its own.
+
+`import camtorch` does not load this module, nor kornia.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from kornia.augmentation import GeometricAugmentationBase2D
+from kornia.augmentation.container.params import ParamItem
+from kornia.augmentation.utils import _transform_output_shape
+from kornia.constants import Resample, SamplePadding
+from torch import Tensor
+
+from camtorch.augment import random
+from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import collate, remade
+from camtorch.augment.change import Change
+from camtorch.augment.ranges import draw
+from camtorch.camera import Camera
+from camtorch.parameters import Memo
+from camtorch.sampling import narrow, widen
+
+__all__ = ["CameraAugmentation", "RandomCamera", "RandomLens", "RandomMount", "with_cameras"]
+
+_KIND = "source_kind"
+_NUMBERS = "source_intrinsics", "source_distortion"
+
+
+class CameraAugmentation(GeometricAugmentationBase2D):
+    r"""An augmentation of camtorch as one of kornia: image, masks, keypoints and boxes move by the same warps.
+
+    The same seed gives the same warps as calling the augmentation itself on a sample.
+
+    Args:
+        augmentation: a `camtorch.augment.Augmentation`, for example a `RandomCamera`.
+        camera: the Camera of the pictures, which may learn; by default the augmentation's own. `with_cameras` gives
+            every sample its own.
+        p, p_batch: how likely a sample, and a batch, is augmented at all; p by default as the augmentation says.
+        same_on_batch: the same draw for the whole batch; by default as the augmentation says.
+        keepdim: whether pictures without batch dim stay without.
+
+    Convention:
+        - pixel coordinates are ``(x, y)`` at integer pixel centres, as in all of kornia and camtorch.
+          ``align_corners`` means nothing; ``resample`` and ``padding_mode`` can be overridden by a call.
+        - keypoints keep their count and order. One without a place in the new picture becomes ``(-1, -1)``;
+          ``aug.change(params).points(keypoints)`` says in addition which ones lie on it.
+        - boxes become those that enclose their moved outlines, which are curved; they are not clipped. A box with no
+          part of its outline on the new picture is invalid, which kornia exports as zeros.
+        - masks take the nearest value, the augmentation's `mask_fill` where nothing is seen, and never the colours and
+          the light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft ones.
+        - the warp is no matrix: ``transform_matrix`` is NaN, also of a container that holds the augmentation. ``last``
+          and ``change(params)`` give what there is instead: the cameras before and after, and how far it turned.
+        - gaze, poses and 3D points have no data key in kornia, and containers leave them as they are. Turn them
+          by ``aug.last.rays(...)``, or call the augmentation itself with samples.
+        - ``inverse`` takes everything back by the inverse warp. What left the picture, or fell between its pixels, is
+          lost; boxes have grown; chromatic aberration and vignetting stay.
+        - params are tensors, drawn on the CPU wherever the module is. A replay is bit-identical.
+    """
+
+    def __init__(self, augmentation, camera=None, *, p=None, p_batch=1.0, same_on_batch=None, keepdim=False):
+        name = type(self).__name__
+        if not isinstance(augmentation, Augmentation):
+            raise TypeError(f"{name}: augmentation must be one of camtorch.augment; got {type(augmentation).__name__}")
+        camera = augmentation.camera if camera is None else camera
+        if not isinstance(camera, Camera):
+            raise TypeError(f"{name}: camera must be the Camera of the pictures; got {type(camera).__name__}")
+        if camera.image_size is None or camera.batch_shape:
+            raise ValueError(
+                f"{name}: camera must be a single one with image_size=(height, width); got batch dims "
+                f"{tuple(camera.batch_shape)} and {camera.image_size}. with_cameras gives every sample its own"
+            )
+        p = augmentation.p if p is None else p
+        if not (0 <= p <= 1 and 0 <= p_batch <= 1):
+            raise ValueError(f"{name}: p and p_batch must be probabilities in [0, 1]; got {p!r} and {p_batch!r}")
+        same_on_batch = augmentation.same_on_batch if same_on_batch is None else same_on_batch
+        super().__init__(p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
+        self.augmentation, self.camera = augmentation, camera
+        self.flags = {"resample": Resample.get(augmentation.options["mode"]), "align_corners": False}
+        self.flags["padding_mode"] = SamplePadding.get(augmentation.options["padding_mode"])
+        size = getattr(augmentation, "image_size", None) or camera.image_size
+        if size != camera.image_size:
+            self.flags["size"] = size
+        self._kind = _kind(camera)
+        # lists of masks come row by row between other labels of the batch
+        self._memos = Memo(), Memo()
+
+    # -- parameters
+
+    def set_rng_device_and_dtype(self, device: torch.device, dtype: torch.dtype) -> None:
+        """Draws stay on the CPU: a seed then means the same everywhere, and params can be looked at for free."""
+        super().set_rng_device_and_dtype(torch.device("cpu"), dtype)
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """Draw, as `Augmentation.draw` does after its gate; pictures must be of the camera's image_size."""
+        count, size = batch_shape[0], tuple(batch_shape[-2:])
+        if size != self.camera.image_size:
+            raise ValueError(
+                f"{self._get_name()}: pictures are {size} (height, width), but the camera's image_size is "
+                f"{self.camera.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
+            )
+        drawn = draw(self.augmentation.ranges, count, 1.0, self.same_on_batch, None)
+        del drawn["apply"]
+        drawn[_KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()
+        if "size" in self.flags:
+            drawn["output_size"] = torch.tensor(self.flags["size"]).expand(count, -1).contiguous()
+        return drawn
+
+    def change(self, params: Mapping[str, Tensor] | None = None, device: torch.device | None = None) -> Change:
+        """What params, by default the last, do to a batch: `source`, `target`, `rotation`, `points(...)` and so on."""
+        params = self._params if params is None else params
+        missing = [name for name in ("batch_prob", *self.augmentation.ranges) if name not in params]
+        if missing:
+            raise ValueError(f"{self._get_name()}: the params lack {', '.join(missing)}; call it first")
+        values = {"apply": self._gate(params), **{name: params[name] for name in self.augmentation.ranges}}
+        camera = self._source(params, device)
+        inputs = [*values.values(), camera.intrinsics, camera.distortion]
+        inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
+        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+            return self.augmentation.change(camera, values)
+        memo = self._memos[len(values["apply"]) == 1]
+        return memo(inputs, (str(self.augmentation.options),), lambda: self.augmentation.change(camera, values))
+
+    @property
+    def last(self) -> Change | None:
+        """The change of the last call."""
+        return self.change() if self._params else None
+
+    def _source(self, params: Mapping[str, Tensor], device: torch.device | None) -> Camera:
+        own = self.camera.intrinsics, self.camera.distortion
+        device = own[0].device if device is None else device
+        numbers = [params.get(name, value).to(device) for name, value in zip(_NUMBERS, own, strict=True)]
+        same = numbers[0] is own[0] and numbers[1] is own[1]
+        return self.camera if same else remade(self.camera, *numbers, self.camera.image_size)
+
+    # -- moving
+
+    def _move(self, params: Mapping[str, Tensor], value: Tensor, move: Callable, back: bool = False):
+        """`move(change, value)`, in the dtype of the value; positions in half precision would be off by pixels."""
+        with torch.autocast(value.device.type, enabled=False):
+            change = self.change(params, value.device)
+            if len(value) != change.count:
+                raise ValueError(f"{self._get_name()}: params for {change.count} samples, here are {len(value)}")
+            moved = move(change.inverse() if back else change, value)
+        moved, valid = moved if isinstance(moved, tuple) else (moved, None)
+        moved = narrow(moved, value.dtype)
+        if back:  # what moves forth is blended by kornia
+            moved = self._blend_by_prob(moved, value, self._gate(params))
+        return moved if valid is None else (moved, valid)
+
+    def apply_transform(self, input, params, flags, transform=None, *, back=False):
+        options = {"mode": Resample.get(flags["resample"]).name.lower()}
+        options["padding_mode"] = SamplePadding.get(flags["padding_mode"]).name.lower()
+        return self._move(params, input, lambda change, images: change.images(images, **options), back)
+
+    def apply_transform_mask(self, input, params, flags, transform=None, *, back=False):
+        fill, mode = self.augmentation.mask_fill, Resample.get(flags["resample"]).name.lower()
+        return self._move(params, input, lambda change, masks: change.labels(masks, fill, mode), back)
+
+    def apply_transform_keypoint(self, input, params, flags, transform=None, *, back=False):
+        rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
+        moved, _ = self._move(params, rows, lambda change, pixels: change.points(pixels), back)
+        result = input.clone()
+        result._data = moved.reshape(input.shape)
+        return result
+
+    def apply_transform_box(self, input, params, flags, transform=None, *, back=False):
+        rows = input.data if input.data.ndim == 4 else input.data.unsqueeze(0)
+        moved, seen = self._move(params, rows, lambda change, corners: change.quadrilaterals(widen(corners)), back)
+        result = input.clone()
+        result._data = moved.reshape(input.shape)
+        result._valid = input._valid & seen.reshape(input._valid.shape)
+        return result
+
+    def inverse_inputs(self, input, params, flags, transform=None, **kwargs):
+        return self.apply_transform(self.transform_tensor(input), params, {**flags, **kwargs}, back=True)
+
+    def inverse_masks(self, input, params, flags, transform=None, **kwargs):
+        shape = params["forward_input_shape"]
+        flags = {**flags, "resample": Resample.NEAREST, **kwargs}
+        rows = self.transform_tensor(input, shape=shape, match_channel=False)
+        moved = self.apply_transform_mask(rows, params, flags, back=True)
+        return _transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved
+
+    def inverse_keypoints(self, input, params, flags, transform=None, **kwargs):
+        return self.apply_transform_keypoint(input, params, flags, back=True)
+
+    def inverse_boxes(self, input, params, flags, transform=None, **kwargs):
+        return self.apply_transform_box(input, params, flags, back=True)
+
+    def compute_transformation(self, input, params, flags):
+        """(B, 3, 3) of NaN: there is no matrix, and an identity would be silently wrong."""
+        return torch.full((input.shape[0], 3, 3), torch.nan, device=input.device, dtype=input.dtype)
+
+    def compute_inverse_transformation(self, transform):
+        return transform
+
+    def __getstate__(self):
+        # a tensor of a graph can be neither copied nor pickled
+        kept = {k: v.detach() if isinstance(v, Tensor) else v for k, v in self._params.items()}
+        return {**self.__dict__, "_params": kept}
+
+    def __repr__(self) -> str:
+        ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())
+        return super().__repr__().replace("(", f"({ranges}", 1)
+
+
+class _Random(CameraAugmentation):
+    _wraps: type[Augmentation]
+
+    def __init__(self, camera, *like, p=1.0, p_batch=1.0, same_on_batch=False, keepdim=False, **options):
+        gates = {"p": p, "p_batch": p_batch, "same_on_batch": same_on_batch}
+        super().__init__(self._wraps(*like, **options), camera, **gates, keepdim=keepdim)
+
+
+class RandomMount(_Random):
+    """`camtorch.augment.RandomMount` for kornia: the camera turned and rolled where it stands, and zoomed.
+
+    Args:
+        camera: of the pictures.
+        p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
+        options: yaw, pitch, roll, zoom and so on, of `camtorch.augment.RandomMount`.
+
+    Convention:
+        as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the picture.
+    """
+
+    _wraps = random.RandomMount
+
+
+class RandomLens(_Random):
+    """`camtorch.augment.RandomLens` for kornia: another lens before the camera, which stays where it looks.
+
+    Args and Convention are as in `RandomMount`; after the camera comes `like`.
+    """
+
+    _wraps = random.RandomLens
+
+
+class RandomCamera(_Random):
+    """`camtorch.augment.RandomCamera` for kornia: another camera in the same place, turned and with another lens.
+
+    Args and Convention are as in `RandomMount`; after the camera comes `like`.
+    """
+
+    _wraps = random.RandomCamera
+
+
+def with_cameras(params, cameras: Camera | Sequence[Camera]):
+    """Params for pictures whose cameras differ in their numbers: of one augmentation, or the list of a container.
+
+    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_cameras(params, cameras))`.
+
+    Args:
+        params: they stay as they are.
+        cameras: a batch, or a list, that differ only in their numbers. Of a video, one for each clip or each frame.
+
+    Raises:
+        ValueError: cameras of another kind or number, or no camera augmentation among the params.
+        TypeError: they are no cameras.
+    """
+    if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
+        cameras = collate(cameras)
+    if not isinstance(cameras, Camera):
+        raise TypeError("with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size")
+    found: list[dict] = []
+
+    def changed(params):
+        if isinstance(params, Mapping):
+            found.extend([params] if _KIND in params else [])
+            return {**params, **_numbers(params, cameras)} if _KIND in params else params
+        return [p._replace(data=changed(p.data)) if isinstance(p, ParamItem) and p.data else p for p in params]
+
+    result = changed(params)
+    if not found:
+        raise ValueError("with_cameras: these are params of no camera augmentation")
+    return result
+
+
+def _numbers(params: Mapping[str, Tensor], cameras: Camera) -> dict[str, Tensor]:
+    kinds, kind, batch = params[_KIND], _kind(cameras), tuple(cameras.batch_shape)
+    if len(kinds) and kinds[0].tolist() != kind:
+        need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
+        raise ValueError(f"with_cameras: needs the augmentation's model, {need}; got {type(cameras).__name__}, {got}")
+    count, clips = len(kinds), int(params.get("video_batch_size", len(kinds)))
+    if batch not in ((), (1,), (count,), (clips,)):
+        raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
+    frames = count // clips if batch == (clips,) and clips else 1
+    numbers = (t.expand(*(batch or (1,)), -1) for t in (cameras.intrinsics, cameras.distortion))
+    numbers = [t.repeat_interleave(frames, 0).expand(count, -1) for t in numbers]
+    return dict(zip(_NUMBERS, numbers, strict=True))
+
+
+def _kind(camera: Camera) -> list[int]:
+    """Model, number of coefficients and image_size as integers, for params hold tensors only."""
+    return [zlib.crc32(type(camera).__name__.encode()), camera.distortion.shape[-1], *(camera.image_size or (0, 0))]

@@ -1,0 +1,147 @@
+"""The data normalisation of gaze estimation, against the published formulas."""
+
+import pytest
+import torch
+from cameras import spread
+
+import camtorch as ct
+from camtorch.augment import FaceNormalizer
+
+SIZE = (240, 320)
+
+
+def published(camera_matrix, centre, head, focal, distance, size):
+    """R and W of Zhang, Sugano, Bulling (ETRA 2018), as the code of ETH-XGaze writes them."""
+    length = centre.norm()
+    scale = distance / length
+    normal = torch.tensor([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]], dtype=centre.dtype)
+    forward = centre / length
+    down = torch.linalg.cross(forward, head[:, 0])
+    down = down / down.norm()
+    right = torch.linalg.cross(down, forward)
+    rotation = torch.stack((right / right.norm(), down, forward))
+    stretch = torch.diag(torch.stack((torch.ones_like(scale), torch.ones_like(scale), scale)))
+    return rotation, normal @ stretch @ rotation @ torch.linalg.inv(camera_matrix), scale
+
+
+def batch(count=3, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(0)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator, dtype=dtype) - 0.5
+
+    pose = ct.Extrinsics(0.8 * rand(count, 3), 0.2 * rand(count, 3) + torch.tensor([0.0, 0, 0.65])).matrix().detach()
+    gaze = torch.nn.functional.normalize(rand(count, 3) - torch.tensor([0.0, 0, 1.5]), dim=-1)
+    return {"head_pose": pose, "gaze": gaze, "points": pose[:, None, :3, 3] + 0.1 * rand(count, 5, 3)}
+
+
+@pytest.fixture
+def pinhole():
+    intrinsics = torch.tensor([300.0, 305.0, 161.0, 118.5], dtype=torch.float64)
+    return ct.Pinhole(intrinsics, image_size=SIZE).requires_grad_(False)
+
+
+def test_a_pinhole_is_normalised_as_published(pinhole):
+    """A picture of the coordinates holds, after the warp, W^-1 of every pixel."""
+    sample = batch()
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
+    sample["image"] = torch.stack((u, v)).expand(3, -1, -1, -1)
+    sample["keypoints"] = pinhole.project(sample["points"])[0]
+    normalizer = FaceNormalizer(camera=pinhole, focal=600.0, distance=0.6, image_size=(96, 128))
+    out = normalizer(sample)
+    assert out["image"].shape == (3, 2, 96, 128)
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in (96, 128)), indexing="ij")
+    grid = torch.stack((u, v, torch.ones_like(u)), -1)
+    for i in range(3):
+        pose = sample["head_pose"][i]
+        rotation, homography, scale = published(pinhole.K, pose[:3, 3], pose[:3, :3], 600.0, 0.6, (96, 128))
+        torch.testing.assert_close(out["rotation"][i], rotation)
+        torch.testing.assert_close(out["scale"][i], scale)
+        source = grid @ torch.linalg.inv(homography).T
+        source = source[..., :2] / source[..., 2:]
+        inside = (source > 0).all(-1) & (source < torch.tensor([SIZE[1] - 1, SIZE[0] - 1])).all(-1)
+        assert inside.float().mean() > 0.5
+        difference = (out["image"][i].movedim(0, -1) - source).norm(dim=-1)[inside]
+        assert difference.max() < 0.01  # the map is from a lattice: a thousandth of a pixel
+        moved = torch.cat((sample["keypoints"][i], torch.ones(5, 1, dtype=torch.float64)), -1) @ homography.T
+        torch.testing.assert_close(out["keypoints"][i], moved[:, :2] / moved[:, 2:], atol=1e-8, rtol=0)
+        torch.testing.assert_close(out["gaze"][i], rotation @ sample["gaze"][i], atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("key", ["pinhole", "kannala_brandt", "fisheye624"])
+def test_faces_come_to_lie_as_theory_says(key):
+    """The face's centre in the middle, the head's x axis level, the size as from the wanted distance, for any lens."""
+    camera, sample = spread(key).requires_grad_(False), batch()
+    eyes = torch.tensor([[-0.032, 0, 0], [0.032, 0, 0]], dtype=torch.float64)  # of the head frame
+    pose = sample["head_pose"]
+    eyes = eyes @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+    sample["points"] = torch.cat((pose[:, None, :3, 3], eyes), 1)
+    sample["keypoints"] = camera.project(sample["points"])[0]
+    out = FaceNormalizer(camera=camera, focal=960.0, distance=0.6)(sample)
+    centre = out["keypoints"][:, 0]
+    torch.testing.assert_close(centre, torch.full_like(centre, 112.0), atol=1e-6, rtol=0)
+    across = out["rotation"] @ (eyes[:, 1] - eyes[:, 0])[..., None]
+    assert across[:, 1].abs().max() < 1e-12
+    # as a pinhole of that focal length sees the turned eyes after S = diag(1, 1, scale)
+    turned = torch.einsum("bij,bnj->bni", out["rotation"], eyes)
+    seen = 960 * turned[..., :2] / (turned[..., 2:] * out["scale"][:, None, None]) + 112
+    torch.testing.assert_close(out["keypoints"][:, 1:], seen, atol=1e-6, rtol=0)
+    projected, valid = out["camera"].project(out["points"])
+    torch.testing.assert_close(projected, out["keypoints"], atol=1e-6, rtol=0)
+    assert valid.all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_predictions_go_back(dtype):
+    camera = spread("kannala_brandt", dtype).requires_grad_(False)
+    sample = {name: value.to(dtype) for name, value in batch().items()}
+    sample["keypoints"] = camera.project(sample["points"])[0]
+    normalizer = FaceNormalizer(camera=camera, distance=0.6)
+    out = normalizer(sample)
+    kept = {name: out[name] for name in ("camera", "rotation", "source_camera", "scale")}
+    back = normalizer.inverse(**kept, gaze=out["gaze"], points=out["points"], keypoints=out["keypoints"])
+    torch.testing.assert_close(back["gaze"], sample["gaze"], atol=1e-6, rtol=0)
+    torch.testing.assert_close(back["points"], sample["points"], atol=1e-6, rtol=0)
+    tolerance = 1e-3 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(back["keypoints"], sample["keypoints"], atol=tolerance, rtol=0)
+    one = normalizer({name: value[0] for name, value in sample.items()})
+    torch.testing.assert_close(one["gaze"], out["gaze"][0])
+    assert one["scale"].shape == ()
+    again = normalizer.inverse(one)
+    torch.testing.assert_close(again["gaze"], sample["gaze"][0], atol=1e-6, rtol=0)
+    assert "rotation" not in back
+
+
+def test_rotation_vectors_and_a_face_centre_of_its_own(pinhole):
+    sample = batch()
+    pose = ct.Extrinsics.from_matrix(sample["head_pose"])
+    normalizer = FaceNormalizer(camera=pinhole, distance=0.6)
+    by_matrix = normalizer(sample)
+    vectors = {"rvec": pose.rotation.detach(), "tvec": pose.translation.detach(), "gaze": sample["gaze"]}
+    by_vector = normalizer(vectors)
+    torch.testing.assert_close(by_vector["rotation"], by_matrix["rotation"])
+    turned = ct.Extrinsics(by_vector["rvec"], by_vector["tvec"]).matrix()
+    torch.testing.assert_close(turned, by_matrix["head_pose"])
+    centre = sample["head_pose"][:, :3, 3] + torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64)
+    aside = normalizer({**sample, "face_center": centre})
+    straight = torch.einsum("bij,bj->bi", aside["rotation"], centre)
+    torch.testing.assert_close(straight[:, :2], torch.zeros(3, 2, dtype=torch.float64), atol=1e-12, rtol=0)
+    torch.testing.assert_close(aside["face_center"], straight)
+
+
+def test_what_cannot_be_normalised_says_why(pinhole):
+    normalizer = FaceNormalizer(camera=pinhole)
+    with pytest.raises(ValueError, match=r"needs head_pose, or rvec and tvec; it has gaze"):
+        normalizer(gaze=torch.rand(2, 3))
+    sample = batch()
+    sample["head_pose"][0, :3, 3] = 0
+    with pytest.raises(ValueError, match="a face is at the camera"):
+        normalizer(sample)
+    with pytest.raises(ValueError, match=r"head_pose must be .*; got shape \(2, 3\)"):
+        normalizer(head_pose=torch.rand(2, 3))
+    with pytest.raises(ValueError, match="distance must be positive; got -1"):
+        FaceNormalizer(distance=-1)
+    with pytest.raises(ValueError, match="to go back, the sample needs camera, rotation, source_camera"):
+        normalizer.inverse(gaze=torch.rand(2, 3))
+    with pytest.raises(ValueError, match="no camera"):
+        FaceNormalizer()(batch())

@@ -1,0 +1,690 @@
+import copy
+import io
+import math
+import pickle
+import subprocess
+import sys
+import warnings
+
+import kornia.augmentation as K  # noqa: N812
+import pytest
+import torch
+from kornia.augmentation.container.params import ParamItem
+from kornia.constants import DataKey
+from kornia.geometry.boxes import Boxes
+from kornia.geometry.keypoints import Keypoints
+from torch.utils.data import DataLoader, Dataset
+
+import camtorch as ct
+from camtorch import augment
+from camtorch.augment import kornia as adapter
+
+HEIGHT, WIDTH = SIZE = 96, 128
+CLASSES = adapter.RandomMount, adapter.RandomLens, adapter.RandomCamera
+KEYS = ["input", "mask", "keypoints", "bbox"]
+
+
+def camera(**numbers):
+    values = {"intrinsics": [95.0, 96.0, 62.5, 48.25], "distortion": [-0.2, 0.05, 0.001, -0.001, 0.0]} | numbers
+    return ct.BrownConrady(*values.values(), image_size=SIZE).requires_grad_(False)
+
+
+def images(count=3, channels=1, size=SIZE):
+    seeded = torch.Generator().manual_seed(1)
+    return torch.rand(count, channels, *size, generator=seeded)
+
+
+def points(count=3, number=5):
+    seeded = torch.Generator().manual_seed(2)
+    return torch.rand(count, number, 2, generator=seeded) * torch.tensor([WIDTH * 0.6, HEIGHT * 0.6]) + 20
+
+
+def masks(count=3):
+    seeded = torch.Generator().manual_seed(3)
+    return torch.randint(0, 200, (count, 1, *SIZE), generator=seeded)
+
+
+def vertices(count=3):
+    corners = torch.tensor([[[30.0, 25.0], [70.0, 25.0], [70.0, 60.0], [30.0, 60.0]]])
+    return corners.expand(count, 1, 4, 2).contiguous()
+
+
+def batch(count=3):
+    return images(count), masks(count), points(count), vertices(count)
+
+
+def equal(first, second):
+    return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+# -- the same as the call on a sample
+
+
+@pytest.mark.parametrize("same_on_batch", [False, True])
+@pytest.mark.parametrize("p", [1.0, 0.5])
+@pytest.mark.parametrize("name", ["RandomMount", "RandomLens", "RandomCamera"])
+def test_a_seed_gives_the_warps_of_the_sample_call(name, p, same_on_batch):
+    own, wrapped = camera(), getattr(augment, name)(p=p, same_on_batch=same_on_batch)
+    aug = getattr(adapter, name)(own, p=p, same_on_batch=same_on_batch)
+    for seed in range(3):
+        torch.manual_seed(seed)
+        warped = aug(images())
+        torch.manual_seed(seed)
+        sample = wrapped({"image": images(), "keypoints": points(), "camera": own})
+        assert torch.equal(warped, sample["image"])
+        assert torch.equal(aug.last.rotation, sample["rotation"])
+        moved = aug.transform_keypoints(Keypoints(points()), aug._params, aug.flags)
+        assert torch.equal(moved.data, sample["keypoints"])
+        assert torch.equal(aug.last.target.intrinsics, sample["camera"].intrinsics)
+
+
+def test_a_made_augmentation_brings_its_camera_p_and_same_on_batch():
+    made = augment.RandomMount(camera=camera(), p=0.25, same_on_batch=True)
+    aug = adapter.CameraAugmentation(made)
+    assert (aug.p, aug.same_on_batch, aug.camera) == (0.25, True, made.camera)
+    assert adapter.CameraAugmentation(made, camera(), p=1.0).p == 1
+    assert "yaw=(-10, 10)" in repr(aug)
+
+
+# -- labels lie where the pictures show them
+
+
+def discs(own, radius=0.09):
+    """Pictures of true discs around rays, and the pixels of their middles."""
+    grid, _ = own.rays()
+    middles = torch.tensor([[-0.22, -0.15, 1.0], [0.2, -0.1, 1.0], [0.05, 0.2, 1.0]])
+    middles = middles / middles.norm(dim=-1, keepdim=True)
+    angles = torch.arccos((grid[None] * middles[:, None, None]).sum(-1).clamp(-1, 1))
+    return ((radius - angles) / 0.02).add(0.5).clamp(0, 1)[None].double(), own.project(middles)[0][None].double()
+
+
+def centroids(own, pictures):
+    """Mean rays of what the pictures show, as pixels: the middle of a disc, whatever the lens does to its outline."""
+    rays, _ = own.rays()
+    pixels = own.pixel_grid()
+    step = [torch.gradient(rays, dim=dim)[0] for dim in (0, 1)]
+    area = torch.linalg.cross(*step).norm(dim=-1)
+    assert pixels.shape[:2] == pictures.shape[-2:]
+    means = (pictures[..., None] * area[..., None] * rays).sum((-3, -2))
+    return own.project(means)[0]
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("like", [None, "kannala_brandt"])
+def test_keypoints_lie_in_the_middle_of_warped_discs(cls, like):
+    torch.manual_seed(4)
+    options = {} if cls is adapter.RandomMount else {"like": like, "fov": (80, 90)}
+    own = camera().double()
+    pictures, middles = discs(own)
+    seq = K.AugmentationSequential(cls(own, **options), data_keys=["input", "keypoints"])
+    for _ in range(3):
+        warped, moved = seq(pictures, middles)
+        found = centroids(augment.cameras.singles(seq[0].last.target)[0].double(), warped[0])
+        assert (found - moved[0]).norm(dim=-1).max() < 0.1
+
+
+def test_keypoints_lie_in_warped_discs_after_flips_and_affine_maps():
+    torch.manual_seed(5)
+    own = camera().double()
+    pictures, middles = discs(own, radius=0.04)
+    seq = K.AugmentationSequential(
+        adapter.RandomCamera(own),
+        K.RandomHorizontalFlip(p=1.0),
+        K.RandomAffine(10.0, p=1.0),
+        data_keys=["input", "keypoints"],
+    )
+    warped, moved = seq(pictures, middles)
+    pixels = own.pixel_grid()
+    found = (warped[0, ..., None] * pixels).sum((-3, -2)) / warped[0].sum((-2, -1))[..., None]
+    assert (found - moved[0]).norm(dim=-1).max() < 0.1
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_boxes_enclose_warped_masks(cls):
+    torch.manual_seed(6)
+    box = torch.tensor([[[40.0, 30.0, 84.0, 64.0]]]).expand(4, 1, 4).contiguous()
+    filled = torch.zeros(4, 1, *SIZE)
+    filled[:, :, 30:65, 40:85] = 1
+    seq = K.AugmentationSequential(cls(camera()), data_keys=["input", "mask", "bbox_xyxy"])
+    _, shown, moved = seq(images(4), filled, box)
+    for mask, found in zip(shown, moved, strict=True):
+        v, u = mask[0].nonzero().unbind(-1)
+        extent = torch.stack((u.min(), v.min(), u.max(), v.max()))
+        assert (extent - found[0]).abs().max() < 1
+
+
+def test_every_box_key_says_the_same():
+    xyxy = torch.tensor([[[30.0, 25.0, 70.0, 60.0]]])
+    xywh = torch.tensor([[[30.0, 25.0, 41.0, 36.0]]])
+    seq = K.AugmentationSequential(
+        adapter.RandomCamera(camera()), data_keys=["input", "bbox", "bbox_xyxy", "bbox_xywh", "class"]
+    )
+    _, corners, plain, sized, label = seq(images(1), vertices(1), xyxy, xywh, torch.tensor([7]))
+    assert torch.allclose(corners[:, :, [0, 2]].flatten(2), plain, atol=1e-4)
+    assert torch.allclose(torch.cat((plain[..., :2], plain[..., 2:] - plain[..., :2] + 1), -1), sized, atol=1e-4)
+    assert label == 7
+
+
+def test_boxes_off_the_picture_are_invalid_and_zero():
+    corners = vertices(2).repeat(1, 2, 1, 1)
+    corners[:, 1] += 4000
+    boxes = Boxes(corners.clone())
+    aug = adapter.RandomMount(camera())
+    aug(images(2))
+    moved = aug.transform_boxes(boxes, aug._params, aug.flags)
+    assert moved._valid.tolist() == [[True, False]] * 2
+    assert torch.isfinite(moved.data).all()
+    assert (moved.to_tensor("xyxy")[:, 1] == 0).all()
+    assert torch.equal(boxes.data, corners)
+    assert boxes._valid.all()
+
+
+def test_boxes_of_several_counts_and_without_batch():
+    aug = adapter.RandomMount(camera())
+    aug(images(2))
+    ragged = Boxes([vertices(1)[0].expand(2, 4, 2).contiguous(), vertices(1)[0]])
+    moved = aug.transform_boxes(ragged, aug._params, aug.flags).to_tensor("xyxy")
+    assert [len(rows) for rows in moved] == [2, 1]
+    aug(images(1))
+    assert aug.transform_boxes(Boxes(vertices(1)[0]), aug._params, aug.flags).data.shape == (1, 4, 2)
+    assert aug.transform_keypoints(Keypoints(points(1)[0]), aug._params, aug.flags).data.shape == (5, 2)
+
+
+def test_keypoints_keep_count_and_order_and_stay_finite():
+    own = ct.KannalaBrandt([40.0, 40.0, 63.5, 47.5], [0.0] * 4, image_size=SIZE).requires_grad_(False)
+    wild = torch.tensor([[[1e30, 0.0], [-1e8, 5.0], [float("nan"), 1.0], [60.0, 40.0]]])
+    aug = adapter.RandomLens(own, "pinhole", fov=(60, 70))
+    aug(images(1))
+    moved = aug.transform_keypoints(Keypoints(wild), aug._params, aug.flags).data
+    assert moved.shape == wild.shape
+    assert torch.isfinite(moved).all()
+    assert aug.last.points(wild)[1].tolist() == [[False, False, False, True]]
+
+
+# -- masks
+
+
+def test_masks_keep_class_ids_and_lists_are_warped_one_by_one():
+    seq = K.AugmentationSequential(
+        adapter.RandomCamera(camera(), mask_fill=255, tolerance=0.0), data_keys=["input", "mask", "keypoints"]
+    )
+    torch.manual_seed(7)
+    _, together, moved = seq(images(), masks(), points())
+    assert together.dtype == torch.int64
+    assert set(together.unique().tolist()) <= {*range(200), 255}
+    params, last = seq._params, seq[0].last
+    _, listed, again = seq(images(), list(masks()), points(), params=params)
+    assert equal([mask.reshape(1, *SIZE) for mask in listed], together)
+    assert torch.equal(moved, again)
+    assert seq[0].last.count == last.count == 3
+    alone = seq(images(), masks()[:, 0], points(), params=params)[1]
+    assert torch.equal(alone, together)
+
+
+def test_soft_masks_take_the_resampling_they_ask_for():
+    soft = images().round()
+    options = {DataKey.MASK: {"resample": "bilinear", "align_corners": None}}
+    torch.manual_seed(8)
+    aug = adapter.RandomMount(camera())
+    hard, smooth = (K.AugmentationSequential(aug, data_keys=["input", "mask"], extra_args=e) for e in (None, options))
+    _, nearest = hard(images(), soft)
+    image, linear = smooth(soft, soft, params=hard._params)
+    assert set(nearest.unique().tolist()) == {0, 1}
+    assert torch.equal(image, linear)
+    assert not torch.equal(nearest, linear)
+    assert torch.equal(aug(soft, params=hard._params[0].data, resample="nearest"), nearest)
+
+
+def test_lens_colours_and_light_leave_masks_alone():
+    aug = adapter.RandomLens(camera(), chromatic=(0.05, 0.05), vignetting=0.5, fill=(0.1, 0.2, 0.3), mode="nearest")
+    picture = images(2, 3)
+    seq = K.AugmentationSequential(aug, data_keys=["input", "mask"])
+    image, mask = seq(picture, picture)
+    assert set(mask.unique().tolist()) <= {0.0, *picture.unique().tolist()}
+    assert (image[:, :, HEIGHT // 2, WIDTH // 2] > 0).all()
+
+
+# -- gates
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_rows_that_p_skips_are_bit_identical(cls):
+    torch.manual_seed(0)
+    seq = K.AugmentationSequential(cls(camera(), p=0.5), data_keys=KEYS)
+    data = batch(8)
+    before = [value.clone() for value in data]
+    moved = seq(*data)
+    gate = seq._params[0].data["batch_prob"] > 0.5
+    assert 0 < gate.sum() < 8
+    assert equal(data, before)
+    for given, value in zip(data, moved, strict=True):
+        assert torch.equal(given[~gate], value[~gate])
+        assert (given[gate] != value[gate]).flatten(1).any(1).all()
+    assert torch.equal(seq[0].last.rotation[~gate], torch.eye(3).expand(int((~gate).sum()), 3, 3))
+    back = seq.inverse(*moved)
+    for given, value in zip(data, back, strict=True):
+        assert torch.equal(given[~gate], value[~gate])
+
+
+def test_same_on_batch_and_p_batch():
+    aug = adapter.RandomCamera(camera(), same_on_batch=True)
+    same = images(1).expand(3, -1, -1, -1)
+    warped = aug(same)
+    assert torch.equal(warped[0], warped[2])
+    assert not torch.equal(warped[0], same[0])
+    # a container overrides what its children say
+    seq = K.AugmentationSequential(adapter.RandomCamera(camera()), same_on_batch=True)
+    warped = seq(same)
+    assert torch.equal(warped[0], warped[2])
+    never = adapter.RandomCamera(camera(), p_batch=0.0)
+    assert torch.equal(never(same), same)
+    torch.manual_seed(1)
+    whole = adapter.RandomCamera(camera(), p_batch=0.5)
+    applied = set()
+    for _ in range(8):
+        whole(same)
+        applied.add(tuple(whole._params["batch_prob"].tolist()))
+    assert applied == {(0.0,) * 3, (1.0,) * 3}
+
+
+def test_keepdim_and_pictures_without_batch():
+    picture = images(1, 3)[0]
+    assert adapter.RandomMount(camera())(picture).shape == (1, 3, *SIZE)
+    kept = adapter.RandomMount(camera(), keepdim=True)
+    assert kept(picture).shape == (3, *SIZE)
+    assert kept(picture[0]).shape == SIZE
+    assert kept.inverse(kept(picture)).shape == (3, *SIZE)
+    seq = K.AugmentationSequential(kept, data_keys=["input", "mask"], keepdim=True)
+    assert [value.shape for value in seq(picture, masks(1)[0])] == [(3, *SIZE), (1, *SIZE)]
+    flat = masks(2)[:, 0]
+    assert [v.shape for v in seq.inverse(*seq(images(2), flat))] == [(2, 1, *SIZE), flat.shape]
+
+
+# -- replay
+
+
+@pytest.mark.parametrize("p", [1.0, 0.5])
+@pytest.mark.parametrize("cls", CLASSES)
+def test_replays_are_bit_identical(cls, p):
+    torch.manual_seed(9)
+    seq = K.AugmentationSequential(cls(camera(), p=p), K.RandomHorizontalFlip(p=0.5), data_keys=KEYS)
+    data = batch()
+    first, params = seq(*data), seq._params
+    for item in params:
+        assert all(isinstance(v, torch.Tensor) and v.device.type == "cpu" for v in item.data.values())
+    seq(*data)
+    assert equal(seq(*data, params=params), first)
+    fresh = K.AugmentationSequential(cls(camera(), p=p), K.RandomHorizontalFlip(p=0.5), data_keys=KEYS)
+    file = io.BytesIO()
+    torch.save(params, file)
+    file.seek(0)
+    with torch.serialization.safe_globals([ParamItem]):
+        loaded = torch.load(file, weights_only=True)
+    assert equal(fresh(*data[1:], params=loaded, data_keys=KEYS[1:]), first[1:])
+    assert equal(fresh(*data, params=loaded), first)
+
+
+def test_params_of_one_augmentation_load_without_any_class():
+    aug = adapter.RandomCamera(camera())
+    warped, file = aug(images()), io.BytesIO()
+    torch.save(aug._params, file)
+    file.seek(0)
+    params = torch.load(file, weights_only=True)
+    assert all(len(value) == 3 for name, value in params.items() if name != "forward_input_shape")
+    assert torch.equal(adapter.RandomCamera(camera())(images(), params=params), warped)
+    params["yaw"] = params["yaw"] + 5
+    assert not torch.equal(aug(images(), params=params), warped)
+    assert torch.allclose(aug.change(params).rotation, aug.last.rotation)
+
+
+def test_one_change_serves_all_keys_of_a_call():
+    made = []
+
+    class Counting(augment.RandomCamera):
+        def change(self, camera, draw):
+            made.append(len(draw["apply"]))
+            return super().change(camera, draw)
+
+    seq = K.AugmentationSequential(adapter.CameraAugmentation(Counting(), camera()), data_keys=KEYS)
+    moved = seq(*batch())
+    seq.inverse(*moved)
+    assert seq[0].last.count == 3
+    assert made == [3]
+    seq[0].camera.intrinsics.data += 1
+    assert not torch.equal(seq(*batch(), params=seq._params)[0], moved[0])
+    assert made == [3, 3]
+
+
+# -- back
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_inverse(cls):
+    torch.manual_seed(10)
+    smooth = torch.nn.functional.interpolate(images(3, 1, (8, 10)), SIZE, mode="bicubic")
+    blocks = (smooth > 0.5).long()
+    seq = K.AugmentationSequential(cls(camera()), K.RandomHorizontalFlip(p=1.0), data_keys=KEYS)
+    image, mask, moved, boxes = seq.inverse(*seq(smooth, blocks, points(), vertices()))
+    inner = (slice(None), slice(None), slice(36, 60), slice(48, 80))
+    assert (image - smooth)[inner].abs().max() < 0.05
+    assert (mask != blocks)[inner].float().mean() < 0.05
+    assert (moved - points()).abs().max() < 1e-3
+    assert (boxes[:, :, 0] <= vertices()[:, :, 0]).all()
+    assert (boxes[:, :, 2] >= vertices()[:, :, 2]).all()
+    assert (boxes - vertices()).abs().max() < 15
+    assert torch.isfinite(seq[0].inverse(smooth)).all()
+
+
+def test_there_is_no_matrix():
+    seq = K.AugmentationSequential(adapter.RandomMount(camera()), K.RandomAffine(10.0, p=1.0))
+    seq(images())
+    assert seq.transform_matrix.shape == (3, 3, 3)
+    assert seq.transform_matrix.isnan().all()
+    matrix = torch.full((2, 3, 3), torch.nan)
+    assert seq[0].compute_inverse_transformation(matrix) is matrix
+
+
+# -- another size
+
+
+def test_another_output_size_reaches_the_next_child():
+    seq = K.AugmentationSequential(
+        adapter.RandomCamera(camera(), image_size=(60, 90)),
+        K.RandomHorizontalFlip(p=1.0),
+        K.RandomCrop((40, 40), p=1.0),
+        data_keys=KEYS,
+    )
+    torch.manual_seed(11)
+    image, mask, _, _ = seq(*batch())
+    assert image.shape[-2:] == mask.shape[-2:] == (40, 40)
+    assert seq._params[0].data["output_size"].tolist() == [[60, 90]] * 3
+    assert seq._params[1].data["forward_input_shape"].tolist() == [3, 1, 60, 90]
+    own = K.AugmentationSequential(adapter.RandomCamera(camera(), image_size=(60, 90)), data_keys=KEYS)
+    moved = own(*batch())
+    back = own.inverse(*moved)
+    assert back[0].shape[-2:] == back[1].shape[-2:] == SIZE
+    assert (back[2] - points()).abs().max() < 1e-3
+    torch.manual_seed(0)
+    with pytest.raises(ValueError, match=r"p < 1"):
+        adapter.RandomCamera(camera(), image_size=(60, 90), p=0.5)(images(8))
+
+
+@pytest.mark.parametrize("options", [{}, {"p": 0.5}, {"image_size": (60, 90)}])
+def test_empty_batches_and_no_labels(options):
+    seq = K.AugmentationSequential(
+        adapter.RandomCamera(camera(), **options), K.RandomHorizontalFlip(p=1.0), data_keys=KEYS
+    )
+    moved = seq(*batch(0))
+    assert moved[0].shape == moved[1].shape == (0, 1, *options.get("image_size", SIZE))
+    assert [value.shape for value in moved[2:]] == [(0, 5, 2), (0, 1, 4, 2)]
+    assert [value.shape for value in seq.inverse(*moved)] == [value.shape for value in batch(0)]
+    aug = adapter.RandomMount(camera())
+    seq = K.AugmentationSequential(aug, data_keys=["input", "keypoints", "bbox_xyxy"])
+    _, keypoints, boxes = seq(images(), torch.zeros(3, 0, 2), torch.zeros(3, 0, 4))
+    assert (keypoints.shape, boxes.shape) == ((3, 0, 2), (3, 0, 4))
+    _, keypoints, boxes = seq.inverse(images(), keypoints, boxes)
+    assert (keypoints.shape, boxes.shape) == ((3, 0, 2), (3, 0, 4))
+
+
+# -- containers
+
+
+def test_nested_containers_and_random_apply():
+    torch.manual_seed(12)
+    seq = K.AugmentationSequential(
+        K.AugmentationSequential(adapter.RandomMount(camera()), K.RandomHorizontalFlip(p=1.0)),
+        K.ImageSequential(adapter.RandomLens(camera(), p=0.5)),
+        adapter.RandomCamera(camera(), p=0.5),
+        data_keys=KEYS,
+    )
+    for random_apply in (False, 2, True):
+        seq.random_apply = seq._read_random_apply(random_apply, 3)
+        first, params = seq(*batch()), seq._params
+        seq(*batch())
+        assert equal(seq(*batch(), params=params), first)
+        assert (seq.inverse(*first, params=params)[2] - points()).abs().max() < 2e-3
+
+
+def test_dict_input():
+    seq = K.AugmentationSequential(adapter.RandomMount(camera()), data_keys=None)
+    given = dict(zip(("image", "mask_iris", "keypoints", "bbox"), batch(), strict=True)) | {"label": torch.arange(3)}
+    moved = seq({**given, "gaze": "stays"})
+    assert moved["gaze"] == "stays"
+    assert (seq.inverse(moved)["keypoints"] - points()).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("same_on_batch", [False, True])
+@pytest.mark.parametrize("same_on_frame", [False, True])
+@pytest.mark.parametrize("data_format", ["BTCHW", "BCTHW"])
+def test_videos(data_format, same_on_frame, same_on_batch):
+    torch.manual_seed(13)
+    clips, frames = 2, 3
+    aug = adapter.RandomCamera(camera(), same_on_batch=same_on_batch)
+    video = K.VideoSequential(aug, data_format=data_format, same_on_frame=same_on_frame)
+    order = (0, 2, 1, 3, 4) if data_format == "BCTHW" else (0, 1, 2, 3, 4)
+    picture = images(1).expand(clips * frames, -1, -1, -1).unflatten(0, (clips, frames)).permute(order)
+    mask = masks(1).expand(clips * frames, -1, -1, -1).unflatten(0, (clips, frames)).permute(order)
+    seq = K.AugmentationSequential(video, data_keys=KEYS)
+    labels = [v(1).expand(clips, frames, *v(1).shape[1:]).contiguous() for v in (points, vertices)]
+    warped, classes, moved, boxes = seq(picture, mask, *labels)
+    params = seq._params
+    assert warped.shape == picture.shape
+    assert classes.dtype == torch.int64
+    for value in (warped.permute(order), moved, boxes):
+        assert torch.equal(value[0, 0], value[0, 1]) == (same_on_frame or same_on_batch)
+        assert torch.equal(value[0, 0], value[1, 0]) == same_on_batch
+    assert equal(seq(picture, mask, *labels, params=params), (warped, classes, moved, boxes))
+    assert aug.last.count == clips * frames
+    assert (seq.inverse(warped, classes, moved, boxes)[2] - labels[0]).abs().max() < 1e-3
+
+
+# -- cameras of single samples
+
+
+def several(count=3):
+    scale = torch.linspace(0.9, 1.1, count)[:, None]
+    own = camera()
+    return ct.BrownConrady(own.intrinsics * scale, own.distortion * scale, image_size=SIZE).requires_grad_(False)
+
+
+def test_every_sample_its_own_camera():
+    cameras = several()
+    aug = adapter.RandomCamera(camera(), tolerance=0.0)
+    torch.manual_seed(14)
+    params = aug.forward_parameters(images().shape)
+    with_own = adapter.with_cameras(params, cameras)
+    assert "source_intrinsics" not in params
+    warped = aug(images(), params=with_own)
+    torch.manual_seed(14)
+    sample = augment.RandomCamera(tolerance=0.0)({"image": images(), "camera": cameras, "keypoints": points()})
+    assert torch.equal(warped, sample["image"])
+    assert torch.equal(aug.last.source.intrinsics, cameras.intrinsics)
+    listed = adapter.with_cameras(params, augment.cameras.singles(cameras))
+    assert all(torch.equal(listed[name], with_own[name]) for name in with_own)
+
+    seq = K.AugmentationSequential(K.AugmentationSequential(aug), K.RandomHorizontalFlip(p=0.0), data_keys=KEYS)
+    torch.manual_seed(14)
+    params = adapter.with_cameras(seq.forward_parameters(images().shape), cameras)
+    _, together, moved, _ = seq(*batch(), params=params)
+    assert torch.equal(moved, seq(*batch(), params=params)[2])
+    assert torch.equal(aug.last.source.intrinsics, cameras.intrinsics)
+    assert equal([m.reshape(1, *SIZE) for m in seq(images(), list(masks()), *batch()[2:], params=params)[1]], together)
+
+
+def test_every_clip_its_own_camera():
+    aug = adapter.RandomMount(camera())
+    video = K.VideoSequential(aug)
+    clips = images(6).unflatten(0, (2, 3))
+    params = video.forward_parameters(clips.shape)
+    video(clips, params=adapter.with_cameras(params, several(2)))
+    assert torch.equal(aug.last.source.intrinsics, several(2).intrinsics.repeat_interleave(3, 0))
+    video(clips, params=adapter.with_cameras(params, several(6)))
+    assert torch.equal(aug.last.source.intrinsics, several(6).intrinsics)
+
+
+def test_errors_say_what_is_wrong():
+    aug = adapter.RandomMount(camera())
+    with pytest.raises(ValueError, match=r"\(50, 60\).*\(96, 128\)"):
+        aug(images(1, 1, (50, 60)))
+    with pytest.raises(TypeError, match="camera must be the Camera"):
+        adapter.RandomMount(None)
+    with pytest.raises(ValueError, match="image_size"):
+        adapter.RandomMount(ct.Pinhole([1.0, 1.0, 0.0, 0.0]))
+    with pytest.raises(ValueError, match="with_cameras"):
+        adapter.RandomMount(several())
+    with pytest.raises(ValueError, match="probabilities"):
+        adapter.RandomMount(camera(), p=2.0)
+    with pytest.raises(TypeError, match="augmentation must be"):
+        adapter.CameraAugmentation(K.RandomAffine(3.0))
+    with pytest.raises(ValueError, match="lack batch_prob"):
+        aug.change()
+    params = aug.forward_parameters(images().shape)
+    for wrong in (ct.BrownConrady([90.0, 90.0, 60.0, 40.0], [0.0] * 4, image_size=SIZE), camera().resize(48, 64)):
+        with pytest.raises(ValueError, match=r"5 coefficients and image_size \(96, 128\); got BrownConrady"):
+            adapter.with_cameras(params, wrong)
+    with pytest.raises(ValueError, match="got KannalaBrandt"):
+        adapter.with_cameras(params, ct.KannalaBrandt([90.0, 90.0, 60.0, 40.0], [0.0] * 4, image_size=SIZE))
+    with pytest.raises(ValueError, match=r"for 3 samples.*\(2,\)"):
+        adapter.with_cameras(params, several(2))
+    with pytest.raises(TypeError, match="must be a Camera"):
+        adapter.with_cameras(params, [camera(), None])
+    with pytest.raises(ValueError, match="no camera augmentation"):
+        adapter.with_cameras(K.AugmentationSequential(K.RandomAffine(3.0)).forward_parameters(images().shape), camera())
+    with pytest.raises(ValueError, match="3 samples, here are 2"):
+        aug(images(2), params=params)
+
+
+# -- dtypes, gradients, copies
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_dtypes(dtype):
+    aug = adapter.RandomCamera(camera())
+    wide = aug(images())
+    params = aug._params
+    warped = aug(images().to(dtype), params=params)
+    assert warped.dtype == dtype
+    assert (warped - wide).abs().max() < 0.01
+    data = [v.to(dtype) if v.is_floating_point() else v for v in batch()]
+    seq = K.AugmentationSequential(aug, data_keys=KEYS)
+    moved = seq(*data)
+    assert [v.dtype for v in moved] == [v.dtype for v in data]
+    assert all(torch.isfinite(v).all() for v in moved)
+    # module.half() must not round the camera
+    assert (copy.deepcopy(aug).to(dtype)(images(), params=params) - wide).abs().max() < 0.01
+
+
+def test_autocast_changes_nothing():
+    seq = K.AugmentationSequential(adapter.RandomCamera(camera()), data_keys=KEYS)
+    plain, params = seq(*batch()), seq._params
+    for fresh in (seq, copy.deepcopy(seq)):
+        with torch.autocast("cpu", torch.bfloat16):
+            assert equal(fresh(*batch(), params=params), plain)
+
+
+def test_gradients_reach_image_and_keypoints():
+    image, keypoints, corners = (v.double().requires_grad_() for v in (images(2), points(2), vertices(2)))
+    seq = K.AugmentationSequential(adapter.RandomCamera(camera(), p=0.7), data_keys=["input", "keypoints", "bbox"])
+    moved = seq(image, keypoints, corners)
+    sum((v**2).sum() for v in moved).backward()
+    assert all(torch.isfinite(v.grad).all() and v.grad.abs().sum() > 0 for v in (image, keypoints, corners))
+    aug = seq[0]
+
+    def one(pixels):
+        return aug.transform_keypoints(Keypoints(pixels), aug._params, aug.flags).data
+
+    assert torch.autograd.gradcheck(one, keypoints, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("key", ["input", "keypoints"])
+def test_gradients_reach_a_learnable_camera(key):
+    own = camera().requires_grad_(True)
+    seq = K.AugmentationSequential(adapter.RandomCamera(own), data_keys=["input", "keypoints"])
+    assert any(value is own.intrinsics for value in seq.parameters())
+    for _ in range(2):
+        own.zero_grad()
+        moved = dict(zip(("input", "keypoints"), seq(images(), points()), strict=True))
+        (moved[key] ** 2).sum().backward()
+        assert torch.isfinite(own.intrinsics.grad).all()
+        assert (own.intrinsics.grad != 0).any()
+        assert (own.distortion.grad != 0).any()
+    with torch.no_grad():
+        frozen = seq(images(), points(), params=seq._params)
+    # without a graph, maps may come from a lattice
+    assert torch.allclose(frozen[0], moved["input"], atol=0.02)
+    copy.deepcopy(seq)
+    leaves = several()
+    leaves.requires_grad_(True)
+    aug = adapter.RandomMount(camera())
+    aug(images(), params=adapter.with_cameras(aug.forward_parameters(images().shape), leaves)).sum().backward()
+    assert (leaves.intrinsics.grad != 0).any(1).all()
+    assert torch.equal(pickle.loads(pickle.dumps(aug)).last.rotation, aug.last.rotation)
+
+
+def test_copies_and_pickles():
+    seq = K.AugmentationSequential(adapter.RandomCamera(camera(), p=0.5), data_keys=KEYS)
+    moved = seq(*batch())
+    for twin in (copy.deepcopy(seq), pickle.loads(pickle.dumps(seq))):
+        assert equal(twin(*batch(), params=seq._params), moved)
+        assert torch.equal(twin[0].last.rotation, seq[0].last.rotation)
+    assert copy.deepcopy(adapter.RandomMount(camera())).last is None
+
+
+# -- compiled
+
+
+@pytest.mark.parametrize(
+    ("cls", "p"), [(adapter.RandomMount, 1.0), (adapter.RandomLens, 1.0), (adapter.RandomCamera, 0.5)]
+)
+def test_compiled_without_a_break(cls, p):
+    torch.compiler.reset()
+    aug = cls(camera(), p=p)
+    compiled = torch.compile(aug, fullgraph=True, backend="aot_eager")
+    torch.manual_seed(15)
+    drawn = compiled(images())
+    torch.manual_seed(15)
+    eager = aug(images())
+    assert (drawn - eager).abs().max() < 1e-3
+    assert (compiled(images(), params=aug._params) - eager).abs().max() < 1e-3
+    assert aug.last.count == 3
+
+
+# -- workers
+
+
+class Faces(Dataset):
+    def __init__(self):
+        self.seq = K.AugmentationSequential(adapter.RandomCamera(camera(), p=0.9), data_keys=["input", "keypoints"])
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, index):
+        torch.manual_seed(index)
+        image, keypoints = self.seq(images(1), points(1))
+        return image[0], keypoints[0], self.seq[0].last.rotation[0]
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_workers(context):
+    expected = [torch.stack(parts) for parts in zip(*map(Faces().__getitem__, range(4)), strict=True)]
+    with warnings.catch_warnings():
+        # of Python 3.12 on, about fork beside threads
+        warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
+        loaded = DataLoader(Faces(), batch_size=2, num_workers=2, multiprocessing_context=context)
+        found = [torch.cat(parts) for parts in zip(*loaded, strict=True)]
+    for first, second in zip(found, expected, strict=True):
+        assert torch.allclose(first, second, atol=1e-5)
+
+
+def test_camtorch_does_not_import_kornia():
+    code = "import sys, camtorch, camtorch.augment; sys.exit('kornia' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_last_turns_what_has_no_data_key():
+    aug = adapter.RandomMount(camera(), yaw=(7, 7), pitch=0, roll=0)
+    aug(images())
+    ahead = aug.last.rays(torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3))
+    assert torch.allclose(torch.rad2deg(torch.atan2(ahead[:, 0], ahead[:, 2])), torch.full((3,), -7.0), atol=1e-4)
+    assert math.isclose(float(aug.last.target.intrinsics[0, 0]), 95, abs_tol=1e-4)

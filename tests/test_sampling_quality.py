@@ -1,0 +1,178 @@
+"""Laws of Warp's options: filling, shrinking without false patterns, and maps within a tolerance."""
+
+import math
+
+import pytest
+import torch
+from cameras import KEYS, spread
+
+import camtorch as ct
+
+SIZE = (120, 160)
+
+
+def pinhole(size=SIZE, focal=140.0, dtype=torch.float32):
+    intrinsics = torch.tensor([focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
+    return ct.Pinhole(intrinsics, image_size=size).requires_grad_(False)
+
+
+def turn(*degrees, dtype=torch.float32):
+    angles = (torch.tensor(float(d), dtype=dtype) for d in degrees)
+    return ct.augment.mount_rotation(*angles)
+
+
+# -- shrinking
+
+
+def zone_plate(side=512):
+    """(1, 1, side, side): rings whose frequency grows evenly, to that of the pixels at the middle of the edges."""
+    at = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
+    return (0.5 + 0.5 * torch.cos(math.pi * (at[:, None] ** 2 + at**2) / side)).float()[None, None]
+
+
+def alias_energy(picture, shrunk_by):
+    """The energy of what differs from grey where the rings are too fine for the small picture."""
+    side = picture.shape[-1]
+    at = (torch.arange(side, dtype=torch.float64) - (side - 1) / 2) / (side / 2)  # 1: the frequency of the large pixels
+    radius = (at[:, None] ** 2 + at**2).sqrt()
+    too_fine = (radius > 1.3 / shrunk_by) & (radius < 1)
+    return (picture[0, 0][too_fine] - 0.5).square().mean()
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("factor", [2, 4, 5.5])
+def test_a_shrunk_zone_plate_shows_no_false_rings(factor, mode):
+    plate = zone_plate()
+    camera = pinhole((512, 512), focal=500.0)
+    small = camera.resize(round(512 / factor), round(512 / factor))
+    plain, smooth = (ct.Warp(camera, small, mode=mode, antialias=on)(plate) for on in (False, True))
+    assert alias_energy(smooth, factor) < 0.05 * alias_energy(plain, factor)
+    # and the rings that fit stay: half of them lose less than half of their contrast
+    side = small.image_size[0]
+    at = (torch.arange(side, dtype=torch.float64) - (side - 1) / 2) / (side / 2)
+    coarse = (at[:, None] ** 2 + at**2).sqrt() < 0.4 / factor
+    assert smooth[0, 0][coarse].std() > 0.5 * plain[0, 0][coarse].std()
+
+
+def test_antialias_follows_the_local_scale():
+    """Where nothing shrinks, nothing is smoothed; masks and single colours stay."""
+    camera = pinhole()
+    target = ct.KannalaBrandt([150.0, 150, 79.5, 59.5], [-0.25, 0.0, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
+    plain, smooth = (ct.Warp(camera, target, antialias=on) for on in (False, True))
+    noise = torch.rand(1, 2, *SIZE)
+    _, _, scale = smooth._sampling()
+    seen = smooth.valid_mask().expand(-1, 2, -1, -1)
+    grows = (scale <= 1).unsqueeze(1) & seen
+    shrinks = (scale > 1.3).unsqueeze(1) & seen
+    assert grows.any()
+    assert shrinks.any()
+    assert torch.equal(plain(noise)[grows], smooth(noise)[grows])
+    assert smooth(noise)[shrinks].var() < 0.9 * plain(noise)[shrinks].var()
+    labels = (noise * 9).long()
+    assert torch.equal(plain(labels, mode="nearest"), smooth(labels, mode="nearest"))
+    ones = torch.ones(1, 1, *SIZE, dtype=torch.uint8) * 200
+    inner = torch.nn.functional.max_pool2d((~smooth.valid_mask()).float(), 9, 1, 4) == 0
+    assert (smooth(ones)[inner] == 200).all()
+
+
+def test_antialias_has_gradients():
+    camera = ct.Pinhole([140.0, 140, 79.5, 59.5], image_size=SIZE)
+    picture = torch.rand(1, 1, *SIZE, requires_grad=True)
+    ct.Warp(camera, pinhole((30, 40), 35.0), antialias=True)(picture).square().sum().backward()
+    assert torch.isfinite(picture.grad).all()
+    assert picture.grad.abs().sum() > 0
+    assert torch.isfinite(camera.intrinsics.grad).all()
+
+
+# -- filling
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "nearest", "bicubic"])
+def test_fill_takes_the_place_of_black(mode):
+    camera, rotation = pinhole(), turn(25, 10, 30)
+    picture = torch.rand(1, 3, *SIZE)
+    black, filled = (ct.Warp(camera, camera, rotation, mode=mode, fill=fill) for fill in (0.0, (0.2, 0.4, 0.6)))
+    value = torch.tensor([0.2, 0.4, 0.6])[:, None, None]
+    # filling is warping what differs from the value
+    torch.testing.assert_close(filled(picture), black(picture - value) + value, atol=1e-5, rtol=0)
+    whole = ct.Warp(camera, camera, rotation, mode=mode, fill=128)(torch.full((1, 1, *SIZE), 128, dtype=torch.uint8))
+    assert (whole == 128).all()
+    assert torch.equal(black(picture, fill=0.5), ct.Warp(camera, camera, rotation, mode=mode, fill=0.5)(picture))
+
+
+def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
+    behind = ct.KannalaBrandt([40.0, 40, 79.5, 59.5], image_size=SIZE).requires_grad_(False)
+    for padding_mode in ("zeros", "border", "reflection"):
+        warp = ct.Warp(pinhole(), behind, turn(60, 0, 0), padding_mode=padding_mode, fill=7.0)
+        _, mapped, _ = warp._sampling()
+        assert (~mapped).any()
+        assert (warp(torch.rand(1, 1, *SIZE))[0, 0][~mapped[0]] == 7).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"fill": float("nan")}, "fill must be finite"),
+        ({"fill": "red"}, "fill must be a number"),
+        ({"tolerance": -1}, "tolerance must be a number of pixels"),
+        ({"tolerance": float("inf")}, "tolerance must be a number of pixels"),
+        ({"padding_mode": "wrap"}, "padding_mode must be one of"),
+    ],
+)
+def test_bad_options_are_refused(options, text):
+    with pytest.raises((ValueError, TypeError), match=text):
+        ct.Warp(pinhole(), pinhole(), **options)
+    with pytest.raises(ValueError, match="fill has 2 values, but the images have 3 channels"):
+        ct.Warp(pinhole(), pinhole(), fill=(1, 2))(torch.rand(1, 3, *SIZE))
+
+
+# -- tolerance
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("other", KEYS)
+def test_maps_from_a_lattice_keep_their_tolerance(key, other):
+    cameras = [spread(k, torch.float32).requires_grad_(False).resize(*SIZE) for k in (key, other)]
+    rotation = torch.stack([turn(0, 0, 0), turn(25, -15, 40), turn(100, 0, 0)])
+    exact = ct.Warp(*cameras, rotation)
+    for tolerance in (0.1, 0.01):
+        close = ct.Warp(*cameras, rotation, tolerance=tolerance)
+        (grid, mapped, _), (other_grid, other_mapped, _) = exact._sampling(), close._sampling()
+        assert torch.equal(mapped, other_mapped)
+        on_picture = (grid.abs() <= 1).all(-1) | (other_grid.abs() <= 1).all(-1)
+        error = ((grid - other_grid) * torch.tensor([SIZE[1] / 2, SIZE[0] / 2])).norm(dim=-1)[mapped & on_picture]
+        # two axes, and what the cubics' error varies between nodes
+        assert error.numel() == 0 or error.max() < 2 * tolerance
+        assert (
+            torch.equal(exact.valid_mask(), close.valid_mask())
+            or (exact.valid_mask() != close.valid_mask()).float().mean() < 1e-3
+        )
+
+
+def test_a_lattice_is_used_and_small_pictures_do_without():
+    camera, target = pinhole(dtype=torch.float64), pinhole(focal=120.0, dtype=torch.float64)
+    rotation = turn(10, 5, 20, dtype=torch.float64)
+    exact, close = (ct.Warp(camera, target, rotation, tolerance=t).grid() for t in (0.0, 0.1))
+    assert not torch.equal(exact, close)
+    tiny = [c.resize(16, 20) for c in (camera, target)]
+    exact, close = (ct.Warp(*tiny, rotation, tolerance=t).grid() for t in (0.0, 0.1))
+    assert torch.equal(exact, close)
+
+
+def test_a_lattice_does_not_mind_how_torch_multiplies_matrices():
+    camera, target = pinhole(), pinhole(focal=120.0)
+    plain = ct.Warp(camera, target, turn(10, 5, 20), tolerance=0.01).grid()
+    before = torch.get_float32_matmul_precision()
+    try:
+        torch.set_float32_matmul_precision("medium")
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            coarse = ct.Warp(camera, target, turn(10, 5, 20), tolerance=0.01).grid()
+    finally:
+        torch.set_float32_matmul_precision(before)
+    torch.testing.assert_close(coarse, plain, atol=1e-6, rtol=0)
+
+
+def test_options_reach_the_inverse_and_dewarp():
+    options = {"mode": "bicubic", "padding_mode": "border", "fill": (0.5,), "antialias": True, "tolerance": 0.01}
+    warp = ct.Dewarp(pinhole(), **options)
+    assert warp.options == options == warp.inverse().options
