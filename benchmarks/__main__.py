@@ -13,12 +13,12 @@ try:
     import cv2
     import torch
 
-    from benchmarks import cameras, images, machine, points, scaling
+    from benchmarks import augment, cameras, images, machine, points, scaling
     from benchmarks.options import Options, progress
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
 
-SUBJECTS = {"points": points, "images": images, "scaling": scaling}
+SUBJECTS = {"points": points, "images": images, "augment": augment, "scaling": scaling}
 # torch keeps so many compiled versions of one function and then gives up; here every contestant is a version
 _COMPILED_VERSIONS = 64
 
