@@ -109,7 +109,7 @@ def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
 
 
 def _over_windows(values: Tensor, dim: int, width: int, pick: Callable) -> Tensor:
-    """The largest, or whatever is picked of two, in every window of 2 or 4; ten times as fast as a pool of torch."""
+    """The largest, or whatever is picked of two, in every window of 2 or 4; torch's pools take longer."""
     for step in (1, 2)[: width // 2]:
         n = values.shape[dim] - step
         values = pick(values.narrow(dim, 0, n), values.narrow(dim, step, n))

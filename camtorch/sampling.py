@@ -43,6 +43,30 @@ def sample(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor
     return _Sample.apply(images, grid, mode, padding_mode).to(dtype)
 
 
+def as_options(owner: str, mode: str, padding_mode: str, fill, antialias: bool, tolerance: float) -> dict:
+    """The checked options of a `Warp`, by name.
+
+    Raises:
+        ValueError: a mode that does not exist, a fill or a tolerance that is none. TypeError: a fill that is no number.
+    """
+    if not 0 <= tolerance < math.inf:
+        raise ValueError(f"{owner}: tolerance must be a number of pixels, zero or more; got {tolerance!r}")
+    return {
+        "mode": one_of(mode, MODES, "mode", owner),
+        "padding_mode": one_of(padding_mode, PADDINGS, "padding_mode", owner),
+        "fill": as_fill(fill, owner),
+        "antialias": bool(antialias),
+        "tolerance": float(tolerance),
+    }
+
+
+def one_of(value: str, allowed: tuple[str, ...], name: str, owner: str) -> str:
+    """The value, if it is allowed."""
+    if value not in allowed:
+        raise ValueError(f"{owner}: {name} must be one of {allowed}; got {value!r}")
+    return value
+
+
 def as_fill(fill, owner: str) -> tuple[float, ...]:
     """One value or one for each channel, as a tuple."""
     try:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from camtorch import compiled, minify
 from camtorch.camera import Camera
 from camtorch.extrinsics import as_rotation, turn
+from camtorch.outlines import EDGE_SAMPLES, along_edges, corners_of
 from camtorch.parameters import (
     GeometryModule,
     Memo,
@@ -20,10 +21,9 @@ from camtorch.parameters import (
     may_look,
 )
 from camtorch.positions import OUTSIDE, in_strips, on_lattice
-from camtorch.sampling import MODES, PADDINGS, as_fill, narrow, sample, widen
+from camtorch.sampling import MODES, PADDINGS, as_fill, as_options, narrow, one_of, sample, widen
 
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
-_EDGE_SAMPLES = 64  # per box edge: a 500 px edge bent to a radius of 300 px is then enclosed to 0.03 px
 
 
 class Warp(GeometryModule):
@@ -73,10 +73,8 @@ class Warp(GeometryModule):
             if camera.image_size is None:
                 raise ValueError(f"Warp: the {name} camera needs an image_size=(height, width)")
         self.source, self.target = source, target
-        if not 0 <= tolerance < float("inf"):
-            raise ValueError(f"Warp: tolerance must be a number of pixels, zero or more; got {tolerance!r}")
-        self.mode, self.padding_mode = _checked(mode, MODES, "mode"), _checked(padding_mode, PADDINGS, "padding_mode")
-        self.fill, self.antialias, self.tolerance = as_fill(fill, "Warp"), bool(antialias), float(tolerance)
+        options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
+        self.mode, self.padding_mode, self.fill, self.antialias, self.tolerance = options.values()
         self._set_rotation(as_rotation(rotation, "Warp"))
         shapes = [source.batch_shape, target.batch_shape, () if rotation is None else self.rotation.shape[:-2]]
         try:
@@ -135,8 +133,10 @@ class Warp(GeometryModule):
                 f"Warp: images are {tuple(images.shape[-2:])} (height, width), "
                 f"but the source camera's image_size is {self.source.image_size}"
             )
-        mode = self.mode if mode is None else _checked(mode, MODES, "mode")
-        padding_mode = self.padding_mode if padding_mode is None else _checked(padding_mode, PADDINGS, "padding_mode")
+        mode = self.mode if mode is None else one_of(mode, MODES, "mode", "Warp")
+        padding_mode = (
+            self.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
+        )
         fill = self.fill if fill is None else as_fill(fill, "Warp")
         grid, mapped, scale = self._sampling()
         if grid.shape[0] == 1:
@@ -263,14 +263,11 @@ class Warp(GeometryModule):
             raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
         if not boxes.is_floating_point():
             boxes = boxes.to(self.source.intrinsics.dtype)
-        x1, y1, x2, y2 = boxes.unbind(-1)
-        return self.enclose(torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2)))
+        return self.enclose(corners_of(boxes))
 
     def enclose(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """As `transform_boxes`, of closed polygons (B, *N, K, 2), or (*N, K, 2)."""
-        along = torch.linspace(0, 1, _EDGE_SAMPLES + 1, dtype=corners.dtype, device=corners.device)[:-1, None]
-        start, end = corners.unsqueeze(-2), corners.roll(-1, -2).unsqueeze(-2)
-        moved, mapped = self._move((start + (end - start) * along).flatten(-3, -2))
+        moved, mapped = self._move(along_edges(corners, EDGE_SAMPLES))
         mapped = mapped & torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
         some = mapped.any(-1, keepdim=True)
         low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
@@ -300,9 +297,3 @@ class Warp(GeometryModule):
         """The options."""
         options = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
         return f"{options}, rotation={self.rotation is not None}"
-
-
-def _checked(value: str, allowed: tuple[str, ...], name: str) -> str:
-    if value not in allowed:
-        raise ValueError(f"Warp: {name} must be one of {allowed}; got {value!r}")
-    return value

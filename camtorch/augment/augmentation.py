@@ -13,6 +13,7 @@ from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
 from camtorch.augment.ranges import Range, draw
 from camtorch.camera import Camera
 from camtorch.parameters import may_look
+from camtorch.sampling import as_options
 
 
 class Augmentation(Mover):
@@ -62,13 +63,7 @@ class Augmentation(Mover):
         if not 0 <= p <= 1:
             raise ValueError(f"{self._name}: p must be a probability in [0, 1]; got {p!r}")
         self.p, self.same_on_batch = float(p), bool(same_on_batch)
-        self.options = {
-            "mode": mode,
-            "padding_mode": padding_mode,
-            "fill": fill,
-            "antialias": antialias,
-            "tolerance": tolerance,
-        }
+        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         self.ranges = {}
         self.last: Change | None = None
         """The change of the last call: its `source`, `target` and `rotation`."""

@@ -23,6 +23,13 @@ def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
     return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
 
 
+def on_device(camera: Camera, device: torch.device) -> Camera:
+    """The camera where the pictures are."""
+    if camera.intrinsics.device == device:
+        return camera
+    return remade(camera, camera.intrinsics.to(device), camera.distortion.to(device), camera.image_size)
+
+
 def kind(camera: Camera) -> tuple:
     """What cameras must have in common to be rows of one batch."""
     return type(camera), camera.distortion.shape[-1], camera.image_size

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from camtorch.augment.cameras import expanded, joined, kind, remade, rows_of, singles
 from camtorch.camera import Camera
+from camtorch.outlines import EDGE_SAMPLES, along_edges, corners_of
 from camtorch.sampling import narrow, widen
 from camtorch.warp import Warp
 
@@ -181,9 +182,7 @@ class Change:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
-            height, width = camera.image_size
-            x1, y1, x2, y2 = rows.unbind(-1)
-            return rows, (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
+            return rows, camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
 
         return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
 
@@ -192,8 +191,7 @@ class Change:
 
         def move(part: Part, rows: Tensor) -> tuple[Tensor, Tensor]:
             enclosing, valid = part.warp.enclose(rows)
-            x1, y1, x2, y2 = enclosing.unbind(-1)
-            return torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2)), valid
+            return corners_of(enclosing), valid
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
             return rows, torch.ones_like(rows[..., 0, 0], dtype=torch.bool)

@@ -14,6 +14,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import rotation_matrix
 from camtorch.models import Pinhole
 from camtorch.parameters import as_image_size
+from camtorch.sampling import as_options
 from camtorch.warp import Warp
 
 
@@ -71,13 +72,7 @@ class FaceNormalizer(Mover):
         self.image_size = as_image_size(image_size, self._name)
         height, width = self.image_size
         self.axis = (width / 2, height / 2) if axis is None else tuple(map(float, axis))
-        self.options = {
-            "mode": mode,
-            "padding_mode": padding_mode,
-            "fill": fill,
-            "antialias": antialias,
-            "tolerance": tolerance,
-        }
+        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
 
     def change(self, camera: Camera, head_rotation: Tensor, face_centre: Tensor) -> Change:
         """From `camera` to the virtual one.

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from camtorch.augment import fields as field_kinds
-from camtorch.augment.cameras import singles
+from camtorch.augment.cameras import on_device, singles
 from camtorch.augment.change import Change
 from camtorch.augment.fields import KEEP, KINDS
 from camtorch.camera import Camera
@@ -87,6 +87,10 @@ class Mover(nn.Module):
                 raise ValueError(f"{self._name}: {name} is of {n} samples, other fields are of {count}")
             count = n
         self._check_cameras(camera, count, named)
+        values = [v for _, value in named.values() for v in (value if isinstance(value, list) else [value])]
+        device = values[0].device if values else torch.device("cpu")
+        many = isinstance(camera, (list, tuple))
+        camera = [on_device(one, device) for one in camera] if many else on_device(camera, device)
         return named, batched, count, camera
 
     def _check_cameras(self, camera, count: int, named: Mapping) -> None:

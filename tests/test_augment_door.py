@@ -1,0 +1,154 @@
+"""What cannot be augmented says so at the door: which field, what it was, what it should be."""
+
+import math
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount, outlines
+
+SIZE = (30, 40)
+
+
+@pytest.fixture
+def camera():
+    return ct.Pinhole([30.0, 30.0, 19.5, 14.5], image_size=SIZE).requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"yaw": (5, -5)}, r"yaw must be \(low, high\) with low <= high; got \(5, -5\)"),
+        ({"yaw": (0, math.nan)}, "yaw must be finite"),
+        ({"yaw": (0, 1, 2)}, r"yaw must be a range \(low, high\) or a number"),
+        ({"yaw": "far"}, r"yaw must be a range \(low, high\) or a number; got 'far'"),
+        ({"pitch": 400}, r"pitch must lie within \[-180, 180\]"),
+        ({"zoom": (0, 1)}, r"zoom must lie within \[0.001, 1000\]; got \(0, 1\)"),
+        ({"p": 1.5}, r"p must be a probability in \[0, 1\]; got 1.5"),
+        ({"mode": "lanczos"}, "mode must be one of"),
+        ({"padding_mode": "wrap"}, "padding_mode must be one of"),
+        ({"fill": math.inf}, "fill must be finite"),
+        ({"fields": {"g": "stare"}}, "fields maps names to image, mask, .* or keep; got {'g': 'stare'}"),
+        ({"camera": "pinhole"}, "camera must be a Camera; got str"),
+        ({"image_size": (30, 0)}, "image_size must be positive"),
+        ({"tolerance": -1}, "tolerance must be"),
+    ],
+)
+def test_options(options, text):
+    with pytest.raises((ValueError, TypeError), match=f"RandomMount: {text}"):
+        RandomMount(**options)
+
+
+def test_lenses(camera):
+    with pytest.raises(ValueError, match=f"preset \\({', '.join(PRESETS)}\\) or a model .*; got 'dms13'"):
+        RandomCamera("dms13")
+    with pytest.raises(ValueError, match="says nothing of the field of view; give fov="):
+        RandomLens("kannala_brandt")
+    with pytest.raises(ValueError, match="fov: a pinhole lens of these coefficients does not reach 190 degrees"):
+        RandomLens("pinhole", fov=190, camera=camera)(keypoints=torch.zeros(1, 2))
+    with pytest.raises(ValueError, match="like must be a single camera; got batch dims"):
+        RandomLens(ct.Pinhole(torch.ones(2, 4)))
+    with pytest.raises(ValueError, match="vignetting must lie within"):
+        RandomLens(vignetting=2)
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"keypoints": torch.zeros(2, 5, 3)}, r"keypoints must be \(B, N, 2\) pixels x, y; got shape \(2, 5, 3\)"),
+        ({"keypoints": torch.zeros(2, 2, 5, 2)}, r"keypoints must be"),
+        ({"boxes": torch.zeros(2, 3, 5)}, r"boxes must be \(B, M, 4\)"),
+        ({"gaze": torch.zeros(2, 2)}, r"gaze must be \(B, \*N, 3\)"),
+        ({"head_pose": torch.zeros(2, 3, 3)}, r"head_pose must be \(B, 4, 4\)"),
+        ({"rvec": torch.zeros(2, 4)}, r"rvec must be \(B, 3\)"),
+        ({"image": torch.zeros(2, 3, 20, 40)}, r"image is \(20, 40\) \(height, width\), but the image_size of camera"),
+        ({"mask": torch.zeros(2, 20, 40)}, r"mask is \(20, 40\) \(height, width\)"),
+        ({"image": torch.zeros(2, 3, *SIZE), "keypoints": torch.zeros(3, 5, 2)}, "keypoints is of 3 samples, other"),
+        ({"keypoints": torch.zeros(2, 5, 2, dtype=torch.complex64)}, "keypoints must be a tensor of real numbers"),
+        ({"keypoints": 5}, "keypoints must be a tensor of real numbers, .*; got int"),
+        ({"image": torch.zeros(2, 3, *SIZE), "stare": torch.zeros(2, 3)}, "'stare' holds real numbers, and whether"),
+        ({"label": 3}, "the sample has no field that moves; known are image, mask"),
+        ({"keypoints": [torch.zeros(3, 2), torch.zeros(3)]}, r"keypoints\[1\] must be"),
+    ],
+)
+def test_fields(camera, fields, text):
+    with pytest.raises((ValueError, TypeError), match=f"RandomMount: {text}"):
+        RandomMount(camera=camera)(fields)
+
+
+def test_cameras_and_draws(camera):
+    mount, points = RandomMount(), torch.zeros(2, 5, 2)
+    with pytest.raises(ValueError, match="no camera; give one as sample"):
+        mount(keypoints=points)
+    with pytest.raises(ValueError, match="camera needs an image_size"):
+        mount(keypoints=points, camera=ct.Pinhole([1.0, 1, 0, 0]))
+    with pytest.raises(TypeError, match="camera must be a Camera; got dict"):
+        mount(keypoints=points, camera={})
+    with pytest.raises(ValueError, match=r"camera has batch dims \(3,\), the samples are 2"):
+        mount(keypoints=points, camera=ct.Pinhole(torch.ones(3, 4), image_size=SIZE))
+    with pytest.raises(ValueError, match="1 cameras for 2 samples"):
+        mount(keypoints=points, camera=[camera])
+    with pytest.raises(ValueError, match="the draw is for 3 samples, here are 2"):
+        mount(keypoints=points, camera=camera, draw=mount.draw(3))
+    with pytest.raises(ValueError, match="the draw lacks yaw, pitch, roll, zoom; it has apply"):
+        mount(keypoints=points, camera=camera, draw={"apply": torch.ones(2, dtype=torch.bool)})
+    with pytest.raises(ValueError, match=r"draw\['yaw'\] must be \(2,\); got shape \(2, 1\)"):
+        mount(keypoints=points, camera=camera, draw={**mount.draw(2), "yaw": torch.zeros(2, 1)})
+    with pytest.raises(ValueError, match="nothing to invert; call it first"):
+        mount.inverse(keypoints=points)
+    half = RandomMount(p=0.5, image_size=(15, 20))
+    draw = {**half.draw(2), "apply": torch.tensor([True, False])}
+    with pytest.raises(ValueError, match=r"would come out in the sizes .* with p < 1"):
+        half(keypoints=points, camera=camera, draw=draw)
+
+
+def test_own_names_and_fields_to_keep(camera):
+    batch = {
+        "eye": torch.rand(2, 4, 2),
+        "stare": torch.rand(2, 3),
+        "weight": torch.rand(2),
+        "keypoints": torch.rand(2, 1, 2),
+    }
+    mount = RandomMount(camera=camera, fields={"eye": "keypoints", "stare": "gaze", "weight": "keep"})
+    out = mount(batch)
+    assert torch.equal(out["weight"], batch["weight"])
+    assert out["eye_valid"].shape == (2, 4)
+    torch.testing.assert_close(out["stare"], (out["rotation"] @ batch["stare"][..., None])[..., 0])
+    assert "stare_valid" not in out
+
+
+def test_labels_that_are_no_numbers_are_invalid_and_finite(camera):
+    keypoints = torch.tensor([[[5.0, 5.0], [math.nan, 3.0], [math.inf, 1.0], [10.0, 10.0]]]).requires_grad_()
+    boxes = torch.tensor([[[1.0, 1.0, 5.0, 5.0], [math.nan, 0.0, 1.0, 1.0]]])
+    out = RandomCamera("dms90", camera=camera, yaw=1, pitch=1, crop=None)(keypoints=keypoints, boxes=boxes)
+    assert out["keypoints_valid"].tolist() == [[True, False, False, True]]
+    assert torch.isfinite(out["keypoints"]).all()
+    assert torch.isfinite(out["boxes"]).all()
+    assert out["boxes_valid"].tolist() == [[True, False]]
+    out["keypoints"].sum().backward()
+    assert torch.isfinite(keypoints.grad).all()
+
+
+def test_the_sample_that_is_given_stays_as_it_is(camera):
+    batch = {"keypoints": torch.rand(2, 5, 2), "boxes": torch.rand(2, 1, 4), "head_pose": torch.eye(4).repeat(2, 1, 1)}
+    before = {name: value.clone() for name, value in batch.items()}
+    RandomMount(camera=camera)(batch)
+    assert batch.keys() == before.keys()
+    assert all(torch.equal(batch[name], before[name]) for name in before)
+
+
+def test_outlines_follow_what_a_box_cannot(camera):
+    box = torch.tensor([[[2.0, 3.0, 30.0, 25.0]]])
+    polygons = outlines(box, samples=8)
+    assert polygons.shape == (1, 1, 32, 2)
+    assert torch.equal(polygons[0, 0, ::8], torch.tensor([[2.0, 3.0], [30.0, 3.0], [30.0, 25.0], [2.0, 25.0]]))
+    out = RandomMount(camera=camera, roll=(45, 45))(polygons=polygons, boxes=box)
+    moved, enclosing = out["polygons"][0, 0], out["boxes"][0, 0]
+    assert out["polygons_valid"].shape == (1, 1, 32)
+    assert (moved >= enclosing[:2] - 1e-3).all()
+    assert (moved <= enclosing[2:] + 1e-3).all()
+    with pytest.raises(ValueError, match=r"boxes must be \(..., 4\)"):
+        outlines(torch.zeros(3))
+    with pytest.raises(ValueError, match="samples must be at least 1; got 0"):
+        outlines(box, 0)
