@@ -213,7 +213,7 @@ class Camera(Picture):
                 values = (torch.where(usable, t.detach(), ideal) for t, ideal in ((intrinsics, 1.0), (distortion, 0.0)))
                 values = [t.clone() for t in values]
                 mask = None if may_look(usable) and bool(usable.all()) else usable.to(intrinsics.dtype)
-                return Cameras(values[0], opaque.domain_of(self._model, values[1]), mask)
+                return Cameras(values[0], opaque.domain_of(self._model, values[1], self.optics), mask)
 
         return self._memo((intrinsics, distortion), (intrinsics.dtype, intrinsics.device), look)
 

@@ -38,14 +38,14 @@ _KEPT = 8
 _domains: list[tuple[str, Tensor, Domain]] = []
 
 
-def domain_of(model: str, k: Tensor) -> Domain:
-    """The domain of these values: one of the last ones, or a new one."""
+def domain_of(model: str, k: Tensor, optics: Optics | None = None) -> Domain:
+    """The domain of these values: one of the last ones, or a new one, of the model's registered optics or given ones."""
     for name, values, domain in _domains:
         if name == model and same(values, k):
             return domain
     with torch.inference_mode(False), torch.no_grad():
         values = k.detach().clone()
-        domain = Domain(MODELS[model], values)
+        domain = Domain(optics or MODELS[model], values)
     _domains.insert(0, (model, values, domain))
     del _domains[_KEPT:]
     return domain
