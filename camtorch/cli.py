@@ -1,4 +1,4 @@
-"""The command line: `camtorch dewarp` and `camtorch demo`. Degrees and WIDTHxHEIGHT here, and only here."""
+"""The command line: `camtorch dewarp`, `augment` and `demo`. Degrees and WIDTHxHEIGHT here, and only here."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from camtorch import __version__
 
 _LARGEST_SIDE = 32768
 _STRIP_PIXELS = 1 << 21
+_MOST_TILES = 100
 
 
 class _Parser(argparse.ArgumentParser):
@@ -53,13 +54,6 @@ def _parser() -> argparse.ArgumentParser:
     dewarp = commands.add_parser("dewarp", help="undistort a picture", allow_abbrev=False)
     dewarp.set_defaults(run=_dewarp)
     dewarp.add_argument("image", type=Path, metavar="IMAGE", help="the picture")
-    dewarp.add_argument("--camera", type=Path, required=True, metavar="FILE", help="its camera: OpenCV's YAML or JSON")
-    dewarp.add_argument(
-        "--model",
-        metavar="KEY",
-        help="the camera model where the file does not say it: kannala_brandt, brown_conrady ...",
-    )
-    dewarp.add_argument("--name", help="which camera, in a file with several")
     dewarp.add_argument(
         "--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective"
     )
@@ -70,10 +64,41 @@ def _parser() -> argparse.ArgumentParser:
         help="horizontal field of view of the new picture; by default that of the old one, up to 120 in perspective",
     )
     dewarp.add_argument("--size", type=_size, metavar="WxH", help="size of the new picture; by default the old one's")
-    dewarp.add_argument("--rescale", action="store_true", help="scale the camera to the picture's resolution")
+
+    augment = commands.add_parser(
+        "augment",
+        help="a contact sheet of a picture with its labels as other cameras see them",
+        description="A contact sheet of a picture with its labels as other cameras see them. Without IMAGE the picture "
+        "is a rendered driver. A RANGE is LOW,HIGH, as in --yaw=-5,20, or a number: so far to either side of doing "
+        "nothing, or just that --fov.",
+        allow_abbrev=False,
+    )
+    augment.set_defaults(run=_augment)
+    augment.add_argument("image", type=Path, nargs="?", metavar="IMAGE", help="the picture")
+    augment.add_argument(
+        "--labels", type=Path, metavar="FILE", help="of IMAGE: JSON of keypoints, boxes, gaze, gaze_from, in pixels"
+    )
+    augment.add_argument("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
+    augment.add_argument("--list", action="store_true", help="print the presets, and nothing else")
+    augment.add_argument("-n", type=int, default=8, metavar="COUNT", help="how many other cameras; 8 by default")
+    augment.add_argument("--seed", type=int, default=0, help="of what is drawn; 0 by default")
+    augment.add_argument("--size", type=_size, metavar="WxH", help="of the new pictures; by default the old one's")
+    for name in ("yaw", "pitch", "roll", "zoom", "fov"):
+        augment.add_argument(f"--{name}", type=_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
+
     demo = commands.add_parser("demo", help="render, dewarp and measure a room seen by five lenses", allow_abbrev=False)
     demo.set_defaults(run=_demo)
-    for command, output in ((dewarp, None), (demo, Path("demo.png"))):
+    for command in (dewarp, augment):
+        needed = command is dewarp
+        command.add_argument("--camera", type=Path, required=needed, metavar="FILE", help="OpenCV's YAML or JSON")
+        command.add_argument(
+            "--model",
+            metavar="KEY",
+            help="the camera model where the file does not say it: kannala_brandt, brown_conrady ...",
+        )
+        command.add_argument("--name", help="which camera, in a file with several")
+        command.add_argument("--rescale", action="store_true", help="scale the camera to the picture's resolution")
+    for command, output in ((dewarp, None), (augment, Path("augment.png")), (demo, Path("demo.png"))):
         command.add_argument("-o", "--output", type=Path, required=output is None, default=output, metavar="OUT")
         command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
     return parser
@@ -94,18 +119,22 @@ def _size(text: str) -> tuple[int, int]:
     return height, width
 
 
-def _dewarp(arguments: argparse.Namespace) -> None:
-    import torch
+def _range(text: str) -> float | tuple[float, float]:
+    """A number, or two."""
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (1, 2):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor LOW,HIGH, as in -5,20")
+    return numbers if len(numbers) == 2 else numbers[0]
 
-    from camtorch import Dewarp, image_files
+
+def _photograph(arguments: argparse.Namespace):
+    """The picture, its Exif orientation, and its camera."""
+    from camtorch import image_files
     from camtorch.io import opencv
 
-    fov = arguments.fov
-    if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
-        wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
-        allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
-        raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
-    image_files.check_target(arguments.output, force=arguments.force)
     picture, orientation = image_files.read(arguments.image)
     camera = opencv.read(arguments.camera, arguments.model, name=arguments.name).requires_grad_(False)
     size = tuple(picture.shape[-2:])
@@ -116,6 +145,22 @@ def _dewarp(arguments: argparse.Namespace) -> None:
         if not arguments.rescale:
             raise ValueError(_resolutions(arguments, size, camera.image_size))
         camera = camera.resize(*size)
+    return picture, orientation, camera
+
+
+def _dewarp(arguments: argparse.Namespace) -> None:
+    import torch
+
+    from camtorch import Dewarp, image_files
+
+    fov = arguments.fov
+    if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
+        wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
+        allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
+        raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
+    image_files.check_target(arguments.output, force=arguments.force)
+    picture, orientation, camera = _photograph(arguments)
+    size = camera.image_size
     with torch.no_grad():
         warp = Dewarp(camera, projection=arguments.projection, fov=fov and math.radians(fov), image_size=arguments.size)
         result, filled = _in_strips(warp, picture)
@@ -169,6 +214,50 @@ def _degrees(target) -> float:
     if target.key == "pinhole":
         left, right = math.atan(left), math.atan(right)
     return math.degrees(left + right)
+
+
+def _augment(arguments: argparse.Namespace) -> None:
+    from camtorch import image_files, labels, sheet, views
+    from camtorch.io import opencv
+
+    if arguments.list:
+        print("\n".join(views.presets()))
+        return
+    lens = views.lens(arguments.preset)
+    if not 1 <= arguments.n <= _MOST_TILES:
+        raise ValueError(f"-n must be 1 to {_MOST_TILES}; got {arguments.n}")
+    if not 0 <= arguments.seed < 1 << 63:
+        raise ValueError(f"--seed must be 0 or more, and below 2 to the 63rd; got {arguments.seed}")
+    needs = {"camera": ("model", "name"), "image": ("labels", "rescale")}
+    for needed, names in needs.items():
+        idle = [name for name in names if getattr(arguments, needed) is None and getattr(arguments, name)]
+        if idle:
+            raise ValueError(f"--{idle[0]} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
+    if arguments.image is not None and arguments.camera is None:
+        raise ValueError(f"{arguments.image}: which camera took it? --camera FILE, its OpenCV calibration, says so")
+    image_files.check_target(arguments.output, force=arguments.force)
+    if arguments.image is not None:
+        picture, orientation, camera = _photograph(arguments)
+        if orientation not in (None, 1):
+            _note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
+        known = None if arguments.labels is None else labels.read(arguments.labels, camera)
+        before = views.photograph(picture, camera, known, arguments.image.name)
+    elif arguments.camera is not None:
+        camera = opencv.read(arguments.camera, arguments.model, name=arguments.name).requires_grad_(False)
+        if camera.image_size is None:
+            raise ValueError(f"{arguments.camera} states no image size, which a rendered picture needs")
+        before = views.scene(camera)
+    else:
+        before = views.scene()
+    ranges = {name: getattr(arguments, name) for name in ("yaw", "pitch", "roll", "zoom", "fov")}
+    ranges = {name: value for name, value in ranges.items() if value is not None}
+    shown = [before]
+    for view in views.augmented(before, lens, arguments.n, arguments.seed, arguments.size, **ranges):
+        print(view.note, flush=True)
+        shown.append(view)
+    title = f"One picture, {sheet.counted(arguments.n, 'other camera')}"
+    image_files.write(arguments.output, sheet.picture(shown, title, views.origin(lens, before)))
+    print(f"{arguments.output}: the picture before, and as each of them sees it, with what became of the labels")
 
 
 def _demo(arguments: argparse.Namespace) -> None:

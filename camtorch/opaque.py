@@ -39,7 +39,7 @@ _domains: list[tuple[str, Tensor, Domain]] = []
 
 
 def domain_of(model: str, k: Tensor, optics: Optics | None = None) -> Domain:
-    """The domain of these values: one of the last ones, or a new one, of the model's registered optics or given ones."""
+    """The domain of these values: one of the last ones, or a new one, of given or the model's optics."""
     for name, values, domain in _domains:
         if name == model and same(values, k):
             return domain
