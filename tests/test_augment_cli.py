@@ -1,0 +1,267 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import camtorch as ct
+from camtorch import labels, sheet, views
+from camtorch.cli import main
+
+CAMERA = (
+    "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
+    "K: [40, 0, 47, 0, 40, 32, 0, 0, 1]\nD: [-0.02, 0.004, -0.003, 0.0006]\n"
+)
+LABELS = {
+    "keypoints": [[20, 30], [60, 20], [500, 3]],
+    "boxes": [[30, 20, 60, 50]],
+    "gaze": [0.5, 0.3, -1],
+    "gaze_from": [50, 30],
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, with a picture, its camera and labels; all pictures are small."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(views, "SCENE_SIZE", (48, 64))
+    monkeypatch.setattr(views, "NEW_SIZE", (96, 128))
+    Path("camera.yml").write_text(CAMERA)
+    Path("labels.json").write_text(json.dumps(LABELS))
+    grey = np.full((64, 96, 3), 128, np.uint8)
+    Image.fromarray(grey).save("in.png")
+    return tmp_path
+
+
+PHOTO = ("in.png", "--camera", "camera.yml", "--labels", "labels.json")
+
+
+def augment(*words, expect=0):
+    assert main(["augment", *map(str, words)]) == expect
+
+
+def pixels(path):
+    with Image.open(path) as image:
+        return np.array(image.convert("RGB")).astype(int)
+
+
+def camera():
+    return ct.KannalaBrandt([40.0, 40, 47, 32], [-0.02, 0.004, -0.003, 0.0006], image_size=(64, 96)).requires_grad_(
+        False
+    )
+
+
+def photograph(known=None, picture=None):
+    picture = torch.full((3, 64, 96), 128, dtype=torch.uint8) if picture is None else picture
+    return views.photograph(picture, camera(), known, "in.png")
+
+
+def near(picture, x, y, colour):
+    """How far the colour nearest to `colour` within a pixel of a place is from it."""
+    x, y = round(x), round(y)
+    part = picture[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3)
+    return np.abs(part - colour).max(-1).min()
+
+
+def test_without_a_picture_it_shows_the_driver(folder, capsys):
+    augment("--preset", "dms130", "-n", 5)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6
+    assert lines[0].startswith("  1: yaw ")
+    assert "22 of 22 points" in lines[0]
+    assert lines[-1].startswith("augment.png: ")
+    picture = pixels("augment.png")
+    # three columns of tiles of 4:3, the first picture on two rows and columns
+    assert picture.shape == (1271, 1340, 3)
+    for colour in (sheet.POINT, sheet.BOX, sheet.GAZE):
+        assert (picture == colour).all(-1).sum() > 200
+
+
+def test_seeds_decide(folder, capsys):
+    for name, seed, count in (("a", 1, 1), ("b", 1, 1), ("c", 2, 1), ("d", 1, 3)):
+        augment(*PHOTO, "-n", count, "--seed", seed, "-o", f"{name}.png")
+    lines = capsys.readouterr().out.splitlines()
+    assert Path("a.png").read_bytes() == Path("b.png").read_bytes() != Path("c.png").read_bytes()
+    assert lines[0] == lines[2] == lines[6] != lines[4]
+
+
+def test_options_reach_the_cameras(folder, capsys):
+    words = ["--yaw=12,12", "--pitch=0,0", "--roll=-5,-5", "--zoom", 0, "--fov", 100, "--preset", "surround190"]
+    augment(*PHOTO, *words, "--size", "80x80", "-n", 1)
+    line = capsys.readouterr().out.splitlines()[0]
+    assert "yaw +12.0 degrees, pitch +0.0 degrees, roll -5.0 degrees, surround190" in line
+    assert 85 < float(line.split("surround190, ")[1].split()[0]) < 115
+
+
+def test_the_list_of_presets(folder, capsys):
+    augment("--list")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(ct.augment.PRESETS)
+    assert "EuRoC" in lines[2]
+    assert not Path("augment.png").exists()
+
+
+def test_a_given_camera_sees_the_driver(folder, capsys):
+    augment("--camera", "camera.yml", "-n", 1)
+    assert "kannala_brandt" in capsys.readouterr().out
+    Path("bare.yml").write_text("K: [40, 0, 47, 0, 40, 32, 0, 0, 1]")
+    augment("--camera", "bare.yml", "-n", 1, "--force", expect=2)
+    assert "bare.yml states no image size" in capsys.readouterr().err
+
+
+def test_marks_lie_where_labels_say(folder):
+    view = photograph(labels.read("labels.json", camera()))
+    assert view.keypoints_valid.tolist() == [True, True, False]
+    picture = np.array(sheet.marked(view, 640, 960)).astype(int)
+    assert picture.shape == (640, 960, 3)
+    for x, y in LABELS["keypoints"][:2]:
+        assert near(picture, 10 * x + 4.5, 10 * y + 4.5, sheet.POINT) < 8
+    x1, y1, x2, y2 = (10 * c + 4.5 for c in LABELS["boxes"][0])
+    for x, y in ((x1, (y1 + y2) / 2), (x2, (y1 + y2) / 2), ((x1 + x2) / 2, y1), ((x1 + x2) / 2, y2)):
+        assert near(picture, x, y, sheet.BOX) < 8
+    ((start, end),) = sheet._arrows(view)
+    assert math.dist(start, LABELS["gaze_from"]) < 1e-4
+    middle = [10 * (s + e) / 2 + 4.5 for s, e in zip(start, end, strict=True)]
+    assert near(picture, *middle, sheet.GAZE) < 8
+    assert (picture != 128).any(-1).mean() < 0.05
+
+
+@pytest.mark.parametrize("preset", ["none", "webcam", "dms130", "surround190", "aria"])
+def test_labels_move_with_the_picture(folder, preset):
+    # a keypoint at each end of the arrow, and a spot of light at one
+    plain = photograph(labels.read("labels.json", camera()))
+    ((start, end),) = sheet._arrows(plain)
+    y, x = torch.meshgrid(torch.arange(64), torch.arange(96), indexing="ij")
+    spot = 250 * torch.exp(-((x - start[0]) ** 2 + (y - start[1]) ** 2) / 8)
+    known = labels.read("labels.json", camera())
+    known.keypoints = torch.tensor([start, end], dtype=torch.float64)
+    before = photograph(known, spot.byte().expand(3, -1, -1).contiguous())
+    for view in views.augmented(before, views.lens(preset), 3, 0):
+        ((start, end),) = sheet._arrows(view)
+        torch.testing.assert_close(view.labels.keypoints.tolist(), [start, end], rtol=0, atol=1e-2)
+        weight = (view.picture[0].double() - 128).clamp(min=0) * (view.picture[0] == view.picture[2])
+        y, x = torch.meshgrid(*(torch.arange(n) for n in weight.shape), indexing="ij")
+        seen = [float((weight * c).sum() / weight.sum()) for c in (x, y)]
+        assert math.dist(seen, start) < 0.6
+
+
+def test_what_is_off_the_picture_is_not_drawn(folder):
+    known = labels.Labels(torch.tensor([[-5.0, 3.0]]), torch.tensor([[200.0, 5, 210, 9]]), *torch.zeros(2, 0, 3))
+    assert (np.array(sheet.marked(photograph(known), 128, 192)) == 128).all()
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGBA", "P", "I;16"])
+def test_kinds_of_picture(folder, mode):
+    grey = np.full((64, 96), 128, np.uint8)
+    grey[:, :48] = 0
+    image = Image.fromarray(grey.astype(np.uint16) * 30) if mode == "I;16" else Image.fromarray(grey).convert(mode)
+    image.save("kind.tif")
+    augment("kind.tif", "--camera", "camera.yml", "-n", 1, "-o", "out.png")
+    assert (pixels("out.png") == sheet.POINT).all(-1).any()
+
+
+def test_long_and_narrow_pictures(folder):
+    for size in ("2000x20", "20x2000"):
+        augment(*PHOTO, "-n", 2, "--size", size, "-o", "out.png", "--force")
+        assert max(pixels("out.png").shape) < 2000
+
+
+def test_columns_leave_little_empty():
+    for count in range(1, 101):
+        columns, span = sheet._columns(count)
+        assert -(count + span * span) % columns <= columns // 2
+        assert columns >= span
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["in.png"], "in.png: which camera took it? --camera FILE"),
+        (["none.png", "--camera", "camera.yml"], "none.png: no such file"),
+        (["in.png", "--camera", "none.yml"], "none.yml: No such file"),
+        (["--labels", "labels.json"], "--labels needs IMAGE"),
+        (["--rescale"], "--rescale needs IMAGE"),
+        (["--model", "pinhole"], "--model needs --camera FILE"),
+        (["--name", "left"], "--name needs --camera FILE"),
+        (["--preset", "fish"], "no preset 'fish'. There are none, the picture's own lens; webcam, a VGA camera"),
+        (["-n", "0"], "-n must be 1 to 100; got 0"),
+        (["-n", "101"], "-n must be 1 to 100"),
+        (["-n", "many"], "argument -n: invalid int value"),
+        (["--seed", "-1"], "--seed must be 0 or more"),
+        (["--seed", str(1 << 64)], "--seed must be 0 or more"),
+        (["--size", "8"], "'8' is not WIDTHxHEIGHT"),
+        (["--yaw", "left"], "--yaw: 'left' is neither a number nor LOW,HIGH"),
+        (["--yaw", "1,2,3"], "--yaw: '1,2,3' is neither"),
+        ([*PHOTO, "--yaw", "200"], "yaw must lie within [-180, 180]"),
+        ([*PHOTO, "--roll", "nan"], "roll must be finite"),
+        ([*PHOTO, "--pitch=5,-5"], "pitch must be (low, high)"),
+        ([*PHOTO, "--preset", "webcam", "--fov", "200"], "does not reach 200 degrees"),
+        (["-o", "none/out.png"], "there is no folder none"),
+        (["-o", "in.png"], "in.png: exists already"),
+        (["half.png", "--camera", "camera.yml"], "--rescale scales the camera"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(folder, capsys, words, text):
+    Image.new("RGB", (48, 32)).save("half.png")
+    before = {path.name for path in folder.iterdir()}
+    augment(*words, expect=2)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("camtorch: error: ")
+    assert captured.err.count("\n") == 1
+    assert text in captured.err
+    assert {path.name for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ("", "no JSON"),
+        ('{"keypoints": [[1, 2], [3', "no JSON"),
+        (b"\xff\xfe\x00\xd8", "no JSON"),
+        ("[" * 100_000, "no JSON"),
+        ("[[1, 2]]", "must be an object"),
+        ("null", "it is null"),
+        ('{"landmarks": [[1, 2]]}', '"landmarks" is not known; known are "keypoints"'),
+        ('{"keypoints": 3}', "keypoints: must be [[x, y], ...]; it is a number"),
+        ('{"keypoints": {"a": 1}}', "it is an object"),
+        ('{"keypoints": [[1, 2], 3]}', "keypoints[1]: must be a list of 2 numbers; it is a number"),
+        ('{"keypoints": [[1, 2], [3, 4, 5]]}', "keypoints[1]: must be 2 numbers; here are 3"),
+        ('{"keypoints": [[1, "2"]]}', 'keypoints[0]: "2" is no number'),
+        ('{"keypoints": [[1, true]]}', "keypoints[0]: true is no number"),
+        ('{"keypoints": [[1, null]]}', "keypoints[0]: null is no number"),
+        ('{"keypoints": [[1, NaN]]}', "keypoints[0]: NaN is no number between"),
+        ('{"keypoints": [[1, 1e999]]}', "keypoints[0]: Infinity is no number between"),
+        ('{"keypoints": [[1, 1' + 999 * "0" + "]]}", "keypoints[0]: 1000"),
+        ('{"keypoints": [[1, 1' + 9999 * "0" + "]]}", "labels.json: "),
+        ('{"boxes": [[1, 2, 3, 4], [9, 2, 3, 4]]}', "boxes[1]: x1 <= x2 and y1 <= y2 must hold; got [9, 2, 3, 4]"),
+        ('{"gaze": [0, 0, 1]}', "gaze needs gaze_from, [x, y], beside it"),
+        ('{"gaze_from": [3, 4]}', "gaze_from needs gaze, [x, y, z], beside it"),
+        ('{"gaze": [0, 0, 0], "gaze_from": [3, 4]}', "gaze: a direction has a length"),
+        ('{"gaze": [0, 0, 1], "gaze_from": [9000, 4]}', "gaze_from: the camera has no ray at [9000, 4]"),
+        (" " * (1 << 21), "larger than 1 MiB"),
+    ],
+)
+def test_bad_labels_are_named(folder, capsys, content, text):
+    Path("labels.json").write_bytes(content if isinstance(content, bytes) else content.encode())
+    augment(*PHOTO, expect=2)
+    error = capsys.readouterr().err
+    assert "labels.json" in error
+    assert text in error
+    assert error.count("\n") == 1
+    assert not Path("augment.png").exists()
+
+
+def test_empty_labels_are_no_labels(folder, capsys):
+    Path("labels.json").write_text("{}")
+    augment(*PHOTO, "-n", 1)
+    assert "points" not in capsys.readouterr().out
+
+
+def test_without_pillow(folder, capsys, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "PIL", None)
+    augment("-n", 1, expect=2)
+    assert "pip install 'camtorch[cli]'" in capsys.readouterr().err
