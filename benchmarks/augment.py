@@ -1,8 +1,8 @@
 """Augmentation: a random camera for every picture of a batch, with its mask and its landmarks.
 
-Every call draws anew and moves the picture, a mask and 68 keypoints of each sample. OpenCV goes sample by sample, from a
-lens that it knows to a turned pinhole camera, and cannot do the last case. kornia's RandomAffine moves the same data by
-an affine map, which needs no camera.
+Every call draws anew and moves the picture, a mask and 68 keypoints of each sample. OpenCV goes sample by sample, from
+a lens that it knows to a turned pinhole camera, and cannot do the other cases. kornia's RandomAffine moves the same
+data by an affine map, which needs no camera.
 """
 
 from __future__ import annotations

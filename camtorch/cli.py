@@ -86,8 +86,15 @@ def _parser() -> argparse.ArgumentParser:
     for name in ("yaw", "pitch", "roll", "zoom", "fov"):
         augment.add_argument(f"--{name}", type=_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
 
-    demo = commands.add_parser("demo", help="render, dewarp and measure a room seen by five lenses", allow_abbrev=False)
+    demo = commands.add_parser("demo", help="render, and measure what camtorch makes of it", allow_abbrev=False)
     demo.set_defaults(run=_demo)
+    demo.add_argument(
+        "subject",
+        nargs="?",
+        choices=("room", "training"),
+        default="room",
+        help="room: dewarp a room seen by five lenses (the default); training: teach networks with augmentation",
+    )
     for command in (dewarp, augment):
         needed = command is dewarp
         command.add_argument("--camera", type=Path, required=needed, metavar="FILE", help="OpenCV's YAML or JSON")
@@ -261,12 +268,15 @@ def _augment(arguments: argparse.Namespace) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> None:
-    from camtorch import demo, image_files
+    from camtorch import demo, image_files, training_demo
 
+    shown, caption = demo, "the sources, what became of them, and what separates that from the truth"
+    if arguments.subject == "training":
+        shown, caption = training_demo, "what each network learned from, and what it finds behind the fisheye"
     image_files.check_target(arguments.output, force=arguments.force)
-    studies = demo.run(lambda line: print(line, flush=True))
-    image_files.write(arguments.output, demo.picture(studies))
-    print(f"{arguments.output}: the sources, what became of them, and what separates that from the truth")
+    results = shown.run(lambda line: print(line, flush=True))
+    image_files.write(arguments.output, shown.picture(results))
+    print(f"{arguments.output}: {caption}")
 
 
 if __name__ == "__main__":

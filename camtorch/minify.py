@@ -52,5 +52,8 @@ def sample_minified(images: Tensor, grid: Tensor, scale: Tensor, mode: str, padd
     for n in range(min(wanted, last)):
         half = [max(side // 2, 1) for side in images.shape[-2:]]
         images = F.interpolate(images, half, mode="bilinear", align_corners=False, antialias=True)
-        result = torch.lerp(result, sample(images, grid, mode, padding_mode), (level - n).clamp(0, 1).to(result))
+        smaller, share = sample(images, grid, mode, padding_mode), (level - n).clamp(0, 1).to(result)
+        # a picture without a share has no part either in what is not a number
+        blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
+        result = torch.where(share > 0, blended, result)
     return result

@@ -11,9 +11,11 @@ from torch import Tensor
 
 OUTSIDE = -9.0  # a sampling position that no picture reaches, not even with its interpolation margin
 _STRIP = 1 << 19  # pixels
+_FEWEST = 8  # cells along a side from which on a lattice pays
 _STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
 _MARGIN = 0.05  # of half a picture: what lies beyond is not sampled
+_OVERSHOOT = 0.5  # of the range of its nodes by which a cubic may leave it: 0.27 along each axis
 _CUBIC = 3 / 128  # a cubic through four even nodes misses its middle by this part of their fourth difference
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -55,7 +57,7 @@ def on_lattice(
     """
     height, width = size
     rows, columns = math.ceil(height / _STEP), math.ceil(width / _STEP)
-    if min(rows, columns) < 4:
+    if min(rows, columns) < _FEWEST:
         return None
     steps = [(torch.arange(n + 3, dtype=like.dtype, device=like.device) - 1) * _STEP for n in (rows, columns)]
     v, u = torch.meshgrid(*steps, indexing="ij")
@@ -96,7 +98,8 @@ def _open_cells(nodes: Tensor, mapped: Tensor, source: tuple[int, int], toleranc
     high, low = (
         _over_windows(_over_windows(nodes, -1, 4, pick), -2, 4, pick) for pick in (torch.maximum, torch.minimum)
     )
-    sampled = ((high > -1 - _MARGIN) & (low < 1 + _MARGIN)).all(1)
+    reach = _MARGIN + _OVERSHOOT * (high - low)
+    sampled = ((high + reach > -1) & (low - reach < 1)).all(1)
     return some, some & (~every | (sampled & (missed * half > tolerance).any(1)))
 
 

@@ -78,6 +78,11 @@ def as_fill(fill, owner: str) -> tuple[float, ...]:
     return values
 
 
+def coverage(images: Tensor, grid: Tensor, mode: str) -> Tensor:
+    """(B, 1, H', W'): what part of a sample comes from the picture, and not from the zeros around it."""
+    return sample(torch.ones_like(images[:1, :1]).expand(len(grid), -1, -1, -1), grid, mode, "zeros")
+
+
 def _sample_in_parts(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
     """`_sample_part` with work for every thread, of which grid_sample gives one to each picture.
 

@@ -21,7 +21,7 @@ from camtorch.parameters import (
     may_look,
 )
 from camtorch.positions import OUTSIDE, in_strips, on_lattice
-from camtorch.sampling import MODES, PADDINGS, as_fill, as_options, narrow, one_of, sample, widen
+from camtorch.sampling import MODES, PADDINGS, as_fill, as_options, coverage, narrow, one_of, sample, widen
 
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 
@@ -41,7 +41,8 @@ class Warp(GeometryModule):
         padding_mode: "zeros", "border" or "reflection", for pixels that the source sees outside its
             picture. A pixel without a ray, or whose ray the source cannot map, always takes `fill`.
         fill: the value of pixels that show nothing, blended in at the rim of "zeros"; one, or one for each channel.
-        antialias: where the picture shrinks, a pixel takes the mean of what it covers ("nearest" does not).
+        antialias: where the picture shrinks, a pixel takes the mean of what it covers, as wide in all directions as in
+            the widest; compiled down to a sixteenth. "nearest" does not.
         tolerance: pixels of the source by which sampling positions may be off, as far as fourth differences tell. From
             0.01 on they come from a lattice, several times as fast. Zero is exact; so are labels always, warps
             with a graph, and those on a GPU.
@@ -86,8 +87,7 @@ class Warp(GeometryModule):
                 "Warp: source, target and rotation may each have one batch dim, of one size; "
                 f"got {', '.join(str(tuple(s)) for s in shapes)}"
             )
-        self._memo = Memo()
-        self._pinned: tuple[Tensor, Tensor, Tensor | None] | None = None
+        self._memo, self._pinned = Memo(), None
 
     def _set_rotation(self, rotation: Tensor | None) -> None:
         if isinstance(rotation, nn.Parameter):
@@ -121,17 +121,15 @@ class Warp(GeometryModule):
             ValueError: another shape or size. TypeError: complex images.
         """
         if not isinstance(images, Tensor) or images.is_complex():
-            what = f"dtype {images.dtype}" if isinstance(images, Tensor) else type(images).__name__
+            what = getattr(images, "dtype", type(images).__name__)
             raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}")
         if images.ndim != 4:
+            hint = "One picture goes in as image[None], masks without channels as masks[:, None]"
+            raise ValueError(f"Warp: images must be (B, C, H, W); got shape {tuple(images.shape)}. {hint}")
+        size, expected = tuple(images.shape[-2:]), self.source.image_size
+        if size != expected:
             raise ValueError(
-                f"Warp: images must be (B, C, H, W); got shape {tuple(images.shape)}. One picture goes in as "
-                "image[None], masks without channels as masks[:, None]"
-            )
-        if tuple(images.shape[-2:]) != self.source.image_size:
-            raise ValueError(
-                f"Warp: images are {tuple(images.shape[-2:])} (height, width), "
-                f"but the source camera's image_size is {self.source.image_size}"
+                f"Warp: images are {size} (height, width), but the source camera's image_size is {expected}"
             )
         mode = self.mode if mode is None else one_of(mode, MODES, "mode", "Warp")
         padding_mode = (
@@ -149,16 +147,19 @@ class Warp(GeometryModule):
         if minifies or any(fill):
             images = widen(images)
         if minifies:
-            result = minify.sample_minified(images, grid, scale, mode, padding_mode)
+            # what lies beyond the rim is left out by coverage: at small levels the rim's pixels are wide
+            beyond = "border" if padding_mode == "zeros" else padding_mode
+            result = minify.sample_minified(images, grid, scale, mode, beyond)
         else:
             result = sample(images, grid, mode, padding_mode)
-        if any(fill) or padding_mode != "zeros":
+        if any(fill) or padding_mode != "zeros" or minifies:
+            if len(fill) not in (1, result.shape[1]):
+                raise ValueError(f"Warp: fill has {len(fill)} values, but the images have {result.shape[1]} channels")
             value = result.new_tensor(fill)[:, None, None]
-            if len(value) not in (1, result.shape[1]):
-                raise ValueError(f"Warp: fill has {len(value)} values, but the images have {result.shape[1]} channels")
             if padding_mode == "zeros":
-                ones = torch.ones_like(images[:1, :1]).expand(len(grid), -1, -1, -1)
-                result = result + value * (1 - sample(ones, grid, mode, "zeros"))
+                covered = coverage(images, grid, mode)
+                result = torch.where(covered != 0, result * covered, 0) if minifies else result
+                result = result + value * (1 - covered)
             else:
                 result = torch.where(mapped.unsqueeze(1), result, value)
         return narrow(result, dtype)
@@ -186,13 +187,14 @@ class Warp(GeometryModule):
 
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
-        if not in_transform():  # what a transform makes dies with it
+        # what a transform makes dies with it; what inference mode makes could not be used in a graph later
+        if not in_transform() and not torch.is_inference_mode_enabled():
             self._pinned = self._sampling()
         return self
 
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        scale = minify.local_scale(grid.detach(), mapped, self.source.image_size) if self.antialias else None
-        return grid, mapped, scale
+        size = self.source.image_size
+        return grid, mapped, minify.local_scale(grid.detach(), mapped, size) if self.antialias else None
 
     def _inputs(self) -> tuple[Tensor | None, ...]:
         s, t = self.source, self.target
@@ -290,8 +292,10 @@ class Warp(GeometryModule):
     @property
     def options(self) -> dict:
         """What another Warp takes to sample in the same way."""
-        names = "mode", "padding_mode", "fill", "antialias", "tolerance"
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in ("mode", "padding_mode", "fill", "antialias", "tolerance")}
+
+    def __getstate__(self):
+        return {**super().__getstate__(), "_pinned": None}
 
     def extra_repr(self) -> str:
         """The options."""

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from camtorch.augment.cameras import collate, expanded, kind, rows_of
+from camtorch.augment.cameras import alone, collate, kind, rows_of
 from camtorch.augment.change import Change, Part
 from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
 from camtorch.augment.ranges import Range, draw
 from camtorch.camera import Camera
-from camtorch.parameters import may_look
+from camtorch.parameters import as_whole, may_look
 from camtorch.sampling import as_options
 
 
@@ -40,9 +40,13 @@ class Augmentation(Mover):
 
     Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere would not be exact:
     near things shift against far ones, which no warp of a picture can do, so no augmentation does it.
+
+    Gradients go to pictures, labels and a camera that learns; what a lens is jittered by counts as given.
     """
 
     ranges: dict[str, Range]
+    image_size: tuple[int, int] | None = None
+    """Of what comes out; None: that of what comes in."""
 
     def __init__(
         self,
@@ -80,6 +84,8 @@ class Augmentation(Mover):
         Returns:
             `apply` (B,) bool, and for each range a float64 tensor (B,) or (B, size) of that name and unit.
         """
+        if as_whole(count, "count", self._name) < 0:
+            raise ValueError(f"{self._name}: count must not be negative; got {count}")
         return draw(self.ranges, count, self.p, self.same_on_batch, generator)
 
     def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
@@ -90,7 +96,15 @@ class Augmentation(Mover):
         draw = self._checked_draw(draw)
         applied = draw["apply"]
         count = len(applied)
-        if isinstance(camera, (list, tuple)):
+        listed = isinstance(camera, (list, tuple))
+        camera = camera if listed else alone(camera)
+        before = {one.image_size for one in (camera if listed else [camera])}
+        if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
+            raise ValueError(
+                f"{self._name}: with p < 1 the image_size must be that of the pictures, so that all come out alike; "
+                f"got image_size={self.image_size} for pictures of {', '.join(map(str, before))}"
+            )
+        if listed:
             groups: dict[tuple, list[int]] = {}
             for i, one in enumerate(camera):
                 groups.setdefault((*kind(one), bool(applied[i])), []).append(i)
@@ -110,31 +124,29 @@ class Augmentation(Mover):
             else:
                 parts.append(Part(rows, None, source))
         sizes = {(part.warp.target if part.warp else part.camera).image_size for part in parts}
-        if len(sizes) > 1:
-            raise ValueError(
-                f"{self._name}: samples of one batch would come out in the sizes {sorted(sizes)}; with p < 1 the "
-                "image_size must be that of the pictures"
-            )
-        return Change(count, parts, listed=isinstance(camera, (list, tuple)))
+        if len(sizes) > 1 and len(before) == 1:
+            text = f"samples of one batch would come out in the sizes {sorted(sizes)}; with p < 1 the size must stay"
+            raise ValueError(f"{self._name}: {text}")
+        return Change(count, parts, listed=listed)
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         missing = [name for name in ("apply", *self.ranges) if name not in draw]
         if missing:
-            raise ValueError(
-                f"{self._name}: the draw lacks {', '.join(missing)}; it has {', '.join(draw) or 'nothing'}"
-            )
-        count = len(draw["apply"])
+            has = ", ".join(draw) or "nothing"
+            raise ValueError(f"{self._name}: the draw lacks {', '.join(missing)}; it has {has}")
+        values = {name: torch.as_tensor(draw[name]) for name in ("apply", *self.ranges)}
+        count = len(values["apply"])
         for name, interval in self.ranges.items():
             shape = (count,) if interval.size is None else (count, interval.size)
-            if tuple(draw[name].shape) != shape:
-                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(draw[name].shape)}")
-        return {name: draw[name] for name in ("apply", *self.ranges)}
+            if tuple(values[name].shape) != shape:
+                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(values[name].shape)}")
+            if may_look(values[name]) and not bool(torch.isfinite(values[name]).all()):
+                raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {values[name].tolist()}")
+        return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
 
     def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         count = len(draw["apply"])
         values = {name: value for name, value in draw.items() if name != "apply"}
-        if tuple(source.batch_shape) == (1,):
-            source = expanded(source, count)
         batched = bool(source.batch_shape) or not _one_for_all(values)
         if not batched:  # one map serves the whole batch
             values = {name: value[0] for name, value in values.items()}
@@ -176,9 +188,9 @@ class Augmentation(Mover):
         sample = {**(sample or {}), **fields}
         named, batched, count, camera = self._batch(sample)
         drawn = self.draw(count, generator) if draw is None else draw
-        if len(drawn["apply"]) != count:
-            raise ValueError(f"{self._name}: the draw is for {len(drawn['apply'])} samples, here are {count}")
         change = self.change(camera, drawn)
+        if change.count != count:
+            raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
             self.last = change
         return self._moved(sample, named, batched, change)

@@ -35,6 +35,11 @@ def kind(camera: Camera) -> tuple:
     return type(camera), camera.distortion.shape[-1], camera.image_size
 
 
+def alone(camera: Camera) -> Camera:
+    """A batch of one as the camera that it holds, which serves any number of samples."""
+    return singles(camera)[0] if tuple(camera.batch_shape) == (1,) else camera
+
+
 def rows_of(camera: Camera, index: Tensor) -> Camera:
     """The cameras of these rows; one without batch dims serves all of them."""
     if not camera.batch_shape:

@@ -42,9 +42,13 @@ class Part:
         rotation = self.warp.rotation
         if rotation is not None and rotation.ndim == 3:
             rotation = rotation[index]
-        warp = Warp(camera, rows_of(self.warp.target, index), rotation, **self.warp.options)
+
+        def of(warp: Warp) -> Warp:
+            return Warp(camera, rows_of(warp.target, index), rotation, **warp.options)
+
         light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
-        return Part(None, warp, camera, light=light)
+        shades = None if self.shades is None else tuple(map(of, self.shades))
+        return Part(None, of(self.warp), camera, shades, light)
 
 
 class Change:
@@ -182,7 +186,8 @@ class Change:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
-            return rows, camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
+            on_picture = camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
+            return rows, on_picture & torch.isfinite(rows).all(-1)
 
         return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
 
@@ -211,9 +216,11 @@ class Change:
         """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
-            before, after = (_forward(camera, rows) for camera in (part.warp.source, part.warp.target))
-            distance = torch.where(before.abs() > 1e-6, rows / before, 0.0)
-            return part.warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
+            wide = widen(rows)
+            before, after = (_forward(camera, wide) for camera in (part.warp.source, part.warp.target))
+            distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
+            moved = part.warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
+            return narrow(moved, rows.dtype)
 
         return self.each(depth, move, lambda camera, rows: rows)
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from camtorch.augment.cameras import remade
+from camtorch.augment.cameras import alone, remade
 from camtorch.augment.change import Change, Part
 from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
 from camtorch.camera import Camera
-from camtorch.extrinsics import rotation_matrix
+from camtorch.extrinsics import check_rotation, rotation_matrix
 from camtorch.models import Pinhole
 from camtorch.parameters import as_image_size
 from camtorch.sampling import as_options
@@ -89,6 +89,8 @@ class FaceNormalizer(Mover):
             "dtype": torch.promote_types(camera.intrinsics.dtype, torch.float32),
             "device": camera.intrinsics.device,
         }
+        check_rotation(head_rotation, "the head's rotation", self._name)
+        camera = alone(camera)
         centre, across = face_centre.to(**like), head_rotation[..., 0].to(**like)
         distance = centre.norm(dim=-1, keepdim=True)
         forward = centre / distance
@@ -115,6 +117,9 @@ class FaceNormalizer(Mover):
         if not isinstance(camera, Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {type(camera).__name__}")
         kinds = {name: value for name, (_, value) in named.items()}
+        listed = [name for name in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(name), list)]
+        if listed:
+            raise TypeError(f"{self._name}: {', '.join(listed)} must be one tensor for all samples; got a list")
         if "head_pose" in kinds:
             head, centre = kinds["head_pose"][..., :3, :3], kinds["head_pose"][..., :3, 3]
         elif "rvec" in kinds and ("tvec" in kinds or "face_center" in kinds):
@@ -127,14 +132,16 @@ class FaceNormalizer(Mover):
         scale = self.distance / centre.norm(dim=-1)
         moved["scale"] = scale if batched else scale.squeeze(0)
         moved["source_camera"] = camera
+        if "rotation" in sample:  # of augmentations before
+            moved["source_rotation"] = sample["rotation"]
         return moved
 
     @without_graph_in_workers
     def inverse(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
         """Move what was predicted on a normalised sample back to the frame and the picture of its source camera.
 
-        The sample has `camera`, `rotation` and `source_camera` as they came out, and any other fields: gaze, keypoints,
-        3D points, pictures.
+        The sample has `camera`, `rotation` and `source_camera` as they came out (and `source_rotation`, after other
+        augmentations), and any other fields: gaze, keypoints, 3D points, pictures.
         """
         sample = {**(sample or {}), **fields}
         missing = [name for name in ("camera", "rotation", "source_camera") if name not in sample]
@@ -142,10 +149,14 @@ class FaceNormalizer(Mover):
             raise ValueError(f"{self._name}: to go back, the sample needs {', '.join(missing)} as they came out")
         normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
         named, batched, count, _ = self._batch({**sample, "camera": normal})
+        before = sample.get("source_rotation")
+        rotation = rotation if before is None else rotation @ before.mT
         rotation = rotation if rotation.ndim == 3 else rotation.unsqueeze(0)
         warp = Warp(source, normal, rotation.to(normal.intrinsics), **self.options)
         moved = self._moved(sample, named, batched, Change(count, [Part(None, warp, source)]).inverse())
         del moved["rotation"]
+        if before is not None:
+            moved["rotation"] = moved.pop("source_rotation")
         return moved
 
     def extra_repr(self) -> str:

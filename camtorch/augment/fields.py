@@ -14,6 +14,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import rotation_matrix, rotation_vector
 
 KEEP = "keep"
+PICTURES = ("image", "mask", "depth", "distance")
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ KINDS = {
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation),
 }
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
-OWN = ("camera", "draw", "generator", "scale")  # no field that moves; `scale` is of a FaceNormalizer
+OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
 
 def kind_of(name: str, value, own: Mapping[str, str], owner: str) -> str | None:
@@ -121,10 +122,14 @@ def kind_of(name: str, value, own: Mapping[str, str], owner: str) -> str | None:
     """
     if name in own:
         return None if own[name] == KEEP else own[name]
+    if name.endswith("_valid"):
+        return None
     base = name if name in KINDS else _ALIASES.get(name)
-    if base is None and not name.endswith("_valid"):
+    if base is None:
         base = max((k for k in KINDS if name.startswith(k + "_")), key=len, default=None)
-    if base is None and _is_real(value):
+        if base is not None and not isinstance(value, (Tensor, np.ndarray, list, tuple)):
+            return None  # image_path, mask_id
+    if base is None and _holds_reals(value):
         raise ValueError(
             f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. "
             f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
@@ -132,9 +137,12 @@ def kind_of(name: str, value, own: Mapping[str, str], owner: str) -> str | None:
     return base
 
 
-def _is_real(value) -> bool:
+def _holds_reals(value) -> bool:
+    """Whether there are real numbers in it that might be geometry; a number alone is none."""
+    if isinstance(value, Mapping):
+        return any(map(_holds_reals, value.values()))
     if isinstance(value, (list, tuple)):
-        return any(map(_is_real, value))
+        return any(isinstance(item, float) or _holds_reals(item) for item in value)
     if isinstance(value, np.ndarray):
         return value.ndim > 0 and np.issubdtype(value.dtype, np.floating)
     return isinstance(value, Tensor) and value.ndim > 0 and value.is_floating_point()
@@ -155,8 +163,16 @@ def as_tensor(value, name: str, kind: str, owner: str) -> Tensor:
         value = torch.from_numpy(value)
     if not isinstance(value, Tensor) or value.is_complex():
         what = f"dtype {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
-        raise TypeError(f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}")
+        raise TypeError(
+            f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{_hint(name)}"
+        )
+    if kind not in PICTURES and not value.is_floating_point():
+        value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
     return value
+
+
+def _hint(name: str) -> str:
+    return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} leaves it as it is"
 
 
 def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
@@ -166,7 +182,7 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     least, most = field.dims, field.most_dims
     if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
-        raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}")
+        raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{_hint(name)}")
     if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
         raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
 

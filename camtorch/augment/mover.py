@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from camtorch.augment import fields as field_kinds
-from camtorch.augment.cameras import on_device, singles
+from camtorch.augment.cameras import alone, on_device, singles
 from camtorch.augment.change import Change
 from camtorch.augment.fields import KEEP, KINDS
 from camtorch.camera import Camera
@@ -90,11 +90,13 @@ class Mover(nn.Module):
         values = [v for _, value in named.values() for v in (value if isinstance(value, list) else [value])]
         device = values[0].device if values else torch.device("cpu")
         many = isinstance(camera, (list, tuple))
-        camera = [on_device(one, device) for one in camera] if many else on_device(camera, device)
+        camera = [on_device(one, device) for one in camera] if many else on_device(alone(camera), device)
         return named, batched, count, camera
 
     def _check_cameras(self, camera, count: int, named: Mapping) -> None:
         cameras = list(camera) if isinstance(camera, (list, tuple)) else [camera]
+        if not cameras:
+            raise ValueError(f"{self._name}: an empty list of cameras; no samples have one camera, too")
         if isinstance(camera, (list, tuple)) and len(cameras) != count:
             raise ValueError(f"{self._name}: {len(cameras)} cameras for {count} samples")
         for i, one in enumerate(cameras):
@@ -107,9 +109,11 @@ class Mover(nn.Module):
             if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
                 raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
             for field, (found, value) in named.items():
-                for picture in value if isinstance(value, list) else [value]:
-                    size = tuple(picture.shape[-2:])
-                    if found in ("image", "mask", "depth", "distance") and size != one.image_size:
+                # one for each sample where there are as many cameras
+                pictures = value if isinstance(value, list) else [value]
+                pictures = pictures[i : i + 1] if isinstance(value, list) and len(cameras) > 1 else pictures
+                for size in {tuple(picture.shape[-2:]) for picture in pictures if found in field_kinds.PICTURES}:
+                    if size != one.image_size:
                         raise ValueError(
                             f"{self._name}: {field} is {size} (height, width), but the image_size of {name} is "
                             f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
@@ -136,7 +140,11 @@ class Mover(nn.Module):
                 self._put_valid(put, sample, f"{name}_valid", valid, batched)
         before = sample.get("image_valid")
         if before is not None:
-            before = change.labels(before if batched else before.unsqueeze(0))
+            before = torch.as_tensor(before) != 0
+            before = before if batched else before.unsqueeze(0)
+            if before.ndim != 4 or len(before) != change.count:
+                raise ValueError(f"{self._name}: image_valid must be (B, 1, H, W); got shape {tuple(before.shape)}")
+            before = change.labels(before)
         if self.valid_mask and any(found == "image" for found, _ in named.values()):
             before = change.valid_mask() if before is None else before & change.valid_mask()
         if before is not None:
@@ -156,10 +164,16 @@ class Mover(nn.Module):
         # geometry is computed in float32 at least; what came in half precision goes out in it
         return result.to(value.dtype) if value.is_floating_point() else result, valid
 
-    @staticmethod
-    def _put_valid(put, sample: Sample, name: str, valid, batched: bool) -> None:
+    def _put_valid(self, put: Callable, sample: Sample, name: str, valid, batched: bool) -> None:
+        """Put the validity of a field, which stays invalid where it was; any number but zero is valid, as in COCO."""
         before = sample.get(name)
-        if isinstance(valid, list):
-            put(name, valid if before is None else [v & b for v, b in zip(valid, before, strict=True)])
-        else:
-            put(name, valid if before is None else valid & (before if batched else before.unsqueeze(0)))
+        if before is not None:
+            many = isinstance(valid, list)
+            before = [torch.as_tensor(b) != 0 for b in (before if many else [before])]
+            now = valid if many else [valid if batched else valid.squeeze(0)]
+            if [b.shape for b in before] != [v.shape for v in now]:
+                shapes = ", ".join(str(tuple(v.shape)) for v in now)
+                raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
+            now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
+            valid = now if many else now[0] if batched else now[0].unsqueeze(0)
+        put(name, valid)

@@ -1,0 +1,223 @@
+"""The demonstration of training: pinhole pictures teach a network that is to work behind a fisheye mounted elsewhere.
+
+Four networks start from the same weights and take as many steps on as many pictures. They find landmarks of drivers'
+faces in the picture, and where these are in space. What they learn from differs: see `TEACHERS`.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from torch import Tensor, nn
+
+from camtorch import cabin
+from camtorch.lessons import MOUNT, NAMES, TEACHERS, Augment, Pictures, cameras, photograph, teacher
+
+_METRE = 40.0  # what a metre of error costs in the loss, where a pixel costs 1
+
+
+@dataclass
+class Result:
+    """What a network learned, and what it then finds in the test pictures."""
+
+    teacher: str
+    lessons: Pictures
+    """A few of the pictures that it learned from."""
+    test: Pictures
+    keypoints: Tensor
+    """(B, N, 2), as found."""
+    losses: list[float]
+    pixels: Tensor
+    """(B, N), how far keypoints are off."""
+    share: Tensor
+    """(B, N), the same as a part of the distance between the eyes."""
+    metres: Tensor
+    """(B, N), how far points are off."""
+
+    def numbers(self) -> str:
+        """The columns of the table."""
+        found = f"{self.pixels.median():9.2f} px{self.pixels.mean():8.2f} px{100 * self.share.median():9.0f} %"
+        return f"{found}{100 * self.metres.median():12.1f} cm"
+
+
+class Network(nn.Module):
+    """Pictures (B, 3, H, W) of one size to keypoints (B, N, 2) and points (B, N, 3)."""
+
+    def __init__(self, size: tuple[int, int], width: int = 16):
+        super().__init__()
+
+        def block(inputs: int, outputs: int, stride: int = 1) -> list[nn.Module]:
+            return [nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.GroupNorm(4, outputs), nn.ReLU()]
+
+        a, b, c, d = width, 2 * width, 3 * width, 4 * width
+        see = [*block(3, a, 2), *block(a, b, 2), *block(b, b), *block(b, c, 2), *block(c, d), *block(d, d, 2)]
+        cells = math.prod(-(-side // 16) for side in size)
+        self.layers = nn.Sequential(*see, nn.Flatten(), nn.Linear(d * cells, 128), nn.ReLU(), nn.Linear(128, 40))
+        self.middle = (size[1] / 2, size[0] / 2)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints and points."""
+        found = self.layers((images - 0.5).contiguous(memory_format=torch.channels_last)).unflatten(1, (len(NAMES), 5))
+        keypoints = 20 * found[..., :2] + found.new_tensor(self.middle)
+        return keypoints, 0.2 * found[..., 2:] + found.new_tensor([0, 0, 0.6])
+
+
+def loss_of(found: tuple[Tensor, Tensor], p: Pictures) -> Tensor:
+    """How far off the landmarks that are seen are found, on average."""
+    keypoints, points = found
+    off = F.smooth_l1_loss(keypoints, p.keypoints, reduction="none", beta=2.0).sum(-1)
+    off = off + _METRE * (points - p.points).norm(dim=-1)
+    return (off * p.seen).sum() / p.seen.sum().clamp(min=1)
+
+
+def learn(
+    network: Network,
+    pictures: Pictures,
+    augment: Augment,
+    steps: int,
+    batch: int = 24,
+    *,
+    seed: int = 0,
+    report: Callable[[int, float], None] = lambda step, loss: None,
+) -> list[float]:
+    """Train a network on batches that are augmented on the fly; the losses of all steps."""
+    generator = torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 5e-3, total_steps=steps, pct_start=0.2)
+    losses = []
+    for step in range(1, steps + 1):
+        chosen = torch.randint(len(pictures), (batch,), generator=generator)
+        lesson = augment(pictures[chosen], generator)
+        loss = loss_of(network(lesson.image), lesson)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        losses.append(loss.item())
+        if step % 100 == 0 or step == steps:
+            report(step, sum(losses[-50:]) / len(losses[-50:]))
+    return losses
+
+
+@torch.no_grad()
+def examine(name: str, network: Network, lessons: Pictures, test: Pictures, losses: list[float]) -> Result:
+    """Have a network find what it has not seen."""
+    keypoints, points = (torch.cat(part) for part in zip(*map(network, test.image.split(50)), strict=True))
+    pixels = (keypoints - test.keypoints).norm(dim=-1)
+    eyes = (test.keypoints[:, :2].mean(1) - test.keypoints[:, 2:4].mean(1)).norm(dim=-1, keepdim=True)
+    metres = (points - test.points).norm(dim=-1)
+    return Result(name, lessons, test, keypoints, losses, pixels, pixels / eyes, metres)
+
+
+def run(
+    report: Callable[[str], None] = print,
+    *,
+    pictures: int = 400,
+    tests: int = 150,
+    steps: int = 500,
+    seed: int = 0,
+) -> list[Result]:
+    """Render, train and examine.
+
+    Args:
+        report: gets lines on the progress, and those of the table.
+        pictures: how many to learn from; of pinhole and fisheye alike.
+        tests: how many fisheye pictures of other drivers to be examined on.
+        steps: of 24 pictures each.
+        seed: of everything drawn.
+
+    Returns:
+        A result for each of `TEACHERS`.
+    """
+    begin, workers = time.monotonic(), min(os.cpu_count() or 1, len(TEACHERS))
+
+    def say(text: str) -> None:
+        report(f"{time.monotonic() - begin:4.0f} s  {text}")
+
+    camera, like = cameras()
+    generator = torch.Generator().manual_seed(seed)
+    drivers, others = (cabin.random_drivers(count, generator) for count in (pictures, tests))
+    # A thread for each network keeps the cores busier than many threads on one small picture
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]), ThreadPoolExecutor(workers) as pool:
+            torch.manual_seed(seed)
+            say(f"rendering {2 * pictures} pictures to learn from and {tests} to be examined on")
+            seen = photograph(camera, drivers, workers=workers)
+            test, bound = (photograph(like, d, MOUNT, workers) for d in (others, drivers))
+            first = Network(camera.image_size)
+
+            def study(name: str) -> Result:
+                # torch's own generator is RandomAffine's alone from here on
+                network = copy.deepcopy(first)
+                source = bound if name == "fisheye" else seen
+                augment = teacher(name, camera, like)
+
+                def tell(step: int, loss: float) -> None:
+                    say(f"{TEACHERS[name]:<24} step {step} of {steps}, loss {loss:.2f}")
+
+                losses = learn(network, source, augment, steps, seed=seed, report=tell)
+                lessons = augment(source[:2], torch.Generator().manual_seed(seed))
+                return examine(name, network, lessons, test, losses)
+
+            # the slowest first
+            studies = {name: pool.submit(study, name) for name in ("camtorch", "affine", "pinhole", "fisheye")}
+            results = [studies[name].result() for name in TEACHERS]
+    finally:
+        torch.set_num_threads(threads)
+    report(f"\n{'learned from':<24}{'landmarks off by':>16}{'mean':>7}{'of eye distance':>16}{'in space':>10}")
+    for result in results:
+        report(f"{TEACHERS[result.teacher]:<24}{result.numbers()}")
+    return results
+
+
+def picture(results: list[Result], tests: int = 5):
+    """One Pillow image: for each network two of its lessons, and what it finds in the same test pictures."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    ink, grey, rim, paper, found = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 245, 235), (226, 29, 72)
+    gap, band, head, scale, sharp = 16, 44, 100, 2.5, 3
+    height, width = (round(scale * side) for side in results[0].test.image.shape[-2:])
+    left = 2 * (width + gap) + 2 * gap
+    size = left + tests * (width + gap) + gap, head + len(results) * (height + band + gap)
+    sheet = Image.new("RGB", size, paper)
+    draw = ImageDraw.Draw(sheet)
+    large, middle, small = (ImageFont.load_default(size=size) for size in (34, 21, 17))
+    draw.text((gap, 14), "One network, four educations", ink, large)
+    draw.text((gap, 66), "what it learned from", grey, small)
+    draw.text((left, 66), "behind a fisheye mounted elsewhere: rings are true, dots are found", grey, small)
+    for row, result in enumerate(results):
+        top = head + row * (height + band + gap)
+        draw.text((gap, top + 10), TEACHERS[result.teacher], ink, middle)
+        off = f"{result.pixels.median():.1f} px in the picture, {100 * result.metres.median():.0f} cm in space"
+        draw.text((left, top + 13), f"off by {off} (medians of {len(result.test)} drivers)", ink, small)
+        tiles = [(gap + i * (width + gap), result.lessons, i, None) for i in range(2)]
+        tiles += [(left + i * (width + gap), result.test, i, result.keypoints[i]) for i in range(tests)]
+        for x, pictures, i, dots in tiles:
+            image = Image.fromarray((255 * pictures.image[i].permute(1, 2, 0)).round().byte().numpy())
+            image = image.resize((width, height), Image.Resampling.LANCZOS)
+            marks = Image.new("RGBA", (sharp * width, sharp * height))
+            on = ImageDraw.Draw(marks)
+
+            def circle(at, radius, on=on, **style):
+                u, v = (sharp * scale * (float(c) + 0.5) for c in at)
+                on.ellipse([u - radius, v - radius, u + radius, v + radius], **style)
+
+            for at in pictures.keypoints[i]:
+                circle(at, 11, outline=(255, 255, 255), width=4)
+            for at in () if dots is None else dots:
+                circle(at, 8, fill=found, outline=(255, 255, 255), width=1)
+            marks = marks.reduce(sharp)
+            image.paste(marks, (0, 0), marks)
+            sheet.paste(image, (x, top + band))
+            draw.rectangle((x - 1, top + band - 1, x + width, top + band + height), outline=rim)
+    return sheet

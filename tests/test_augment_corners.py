@@ -1,0 +1,158 @@
+"""Corners of the augmentations where they once were wrong."""
+
+import copy
+import math
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.augment import PRESETS, FaceNormalizer, RandomCamera, RandomLens, RandomMount
+
+SIZE = (60, 80)
+
+
+@pytest.fixture
+def camera():
+    return ct.Pinhole([60.0, 60.0, 39.5, 29.5], image_size=SIZE).requires_grad_(False)
+
+
+def test_a_lattice_invents_no_picture():
+    """A cubic through nodes off the picture may swing onto it."""
+    source = PRESETS["dms90"].camera()
+    wide = {"fov": 200, "yaw": (-90, 90), "pitch": 20, "roll": 20, "image_size": (224, 224)}
+    exact, close = (RandomCamera("kannala_brandt", camera=source, tolerance=t, **wide) for t in (0.0, 0.001))
+    draw = exact.draw(12, torch.Generator().manual_seed(0))
+    ones = torch.ones(12, 1, *source.image_size)
+    difference = exact(image=ones, draw=draw)["image"] - close(image=ones, draw=draw)["image"]
+    assert difference.abs().max() < 0.01
+
+
+def test_a_face_goes_back_to_the_camera_it_came_from(camera):
+    pose = torch.eye(4).repeat(2, 1, 1)
+    pose[:, 2, 3] = 0.7
+    sample = {"head_pose": pose, "gaze": torch.tensor([[0.1, 0.2, -1.0]] * 2), "keypoints": torch.rand(2, 5, 2) * 50}
+    turned = RandomMount(camera=camera, roll=40)(sample)
+    normalizer = FaceNormalizer(distance=0.6)
+    back = normalizer.inverse(normalizer(turned))
+    for name in ("gaze", "keypoints", "rotation", "head_pose"):
+        torch.testing.assert_close(back[name], turned[name], atol=2e-4, rtol=1e-5)
+    with pytest.raises(ValueError, match="the head's rotation must hold rotation matrices"):
+        normalizer(head_pose=2 * pose, camera=camera)
+    with pytest.raises(TypeError, match="head_pose must be one tensor for all samples; got a list"):
+        normalizer(head_pose=list(pose), camera=camera)
+
+
+def test_what_is_no_number_stays_where_it_is_when_a_picture_shrinks(camera):
+    picture = torch.rand(2, 1, *SIZE)
+    picture[0, 0, 30, 40] = math.nan
+    shrunk = torch.tensor([[60.0, 60, 39.5, 29.5], [10.0, 10, 39.5, 29.5]])
+    target = ct.Pinhole(shrunk, image_size=SIZE).requires_grad_(False)
+    out = ct.Warp(camera, target, antialias=True)(picture)
+    assert out[0].isnan().sum() <= 36  # a rounding error above its size, it takes a share of the next level
+    assert not out[1].isnan().any()
+
+
+@pytest.mark.parametrize("zoom", [1.0, 0.3, 0.1])
+def test_a_white_picture_on_white_is_white(camera, zoom):
+    mount = RandomMount(camera=camera, zoom=(zoom, zoom), antialias=True, fill=1.0)
+    white = mount(image=torch.ones(1, 1, *SIZE))["image"]
+    torch.testing.assert_close(white, torch.ones_like(white))
+
+
+def test_a_list_of_pictures_shows_the_lens_as_a_batch_does(camera):
+    lens = RandomLens(camera=camera, chromatic=0.03, vignetting=(0.3, 0.6))
+    pictures, draw = torch.rand(3, 3, *SIZE), lens.draw(3)
+    together, apart = lens(image=pictures, draw=draw)["image"], lens(image=list(pictures), draw=draw)["image"]
+    torch.testing.assert_close(torch.stack(apart), together, atol=2e-3, rtol=0)
+
+
+def test_validity_that_comes_in_may_be_cocos(camera):
+    points = torch.tensor([[[10.0, 10.0], [30.0, 30.0], [50.0, 20.0]]])
+    mount = RandomMount(camera=camera, p=0)
+    out = mount(keypoints=points, keypoints_valid=torch.tensor([[0, 1, 2]]))
+    assert out["keypoints_valid"].tolist() == [[False, True, True]]
+    with pytest.raises(ValueError, match=r"keypoints_valid must be \(1, 3\); got \[\(3,\)\]"):
+        mount(keypoints=points, keypoints_valid=torch.ones(3))
+
+
+def test_a_gate_of_numbers_is_a_gate(camera):
+    mount, points = RandomMount(camera=camera), torch.rand(2, 4, 2) * 50
+    draw = mount.draw(2)
+    for gate in (torch.tensor([0.9, 0.2]), torch.tensor([255, 0], dtype=torch.uint8), [1, 0]):
+        out = mount(keypoints=points, draw={**draw, "apply": gate})["keypoints"]
+        assert out.shape == points.shape
+        assert torch.equal(out[1], points[1])
+        assert not torch.equal(out[0], points[0])
+    with pytest.raises(ValueError, match=r"draw\['yaw'\] must be finite"):
+        mount(keypoints=points, draw={**draw, "yaw": torch.tensor([math.nan, 0.0])})
+    with pytest.raises(ValueError, match="the draw lacks apply, yaw"):
+        mount(keypoints=points, draw={})
+    with pytest.raises(ValueError, match="count must not be negative; got -1"):
+        mount.draw(-1)
+
+
+@pytest.mark.parametrize("p", [0, 1])
+def test_labels_of_whole_numbers_and_of_none(camera, p):
+    mount = RandomMount(camera=camera, p=p)
+    boxes = torch.tensor([[[math.nan, 1.0, 5.0, 5.0], [1.0, 1.0, math.inf, 5.0], [1.0, 1.0, 5.0, 5.0]]])
+    assert mount(boxes=boxes)["boxes_valid"].tolist()[0][:2] == [False, False]
+    assert mount(keypoints=torch.tensor([[[3, 4]]]))["keypoints"].dtype == torch.float32
+
+
+def test_a_camera_in_a_batch_of_one_serves_all(camera):
+    one = ct.Pinhole(torch.tensor([[60.0, 60, 39.5, 29.5]]), image_size=SIZE).requires_grad_(False)
+    mount, points = RandomMount(p=0.5), torch.rand(6, 4, 2) * 50
+    draw = mount.draw(6, torch.Generator().manual_seed(0))
+    ours, alone = mount(keypoints=points, camera=one, draw=draw), mount(keypoints=points, camera=camera, draw=draw)
+    torch.testing.assert_close(ours["keypoints"], alone["keypoints"])
+
+
+def test_cameras_of_several_sizes(camera):
+    cameras = [camera, camera.resize(50, 70)]
+    pictures = [torch.rand(3, 60, 80), torch.rand(3, 50, 70)]
+    out = RandomMount(image_size=(30, 40))(image=pictures, camera=cameras, keypoints=torch.rand(2, 3, 2) * 40)
+    assert [tuple(picture.shape) for picture in out["image"]] == [(3, 30, 40)] * 2
+    out = RandomMount()(image=pictures, camera=cameras)
+    assert [tuple(picture.shape) for picture in out["image"]] == [(3, 60, 80), (3, 50, 70)]
+    with pytest.raises(ValueError, match="an empty list of cameras"):
+        RandomMount()(keypoints=torch.zeros(0, 3, 2), camera=[])
+
+
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.uint8, torch.float16])
+def test_depth_of_any_kind_of_number(camera, dtype):
+    depth = torch.full((1, *SIZE), 100).to(dtype)
+    out = RandomMount(camera=camera, yaw=0, pitch=0)(depth=depth)["depth"]
+    assert out.dtype == dtype
+    known = out.float()[out.float() != 0]
+    assert ((known - 100).abs() <= 1).all()  # the nearest pixel may lie half a pixel aside
+
+
+def test_what_inference_mode_saw_can_be_inverted_in_training(camera):
+    mount = RandomMount(camera=camera)
+    picture = torch.rand(1, 3, *SIZE)
+    with torch.inference_mode():
+        mount(image=picture)
+    weight = torch.ones(1, requires_grad=True)
+    mount.inverse(image=picture * weight)["image"].sum().backward()
+    assert torch.isfinite(weight.grad).all()
+
+
+def test_copies_of_what_a_learning_camera_made():
+    camera = ct.Pinhole([60.0, 60.0, 39.5, 29.5], image_size=SIZE)
+    mount = RandomMount(camera=camera)
+    out = mount(image=torch.rand(1, 3, *SIZE))
+    assert copy.deepcopy(out["camera"]).image_size == SIZE
+    assert copy.deepcopy(mount.last).target.image_size == SIZE
+
+
+def test_fields_that_only_sound_like_geometry(camera):
+    mount = RandomMount(camera=camera)
+    sample = {"keypoints": torch.zeros(1, 1, 2), "image_path": "a.png", "mask_id": 7, "boxes_note": None}
+    out = mount(sample)
+    assert (out["image_path"], out["mask_id"]) == ("a.png", 7)
+    for hidden in ({"meta": {"boxes": torch.zeros(1, 4)}}, {"scores": [0.5, 0.25]}):
+        with pytest.raises(ValueError, match="holds real numbers"):
+            mount(sample, **hidden)
+    with pytest.raises(ValueError, match=r"fields=\{'boxes_label': 'keep'\} leaves it as it is"):
+        mount(sample, boxes_label=torch.zeros(1, 3))
