@@ -12,10 +12,10 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch import scene
 from camtorch.camera import Camera
 from camtorch.dewarp import Dewarp
 from camtorch.models import BrownConrady, Fisheye62, Fisheye624, KannalaBrandt, Pinhole
+from camtorch.scenes import room
 
 
 @dataclass
@@ -92,15 +92,15 @@ def study(lens: Lens, samples: int = 6) -> Study:
     """Render, dewarp and measure one lens: `samples` rays per pixel of the source, twice as many of the truth."""
     to_camera = _rotation(lens.pitch, lens.roll)
     warp = Dewarp(lens.camera, fov=math.radians(lens.degrees), image_size=lens.size, rotation=to_camera.T)
-    source = scene.render(warp.source, to_camera, samples=samples)
-    direct = scene.render(warp.target, samples=2 * samples)
+    source = room.render(warp.source, to_camera, samples=samples)
+    direct = room.render(warp.target, samples=2 * samples)
     dewarped = warp(source[None])[0]
     valid = warp.valid_mask()[0, 0]
     valid = valid & _away_from_rim(valid)
     error = (dewarped - direct)[:, valid].square().mean()
-    edges = _edges(scene.lines(), (source, warp.source, to_camera), (dewarped, warp.target, torch.eye(3).double()))
-    points = scene.keypoints()
-    points = points[scene.visible(points)]
+    edges = _edges(room.lines(), (source, warp.source, to_camera), (dewarped, warp.target, torch.eye(3).double()))
+    points = room.keypoints()
+    points = points[room.visible(points)]
     pixels, seen = warp.source.project(points @ to_camera.T)
     truth, _ = warp.target.project(points)
     moved, mapped = warp.transform_points(pixels)
@@ -242,7 +242,7 @@ def _edges(lines: Tensor, *views: tuple[Tensor, Camera, Tensor]) -> list[list[Te
     found: list[list[Tensor]] = [[] for _ in views]
     for start, end in lines:
         points = start + share * (end - start)
-        use = scene.visible(points)
+        use = room.visible(points)
         places = []
         for picture, camera, rotation in views:
             pixels, valid = camera.project(points @ rotation.T)

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch import cabin
 from camtorch.augment import RandomCamera, mount_rotation
 from camtorch.camera import Camera
 from camtorch.models import KannalaBrandt, Pinhole
+from camtorch.scenes import cabin
 
 NAMES = (
     *("right_eye_outer", "right_eye_inner", "left_eye_inner", "left_eye_outer"),

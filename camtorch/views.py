@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch import cabin
 from camtorch.augment import PRESETS, RandomCamera
 from camtorch.camera import Camera
 from camtorch.labels import Labels
 from camtorch.models import Pinhole
+from camtorch.scenes import cabin
 
 SCENE_SIZE = (480, 640)
 """(height, width) of the rendered picture; of a given camera the width is this at most."""

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch import driver
-from camtorch.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
+from camtorch.scenes import driver
+from camtorch.scenes.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
 
 
 def pinhole(focal: float, height: int, width: int, centre=None) -> ct.Pinhole:

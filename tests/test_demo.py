@@ -3,7 +3,8 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch import Pinhole, cli, demo, scene
+from camtorch import Pinhole, cli, demo
+from camtorch.scenes import room
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def test_keypoints_move_with_the_picture(studies):
 def test_a_wrong_camera_would_be_noticed():
     # the measurements must be able to fail: the same picture, dewarped with another k1
     lens = next(lens for lens in demo.lenses(320) if lens.title == "Brown-Conrady")
-    source = scene.render(lens.camera, samples=2)
+    source = room.render(lens.camera, samples=2)
     wrong = lens.camera.resize(*lens.camera.image_size)
     with torch.no_grad():
         wrong.distortion[:1] *= 0.7
@@ -44,7 +45,7 @@ def test_a_wrong_camera_would_be_noticed():
     for camera in (lens.camera, wrong):
         warp = demo.Dewarp(camera, fov=1.5, image_size=lens.size)
         view = (warp(source[None])[0], warp.target, torch.eye(3, dtype=torch.float64))
-        bends.append(demo._bend(demo._edges(scene.lines(), view)[0]))
+        bends.append(demo._bend(demo._edges(room.lines(), view)[0]))
     assert bends[1] > 3 * bends[0]
 
 
@@ -66,13 +67,13 @@ def test_all_lenses_one_picture(tmp_path, monkeypatch, capsys):
 def test_scene_is_where_it_says():
     # around every corner of the test chart opposite squares are alike and neighbours are not
     camera = Pinhole([400.0, 400, 319.5, 239.5], image_size=(480, 640)).double().requires_grad_(False)
-    points = scene.keypoints()
-    points = points[scene.visible(points) & (points[:, 2] == points[:, 2].max())]
+    points = room.keypoints()
+    points = points[room.visible(points) & (points[:, 2] == points[:, 2].max())]
     assert len(points) == 12
     pixels, valid = camera.project(points)
     assert valid.all()
     corners = pixels[:, None] + torch.tensor([[-3.0, -3.0], [3, -3], [3, 3], [-3, 3]], dtype=torch.float64)
-    a, b, c, d = scene.radiance(camera.unproject(corners)[0]).unbind(1)
+    a, b, c, d = room.radiance(camera.unproject(corners)[0]).unbind(1)
     assert (a - c).abs().max() < 0.1
     assert (b - d).abs().max() < 0.1
     assert (a - b).abs().amax(-1).min() > 0.3
@@ -80,16 +81,16 @@ def test_scene_is_where_it_says():
 
 def test_rays_of_any_shape_and_dtype():
     rays = torch.tensor([[[0.1, 0.2, 1.0]], [[0.0, 0.0, 1.0]]], dtype=torch.float64)
-    colours = scene.radiance(rays)
+    colours = room.radiance(rays)
     assert colours.shape == rays.shape
     assert ((colours >= 0) & (colours <= 1)).all()
-    assert torch.equal(colours[1, 0], scene.radiance(rays[1, 0]))
+    assert torch.equal(colours[1, 0], room.radiance(rays[1, 0]))
 
 
 def test_no_rays_no_light():
     # a fold of this lens lies inside the picture
     camera = demo.BrownConrady([100.0, 100, 79.5, 59.5], [-0.6, 0.0, 0.0, 0.0], image_size=(120, 160))
-    picture = scene.render(camera, samples=1)
+    picture = room.render(camera, samples=1)
     _, valid = camera.rays()
     assert not valid.all()
     assert (picture[:, ~valid] == 0).all()

@@ -3,8 +3,9 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch import cabin, cli, lessons, training_demo
+from camtorch import cli, lessons, training_demo
 from camtorch.lessons import PLANNED, TEACHERS, Pictures
+from camtorch.scenes import cabin
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch import driver, landmarks
 from camtorch.camera import Camera
-from camtorch.driver import FRIENDLY, LOOKS
-from camtorch.landmarks import LANDMARKS
-from camtorch.sight import BACKGROUND, CLASSES, Scene, see
+from camtorch.scenes import driver, landmarks
+from camtorch.scenes.driver import FRIENDLY, LOOKS
+from camtorch.scenes.landmarks import LANDMARKS
+from camtorch.scenes.sight import BACKGROUND, CLASSES, Scene, see
 
 __all__ = ["CLASSES", "LANDMARKS", "LOOKS", "Drivers", "random_drivers", "render", "render_classes"]
 

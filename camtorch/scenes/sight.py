@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch import driver, paint
-from camtorch.car import BOXES, MOVING, WALLS, corners, cushion, seat_paint, slabs, wall_paint
-from camtorch.driver import LOOKS, Neck, Planes, Shape
+from camtorch.scenes import driver, paint
+from camtorch.scenes.car import BOXES, MOVING, WALLS, corners, cushion, seat_paint, slabs, wall_paint
+from camtorch.scenes.driver import LOOKS, Neck, Planes, Shape
 
 CLASSES = ("background", "skin", "hair", "eye", "clothes", "seat", "window", "cabin")
 BACKGROUND, SKIN, HAIR, EYE, CLOTHES, SEAT, WINDOW, CABIN = range(8)

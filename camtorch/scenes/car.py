@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch.driver import Planes
-from camtorch.paint import blend
-from camtorch.room import colour, soft
+from camtorch.scenes.driver import Planes
+from camtorch.scenes.paint import blend
+from camtorch.scenes.walls import colour, soft
 
 # a point on each wall and where it faces; all the car is on that side of it
 WALLS = (

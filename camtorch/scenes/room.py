@@ -10,8 +10,8 @@ import math
 import torch
 from torch import Tensor
 
-from camtorch import room
 from camtorch.camera import Camera
+from camtorch.scenes import walls
 
 Planes = tuple[Tensor, Tensor, Tensor]
 _CHUNK = 1 << 17
@@ -50,13 +50,13 @@ def _facing(ray: Planes, axis: Tensor) -> Tensor:
 
 def _hit(origin: Planes, ray: Planes) -> tuple[Tensor, Tensor, Tensor]:
     """Distance to the first surface, which one it is, and its normal."""
-    walls = torch.stack(
-        [(torch.where(r > 0, h, w) - o) / r for o, r, w, h in zip(origin, ray, room.LOW, room.HIGH, strict=True)]
+    ahead = torch.stack(
+        [(torch.where(r > 0, h, w) - o) / r for o, r, w, h in zip(origin, ray, walls.LOW, walls.HIGH, strict=True)]
     )
-    distance, axis = walls.min(0)
+    distance, axis = ahead.min(0)
     normal = _facing(ray, axis)
     what = 2 * axis + (normal.sum(0) < 0)
-    for bounds, boxes, balls in room.GROUPS:
+    for bounds, boxes, balls in walls.GROUPS:
         near, far, _ = _slabs(origin, ray, bounds)
         some = ((near < far) & (far > 0) & (near < distance)).nonzero()[:, 0]
         o, r = tuple(c[some] for c in origin), tuple(c[some] for c in ray)
@@ -84,7 +84,7 @@ def _light(origin: Planes, ray: Planes, mirror: bool = True) -> Tensor:
     albedo, glow, gloss = torch.empty_like(normal), torch.empty_like(normal), torch.empty_like(distance)
     for kind in what.bincount().nonzero()[:, 0].tolist():
         here = (what == kind).nonzero()[:, 0]
-        albedo[:, here], glow[:, here], gloss[here] = room.surface(
+        albedo[:, here], glow[:, here], gloss[here] = walls.surface(
             kind, tuple(c[here] for c in point), tuple(c[here] for c in ray)
         )
     light = albedo * _irradiance(point, normal) + glow
@@ -103,29 +103,29 @@ def _irradiance(point: Planes, normal: Tensor) -> Tensor:
     """(3, N): soft light of the room, the window and the lamps, and the sun through the panes."""
     x, y, z = point
     corner = torch.ones_like(x)
-    for c, n, low, high in zip(point, normal, room.LOW, room.HIGH, strict=True):
+    for c, n, low, high in zip(point, normal, walls.LOW, walls.HIGH, strict=True):
         for gap in (c - low, high - c):
             corner = corner * (1 - 0.42 * torch.exp(-gap / 0.35) * (1 - n.abs()))
-    on_floor = room.soft(y, 1.0, 2.0, 0.02)
-    corner = corner * (1 - 0.6 * on_floor * room.soft(x, -0.75, 0.75, 0.12) * room.soft(z, 2.0, 2.9, 0.12))
+    on_floor = walls.soft(y, 1.0, 2.0, 0.02)
+    corner = corner * (1 - 0.6 * on_floor * walls.soft(x, -0.75, 0.75, 0.12) * walls.soft(z, 2.0, 2.9, 0.12))
     light = corner * (0.5 - 0.08 * normal[1]) * torch.tensor([[1.08], [1.0], [0.93]])
     to = (-x, -0.3 - y, 4.3 - z)
     square = sum(c * c for c in to) + 1e-6
     facing = sum(a * b for a, b in zip(to, normal, strict=True)).clamp(min=0) * to[2].clamp(min=0) / square
     light = light + 3.0 * facing / (square + 0.9) * torch.tensor([[1.0], [0.93], [0.84]]) * corner
-    for lamp in room.LAMPS:
+    for lamp in walls.LAMPS:
         to = [c - p for c, p in zip(lamp, point, strict=True)]
         square = sum(c * c for c in to) + 1e-6
         facing = sum(a * b for a, b in zip(to, normal, strict=True)).clamp(min=0) * square.rsqrt()
         light = light + 0.3 * facing / (square + 0.2) * torch.tensor([[1.0], [0.85], [0.62]]) * corner
-    facing = sum(a * b for a, b in zip(room.SUN, normal, strict=True))
-    way = ((room.HIGH[2] - z) / room.SUN[2]).clamp(min=0)
-    sun = facing.clamp(min=0) * room.panes(x + way * room.SUN[0], y + way * room.SUN[1], 0.004 + 0.008 * way)
+    facing = sum(a * b for a, b in zip(walls.SUN, normal, strict=True))
+    way = ((walls.HIGH[2] - z) / walls.SUN[2]).clamp(min=0)
+    sun = facing.clamp(min=0) * walls.panes(x + way * walls.SUN[0], y + way * walls.SUN[1], 0.004 + 0.008 * way)
     lit = (sun > 1e-3).nonzero()[:, 0]
     start = tuple(p[lit] + 1e-3 * n[lit] for p, n in zip(point, normal, strict=True))
-    direction = tuple(torch.full_like(start[0], c) for c in room.SUN)
-    shaded = _ball(start, direction, room.GLOBE, room.GLOBE_RADIUS) < torch.inf
-    for box in (*room.TABLE, room.CUBE):
+    direction = tuple(torch.full_like(start[0], c) for c in walls.SUN)
+    shaded = _ball(start, direction, walls.GLOBE, walls.GLOBE_RADIUS) < torch.inf
+    for box in (*walls.TABLE, walls.CUBE):
         near, far, _ = _slabs(start, direction, box)
         shaded = shaded | ((near < far) & (near > 0))
     sun[lit] = torch.where(shaded, 0.0, sun[lit])
@@ -162,7 +162,7 @@ def render(camera: Camera, rotation: Tensor | None = None, *, samples: int = 12)
 
     Args:
         camera: with image_size and without batch dims.
-        rotation: (3, 3), camera from room.
+        rotation: (3, 3), camera from walls.
         samples: rays per pixel, spread over it as a lattice; their mean is the pixel, as on a sensor.
     """
     height, width = camera.image_size
@@ -185,26 +185,28 @@ def render(camera: Camera, rotation: Tensor | None = None, *, samples: int = 12)
 
 def keypoints() -> Tensor:
     """(N, 3): corners between four squares, on the test chart and on the floor beside the rug."""
-    x, y, z = room.TEST_CHART[0], room.TEST_CHART[2], room.HIGH[2]
-    chart = [(x + room.SQUARE * i, y + room.SQUARE * j, z) for i in range(1, 4) for j in range(1, 5)]
-    floor = [(room.TILE * (i - 0.5), room.HIGH[1], 0.05 + room.TILE * j) for i in range(-3, 5) for j in range(-2, 8)]
-    floor = [p for p in floor if not (abs(p[0]) < room.RUG[1] + 0.1 and room.RUG[2] - 0.1 < p[2] < room.RUG[3] + 0.1)]
+    x, y, z = walls.TEST_CHART[0], walls.TEST_CHART[2], walls.HIGH[2]
+    chart = [(x + walls.SQUARE * i, y + walls.SQUARE * j, z) for i in range(1, 4) for j in range(1, 5)]
+    floor = [(walls.TILE * (i - 0.5), walls.HIGH[1], 0.05 + walls.TILE * j) for i in range(-3, 5) for j in range(-2, 8)]
+    floor = [
+        p for p in floor if not (abs(p[0]) < walls.RUG[1] + 0.1 and walls.RUG[2] - 0.1 < p[2] < walls.RUG[3] + 0.1)
+    ]
     return torch.tensor(chart + floor, dtype=torch.float64)
 
 
 def lines() -> Tensor:
     """(N, 2, 3): the ends of straight edges between two colours, with nothing else close by."""
-    left, right, back, floor = room.LOW[0], room.HIGH[0], room.HIGH[2], room.HIGH[1]
+    left, right, back, floor = walls.LOW[0], walls.HIGH[0], walls.HIGH[2], walls.HIGH[1]
     edges = []
-    for y in (room.RAIL + 0.1, 1.13):
-        edges += [((left, y, back), (right, y, back)), ((right, y, room.LOW[2]), (right, y, back))]
-        edges += [((left, y, room.LOW[2]), (left, y, room.DOOR[0] - 0.12))]
+    for y in (walls.RAIL + 0.1, 1.13):
+        edges += [((left, y, back), (right, y, back)), ((right, y, walls.LOW[2]), (right, y, back))]
+        edges += [((left, y, walls.LOW[2]), (left, y, walls.DOOR[0] - 0.12))]
     for (a, b, c, d), margin, place in (
-        (room.WINDOW, 0.0, lambda u, v: (u, v, back)),
-        (room.TEST_CHART, room.FRAME, lambda u, v: (u, v, back)),
-        (room.PRINT, room.FRAME, lambda u, v: (u, v, back)),
-        (room.POSTER, room.FRAME, lambda u, v: (left, v, u)),
-        (room.SHELF, 0.0, lambda u, v: (right, v, u)),
+        (walls.WINDOW, 0.0, lambda u, v: (u, v, back)),
+        (walls.TEST_CHART, walls.FRAME, lambda u, v: (u, v, back)),
+        (walls.PRINT, walls.FRAME, lambda u, v: (u, v, back)),
+        (walls.POSTER, walls.FRAME, lambda u, v: (left, v, u)),
+        (walls.SHELF, 0.0, lambda u, v: (right, v, u)),
     ):
         ends = (
             place(a - margin, c - margin),
@@ -213,6 +215,6 @@ def lines() -> Tensor:
             place(a - margin, d + margin),
         )
         edges += zip(ends, (*ends[1:], ends[0]), strict=True)
-    edges += [((left, room.DOOR[2], z), (left, floor - 0.2, z)) for z in room.DOOR[:2]]
-    edges += [((low[0], high[1], z), (high[0], high[1], z)) for low, high in room.BEAMS for z in (low[2], high[2])]
+    edges += [((left, walls.DOOR[2], z), (left, floor - 0.2, z)) for z in walls.DOOR[:2]]
+    edges += [((low[0], high[1], z), (high[0], high[1], z)) for low, high in walls.BEAMS for z in (low[2], high[2])]
     return torch.tensor(edges, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The surfaces of the room in `scene`: where they are, and their colours, as formulas.
+"""The surfaces of `room`: where they are, and their colours, as formulas.
 
 Convention: x right, y down, z forward, in metres. Colours are linear light, (3, N) or (3, 1).
 """

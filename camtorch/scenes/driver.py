@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.room import soft
+from camtorch.scenes.walls import soft
 
 Planes = tuple[Tensor, Tensor, Tensor]
 

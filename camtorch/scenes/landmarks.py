@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch import driver
-from camtorch.driver import Shape
+from camtorch.scenes import driver
+from camtorch.scenes.driver import Shape
 
 LANDMARKS = (
     *("right_eye_outer", "right_eye_inner", "left_eye_inner", "left_eye_outer", "right_iris", "left_iris"),
