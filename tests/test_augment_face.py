@@ -139,6 +139,8 @@ def test_what_cannot_be_normalised_says_why(pinhole):
         normalizer(sample)
     with pytest.raises(ValueError, match=r"head_pose must be .*; got shape \(2, 3\)"):
         normalizer(head_pose=torch.rand(2, 3))
+    with pytest.raises(ValueError, match="both must be in one unit: distance=0"):
+        normalizer(batch())
     with pytest.raises(ValueError, match="distance must be positive; got -1"):
         FaceNormalizer(distance=-1)
     with pytest.raises(ValueError, match="to go back, the sample needs camera, rotation, source_camera"):

@@ -185,7 +185,7 @@ class Augmentation(Mover):
             ValueError: no camera, fields of wrong shapes, pictures that are not of the camera's image_size, an unknown
                 field that might be geometry, a draw of another size. TypeError: a field that is no tensor.
         """
-        sample = {**(sample or {}), **fields}
+        sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
         drawn = self.draw(count, generator) if draw is None else draw
         change = self.change(camera, drawn)
@@ -208,7 +208,7 @@ class Augmentation(Mover):
 
         What left the picture stays lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
         """
-        sample = {**(sample or {}), **fields}
+        sample = self._given(sample, fields)
         if draw is None and self.last is None:
             raise ValueError(f"{self._name}: nothing to invert; call it first, or give draw= and camera=")
         change = (self.last if draw is None else self.change(camera, draw)).inverse()

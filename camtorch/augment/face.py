@@ -13,9 +13,11 @@ from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotation_matrix
 from camtorch.models import Pinhole
-from camtorch.parameters import as_image_size
+from camtorch.parameters import as_image_size, is_concrete
 from camtorch.sampling import as_options
 from camtorch.warp import Warp
+
+_ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
 
 
 class FaceNormalizer(Mover):
@@ -98,6 +100,13 @@ class FaceNormalizer(Mover):
         size = down.norm(dim=-1, keepdim=True)
         if not torch.compiler.is_compiling() and not bool((torch.isfinite(size) & (size > 1e-6)).all()):
             raise ValueError(f"{self._name}: a face is at the camera, not finite, or seen along the head's x axis")
+        scale = self.distance / distance.detach()
+        if is_concrete(scale) and not bool(((scale < _ODD) & (scale > 1 / _ODD)).all()):
+            at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())
+            raise ValueError(
+                f"{self._name}: faces are at distances of {at}, but distance={self.distance:g}; both must be in one "
+                "unit: distance=0.6 for poses in metres"
+            )
         down = down / size
         rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
         focal = (self.focal / self.distance * distance).expand(-1, 2)
@@ -112,7 +121,7 @@ class FaceNormalizer(Mover):
         Raises:
             ValueError: no head pose, and as `Augmentation`.
         """
-        sample = {**(sample or {}), **fields}
+        sample = self._given(sample, fields)
         named, batched, _, camera = self._batch(sample)
         if not isinstance(camera, Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {type(camera).__name__}")
@@ -143,7 +152,7 @@ class FaceNormalizer(Mover):
         The sample has `camera`, `rotation` and `source_camera` as they came out (and `source_rotation`, after other
         augmentations), and any other fields: gaze, keypoints, 3D points, pictures.
         """
-        sample = {**(sample or {}), **fields}
+        sample = self._given(sample, fields)
         missing = [name for name in ("camera", "rotation", "source_camera") if name not in sample]
         if missing:
             raise ValueError(f"{self._name}: to go back, the sample needs {', '.join(missing)} as they came out")

@@ -48,6 +48,13 @@ class Mover(nn.Module):
 
     # -- moving
 
+    def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
+        """The sample and the keyword arguments as one dict."""
+        if sample is not None and not isinstance(sample, Mapping):
+            got = type(sample).__name__
+            raise TypeError(f"{self._name} takes a dict of fields, or keywords, as in image=...; got {got}")
+        return {**(sample or {}), **fields}
+
     def _sorted(self, sample: Sample) -> dict[str, tuple[str, object]]:
         """Name -> (kind, value) of the fields that move."""
         named = {}

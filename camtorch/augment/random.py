@@ -25,7 +25,8 @@ class RandomCamera(Augmentation):
     think of mounts and lenses in degrees; everything else in camtorch is in radians.
 
     Args:
-        like: whose lens the new camera has. None: the sample's own camera. A Camera. The name of a preset, see
+        like: whose lens the new camera has. None: the sample's own camera. A Camera, whose numbers are copied and do
+            not learn. The name of a preset, see
             `PRESETS`. A key of `ct.MODELS`, for that model with zero coefficients; it needs `fov`.
         camera: of samples that do not bring one.
         yaw: degrees by which the camera turns to its right.
@@ -186,7 +187,7 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
     if like is None or isinstance(like, Camera):
         if like is not None and like.batch_shape:
             raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
-        return like
+        return None if like is None else frozen(like, like.image_size)
     if isinstance(like, str) and like in PRESETS:
         return PRESETS[like].camera()
     if isinstance(like, str) and like in MODELS:
