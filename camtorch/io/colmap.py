@@ -5,6 +5,7 @@ Pixel centres are at 0.5 there. Poses are camera from world, as here.
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import re
@@ -47,8 +48,9 @@ _LARGEST_ID = (1 << 32) - 2  # the one above means none
 
 def matches_text(text: str) -> bool:
     """Whether a file may be a cameras.txt: its first line without # is an id, a model and a size."""
-    line = re.search(r"^(?!\s*#)[^\S\n]*\S[^\n]*", text, re.MULTILINE)
-    return line is not None and re.match(r"\s*\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+\s", line[0] + " ") is not None
+    lines = (line.strip() for line in io.StringIO(text))
+    line = next((line for line in lines if line and not line.startswith("#")), "")
+    return re.match(r"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)", line) is not None
 
 
 def read(path, text: str | None = None) -> Rig:
@@ -166,12 +168,21 @@ def write(rig: Rig, path) -> dict[str, bytes]:
         entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
     binary = os.fspath(path).endswith(".bin")
     files = {os.fspath(path): (_as_bytes if binary else _as_text)(entries)}
+    beside = _images_beside(path)
+    if not rig.extrinsics and os.path.exists(beside):
+        _check_images(lossy, {str(i) for i in ids}, beside)
     if rig.extrinsics:
-        beside = _images_beside(path)
         content = colmap_images.content(lossy, rig, identities, beside, binary)
         if content is not None:
             files[beside] = content
     return files
+
+
+def _check_images(lossy: Lossy, ids: set[str], beside: str) -> None:
+    """The images that stay where they are must have their cameras."""
+    for image in colmap_images.read(beside):
+        if image.camera not in ids:
+            lossy.fail(f"camera {image.camera}", f"missing, while {beside} has images of it")
 
 
 def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]]:

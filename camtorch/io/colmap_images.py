@@ -16,6 +16,7 @@ from camtorch.rig import Rig
 
 _HEAD = struct.Struct("<I7dI")
 _POINT = 24  # x, y and the id of a 3D point
+_MOST_IMAGES = 200_000  # a pose takes some 5 kB
 _LONGEST_NAME = 4096
 _LONGEST_LINE = 1 << 26
 
@@ -37,7 +38,11 @@ def read(path) -> Iterator[Image]:
         CameraFileError: it is none.
     """
     with open(path, "rb") as file:
-        yield from (_from_bytes if os.fspath(path).endswith(".bin") else _from_text)(path, file)
+        images = (_from_bytes if os.fspath(path).endswith(".bin") else _from_text)(path, file)
+        for i, image in enumerate(images):
+            if i >= _MOST_IMAGES:
+                image.record.fail(f"more than {_MOST_IMAGES} images")
+            yield image
 
 
 def _from_text(path, file: BinaryIO) -> Iterator[Image]:

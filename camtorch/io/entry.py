@@ -48,8 +48,8 @@ def load(path, format: str | None = None) -> Rig:
 
     Returns:
         A `Rig`: `rig.cameras`, `rig.extrinsics` (camera from rig, or from world for posed images), `rig.camera` if
-        there is only one. Pixel centres, axes and directions are camtorch's, whatever the file's are. Names are the file's;
-        one nameless camera is "camera".
+        there is only one. Pixel centres, axes and directions are camtorch's, whatever the file's are. Names are the
+        file's; one nameless camera is "camera".
 
     Raises:
         CameraFileError: the file cannot be used; it says where and why. OSError: it cannot be opened.

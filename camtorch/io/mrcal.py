@@ -24,9 +24,7 @@ _TOKEN = re.compile(
 
 def matches_text(text: str) -> bool:
     """Whether this is the start of such a file: comments, a brace, a key in Python's quotes."""
-    return (
-        re.match(r"(?:\s+|#[^\n]*\n)*\{(?:\s+|#[^\n]*\n)*(?:'|\"(?:lens_?model|distortion_model)\")", text) is not None
-    )
+    return re.match(r"(?:\s|#[^\n]*\n)*\{(?:\s|#[^\n]*\n)*(?:'|\"(?:lens_?model|distortion_model)\")", text) is not None
 
 
 def parse_literal(path, text: str) -> dict[str, Any]:

@@ -41,7 +41,9 @@ class Record:
         return list(self.value)
 
     def __contains__(self, key: str) -> bool:
-        return key in self.keys()
+        if not isinstance(self.value, dict):
+            self.fail("not keys and values")
+        return key in self.value
 
     def __getitem__(self, key: str) -> Record:
         found = self.get(key)

@@ -11,8 +11,9 @@ from camtorch.io import CameraFileError
 
 LARGEST_FILE = 1 << 24
 _LARGEST_YAML = 1 << 22
+_LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
-_MOST_VALUES = 1 << 21
+_MOST_VALUES = 1 << 18  # a second or two of work
 
 
 def read_bytes(path) -> bytes:
@@ -88,14 +89,16 @@ def _from_yaml(path, text: str):
         import yaml
     except ImportError:
         raise ImportError("reading YAML camera files needs PyYAML: pip install 'camtorch[cli]'") from None
-    if len(text) > _LARGEST_YAML:
-        raise CameraFileError(path, "size", f"more than {_LARGEST_YAML >> 20} MiB of YAML")
+    loader = getattr(yaml, "CSafeLoader", None)
+    largest = _LARGEST_SLOW_YAML if loader is None else _LARGEST_YAML
+    if len(text) > largest:
+        raise CameraFileError(path, "size", f"more than {largest >> 10} KiB of YAML")
     # "%YAML:1.0", as OpenCV writes it, is not YAML
     text = re.sub(r"\A%YAML[^\n]*", "", text)
     tree = Tree(path)
     try:
         # events, not yaml.load: no recursion, no tags, and none of YAML 1.1's ideas of what is a number
-        for event in yaml.parse(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+        for event in yaml.parse(text, loader or yaml.SafeLoader):
             tree.place = f"line {event.start_mark.line + 1}"
             _take(yaml, tree, event)
     except yaml.YAMLError as error:
@@ -147,6 +150,7 @@ class Tree:
         self.root: Any = None
         self._open: list[list] = []  # container, key that waits for its value, anchor, how many values
         self._anchors: dict[str, tuple[Any, int]] = {}
+        self._count = 0
 
     def fail(self, reason: object):
         """Raise the CameraFileError of this place."""
@@ -189,6 +193,9 @@ class Tree:
         self._put(value, count, None)
 
     def _put(self, value: Any, count: int, anchor: str | None) -> None:
+        self._count += 1
+        if self._count > _MOST_VALUES:
+            self.fail("too many values")
         if anchor:
             self._anchors[anchor] = (value, count)
         if not self._open:

@@ -149,7 +149,9 @@ class Lossy:
         self.no_images(rig)
         for name, extrinsics in rig.extrinsics.items():
             if self.pose(name, extrinsics) != ([0.0] * 3, [0.0] * 3):
-                self.fail(name, f"its extrinsics would be lost; {self.format} has no place for them")
+                self.fail(
+                    name, f"its extrinsics would be lost; {self.format} has no place for them. Save the camera alone"
+                )
 
     def pose(self, name: str, extrinsics: Extrinsics) -> tuple[list[float], list[float]]:
         """Rotation vector and translation of a single pose."""
