@@ -90,7 +90,8 @@ def render(rig: Rig, path) -> str:
         "CameraCalibrations": entries,
         "DeviceClassInfo": {"BuildVersion": "DVT-S", "DeviceClass": "Aria"},
         "FileFormat": {"Tags": [], "Timestamp": "", "UnixTime": 0, "Version": 3},
-        "OriginSpecification": {"ChildLabel": entries[0]["Label"] if entries else "", "Type": "Custom"},
+        # projectaria_tools takes no other origin, be there such a camera or not
+        "OriginSpecification": {"ChildLabel": "camera-slam-left", "Type": "Custom"},
         "Serial": "",
     }
     return as_json(whole)

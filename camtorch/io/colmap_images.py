@@ -119,8 +119,10 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
     entries = []
     for name, extrinsics in rig.extrinsics.items():
         lossy.pose(name, extrinsics)
-        if "\0" in name or "\n" in name or name != name.strip() or not name:
-            lossy.fail(name or "extrinsics", "a name that COLMAP cannot write")
+        if not name or "\0" in name or (not binary and (name.split() != [name])):
+            lossy.fail(
+                repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
+            )
         quaternion, translation = poses.to_quaternion(extrinsics)
         entries.append((name, identities[rig.images.get(name, name)], [*quaternion, *translation]))
     if os.path.exists(path):

@@ -102,9 +102,9 @@ def _pose(record: Record) -> Extrinsics:
     position = [row[3] for row in rows[:3]]
     # world from our camera: the columns of y and z turned round
     turned = [[row[0], -row[1], -row[2]] for row in rows[:3]]
-    rotation = [-v for v in poses.vector_of_matrix(record, turned)]
+    rotation = [0.0 - v for v in poses.vector_of_matrix(record, turned)]
     poses.pose(record, rotation, position)
-    translation = [-v for v in poses.turn(poses.transposed(turned), position)]
+    translation = [0.0 - v for v in poses.turn(poses.transposed(turned), position)]
     return poses.keep(poses.pose(record, rotation, translation), "nerfstudio", rows)
 
 

@@ -142,7 +142,7 @@ def transposed(matrix: Matrix) -> list[list[float]]:
 def inverse(rotation: Vector, translation: Vector) -> tuple[list[float], list[float]]:
     """The pose that undoes this one."""
     back = turn(transposed(matrix_of_vector(rotation)), translation)
-    return [-v for v in rotation], [-v for v in back]
+    return [0.0 - v for v in rotation], [0.0 - v for v in back]
 
 
 def compose(second: Extrinsics, first: Extrinsics) -> tuple[list[list[float]], list[float]]:
@@ -165,7 +165,7 @@ def from_rows(record: Record, undo: bool = False) -> Extrinsics:
     if undo:
         pose(record, rotation, translation)
         back = turn(transposed([row[:3] for row in rows[:3]]), translation)
-        rotation, translation = [-v for v in rotation], [-v for v in back]
+        rotation, translation = [0.0 - v for v in rotation], [0.0 - v for v in back]
     return keep(pose(record, rotation, translation), "undone rows" if undo else "rows", rows)
 
 
