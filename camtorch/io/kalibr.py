@@ -80,7 +80,7 @@ def render(rig: Rig, path) -> str:
     lossy.no_images(rig)
     posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
     first = next(iter(posed.values()), None)
-    chained = poses.is_identity(first) and (first is None or poses.written(first, "rows") is None)
+    chained = first is None or (len(posed) > 1 and poses.is_identity(first) and poses.written(first, "rows") is None)
     lines, previous = [], None
     for i, (name, camera) in enumerate(rig.cameras.items()):
         lines.append(f"cam{i}:")

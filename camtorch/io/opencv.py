@@ -220,7 +220,8 @@ def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str)
     if key == "kannala_brandt":
         distortion = lossy.at_most(name, camera, distortion, (_FISHEYE_COUNT,))
     fisheye = int(key == "kannala_brandt")
-    says = fisheye or len(distortion) == _FISHEYE_COUNT or "fisheye_model" in values
+    # with one flag for all, several cameras must agree, be it on a flag that is not needed
+    says = fisheye or len(distortion) == _FISHEYE_COUNT or end
     if says and values.setdefault("fisheye_model", fisheye) != fisheye:
         lossy.fail(name, "a lens unlike that of the cameras before it; OpenCV's file has one fisheye_model for all")
     short = {"": ("camera_matrix", "distortion_coefficients")}

@@ -113,7 +113,11 @@ def _from_yaml(path, text: str):
 
 
 def _take(yaml, tree: Tree, event) -> None:
-    if isinstance(event, yaml.AliasEvent):
+    if tree.documents > 1 and isinstance(event, yaml.NodeEvent):
+        # rostopic ends a message with ---, which begins an empty document
+        if not isinstance(event, yaml.ScalarEvent) or event.value:
+            tree.fail("a second document in the file")
+    elif isinstance(event, yaml.AliasEvent):
         tree.alias(event.anchor)
     elif isinstance(event, yaml.ScalarEvent):
         _check_tag(tree, event, ("str",))
@@ -126,8 +130,8 @@ def _take(yaml, tree: Tree, event) -> None:
         tree.open({}, event.anchor)
     elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
         tree.close()
-    elif isinstance(event, yaml.DocumentStartEvent) and tree.root is not None:
-        tree.fail("a second document in the file")
+    elif isinstance(event, yaml.DocumentStartEvent):
+        tree.documents += 1
 
 
 def _check_tag(tree: Tree, event, names: tuple[str, ...]) -> None:
@@ -150,7 +154,7 @@ class Tree:
         self.root: Any = None
         self._open: list[list] = []  # container, key that waits for its value, anchor, how many values
         self._anchors: dict[str, tuple[Any, int]] = {}
-        self._count = 0
+        self._count = self.documents = 0
 
     def fail(self, reason: object):
         """Raise the CameraFileError of this place."""
