@@ -27,6 +27,7 @@ def matches(keys: dict) -> bool:
 def parse(record: Record) -> Rig:
     """The cameras by their labels; the rig is the device. `MaxSolidAngle`, IMUs and the rest are not read."""
     cameras, extrinsics = {}, {}
+    record.few(len(record["CameraCalibrations"]))
     for entry in record["CameraCalibrations"]:
         name = entry["Label"].text()
         if name in cameras:

@@ -44,6 +44,7 @@ def parse(record: Record) -> Rig:
     for key, items in (("resolution", sizes), ("T_imu_cam", places)):
         if len(items) != len(models):
             record[key].fail(f"{len(items)} of them for {len(models)} cameras")
+    record.few(len(models))
     cameras, extrinsics = {}, {}
     for i, (model, size, place) in enumerate(zip(models, sizes, places, strict=True)):
         key, coefficients = _MODELS[one_of(model["camera_type"], _MODELS)]

@@ -43,6 +43,7 @@ _MODELS = {
 # how many coefficients the camera has of a model that leaves some of them out
 _COUNTS = {"SIMPLE_RADIAL": 4, "RADIAL": 4, "SIMPLE_FISHEYE": 1, "FISHEYE": 1}
 _IDS = {values[0]: name for name, values in _MODELS.items()}
+_MOST_WORDS = 32
 _LARGEST_ID = (1 << 32) - 2  # the one above means none
 
 
@@ -80,11 +81,12 @@ def _images_beside(path) -> str:
 
 def _from_text(path, text: str) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
-    for i, line in enumerate(text.splitlines(), 1):
-        words = line.split()
+    for i, line in enumerate(io.StringIO(text), 1):
+        words = line.split(maxsplit=_MOST_WORDS)
         if not words or words[0].startswith("#"):
             continue
         record = Record(path, words, f"line {i}")
+        record.few(len(cameras))
         if len(words) < 4:
             record.fail("less than an id, a model, a width and a height")
         identity, name, width, height, *values = record
@@ -112,6 +114,7 @@ def _from_bytes(path, content: bytes) -> dict[str, Camera]:
     (count,) = take("<Q")
     if count > len(content) // 24:
         record.fail(f"{count} cameras, for which the file is too small")
+    record.few(count)
     for _ in range(count):
         identity, model, width, height = take("<IiQQ")
         name = _IDS.get(model) or record.fail(f"the model {model} is not known here; known are {sorted(_IDS)}")

@@ -38,14 +38,15 @@ def parse(record: Record) -> Rig:
     cameras, extrinsics, images = {}, {}, {}
     frames = list(record["frames"]) if "frames" in record else []
     own = [any(key in frame for key in _OF_A_CAMERA) for frame in frames]
+    record.few(sum(own))
     if not frames or not all(own):
-        cameras["camera"] = _camera(record, {})
+        cameras["camera"] = _camera(record)
     for frame, has_own in zip(frames, own, strict=True):
         name = frame["file_path"].text()
         if name in extrinsics or name in cameras:
             frame["file_path"].fail(f"a second frame is called {name!r:.60}")
         if has_own:
-            cameras[name] = _camera(record, frame.value)
+            cameras[name] = _camera(record, frame)
         else:
             images[name] = "camera"
         rows = frame["transform_matrix"]
@@ -53,12 +54,15 @@ def parse(record: Record) -> Rig:
     return Rig(cameras, extrinsics, images=images)
 
 
-def _camera(record: Record, own: dict) -> Camera:
+def _camera(record: Record, frame: Record | None = None) -> Camera:
     """The camera of a file, with what a frame says of its own."""
-    for key in own:
-        if key in _OF_A_CAMERA and key in record and record.value[key] != own[key]:
-            record[key].fail("a frame says otherwise; Nerfstudio would take this one for all frames")
-    merged = Record(record.path, {**record.value, **own}, record.place)
+    values = {key: record.value[key] for key in _OF_A_CAMERA if key in record}
+    merged = Record(record.path, values, record.place)
+    if frame is not None:
+        for key in _OF_A_CAMERA:
+            if key in frame and values.setdefault(key, frame.value[key]) != frame.value[key]:
+                record[key].fail("a frame says otherwise; Nerfstudio would take this one for all frames")
+        merged.place = frame.place
     model = one_of(merged["camera_model"], _MODELS) if "camera_model" in merged else "OPENCV"
     size = (merged["h"].side(), merged["w"].side()) if "h" in merged and "w" in merged else None
     key = _MODELS[model]

@@ -6,7 +6,7 @@ import json
 import os
 import re
 import warnings
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import torch
 
@@ -60,6 +60,7 @@ def parse(record: Record) -> Rig:
     names = sorted(file.by_name(_MATRIX))
     if not names:
         file.camera(None, None)
+    record.few(len(names))
     cameras = {name or "camera": file.camera(None, name) for name in names}
     extrinsics = {}
     if names in _PAIRS and "R" in record and "T" in record:
@@ -72,6 +73,7 @@ class _File:
 
     def __init__(self, record: Record):
         self.record, self.path, self.keys = record, record.path, record.keys()
+        self.found: dict[re.Pattern, Any] = {}
 
     def camera(self, model: str | None, name: str | None) -> Camera:
         key, distortion_key = self.keys_of_camera(name)
@@ -116,18 +118,21 @@ class _File:
         return matrices[name], distortions.get(name)
 
     def by_name(self, pattern: re.Pattern) -> dict[str, str]:
+        if pattern in self.found:
+            return self.found[pattern]
         named: dict[str, str] = {}
         for key in self.keys:
             if match := pattern.fullmatch(key):
                 if match[1] in named:
                     self.fail(key, f"one camera has this and {named[match[1]]}")
                 named[match[1]] = key
+        self.found[pattern] = named
         return named
 
     def model(self, distortion: list[float]) -> str:
-        for key in filter(_OTHER_LENS.fullmatch, self.keys):
+        if self.find(_OTHER_LENS) is not None:
             self.fail(
-                key,
+                self.find(_OTHER_LENS),
                 "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
                 "or --model kannala_brandt",
             )
@@ -165,7 +170,9 @@ class _File:
         return height, width
 
     def find(self, pattern: re.Pattern) -> str | None:
-        return next(filter(pattern.fullmatch, self.keys), None)
+        if pattern not in self.found:
+            self.found[pattern] = next(filter(pattern.fullmatch, self.keys), None)
+        return self.found[pattern]
 
     def numbers(self, key: str) -> list[float]:
         """An OpenCV matrix, a list, or a list of rows as one list."""

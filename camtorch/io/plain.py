@@ -26,6 +26,7 @@ def matches(keys: dict) -> bool:
 def parse(record: Record) -> Rig:
     """The cameras, their poses and the images that they took."""
     record["camtorch"].whole(1, _VERSION, f"version that this camtorch reads, which is up to {_VERSION}")
+    record["cameras"].few(len(record["cameras"].keys()))
     cameras = {name: _camera(record["cameras"][name]) for name in record["cameras"].keys()}  # noqa: SIM118
     extrinsics, images = {}, {}
     for name in record["extrinsics"].keys() if "extrinsics" in record else ():

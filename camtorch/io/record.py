@@ -13,6 +13,7 @@ from camtorch.camera import MODELS, Camera
 from camtorch.io import CameraFileError
 
 LARGEST_SIDE = 1 << 20
+_MOST_CAMERAS = 20_000
 _LONGEST_NUMBER = 400  # no double needs as many characters
 
 
@@ -122,6 +123,11 @@ class Record:
         return [row.numbers(columns) for row in self]
 
     # -- cameras
+
+    def few(self, count: int) -> None:
+        """Refuse a file of more cameras than anyone has: each costs some kilobytes and a tenth of a millisecond."""
+        if count > _MOST_CAMERAS:
+            self.fail(f"{count} cameras; more than {_MOST_CAMERAS} are not read")
 
     def camera(self, key: str, intrinsics: list[float], distortion: list[float], size) -> Camera:
         """The camera of a model of `camtorch.MODELS`, in float64."""

@@ -13,6 +13,7 @@ LARGEST_FILE = 1 << 24
 _LARGEST_YAML = 1 << 22
 _LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
+_MOST_JSON_VALUES = 1 << 21
 _MOST_VALUES = 1 << 18  # a second or two of work
 
 
@@ -76,6 +77,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _from_json(path, text: str):
+    if sum(map(text.count, "[{,")) > _MOST_JSON_VALUES:
+        raise CameraFileError(path, "content", "too many values")
     try:
         return json.loads(text, object_pairs_hook=_unique, parse_int=str, parse_float=str, parse_constant=str)
     except json.JSONDecodeError as error:

@@ -10,6 +10,7 @@ from camtorch.io import CameraFileError
 
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
 _DEEPEST = 100
+_MOST_VALUES = 1 << 18
 
 
 def parse_storage(path, text: str) -> dict[str, Any]:
@@ -41,6 +42,7 @@ class _Elements:
     def __init__(self, path, parser):
         self.path, self.parser, self.root = path, parser, None
         self.open: list[tuple[str, list[str], list[tuple[str, Any]]]] = []
+        self.count = 0
 
     def fail(self, reason: str):
         raise CameraFileError(self.path, f"line {self.parser.CurrentLineNumber}", reason)
@@ -50,14 +52,23 @@ class _Elements:
             self.fail("nested too deeply")
         if not self.open and name != "opencv_storage":
             self.fail(f"<{name:.60}> where <opencv_storage> belongs: XML is read where OpenCV wrote it")
+        self.counted(1)
         self.open.append((name, [], []))
+
+    def counted(self, more: int) -> None:
+        self.count += more
+        if self.count > _MOST_VALUES:
+            self.fail("too many values")
 
     def text(self, text: str) -> None:
         self.open[-1][1].append(text)
 
     def end(self, name: str) -> None:
         _, texts, children = self.open.pop()
-        words = [quoted or plain for quoted, plain in _WORD.findall("".join(texts))]
+        words = []
+        for word in _WORD.finditer("".join(texts)):
+            self.counted(1)
+            words.append(word[1] or word[2] or "")
         names = [key for key, _ in children]
         if not self.open or (children and set(names) != {"_"}):
             if words:
