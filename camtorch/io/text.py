@@ -14,7 +14,7 @@ _LARGEST_YAML = 1 << 22
 _LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
 _MOST_JSON_VALUES = 1 << 21
-_MOST_VALUES = 1 << 18  # a second or two of work
+_MOST_VALUES = 1 << 17  # a second of work
 
 
 def read_bytes(path) -> bytes:
