@@ -138,6 +138,25 @@ def test_nerfstudio_camera_of_each_frame(tmp_path):
         ct.load(path)
 
 
+def test_nerfstudio_of_instant_ngp(tmp_path):
+    path = tmp_path / "transforms.json"
+    text = {"camera_angle_x": 1.2, "w": 640, "h": 480, "frames": []}
+    path.write_text(json.dumps(text))
+    focal = 320 / math.tan(0.6)
+    assert ct.load(path).camera.intrinsics.tolist() == [focal, focal, 319.5, 239.5]
+    for more, kind in (
+        ({"camera_model": "PINHOLE", "k1": 0, "p2": 0}, ct.Pinhole),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, ct.BrownConrady),
+        ({"k1": 0.1}, ct.BrownConrady),
+        ({"k1": 0.1, "is_fisheye": True}, ct.KannalaBrandt),
+    ):
+        path.write_text(json.dumps(text | more))
+        assert type(ct.load(path).camera) is kind
+    path.write_text(json.dumps(text | {"k1": 0.1, "k4": 0.1}))
+    with pytest.raises(ct.CameraFileError, match=r"k4: 0\.1, which Nerfstudio does not use"):
+        ct.load(path)
+
+
 @pytest.mark.parametrize("suffix", ["txt", "bin"])
 def test_colmap_images(suffix, tmp_path):
     camera = ct.KannalaBrandt(float64([500, 501, 320, 240]), float64([0.1, 0, 0, 0]), image_size=(480, 640))

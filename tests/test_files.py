@@ -60,6 +60,14 @@ def cases():
             names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
             model = "kannala_brandt" if fisheye else "brown_conrady"
             yield name, None, model, core, [expected[k] for k in names], (expected["w"], expected["h"])
+        elif name.startswith("kalibr"):
+            for key, model in (("cam0", "brown_conrady"), ("cam1", "kannala_brandt")):
+                size = (1280, 800) if key == "cam0" else (1920, 1280)
+                yield name, key, model, expected[key]["intrinsics"], expected[key]["D"], size
+        elif name.startswith("basalt"):
+            for i, (model, camera) in enumerate(zip(("double_sphere", "kannala_brandt"), expected, strict=True)):
+                values = list(camera["intrinsics"].values())
+                yield name, f"cam{i}", model, values[:4], values[4:], tuple(MANIFEST[name]["resolution"][i])
         elif name.startswith("mrcal"):
             values = expected["intrinsics"]
             model = "brown_conrady" if values[4:] else "pinhole"
@@ -98,6 +106,12 @@ def pixel_of(model, core, distortion):
         r = math.sqrt(r2)
         theta = math.atan(r)
         scale = theta / r * (1 + sum(k * theta ** (2 * i + 2) for i, k in enumerate(distortion)))
+        x, y = x * scale, y * scale
+    elif model == "double_sphere":
+        xi, alpha = distortion
+        d1 = math.sqrt(r2 + 1)
+        d2 = math.sqrt(r2 + (xi * d1 + 1) ** 2)
+        scale = 1 / (alpha * d2 + (1 - alpha) * (xi * d1 + 1))
         x, y = x * scale, y * scale
     elif model == "brown_conrady":
         radial = 1 + d[0] * r2 + d[1] * r2**2 + d[4] * r2**3
@@ -139,5 +153,10 @@ def test_each_model_of_colmap(entry, suffix, tmp_path):
     ct.save(rig, path)
     assert_same(rig, ct.Rig({"7": expected}))
     assert_same(ct.load(path), rig)
+    if expected.key in ("pinhole", "brown_conrady", "kannala_brandt"):
+        found = expected.project(float64(POINT))[0] + 0.5
+        theirs = (expected.intrinsics + float64([0, 0, 0.5, 0.5])).tolist()
+        reference = pixel_of(expected.key, theirs, expected.distortion.tolist())
+        assert torch.allclose(found, float64(reference), rtol=0, atol=1e-9)
     if suffix == "txt":
         assert path.read_text().splitlines()[-1].split()[1] == name

@@ -25,7 +25,7 @@ _MODELS = {
 _RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
 _TANGENTIAL = ("p1", "p2")
 _CORE = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "distortion_params")
-_OF_A_CAMERA = ("camera_model", *_CORE, *_RADIAL, *_TANGENTIAL)
+_OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL)
 
 
 def matches(keys: dict) -> bool:
@@ -63,7 +63,9 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
             if key in frame and values.setdefault(key, frame.value[key]) != frame.value[key]:
                 record[key].fail("a frame says otherwise; Nerfstudio would take this one for all frames")
         merged.place = frame.place
-    model = one_of(merged["camera_model"], _MODELS) if "camera_model" in merged else "OPENCV"
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV"  # as instant-ngp has it
+    if "camera_model" in merged:
+        model = one_of(merged["camera_model"], _MODELS)
     size = (merged["h"].side(), merged["w"].side()) if "h" in merged and "w" in merged else None
     key = _MODELS[model]
     if key == "equirectangular":
@@ -88,6 +90,8 @@ def _distortion(record: Record, key: str) -> tuple[str, list[float]]:
     if key == "fisheye624":
         return key, record["distortion_params"].numbers(12)
     there = {name: record[name].number() for name in (*_RADIAL, *_TANGENTIAL) if name in record}
+    if key == "pinhole" and any(there.values()):
+        key = "brown_conrady"  # the same to Nerfstudio
     names = {"pinhole": (), "kannala_brandt": ("k1", "k2", "k3", "k4")}.get(key, ("k1", "k2", "p1", "p2", "k3"))
     for name, value in there.items():
         if value and name not in names:

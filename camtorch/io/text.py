@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from typing import Any
+from typing import Any, NoReturn
 
 from camtorch.io import CameraFileError
 
@@ -159,7 +159,7 @@ class Tree:
         self._anchors: dict[str, tuple[Any, int]] = {}
         self._count = self.documents = 0
 
-    def fail(self, reason: object):
+    def fail(self, reason: object) -> NoReturn:
         """Raise the CameraFileError of this place."""
         raise CameraFileError(self.path, self.place, reason) from None
 

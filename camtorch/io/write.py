@@ -9,7 +9,7 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NoReturn
 
 from camtorch.camera import Camera
@@ -113,7 +113,7 @@ class Lossy:
             self.fail(name, f"fx = {fx!r} and fy = {fy!r}; the model has one focal length in {self.format}")
         return [fx, cx, cy]
 
-    def model(self, name: str, camera: Camera, known: Sequence[str]) -> str:
+    def model(self, name: str, camera: Camera, known: Collection[str]) -> str:
         """The key of the camera's model, which must be a known one."""
         if camera.key not in known:
             self.fail(name, f"{self.format} has no name for {camera.key}; it has for {', '.join(sorted(known))}")
