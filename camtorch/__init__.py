@@ -4,7 +4,7 @@ from camtorch import augment, io
 from camtorch.camera import MODELS, Camera
 from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
-from camtorch.io import CameraFileError
+from camtorch.io import CameraFileError, load, save
 from camtorch.models import (
     BrownConrady,
     Cylindrical,
@@ -15,6 +15,7 @@ from camtorch.models import (
     KannalaBrandt,
     Pinhole,
 )
+from camtorch.rig import Rig
 from camtorch.warp import Warp
 
 __version__ = "0.1.0"
@@ -33,7 +34,10 @@ __all__ = [
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
     "Pinhole",
+    "Rig",
     "Warp",
     "augment",
     "io",
+    "load",
+    "save",
 ]

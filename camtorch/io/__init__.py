@@ -18,5 +18,6 @@ class CameraFileError(ValueError):
 
 
 from camtorch.io import opencv  # noqa: E402 (it raises the error above)
+from camtorch.io.entry import FORMATS, load, save  # noqa: E402
 
-__all__ = ["CameraFileError", "opencv"]
+__all__ = ["FORMATS", "CameraFileError", "load", "opencv", "save"]

@@ -1,8 +1,9 @@
-"""OpenCV's camera files: what `cv2.FileStorage` writes as YAML or JSON."""
+"""OpenCV's camera files: what `cv2.FileStorage` writes as YAML, JSON or XML, of one camera or of a stereo pair."""
 
 from __future__ import annotations
 
-import math
+import json
+import os
 import re
 import warnings
 from typing import Any, NoReturn
@@ -10,23 +11,27 @@ from typing import Any, NoReturn
 import torch
 
 from camtorch.camera import MODELS, Camera
-from camtorch.io import CameraFileError
+from camtorch.extrinsics import Extrinsics
+from camtorch.io import CameraFileError, poses
+from camtorch.io.record import Record
 from camtorch.io.text import read_mapping
+from camtorch.io.write import Lossy, number
+from camtorch.rig import Rig
 
 # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
-_NAME = r"_?(\d*|left|right)"
-_MATRIX = re.compile(rf"(?:K|M|(?i:camera_?matrix|intrinsic_?matrix)){_NAME}")
-_DISTORTION = re.compile(rf"(?:D|(?i:dist(?:ortion)?(?:_?coeff?s|_?coefficients)?)){_NAME}")
+_NAMES = r"\d*|left|right"
+_MATRIX = re.compile(rf"(?:K|M|(?i:camera_?matrix|intrinsic_?matrix))_?({_NAMES})")
+_DISTORTION = re.compile(rf"(?:D|(?i:dist(?:ortion)?(?:_?coeff?s|_?coefficients)?))_?({_NAMES})")
 _WIDTH = re.compile(r"(?i:(?:image_?)?width)")
 _HEIGHT = re.compile(r"(?i:(?:image_?)?height)")
 _FISHEYE = re.compile(r"(?i:(?:is_?)?fisheye(?:_?model)?)")
 _OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model|xi)")
-_LARGEST_SIDE = 1 << 20
 _FISHEYE_COUNT = 4  # of cv2.fisheye, and one of the counts of cv2.calibrateCamera
+_PAIRS = (["1", "2"], ["left", "right"])
 
 
 def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
-    """The camera of an OpenCV YAML or JSON file, in float64.
+    """The camera of an OpenCV YAML, JSON or XML file, in float64.
 
     Args:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`) and, where it has them,
@@ -41,18 +46,38 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
     """
     if model is not None and model not in MODELS:
         raise ValueError(f"unknown model {model!r}; known are {', '.join(sorted(MODELS))}")
-    return _File(path, read_mapping(path)).camera(model, name)
+    return _File(Record(path, read_mapping(path))).camera(model, name)
+
+
+def matches(keys: dict) -> bool:
+    """Whether these may be the keys of such a file."""
+    return any(_MATRIX.fullmatch(key) for key in keys)
+
+
+def parse(record: Record) -> Rig:
+    """The cameras of a file, called by the ends of their keys; `X2 = R X1 + T` of a pair."""
+    file = _File(record)
+    names = sorted(file.by_name(_MATRIX))
+    if not names:
+        file.camera(None, None)
+    record.few(len(names))
+    cameras = {name or "camera": file.camera(None, name) for name in names}
+    extrinsics = {}
+    if names in _PAIRS and "R" in record and "T" in record:
+        extrinsics = dict(zip(names, (poses.pose(record, [0.0] * 3, [0.0] * 3), file.pose("R", "T")), strict=True))
+    return Rig(cameras, extrinsics)
 
 
 class _File:
-    """The keys of a file, and its path for the errors."""
+    """The keys of a file."""
 
-    def __init__(self, path, keys: dict[str, Any]):
-        self.path, self.keys = path, keys
+    def __init__(self, record: Record):
+        self.record, self.path, self.keys = record, record.path, record.keys()
+        self.found: dict[re.Pattern, Any] = {}
 
     def camera(self, model: str | None, name: str | None) -> Camera:
         key, distortion_key = self.keys_of_camera(name)
-        matrix = self.numbers(key, self.keys[key])
+        matrix = self.numbers(key)
         if len(matrix) != 9:
             self.fail(key, f"a camera matrix has 3 x 3 numbers, this has {len(matrix)}")
         fx, skew, cx, below, fy, cy, *bottom = matrix
@@ -62,7 +87,7 @@ class _File:
             )
         if below or bottom != [0, 0, 1]:
             self.fail(key, "is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
-        distortion = self.numbers(distortion_key, self.keys[distortion_key]) if distortion_key else []
+        distortion = self.numbers(distortion_key) if distortion_key else []
         kind = MODELS[model or self.model(distortion)]
         arguments = [torch.tensor([fx, fy, cx, cy], dtype=torch.float64)]
         if distortion:
@@ -93,33 +118,47 @@ class _File:
         return matrices[name], distortions.get(name)
 
     def by_name(self, pattern: re.Pattern) -> dict[str, str]:
+        if pattern in self.found:
+            return self.found[pattern]
         named: dict[str, str] = {}
         for key in self.keys:
             if match := pattern.fullmatch(key):
                 if match[1] in named:
                     self.fail(key, f"one camera has this and {named[match[1]]}")
                 named[match[1]] = key
+        self.found[pattern] = named
         return named
 
     def model(self, distortion: list[float]) -> str:
-        for key in filter(_OTHER_LENS.fullmatch, self.keys):
+        if self.find(_OTHER_LENS) is not None:
             self.fail(
-                key,
+                self.find(_OTHER_LENS),
                 "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
                 "or --model kannala_brandt",
             )
-        flag = self.keys.get(self.find(_FISHEYE), "0")
+        key = self.find(_FISHEYE)
+        flag = "0" if key is None else self.record[key].value
         if not isinstance(flag, (str, bool)):
-            self.fail(self.find(_FISHEYE), "is neither true nor false")
+            self.fail(key, "is neither true nor false")
         if str(flag).strip().lower() not in ("", "0", "0.", "0.0", "false", "no", "off", "n"):
             return "kannala_brandt"
-        if len(distortion) == _FISHEYE_COUNT and self.find(_FISHEYE) is None:
+        if len(distortion) == _FISHEYE_COUNT and key is None:
             warnings.warn(
                 f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
                 "If they come from cv2.fisheye, the model is kannala_brandt",
-                stacklevel=4,
+                stacklevel=5,
             )
         return "brown_conrady" if distortion else "pinhole"
+
+    def pose(self, rotation_key: str, translation_key: str) -> Extrinsics:
+        rotation, translation = self.numbers(rotation_key), self.numbers(translation_key)
+        for key, values, count in ((rotation_key, rotation, 9), (translation_key, translation, 3)):
+            if len(values) != count:
+                self.fail(key, f"{len(values)} numbers where {count} belong")
+        rows = [rotation[i : i + 3] for i in (0, 3, 6)]
+        record = self.record[rotation_key]
+        pose = poses.pose(self.record[translation_key], poses.vector_of_matrix(record, rows), translation)
+        return poses.keep(pose, "rows", poses.as_rows(rows, translation))
 
     def image_size(self) -> tuple[int, int] | None:
         keys = self.find(_HEIGHT), self.find(_WIDTH)
@@ -127,37 +166,130 @@ class _File:
             return None
         if None in keys:
             self.fail("image_height" if keys[0] is None else "image_width", "missing, while the other side is given")
-        height, width = (self.number(key, self.keys[key]) for key in keys)
-        for key, side in zip(keys, (height, width), strict=True):
-            if side != int(side) or not 0 < side <= _LARGEST_SIDE:
-                self.fail(key, f"{side:g} is no number of pixels")
-        return int(height), int(width)
+        height, width = (self.record[key].side() for key in keys)
+        return height, width
 
     def find(self, pattern: re.Pattern) -> str | None:
-        return next(filter(pattern.fullmatch, self.keys), None)
+        if pattern not in self.found:
+            self.found[pattern] = next(filter(pattern.fullmatch, self.keys), None)
+        return self.found[pattern]
 
-    def numbers(self, key: str, value) -> list[float]:
+    def numbers(self, key: str) -> list[float]:
         """An OpenCV matrix, a list, or a list of rows as one list."""
-        if isinstance(value, dict):
-            rows, cols = (self.number(f"{key}.{side}", value.get(side)) for side in ("rows", "cols"))
-            data = value.get("data")
+        record = self.record[key]
+        if isinstance(record.value, dict):
+            rows, cols = (Record(self.path, record.value.get(s), f"{key}.{s}").number() for s in ("rows", "cols"))
+            data = record.value.get("data")
             if not isinstance(data, list) or len(data) != rows * cols:
                 count = f"{len(data)} numbers" if isinstance(data, list) else "no list"
                 self.fail(f"{key}.data", f"{count}, where rows and cols say {rows:g} x {cols:g}")
-            return [self.number(f"{key}.data[{i}]", item) for i, item in enumerate(data)]
-        if not isinstance(value, list):
+            return record["data"].numbers()
+        if not isinstance(record.value, list):
             self.fail(key, "is neither an OpenCV matrix nor a list of numbers")
-        rows = [row if isinstance(row, list) else [row] for row in value]
-        return [self.number(f"{key}[{i}]", item) for i, row in enumerate(rows) for item in row]
-
-    def number(self, key: str, value) -> float:
-        try:
-            number = float(value) if isinstance(value, str) else math.nan
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
-            self.fail(key, f"{value!r:.60} is no finite number" if isinstance(value, str) else "is no number")
-        return number
+        return [item.number() for row in record for item in (row if isinstance(row.value, list) else [row])]
 
     def fail(self, place: str, reason: object) -> NoReturn:
         raise CameraFileError(self.path, place, reason) from None
+
+
+# -- writing
+
+
+def render(rig: Rig, path) -> str:
+    """The text of a file of one camera, or of several of which the second of two may have a pose."""
+    lossy = Lossy(path, "OpenCV")
+    lossy.no_images(rig)
+    names, ends = list(rig.cameras), list(rig.cameras)
+    if not names:
+        lossy.fail("cameras", "none")
+    if len(names) == 1:
+        ends = [names[0] if re.fullmatch(_NAMES, names[0]) else ""]
+    elif not all(name and re.fullmatch(_NAMES, name) for name in names):
+        ends = [str(i + 1) for i in range(len(names))]
+    values: dict[str, int | list[list[float]]] = {}
+    for name, end in zip(names, ends, strict=True):
+        _add_camera(lossy, values, name, rig.cameras[name], end)
+    _add_pose(lossy, values, rig, sorted(zip(ends, names, strict=True)))
+    suffix = os.path.splitext(str(path))[1].lower()
+    return {".json": _json, ".xml": _xml}.get(suffix, _yaml)(values)
+
+
+def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str) -> None:
+    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt"))
+    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    if camera.image_size is not None:
+        values_of_size = {"image_width": camera.image_size[1], "image_height": camera.image_size[0]}
+        if values and any(values.get(key) != value for key, value in values_of_size.items()):
+            lossy.fail(name, "a size unlike that of the cameras before it; OpenCV's file has one for all")
+        values.update(values_of_size)
+    elif "image_width" in values:
+        lossy.fail(name, "no image_size, unlike the cameras before it; OpenCV's file has one for all")
+    if key == "kannala_brandt":
+        distortion = lossy.at_most(name, camera, distortion, (_FISHEYE_COUNT,))
+    fisheye = int(key == "kannala_brandt")
+    # with one flag for all, several cameras must agree, be it on a flag that is not needed
+    says = fisheye or len(distortion) == _FISHEYE_COUNT or end
+    if says and values.setdefault("fisheye_model", fisheye) != fisheye:
+        lossy.fail(name, "a lens unlike that of the cameras before it; OpenCV's file has one fisheye_model for all")
+    short = {"": ("camera_matrix", "distortion_coefficients")}
+    joint = "_" if end.isalpha() else ""
+    matrix_key, distortion_key = short.get(end, (f"M{joint}{end}", f"D{joint}{end}"))
+    values[matrix_key] = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    if distortion:
+        values[distortion_key] = [[value] for value in distortion]
+
+
+def _add_pose(lossy: Lossy, values: dict, rig: Rig, ends_and_names: list[tuple[str, str]]) -> None:
+    ends, names = zip(*ends_and_names, strict=True)
+    if len(names) == 2 and list(ends) in _PAIRS and names[1] in rig.extrinsics:
+        lossy.all_posed(rig)
+        if not poses.is_identity(rig.extrinsics[names[0]]):
+            lossy.fail(names[0], "its extrinsics would be lost; in OpenCV's file the first camera is where the rig is")
+        rows = poses.to_rows(rig.extrinsics[names[1]])
+        values["R"] = [row[:3] for row in rows[:3]]
+        values["T"] = [row[3:] for row in rows[:3]]
+    else:
+        lossy.no_pose(rig)
+
+
+def _words(matrix: list[list[float]], separator: str) -> str:
+    return separator.join(number(value) for row in matrix for value in row)
+
+
+def _yaml(values: dict) -> str:
+    lines = ["%YAML:1.0", "---"]
+    for key, value in values.items():
+        if isinstance(value, int):
+            lines.append(f"{key}: {value}")
+        else:
+            lines += [f"{key}: !!opencv-matrix", f"   rows: {len(value)}", f"   cols: {len(value[0])}", "   dt: d"]
+            lines.append(f"   data: [ {_words(value, ', ')} ]")
+    return "\n".join(lines) + "\n"
+
+
+def _json(values: dict) -> str:
+    whole = {
+        key: value
+        if isinstance(value, int)
+        else {
+            "type_id": "opencv-matrix",
+            "rows": len(value),
+            "cols": len(value[0]),
+            "dt": "d",
+            "data": [v for row in value for v in row],
+        }
+        for key, value in values.items()
+    }
+    return json.dumps(whole, indent=4, allow_nan=False) + "\n"
+
+
+def _xml(values: dict) -> str:
+    lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
+    for key, value in values.items():
+        if isinstance(value, int):
+            lines.append(f"<{key}>{value}</{key}>")
+        else:
+            lines += [f'<{key} type_id="opencv-matrix">', f"  <rows>{len(value)}</rows>"]
+            lines += [f"  <cols>{len(value[0])}</cols>", "  <dt>d</dt>", "  <data>"]
+            lines.append(f"    {_words(value, ' ')}</data></{key}>")
+    return "\n".join([*lines, "</opencv_storage>"]) + "\n"

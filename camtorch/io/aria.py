@@ -1,0 +1,98 @@
+"""Project Aria's device calibration JSON."""
+
+from __future__ import annotations
+
+import math
+
+from camtorch.io import poses
+from camtorch.io.record import Record, one_of
+from camtorch.io.write import Lossy, as_json
+from camtorch.rig import Rig
+
+# Projection.Name -> key, how many focal lengths, how many coefficients
+_MODELS = {
+    "FisheyeRadTanThinPrism": ("fisheye624", 1, 12),
+    "Fisheye62": ("fisheye62", 1, 8),
+    "KannalaBrandtK3": ("kannala_brandt", 2, 4),
+    "Linear": ("pinhole", 2, 0),
+    "Spherical": ("kannala_brandt", 2, 0),
+}
+
+
+def matches(keys: dict) -> bool:
+    """Whether these are the keys of such a file."""
+    return "CameraCalibrations" in keys
+
+
+def parse(record: Record) -> Rig:
+    """The cameras by their labels; the rig is the device. `MaxSolidAngle`, IMUs and the rest are not read."""
+    cameras, extrinsics = {}, {}
+    record.few(len(record["CameraCalibrations"]))
+    for entry in record["CameraCalibrations"]:
+        name = entry["Label"].text()
+        if name in cameras:
+            entry["Label"].fail(f"a second camera is called {name!r:.60}")
+        projection = entry["Projection"]
+        key, focals, count = _MODELS[one_of(projection["Name"], _MODELS)]
+        values = projection["Params"].numbers(focals + 2 + count)
+        intrinsics = values[:1] * (2 - focals) + values[: focals + 2]
+        distortion = values[focals + 2 :] or [0.0] * 4 * (key == "kannala_brandt")
+        size = None
+        config = entry.get("ConfigData")
+        if config is not None and "ImageWidth" in config:
+            size = config["ImageHeight"].side(), config["ImageWidth"].side()
+        cameras[name] = projection.camera(key, intrinsics, distortion, size)
+        if "T_Device_Camera" in entry:
+            place = entry["T_Device_Camera"]
+            quaternion = place["UnitQuaternion"]
+            if len(quaternion) != 2:
+                quaternion.fail("is not [w, [x, y, z]]")
+            w, xyz = quaternion
+            extrinsics[name] = poses.from_quaternion(
+                quaternion, [w.number(), *xyz.numbers(3)], place["Translation"].numbers(3), undo=True
+            )
+    return Rig(cameras, extrinsics)
+
+
+def render(rig: Rig, path) -> str:
+    """The text of a file that projectaria_tools reads."""
+    lossy = Lossy(path, "Aria")
+    entries = []
+    for name, extrinsics in lossy.all_posed(rig).items():
+        camera = rig.cameras[name]
+        height, width = lossy.size(name, camera)
+        key = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
+        intrinsics, distortion = lossy.numbers(name, camera)
+        kind, focals, count = next((kind, f, count) for kind, (k, f, count) in _MODELS.items() if k == key)
+        if focals == 1:
+            intrinsics = lossy.single_focal(name, intrinsics)
+        quaternion, translation = poses.to_quaternion(extrinsics, undo=True)
+        entries.append(
+            {
+                "Calibrated": True,
+                "ConfigData": {"ImageHeight": height, "ImageWidth": width, "MaxSolidAngle": math.pi},
+                "Label": name,
+                "Projection": {
+                    "Description": f"see {kind}.h",
+                    "Name": kind,
+                    "Params": [*intrinsics, *lossy.at_most(name, camera, distortion, (count,))],
+                },
+                "SerialNumber": "0",
+                "T_Device_Camera": {
+                    "Translation": translation,
+                    "UnitQuaternion": [quaternion[0], quaternion[1:]],
+                },
+            }
+        )
+    whole = {
+        "AlgorithmName": "camtorch",
+        "AlgorithmVersion": "1",
+        "CalibrationSource": "Unknown",
+        "CameraCalibrations": entries,
+        "DeviceClassInfo": {"BuildVersion": "DVT-S", "DeviceClass": "Aria"},
+        "FileFormat": {"Tags": [], "Timestamp": "", "UnixTime": 0, "Version": 3},
+        # projectaria_tools takes no other origin, be there such a camera or not
+        "OriginSpecification": {"ChildLabel": "camera-slam-left", "Type": "Custom"},
+        "Serial": "",
+    }
+    return as_json(whole)

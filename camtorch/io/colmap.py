@@ -1,0 +1,232 @@
+"""COLMAP's cameras.txt and cameras.bin, and the poses of images.txt and images.bin beside them.
+
+Pixel centres are at 0.5 there. Poses are camera from world, as here.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import struct
+
+from camtorch.camera import Camera
+from camtorch.io import colmap_images
+from camtorch.io.nerfstudio import panorama
+from camtorch.io.record import Record
+from camtorch.io.text import read_bytes, read_text
+from camtorch.io.write import Lossy, number
+from camtorch.rig import Rig
+
+# model -> id, key, how many focal lengths, how many coefficients; where a smaller model comes first
+_MODELS = {
+    "SIMPLE_PINHOLE": (0, "pinhole", 1, 0),
+    "PINHOLE": (1, "pinhole", 2, 0),
+    "SIMPLE_RADIAL": (2, "brown_conrady", 1, 1),
+    "RADIAL": (3, "brown_conrady", 1, 2),
+    "OPENCV": (4, "brown_conrady", 2, 4),
+    "FULL_OPENCV": (6, "brown_conrady", 2, 8),
+    "FOV": (7, "fov", 2, 1),
+    "SIMPLE_FISHEYE": (14, "kannala_brandt", 1, 0),
+    "FISHEYE": (15, "kannala_brandt", 2, 0),
+    "SIMPLE_RADIAL_FISHEYE": (8, "kannala_brandt", 1, 1),
+    "RADIAL_FISHEYE": (9, "kannala_brandt", 1, 2),
+    "OPENCV_FISHEYE": (5, "kannala_brandt", 2, 4),
+    "THIN_PRISM_FISHEYE": (10, "thin_prism_fisheye", 2, 8),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (11, "fisheye624", 2, 12),
+    "SIMPLE_DIVISION": (12, "division", 1, 1),
+    "DIVISION": (13, "division", 2, 1),
+    "EUCM": (16, "eucm", 2, 2),
+    "EQUIRECTANGULAR": (17, "equirectangular", 0, 0),
+}
+# how many coefficients the camera has of a model that leaves some of them out
+_COUNTS = {"SIMPLE_RADIAL": 4, "RADIAL": 4, "SIMPLE_FISHEYE": 1, "FISHEYE": 1}
+_IDS = {values[0]: name for name, values in _MODELS.items()}
+_MOST_WORDS = 32
+_LARGEST_ID = (1 << 32) - 2  # the one above means none
+
+
+def matches_text(text: str) -> bool:
+    """Whether a file may be a cameras.txt: its first line without # is an id, a model and a size."""
+    lines = (line.strip() for line in io.StringIO(text))
+    line = next((line for line in lines if line and not line.startswith("#")), "")
+    return re.match(r"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)", line) is not None
+
+
+def read(path, text: str | None = None) -> Rig:
+    """The cameras, called by their ids, and the poses of the images beside them, by the names of the images."""
+    binary = text is None and os.fspath(path).endswith(".bin")
+    if binary:
+        cameras = _from_bytes(path, read_bytes(path))
+    else:
+        cameras = _from_text(path, read_text(path) if text is None else text)
+    beside = _images_beside(path)
+    if not os.path.exists(beside):
+        return Rig(cameras)
+    extrinsics, images = {}, {}
+    for image in colmap_images.read(beside):
+        if image.name in extrinsics:
+            image.record.fail(f"a second image is called {image.name!r:.60}")
+        if image.camera not in cameras:
+            image.record.fail(f"its camera {image.camera} is not in {os.path.basename(path)}")
+        extrinsics[image.name], images[image.name] = image.extrinsics, image.camera
+    return Rig(cameras, extrinsics, images=images)
+
+
+def _images_beside(path) -> str:
+    folder, name = os.path.split(os.fspath(path))
+    return os.path.join(folder, "images" + (os.path.splitext(name)[1] or ".txt"))
+
+
+def _from_text(path, text: str) -> dict[str, Camera]:
+    cameras: dict[str, Camera] = {}
+    for i, line in enumerate(io.StringIO(text), 1):
+        words = line.split(maxsplit=_MOST_WORDS)
+        if not words or words[0].startswith("#"):
+            continue
+        record = Record(path, words, f"line {i}")
+        record.few(len(cameras))
+        if len(words) < 4:
+            record.fail("less than an id, a model, a width and a height")
+        identity, name, width, height, *values = record
+        identity = str(identity.whole(0, _LARGEST_ID, "camera id"))
+        if identity in cameras:
+            record.fail(f"a second camera has the id {identity}")
+        if name.value not in _MODELS:
+            name.fail(f"the model {name.value!r:.60} is not known here; known are {', '.join(_MODELS)}")
+        size = height.side(), width.side()
+        cameras[identity] = _camera(record, name.value, size, [value.number() for value in values])
+    return cameras
+
+
+def _from_bytes(path, content: bytes) -> dict[str, Camera]:
+    cameras: dict[str, Camera] = {}
+    record, position = Record(path, None, "byte 0"), 0
+
+    def take(layout: str) -> tuple:
+        nonlocal position
+        record.place, position = f"byte {position}", position + struct.calcsize(layout)
+        if position > len(content):
+            record.fail(f"the file ends here, {position - len(content)} bytes too early")
+        return struct.unpack_from(layout, content, position - struct.calcsize(layout))
+
+    (count,) = take("<Q")
+    if count > len(content) // 24:
+        record.fail(f"{count} cameras, for which the file is too small")
+    record.few(count)
+    for _ in range(count):
+        identity, model, width, height = take("<IiQQ")
+        name = _IDS.get(model) or record.fail(f"the model {model} is not known here; known are {sorted(_IDS)}")
+        if str(identity) in cameras:
+            record.fail(f"a second camera has the id {identity}")
+        if identity > _LARGEST_ID:
+            record.fail(f"{identity} is no camera id")
+        height, width = Record(path, [str(width), str(height)], record.place).size()
+        values = list(take(f"<{_parameters(name)}d"))
+        if not all(map(math.isfinite, values)):
+            record.fail(f"parameters that are not finite: {values}")
+        cameras[str(identity)] = _camera(record, name, (height, width), values)
+    if position < len(content):
+        record.place = f"byte {position}"
+        record.fail(f"{len(content) - position} bytes after the last camera")
+    return cameras
+
+
+def _parameters(name: str) -> int:
+    _, _, focals, count = _MODELS[name]
+    return focals + 2 + count
+
+
+def _camera(record: Record, name: str, size: tuple[int, int], values: list[float]) -> Camera:
+    _, key, focals, _ = _MODELS[name]
+    if len(values) != _parameters(name):
+        record.fail(f"{len(values)} parameters; {name} has {_parameters(name)}")
+    if key == "equirectangular":
+        if values != [size[1], size[0]]:
+            record.fail(f"a panorama of {values[0]:g} x {values[1]:g} in a picture of {size[1]} x {size[0]}")
+        return record.camera(key, panorama(size), [], size)
+    fx, fy = values[0], values[focals - 1]
+    cx, cy, *distortion = values[focals:]
+    distortion += [0.0] * (_COUNTS.get(name, 0) - len(distortion))
+    return record.camera(key, [fx, fy, cx - 0.5, cy - 0.5], distortion, size)
+
+
+# -- writing
+
+
+def write(rig: Rig, path) -> dict[str, bytes]:
+    """The files of a rig: cameras, and images beside them where there are poses.
+
+    Each camera takes the smallest model that holds its values, and its id where its name is one.
+    """
+    lossy = Lossy(path, "COLMAP")
+    ids = [int(name) if re.fullmatch(r"0|[1-9]\d{0,9}", name) else -1 for name in rig.cameras]
+    if not all(0 <= i <= _LARGEST_ID for i in ids):
+        ids = list(range(1, len(ids) + 1))
+    identities = dict(zip(rig.cameras, ids, strict=True))
+    entries = []
+    for name, camera in rig.cameras.items():
+        height, width = lossy.size(name, camera)
+        entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
+    binary = os.fspath(path).endswith(".bin")
+    files = {os.fspath(path): (_as_bytes if binary else _as_text)(entries)}
+    beside = _images_beside(path)
+    if not rig.extrinsics and os.path.exists(beside):
+        _check_images(lossy, {str(i) for i in ids}, beside)
+    if rig.extrinsics:
+        content = colmap_images.content(lossy, rig, identities, beside, binary)
+        if content is not None:
+            files[beside] = content
+    return files
+
+
+def _check_images(lossy: Lossy, ids: set[str], beside: str) -> None:
+    """The images that stay where they are must have their cameras."""
+    for image in colmap_images.read(beside):
+        if image.camera not in ids:
+            lossy.fail(f"camera {image.camera}", f"missing, while {beside} has images of it")
+
+
+def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]]:
+    """The smallest model whose camera has these values and this many coefficients, and its parameters."""
+    key = lossy.model(name, camera, {values[1] for values in _MODELS.values()})
+    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    if key == "equirectangular":
+        height, width = lossy.size(name, camera)
+        if [fx, fy, cx, cy] != panorama((height, width)):
+            lossy.fail(name, "a part of a panorama; COLMAP has the whole sphere only")
+        return "EQUIRECTANGULAR", [float(width), float(height)]
+    fitting = []
+    for model, (_, k, focals, count) in _MODELS.items():
+        if k == key and (focals == 2 or fx == fy) and not any(distortion[count:]):
+            exact = len(distortion) == _COUNTS.get(model, count)
+            fitting.append((not exact, _parameters(model), model, count))
+    if not fitting:
+        most = max(count for _, k, _, count in _MODELS.values() if k == key)
+        if any(distortion[most:]):
+            lost = [n for n, value in zip(camera.distortion_names[most:], distortion[most:], strict=True) if value]
+            lossy.fail(name, f"{' '.join(lost)} would be lost; COLMAP has {most} coefficients for {key}")
+        lossy.fail(name, f"fx = {fx!r} and fy = {fy!r}; COLMAP's model has one focal length")
+    _, _, model, count = min(fitting)
+    values = (distortion + [0.0] * count)[:count]
+    return model, [*(fx, fy)[: _MODELS[model][2]], cx + 0.5, cy + 0.5, *values]
+
+
+def _as_text(entries: list[tuple]) -> bytes:
+    lines = [
+        "# Camera list with one line of data per camera:",
+        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+        f"# Number of cameras: {len(entries)}",
+    ]
+    for identity, model, values, width, height in entries:
+        lines.append(f"{identity} {model} {width} {height} {' '.join(map(number, values))}")
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _as_bytes(entries: list[tuple]) -> bytes:
+    parts = [struct.pack("<Q", len(entries))]
+    for identity, model, values, width, height in entries:
+        parts.append(struct.pack("<IiQQ", identity, _MODELS[model][0], width, height))
+        parts.append(struct.pack(f"<{len(values)}d", *values))
+    return b"".join(parts)

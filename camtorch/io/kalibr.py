@@ -1,0 +1,123 @@
+"""Kalibr's camchain: cam0, cam1, ... each with its pose relative to the one before, or to the IMU."""
+
+from __future__ import annotations
+
+import itertools
+import re
+
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.io import poses
+from camtorch.io.record import Record
+from camtorch.io.write import Lossy, listed
+from camtorch.rig import Rig
+
+# camera_model, distortion_model -> key, how many of its coefficients stand before the intrinsics, how many after
+_MODELS = {
+    ("pinhole", "none"): ("pinhole", 0, 0),
+    ("pinhole", "radtan"): ("brown_conrady", 0, 4),
+    ("pinhole", "equidistant"): ("kannala_brandt", 0, 4),
+    ("pinhole", "fov"): ("fov", 0, 1),
+    ("omni", "radtan"): ("mei", 1, 4),
+    ("omni", "none"): ("mei", 1, 0),
+    ("eucm", "none"): ("eucm", 2, 0),
+    ("ds", "none"): ("double_sphere", 2, 0),
+}
+_NAME = re.compile(r"cam(\d{1,4})")
+
+
+def matches(keys: dict) -> bool:
+    """Whether these are the keys of such a file."""
+    return any(_NAME.fullmatch(key) and isinstance(value, dict) for key, value in keys.items())
+
+
+def parse(record: Record) -> Rig:
+    """The cameras; the rig is the IMU where `T_cam_imu` is given, else cam0."""
+    numbered = sorted((int(match[1]), key) for key in record.keys() if (match := _NAME.fullmatch(key)))  # noqa: SIM118
+    names = [name for _, name in numbered]
+    if [number for number, _ in numbered] != list(range(len(numbered))):
+        record.fail(f"the cameras are not numbered from cam0 on: {', '.join(names):.80}")
+    cameras = {name: _camera(record[name]) for name in names}
+    return Rig(cameras, _extrinsics(record, names))
+
+
+def _camera(record: Record) -> Camera:
+    names = record["camera_model"].text(), record["distortion_model"].text()
+    if names not in _MODELS:
+        record.fail(f"{'-'.join(names)!r:.60} is not known here; known are {', '.join(map('-'.join, _MODELS))}")
+    key, before, after = _MODELS[names]
+    values = record["intrinsics"].numbers(before + 4)
+    coefficients = record["distortion_coeffs"] if after or "distortion_coeffs" in record else None
+    distortion = values[:before] + (coefficients.numbers(after) if coefficients is not None else [])
+    if names == ("omni", "none"):
+        distortion += [0.0] * 4
+    return record.camera(key, values[before:], distortion, record["resolution"].size())
+
+
+def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
+    if any("T_cam_imu" in record[name] for name in names):
+        return {name: poses.from_rows(record[name]["T_cam_imu"]) for name in names}
+    if any("T_imu_cam" in record[name] for name in names):
+        return {name: poses.from_rows(record[name]["T_imu_cam"], undo=True) for name in names}
+    if not any("T_cn_cnm1" in record[name] for name in names[1:]):
+        return {}
+    chain = {names[0]: poses.pose(record, [0.0] * 3, [0.0] * 3)}
+    for previous, name in itertools.pairwise(names):
+        step = poses.from_rows(record[name]["T_cn_cnm1"])
+        before, rows = chain[previous], poses.to_rows(step)
+        if poses.is_identity(before):
+            chain[name] = step
+        else:
+            matrix, translation = poses.compose(step, before)
+            chain[name] = poses.pose(record[name], poses.vector_of_matrix(record[name], matrix), translation)
+        poses.keep(chain[name], "step", rows, before)
+    return chain
+
+
+def render(rig: Rig, path) -> str:
+    """The text of a file; the cameras become cam0, cam1, ... in their order."""
+    lossy = Lossy(path, "Kalibr")
+    lossy.no_images(rig)
+    posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
+    first = next(iter(posed.values()), None)
+    chained = first is None or (len(posed) > 1 and poses.is_identity(first) and poses.written(first, "rows") is None)
+    lines, previous = [], None
+    for i, (name, camera) in enumerate(rig.cameras.items()):
+        lines.append(f"cam{i}:")
+        if not chained:
+            lines += _rows("T_cam_imu", poses.to_rows(posed[name]))
+        if previous is not None:
+            lines += _rows("T_cn_cnm1", _step(posed[name], previous))
+        previous = posed.get(name)
+        lines += _entries(lossy, name, camera, i)
+    return "\n".join(lines) + "\n"
+
+
+def _step(this: Extrinsics, previous: Extrinsics) -> list[list[float]]:
+    kept = poses.written(this, "step", previous)
+    if kept is not None:
+        return kept
+    if poses.is_identity(previous):
+        return poses.to_rows(this)
+    return poses.as_rows(*poses.compose(this, previous.inverse()))
+
+
+def _entries(lossy: Lossy, name: str, camera: Camera, index: int) -> list[str]:
+    height, width = lossy.size(name, camera)
+    key = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
+    intrinsics, distortion = lossy.numbers(name, camera)
+    names, before, after = next((names, b, a) for names, (k, b, a) in _MODELS.items() if k == key)
+    distortion = lossy.at_most(name, camera, distortion, (before + after,))
+    return [
+        f"  camera_model: {names[0]}",
+        f"  distortion_model: {names[1]}",
+        f"  intrinsics: {listed(distortion[:before] + intrinsics)}",
+        f"  distortion_coeffs: {listed(distortion[before:])}",
+        f"  resolution: [{width}, {height}]",
+        "  cam_overlaps: []",
+        f"  rostopic: /cam{index}/image_raw",
+    ]
+
+
+def _rows(key: str, rows: list[list[float]]) -> list[str]:
+    return [f"  {key}:", *(f"  - {listed(row)}" for row in rows)]

@@ -1,0 +1,175 @@
+"""Nerfstudio's transforms.json: pixel centres at 0.5, cameras with y up and z back, poses camera-to-world."""
+
+from __future__ import annotations
+
+import math
+
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.io import poses
+from camtorch.io.record import Record, one_of
+from camtorch.io.write import Lossy, as_json
+from camtorch.rig import Rig
+
+# camera_model -> key
+_MODELS = {
+    "OPENCV": "brown_conrady",
+    "OPENCV_FISHEYE": "kannala_brandt",
+    "PINHOLE": "pinhole",
+    "SIMPLE_PINHOLE": "pinhole",
+    "SIMPLE_RADIAL": "brown_conrady",
+    "RADIAL": "brown_conrady",
+    "FISHEYE624": "fisheye624",
+    "EQUIRECTANGULAR": "equirectangular",
+}
+_RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
+_TANGENTIAL = ("p1", "p2")
+_CORE = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "distortion_params")
+_OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL)
+
+
+def matches(keys: dict) -> bool:
+    """Whether these are the keys of such a file."""
+    return ("frames" in keys and "camtorch" not in keys) or "fl_x" in keys or "camera_angle_x" in keys
+
+
+def parse(record: Record) -> Rig:
+    """The camera of all frames, called "camera", or one for each frame; and the poses of the frames."""
+    cameras, extrinsics, images = {}, {}, {}
+    frames = list(record["frames"]) if "frames" in record else []
+    own = [any(key in frame for key in _OF_A_CAMERA) for frame in frames]
+    record.few(sum(own))
+    if not frames or not all(own):
+        cameras["camera"] = _camera(record)
+    for frame, has_own in zip(frames, own, strict=True):
+        name = frame["file_path"].text()
+        if name in extrinsics or name in cameras:
+            frame["file_path"].fail(f"a second frame is called {name!r:.60}")
+        if has_own:
+            cameras[name] = _camera(record, frame)
+        else:
+            images[name] = "camera"
+        rows = frame["transform_matrix"]
+        extrinsics[name] = _pose(rows)
+    return Rig(cameras, extrinsics, images=images)
+
+
+def _camera(record: Record, frame: Record | None = None) -> Camera:
+    """The camera of a file, with what a frame says of its own."""
+    values = {key: record.value[key] for key in _OF_A_CAMERA if key in record}
+    merged = Record(record.path, values, record.place)
+    if frame is not None:
+        for key in _OF_A_CAMERA:
+            if key in frame and values.setdefault(key, frame.value[key]) != frame.value[key]:
+                record[key].fail("a frame says otherwise; Nerfstudio would take this one for all frames")
+        merged.place = frame.place
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV"  # as instant-ngp has it
+    if "camera_model" in merged:
+        model = one_of(merged["camera_model"], _MODELS)
+    size = (merged["h"].side(), merged["w"].side()) if "h" in merged and "w" in merged else None
+    key = _MODELS[model]
+    if key == "equirectangular":
+        if size is None:
+            merged["w"].fail("missing")
+        return merged.camera(key, panorama(size), [], size)
+    if "fl_x" in merged:
+        fx = merged["fl_x"].number()
+    else:
+        angle = merged["camera_angle_x"].number()
+        if not 0 < angle < math.pi:
+            merged["camera_angle_x"].fail(f"{angle:g} is no angle of a pinhole camera")
+        fx = merged["w"].side() / 2 / math.tan(angle / 2)
+    fy = merged["fl_y"].number() if "fl_y" in merged else fx
+    centre = [merged[c].number() if c in merged else merged[side].side() / 2 for c, side in (("cx", "w"), ("cy", "h"))]
+    key, distortion = _distortion(merged, key)
+    return merged.camera(key, [fx, fy, centre[0] - 0.5, centre[1] - 0.5], distortion, size)
+
+
+def _distortion(record: Record, key: str) -> tuple[str, list[float]]:
+    """Model and coefficients; those that a model does not have must be zero."""
+    if key == "fisheye624":
+        return key, record["distortion_params"].numbers(12)
+    there = {name: record[name].number() for name in (*_RADIAL, *_TANGENTIAL) if name in record}
+    if key == "pinhole" and any(there.values()):
+        key = "brown_conrady"  # the same to Nerfstudio
+    names = {"pinhole": (), "kannala_brandt": ("k1", "k2", "k3", "k4")}.get(key, ("k1", "k2", "p1", "p2", "k3"))
+    for name, value in there.items():
+        if value and name not in names:
+            record[name].fail(f"{value:g}, which Nerfstudio does not use to undistort with this camera_model")
+    if key == "brown_conrady":
+        if not there:
+            return "pinhole", []
+        names = names if "k3" in there else names[:4]
+    return key, [there.get(name, 0.0) for name in names]
+
+
+def _pose(record: Record) -> Extrinsics:
+    rows = record.rows(4 if len(record) == 4 else 3, 4)
+    if rows[3:] and rows[3] != [0, 0, 0, 1]:
+        record.fail("the last row is not 0 0 0 1")
+    position = [row[3] for row in rows[:3]]
+    # world from our camera: the columns of y and z turned round
+    turned = [[row[0], -row[1], -row[2]] for row in rows[:3]]
+    rotation = [0.0 - v for v in poses.vector_of_matrix(record, turned)]
+    poses.pose(record, rotation, position)
+    translation = [0.0 - v for v in poses.turn(poses.transposed(turned), position)]
+    return poses.keep(poses.pose(record, rotation, translation), "nerfstudio", rows)
+
+
+def panorama(size: tuple[int, int]) -> list[float]:
+    """The intrinsics of the equirectangular picture of the whole sphere."""
+    height, width = size
+    return [width / (2 * math.pi), height / math.pi, width / 2 - 0.5, height / 2 - 0.5]
+
+
+def render(rig: Rig, path) -> str:
+    """The text of a file: one camera for all, or one for each frame."""
+    lossy = Lossy(path, "Nerfstudio")
+    written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
+    models = {name: entries.pop("camera_model") for name, entries in written.items()}
+    if len(set(models.values())) != 1:
+        lossy.fail("cameras", f"{', '.join(sorted(set(models.values()))) or 'none'}; a file has one camera_model")
+    for name in rig.cameras:
+        if len(rig.cameras) > 1 and name not in rig.extrinsics and name not in rig.images.values():
+            lossy.fail(name, "no extrinsics; several cameras are told apart by their frames")
+    shared = len(rig.cameras) == 1 and next(iter(rig.cameras)) not in rig.extrinsics
+    whole: dict = {"camera_model": next(iter(models.values()))}
+    if shared:
+        whole.update(next(iter(written.values())))
+    whole["frames"] = []
+    for name, extrinsics in rig.extrinsics.items():
+        own = {} if shared else written[rig.images.get(name, name)]
+        lossy.pose(name, extrinsics)
+        whole["frames"].append({"file_path": name, **own, "transform_matrix": _rows(extrinsics)})
+    return as_json(whole)
+
+
+def _entries(lossy: Lossy, name: str, camera: Camera) -> dict:
+    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    key = lossy.model(name, camera, set(_MODELS.values()))
+    entries = {"camera_model": next(model for model, k in _MODELS.items() if k == key)}
+    if key == "equirectangular":
+        size = lossy.size(name, camera)
+        if [fx, fy, cx, cy] != panorama(size):
+            lossy.fail(name, "a part of a panorama; Nerfstudio has the whole sphere only")
+        return {**entries, "w": size[1], "h": size[0]}
+    entries |= {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
+    if camera.image_size is not None:
+        entries |= {"w": camera.image_size[1], "h": camera.image_size[0]}
+    if key == "fisheye624":
+        entries["distortion_params"] = distortion
+    elif key == "kannala_brandt":
+        entries |= zip(_RADIAL[:4], lossy.at_most(name, camera, distortion, (4,)), strict=True)
+    elif key == "brown_conrady":
+        distortion = lossy.at_most(name, camera, distortion, (4, 5))
+        entries |= zip(("k1", "k2", "p1", "p2", "k3"), distortion, strict=False)
+    return entries
+
+
+def _rows(extrinsics: Extrinsics) -> list[list[float]]:
+    kept = poses.written(extrinsics, "nerfstudio")
+    if kept is not None:
+        return kept
+    rotation, position = poses.inverse(*poses.numbers(extrinsics))
+    turned = [[row[0], -row[1], -row[2]] for row in poses.matrix_of_vector(rotation)]
+    return poses.as_rows(turned, position)

@@ -1,0 +1,111 @@
+"""camtorch's own JSON, which holds any camera of any model to the last bit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.io.record import Record
+from camtorch.io.write import Lossy, as_json
+from camtorch.rig import Rig
+
+_VERSION = 1
+_DEEPEST_BATCH = 8
+
+
+def matches(keys: dict) -> bool:
+    """Whether these are the keys of such a file."""
+    return "camtorch" in keys
+
+
+def parse(record: Record) -> Rig:
+    """The cameras, their poses and the images that they took."""
+    record["camtorch"].whole(1, _VERSION, f"version that this camtorch reads, which is up to {_VERSION}")
+    record["cameras"].few(len(record["cameras"].keys()))
+    cameras = {name: _camera(record["cameras"][name]) for name in record["cameras"].keys()}  # noqa: SIM118
+    extrinsics, images = {}, {}
+    for name in record["extrinsics"].keys() if "extrinsics" in record else ():
+        entry = record["extrinsics"][name]
+        if "camera" in entry:
+            images[name] = entry["camera"].text()
+        if images.get(name, name) not in cameras:
+            entry.fail(f"of the camera {images.get(name, name)!r:.60}, which is not in the file")
+        try:
+            extrinsics[name] = Extrinsics(_tensor(entry["rotation"], 3), _tensor(entry["translation"], 3))
+        except ValueError as error:
+            entry.fail(error)
+    return Rig(cameras, extrinsics, images=images)
+
+
+def _camera(record: Record) -> Camera:
+    key = record["model"].text()
+    names = [name.text() for name in record["distortion_names"]] if "distortion_names" in record else []
+    kind = record.model(key)
+    arguments = [_tensor(record["intrinsics"], 4)]
+    if names:
+        if list(kind.names_of(len(names)) or ()) != names:
+            record["distortion_names"].fail(f"not those of {kind.__name__}, which takes {kind.counts_text()}")
+        arguments.append(_tensor(record["distortion"], len(names)))
+    size = None
+    if "image_size" in record:
+        height, width = (side.side() for side in _two(record["image_size"]))
+        size = (height, width)
+    try:
+        return kind(*arguments, image_size=size)
+    except (ValueError, TypeError) as error:
+        return record.fail(error)
+
+
+def _two(record: Record) -> Record:
+    if len(record) != 2:
+        record.fail("a size is [height, width]")
+    return record
+
+
+def _tensor(record: Record, last: int) -> Tensor:
+    """Numbers (*B, last)."""
+    values, shape = _flat(record, 0)
+    if not shape or shape[-1] != last or math.prod(shape) != len(values):
+        record.fail(f"numbers (*B, {last}); these are {tuple(shape)}")
+    return torch.tensor(values, dtype=torch.float64).reshape(shape)
+
+
+def _flat(record: Record, depth: int) -> tuple[list[float], list[int]]:
+    if not isinstance(record.value, list):
+        return [record.number()], []
+    if depth > _DEEPEST_BATCH:
+        record.fail("nested too deeply")
+    parts = [_flat(item, depth + 1) for item in record]
+    if any(shape != parts[0][1] for _, shape in parts):
+        record.fail("rows of different lengths")
+    return [value for values, _ in parts for value in values], [len(parts), *(parts[0][1] if parts else [])]
+
+
+def render(rig: Rig, path) -> str:
+    """The text of a file. Numbers are float64, which holds those of a float32 camera exactly."""
+    lossy = Lossy(path, "camtorch")
+    cameras, extrinsics = {}, {}
+    for name, camera in rig.cameras.items():
+        entry = {"model": camera.key, "intrinsics": _values(lossy, name, camera.intrinsics)}
+        if camera.distortion.shape[-1]:
+            entry["distortion_names"] = list(camera.distortion_names)
+            entry["distortion"] = _values(lossy, name, camera.distortion)
+        if camera.image_size is not None:
+            entry["image_size"] = list(camera.image_size)
+        cameras[name] = entry
+    for name, pose in rig.extrinsics.items():
+        extrinsics[name] = {key: _values(lossy, name, getattr(pose, key)) for key in ("rotation", "translation")}
+        if name in rig.images:
+            extrinsics[name]["camera"] = rig.images[name]
+    return as_json({"camtorch": _VERSION, "cameras": cameras, "extrinsics": extrinsics})
+
+
+def _values(lossy: Lossy, name: str, tensor: Tensor) -> Sequence:
+    if not bool(torch.isfinite(tensor).all()):
+        lossy.fail(name, "numbers that are not finite")
+    return tensor.detach().double().tolist()

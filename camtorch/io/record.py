@@ -1,0 +1,158 @@
+"""What stands in a file, with the place where it stands for the errors."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from typing import Any, NoReturn
+
+import torch
+
+from camtorch.camera import MODELS, Camera
+from camtorch.io import CameraFileError
+
+LARGEST_SIDE = 1 << 20
+_MOST_CAMERAS = 20_000
+_LONGEST_NUMBER = 400  # no double needs as many characters
+
+
+class Record:
+    """A value of a file: text, True, False, None, a list or a mapping. Numbers are text until someone asks.
+
+    Args:
+        path: the file.
+        value: what stands there.
+        place: where it stands.
+    """
+
+    def __init__(self, path, value: Any, place: str = ""):
+        self.path, self.value, self.place = path, value, place
+
+    def fail(self, reason: object) -> NoReturn:
+        """Raise the CameraFileError of this place."""
+        raise CameraFileError(self.path, self.place or "content", reason) from None
+
+    # -- mappings
+
+    def keys(self) -> list[str]:
+        """The keys of a mapping."""
+        if not isinstance(self.value, dict):
+            self.fail("not keys and values")
+        return list(self.value)
+
+    def __contains__(self, key: str) -> bool:
+        if not isinstance(self.value, dict):
+            self.fail("not keys and values")
+        return key in self.value
+
+    def __getitem__(self, key: str) -> Record:
+        found = self.get(key)
+        if found is None:
+            Record(self.path, None, self.place_of(key)).fail("missing")
+        return found
+
+    def get(self, key: str) -> Record | None:
+        """The value of a key, or None."""
+        return Record(self.path, self.value[key], self.place_of(key)) if key in self else None
+
+    def place_of(self, key: str) -> str:
+        """The place of a key; of one that would spoil the line a short form."""
+        key = key if key.isprintable() and len(key) <= 60 else f"{key!r:.60}"
+        return f"{self.place}.{key}" if self.place else key
+
+    # -- lists
+
+    def __iter__(self) -> Iterator[Record]:
+        if not isinstance(self.value, list):
+            self.fail("no list")
+        for i, item in enumerate(self.value):
+            yield Record(self.path, item, f"{self.place}[{i}]")
+
+    def __len__(self) -> int:
+        if not isinstance(self.value, list):
+            self.fail("no list")
+        return len(self.value)
+
+    # -- values
+
+    def text(self) -> str:
+        """A text."""
+        if not isinstance(self.value, str):
+            self.fail("no text")
+        return self.value
+
+    def number(self) -> float:
+        """A finite number."""
+        number = math.nan
+        if isinstance(self.value, str) and len(self.value) <= _LONGEST_NUMBER:
+            with contextlib.suppress(ValueError):
+                number = float(self.value)
+        if not math.isfinite(number):
+            self.fail(f"{self.value!r:.60} is no finite number" if isinstance(self.value, str) else "is no number")
+        return number
+
+    def whole(self, low: int, high: int, what: str) -> int:
+        """A whole number from low to high; `what` is what the error says it is not."""
+        number = self.number()
+        if number != int(number) or not low <= number <= high:
+            self.fail(f"{number:g} is no {what}")
+        return int(number)
+
+    def side(self) -> int:
+        """The width or the height of a picture."""
+        return self.whole(1, LARGEST_SIDE, "number of pixels")
+
+    def size(self) -> tuple[int, int]:
+        """(height, width) of a list [width, height]."""
+        if len(self) != 2:
+            self.fail(f"a size is [width, height]; this has {len(self)} numbers")
+        width, height = (side.side() for side in self)
+        return height, width
+
+    def numbers(self, count: int | None = None) -> list[float]:
+        """A list of finite numbers, of that many if given."""
+        if count is not None and len(self) != count:
+            self.fail(f"{len(self)} numbers where {count} belong")
+        return [item.number() for item in self]
+
+    def rows(self, rows: int, columns: int) -> list[list[float]]:
+        """A list of lists of finite numbers."""
+        if len(self) != rows:
+            self.fail(f"{len(self)} rows where {rows} belong")
+        return [row.numbers(columns) for row in self]
+
+    # -- cameras
+
+    def few(self, count: int) -> None:
+        """Refuse a file of more cameras than anyone has: each costs some kilobytes and a tenth of a millisecond."""
+        if count > _MOST_CAMERAS:
+            self.fail(f"{count} cameras; more than {_MOST_CAMERAS} are not read")
+
+    def camera(self, key: str, intrinsics: list[float], distortion: list[float], size) -> Camera:
+        """The camera of a model of `camtorch.MODELS`, in float64."""
+        kind = self.model(key)
+        arguments = [torch.tensor(intrinsics, dtype=torch.float64)]
+        if distortion:
+            if kind.names_of(len(distortion)) is None or not kind.names_of(len(distortion)):
+                self.fail(f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
+            arguments.append(torch.tensor(distortion, dtype=torch.float64))
+        try:
+            return kind(*arguments, image_size=size)
+        except CameraFileError:
+            raise
+        except (ValueError, TypeError) as error:
+            self.fail(error)
+
+    def model(self, key: str) -> type[Camera]:
+        """The model of that key."""
+        if key not in MODELS:
+            self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have")
+        return MODELS[key]
+
+
+def one_of(record: Record, names) -> str:
+    """The text of a record, which must be one of the names."""
+    if record.text() not in names:
+        record.fail(f"{record.text()!r:.60} is not known here; known are {', '.join(sorted(names))}")
+    return record.text()

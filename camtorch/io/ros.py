@@ -1,0 +1,83 @@
+"""ROS camera_info: the YAML of camera_calibration, or a message as `rostopic echo` prints it."""
+
+from __future__ import annotations
+
+from camtorch.io.record import Record, one_of
+from camtorch.io.write import Lossy, listed, quoted
+from camtorch.rig import Rig
+
+_MODELS = {
+    "plumb_bob": ("brown_conrady", (4, 5)),
+    "rational_polynomial": ("brown_conrady", (8, 12, 14)),
+    "equidistant": ("kannala_brandt", (4,)),
+    "none": ("pinhole", ()),
+    "": ("pinhole", ()),
+}
+
+
+def matches(keys: dict) -> bool:
+    """Whether these are the keys of such a file."""
+    return "distortion_model" in keys and any(key in keys for key in ("camera_matrix", "K", "k"))
+
+
+def parse(record: Record) -> Rig:
+    """The camera of a file: K and D. R and P, the rectification of a stereo pair, are not read."""
+    name = record["camera_name"].text() if "camera_name" in record else "camera"
+    width, height = (_either(record, f"image_{side}", side).side() for side in ("width", "height"))
+    matrix = _either(record, "camera_matrix", "K", "k")
+    fx, skew, cx, below, fy, cy, *bottom = _numbers(matrix, 9)
+    if skew:
+        matrix.fail(f"a skew of {skew:g}, which no model here has; write 0 there to ignore it as OpenCV does")
+    if below or bottom != [0, 0, 1]:
+        matrix.fail("is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+    key, counts = _MODELS[one_of(record["distortion_model"], _MODELS)]
+    coefficients = _either(record, "distortion_coefficients", "D", "d")
+    distortion = _numbers(coefficients)
+    if not distortion:
+        key = "pinhole"
+    elif len(distortion) not in counts:
+        takes = " or ".join(map(str, counts)) or "none"
+        coefficients.fail(f"{len(distortion)} coefficients; {record['distortion_model'].value} takes {takes}")
+    camera = coefficients.camera(key, [fx, fy, cx, cy], distortion, (height, width))
+    return Rig({name or "camera": camera})
+
+
+def _either(record: Record, *keys: str) -> Record:
+    return record[next((key for key in keys if key in record), keys[0])]
+
+
+def _numbers(record: Record, count: int | None = None) -> list[float]:
+    if isinstance(record.value, dict):
+        rows, cols = (record[key].whole(0, 1000, "number of rows or columns") for key in ("rows", "cols"))
+        if len(record["data"]) != rows * cols:
+            record["data"].fail(f"{len(record['data'])} numbers, where rows and cols say {rows} x {cols}")
+        record = record["data"]
+    return record.numbers(count)
+
+
+def render(rig: Rig, path) -> str:
+    """The text of a file: R is the identity, and P is K."""
+    lossy = Lossy(path, "ROS camera_info")
+    name, camera = lossy.only_camera(rig)
+    lossy.no_pose(rig)
+    height, width = lossy.size(name, camera)
+    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt"))
+    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    model = "rational_polynomial" if len(distortion) > 5 else "plumb_bob"
+    if key == "kannala_brandt":
+        model, distortion = "equidistant", lossy.at_most(name, camera, distortion, (4,))
+    lines = [
+        f"image_width: {width}",
+        f"image_height: {height}",
+        f"camera_name: {quoted(name)}",
+        *_matrix("camera_matrix", 3, 3, [fx, 0, cx, 0, fy, cy, 0, 0, 1]),
+        f"distortion_model: {model}",
+        *_matrix("distortion_coefficients", 1, len(distortion), distortion),
+        *_matrix("rectification_matrix", 3, 3, [1, 0, 0, 0, 1, 0, 0, 0, 1]),
+        *_matrix("projection_matrix", 3, 4, [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _matrix(key: str, rows: int, cols: int, data: list[float]) -> list[str]:
+    return [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", f"  data: {listed(data)}"]

@@ -1,0 +1,212 @@
+"""Extrinsics in files: directions, axes, chains, and what comes back to the last bit."""
+
+import json
+import math
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rigs import FILES, POINT, SUFFIXES, assert_same, float64, load
+
+import camtorch as ct
+
+T = [[0.999850307569043, -0.005207406814266403, 0.016499859646724586, -0.11]]
+T += [[0.005392633690220337, 0.9999227207198279, -0.011201432503970198, 0.0004]]
+T += [[-0.016440254133497537, 0.011288733433323263, 0.9998011214944192, -0.0008]]
+
+
+def test_opencv_stereo():
+    rig = load("opencv_stereo.yml")
+    assert list(rig.cameras) == list(rig.extrinsics) == ["1", "2"]
+    assert rig.extrinsics["1"](float64(POINT)).tolist() == list(POINT)
+    second = float64([row[:3] for row in T]) @ float64(POINT) + float64([-0.0832, 0.0009, 0.0004])
+    assert torch.allclose(rig.extrinsics["2"](float64(POINT)), second, rtol=0, atol=1e-15)
+
+
+def camchain(**extra):
+    lines = []
+    for i, name in enumerate(("cam0", "cam1", "cam2")):
+        lines += [f"{name}:", "  camera_model: pinhole", "  distortion_model: radtan"]
+        lines += [f"  distortion_coeffs: [0.1, {i}.5, 0.0, 1e-3]", f"  intrinsics: [500, 501, 320.5, {240 + i}]"]
+        lines += ["  resolution: [640, 480]", *(f"  {key}: {value}" for key, value in extra.get(name, {}).items())]
+    return "\n".join(lines)
+
+
+def test_kalibr_chain(tmp_path):
+    path, rows = tmp_path / "chain.yaml", [*T, [0, 0, 0, 1]]
+    path.write_text(camchain(cam1={"T_cn_cnm1": rows}, cam2={"T_cn_cnm1": rows}))
+    rig = ct.load(path)
+    step, point = float64(rows), float64([*POINT, 1])
+    for i, name in enumerate(rig.cameras):
+        expected = torch.linalg.matrix_power(step, i) @ point
+        assert torch.allclose(rig.extrinsics[name](point[:3]), expected[:3], rtol=0, atol=1e-14)
+    ct.save(rig, path)
+    assert_same(ct.load(path), rig)
+    rig.extrinsics["cam0"] = rig.extrinsics["cam1"]
+    ct.save(rig, path)
+    moved = ct.load(path)
+    assert "T_cam_imu" in path.read_text()
+    for name, pose in rig.extrinsics.items():
+        assert torch.allclose(moved.extrinsics[name](point[:3]), pose(point[:3]), rtol=0, atol=1e-14)
+
+
+def test_kalibr_imu(tmp_path):
+    path, rows = tmp_path / "chain.yaml", [*T, [0, 0, 0, 1]]
+    path.write_text(camchain(**{f"cam{i}": {"T_cam_imu": rows} for i in range(3)}))
+    rig = ct.load(path)
+    assert torch.allclose(rig.extrinsics["cam2"].matrix(), float64(rows), rtol=0, atol=1e-15)
+    ct.save(rig, path)
+    assert_same(ct.load(path), rig)
+
+
+def test_kalibr_models(tmp_path):
+    path = tmp_path / "chain.yaml"
+    models = {
+        ("omni", "radtan"): ("mei", 1, 4),
+        ("eucm", "none"): ("eucm", 2, 0),
+        ("ds", "none"): ("double_sphere", 2, 0),
+    }
+    models[("pinhole", "fov")] = ("fov", 0, 1)
+    tried = 0
+    for (projection, lens), (key, before, after) in models.items():
+        first, last = [0.5, 0.6][:before], [0.01, 0.02, 0.003, 0.004][:after]
+        text = f"cam0:\n  camera_model: {projection}\n  distortion_model: {lens}\n  resolution: [640, 480]\n"
+        path.write_text(f"{text}  intrinsics: {[*first, 500.0, 501.0, 320.0, 240.0]}\n  distortion_coeffs: {last}\n")
+        if key not in ct.MODELS:
+            with pytest.raises(ct.CameraFileError, match=f"needs the camera model '{key}'"):
+                ct.load(path)
+            continue
+        camera = ct.load(path).camera
+        assert camera.intrinsics.tolist() == [500, 501, 320, 240]
+        assert camera.distortion.tolist() == first + last
+        ct.save(camera, path, "kalibr")
+        assert_same(ct.load(path), ct.Rig({"cam0": camera}))
+        tried += 1
+    if not tried:
+        pytest.skip("model not in ct.MODELS: none of mei, eucm, double_sphere, fov")
+
+
+@pytest.mark.parametrize("name", ["aria_device_calibration.json", "basalt_calibration.json"])
+def test_poses_of_cameras_on_a_device_are_turned_round(name):
+    rig = load(name)
+    if name.startswith("aria"):
+        entries = json.loads((FILES / name).read_text())["CameraCalibrations"]
+        where = {e["Label"]: e["T_Device_Camera"]["Translation"] for e in entries}
+    else:
+        entries = json.loads((FILES / name).read_text())["value0"]["T_imu_cam"]
+        where = {f"cam{i}": [e["px"], e["py"], e["pz"]] for i, e in enumerate(entries)}
+    for camera, position in where.items():
+        assert torch.allclose(rig.extrinsics[camera].position, float64(position), rtol=0, atol=1e-15)
+
+
+def test_nerfstudio_axes():
+    """A camera without rotation there looks along -z of the world, with y up."""
+    rig = load("nerfstudio_transforms.json")
+    assert list(rig.cameras) == ["camera"]
+    pose = rig.extrinsics["images/frame_00002.jpg"]
+    assert torch.allclose(pose(float64([0.1, 0.2, -1.0])), float64([0.1, -0.2, 1.0]), rtol=0, atol=1e-15)
+    matrix = float64(json.loads((FILES / "nerfstudio_transforms.json").read_text())["frames"][0]["transform_matrix"])
+    seen = torch.linalg.inv(matrix) @ float64([0.3, 0.4, -5.0, 1.0])
+    pose = rig.extrinsics["images/frame_00001.jpg"]
+    assert torch.allclose(pose(float64([0.3, 0.4, -5.0])), seen[:3] * float64([1, -1, -1]), rtol=0, atol=1e-14)
+    assert rig.camera_of("images/frame_00001.jpg") is rig.camera
+
+
+def test_nerfstudio_camera_of_each_frame(tmp_path):
+    path, rows = tmp_path / "transforms.json", [*T, [0, 0, 0, 1]]
+    frames = [
+        {
+            "file_path": f"{i}.png",
+            "transform_matrix": rows,
+            "fl_x": 500 + i,
+            "fl_y": 501,
+            "cx": 320,
+            "cy": 240,
+            "w": 640,
+        }
+        | {"h": 480, "k1": 0.1, "k2": 0, "p1": 0, "p2": 0.01}
+        for i in range(2)
+    ]
+    path.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}))
+    rig = ct.load(path)
+    assert {name: camera.intrinsics[0].item() for name, camera in rig.cameras.items()} == {"0.png": 500, "1.png": 501}
+    ct.save(rig, path)
+    assert_same(ct.load(path), rig)
+    path.write_text(json.dumps({"camera_model": "OPENCV", "fl_x": 400, "frames": frames}))
+    with pytest.raises(ct.CameraFileError, match="fl_x: a frame says otherwise"):
+        ct.load(path)
+
+
+def test_nerfstudio_of_instant_ngp(tmp_path):
+    path = tmp_path / "transforms.json"
+    text = {"camera_angle_x": 1.2, "w": 640, "h": 480, "frames": []}
+    path.write_text(json.dumps(text))
+    focal = 320 / math.tan(0.6)
+    assert ct.load(path).camera.intrinsics.tolist() == [focal, focal, 319.5, 239.5]
+    for more, kind in (
+        ({"camera_model": "PINHOLE", "k1": 0, "p2": 0}, ct.Pinhole),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, ct.BrownConrady),
+        ({"k1": 0.1}, ct.BrownConrady),
+        ({"k1": 0.1, "is_fisheye": True}, ct.KannalaBrandt),
+    ):
+        path.write_text(json.dumps(text | more))
+        assert type(ct.load(path).camera) is kind
+    path.write_text(json.dumps(text | {"k1": 0.1, "k4": 0.1}))
+    with pytest.raises(ct.CameraFileError, match=r"k4: 0\.1, which Nerfstudio does not use"):
+        ct.load(path)
+
+
+@pytest.mark.parametrize("suffix", ["txt", "bin"])
+def test_colmap_images(suffix, tmp_path):
+    camera = ct.KannalaBrandt(float64([500, 501, 320, 240]), float64([0.1, 0, 0, 0]), image_size=(480, 640))
+    poses = {f"{i}.jpg": ct.Extrinsics(float64([0.3 * i, -0.7, 3.0]), float64([1, 2, i])) for i in range(3)}
+    rig = ct.Rig({"4": camera}, poses, images=dict.fromkeys(poses, "4"))
+    ct.save(rig, tmp_path / f"cameras.{suffix}")
+    first = ct.load(tmp_path)
+    for name, pose in poses.items():
+        assert torch.allclose(first.extrinsics[name].matrix(), pose.matrix(), rtol=0, atol=1e-14)
+    assert torch.equal(first.camera_of("2.jpg").intrinsics, camera.intrinsics)
+    ct.save(first, tmp_path / f"cameras.{suffix}")
+    assert_same(ct.load(tmp_path), first)
+
+
+def test_colmap_points_are_not_lost(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    images = "# list\n1 1 0 0 0 0 0 0 1 a.jpg\n10.5 11.5 -1\n2 1 0 0 0 0 0 1 1 b.jpg\n\n"
+    (tmp_path / "images.txt").write_text(images)
+    rig = ct.load(tmp_path)
+    assert list(rig.extrinsics) == ["a.jpg", "b.jpg"]
+    ct.save(
+        ct.Rig({"1": rig.cameras["1"].resize(240, 320)}, rig.extrinsics, images=rig.images), tmp_path / "cameras.txt"
+    )
+    assert (tmp_path / "images.txt").read_text() == images
+    assert ct.load(tmp_path).camera.image_size == (240, 320)
+    rig.extrinsics["a.jpg"] = rig.extrinsics["b.jpg"]
+    with pytest.raises(ct.CameraFileError, match="points of images, which would be lost"):
+        ct.save(rig, tmp_path / "cameras.txt")
+    with pytest.raises(ct.CameraFileError, match="camera 1: missing, while"):
+        ct.save(ct.Rig({"2": rig.camera}), tmp_path / "cameras.txt")
+
+
+rotations = st.lists(st.floats(-3, 3), min_size=3, max_size=3).filter(lambda v: math.hypot(*v) < 3.1)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(rotation=rotations, translation=st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3))
+def test_any_pose_survives(rotation, translation, tmp_path):
+    camera = ct.Pinhole(float64([500, 501, 320, 240]), image_size=(480, 640))
+    pose = ct.Extrinsics(float64(rotation), float64(translation))
+    for format, suffix in SUFFIXES.items():
+        if format in ("opencv", "ros"):
+            continue
+        path = tmp_path / f"cameras{suffix}"
+        ct.save(ct.Rig({"cam0": camera}, {"cam0": pose}), path, format)
+        first = ct.load(path)
+        (found,) = first.extrinsics.values()
+        limit = 1e-15 * (8 + math.hypot(*translation))
+        assert torch.allclose(found.matrix(), pose.matrix(), rtol=0, atol=limit)
+        if format in ("mrcal", "camtorch"):
+            assert torch.equal(found.rotation, pose.rotation)
+        ct.save(first, path, format)
+        assert_same(ct.load(path), first)

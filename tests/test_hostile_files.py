@@ -1,0 +1,263 @@
+"""Broken and hostile files: one error with file, place and reason, quickly, and nothing else."""
+
+import json
+import math
+import struct
+import time
+import tracemalloc
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rigs import FILES, SAMPLES
+
+import camtorch as ct
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*4 coefficients and no fisheye_model")
+CAMERA = "1 PINHOLE 640 480 500 500 320 240\n"
+IMAGE = "1 1 0 0 0 0 0 0 1 a.jpg\n\n"
+
+
+def written(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def loads_or_says_why(path):
+    """Any content gives a rig of finite numbers, or the one error in one line that names the file."""
+    try:
+        rig = ct.load(path)
+    except ct.CameraFileError as error:
+        text = str(error)
+        assert text.startswith(str(path.parent))  # an images file beside it is another file
+        assert text.isprintable(), text
+        assert len(text) < 1000
+        return False
+    for camera in rig.cameras.values():
+        assert torch.isfinite(camera.intrinsics).all()
+        assert torch.isfinite(camera.distortion).all()
+    for pose in rig.extrinsics.values():
+        assert torch.isfinite(pose.matrix()).all()
+    return True
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_truncated_at_every_byte(name, tmp_path):
+    whole = (FILES / name).read_bytes()
+    for length in range(len(whole)):
+        loads_or_says_why(written(tmp_path / name, whole[:length]))
+
+
+@pytest.mark.parametrize("suffix", ["txt", "bin"])
+def test_images_truncated_at_every_byte(suffix, tmp_path):
+    poses = {f"{i}.jpg": ct.Extrinsics([0.1, i, 0], [1, 2, 3]) for i in range(2)}
+    camera = ct.Pinhole([500.0, 500, 320, 240], image_size=(480, 640))
+    ct.save(ct.Rig({"1": camera}, poses, images=dict.fromkeys(poses, "1")), tmp_path / f"cameras.{suffix}")
+    whole = (tmp_path / f"images.{suffix}").read_bytes()
+    for length in range(len(whole)):
+        written(tmp_path / f"images.{suffix}", whole[:length])
+        loads_or_says_why(tmp_path / f"cameras.{suffix}")
+
+
+@settings(max_examples=600)
+@given(
+    name=st.sampled_from(SAMPLES),
+    position=st.floats(0, 1),
+    content=st.binary(min_size=1, max_size=8)
+    | st.sampled_from([b"NaN", b"1e400", b"-", b"{", b"]", b"&a *a", b"null"]),
+    cut=st.integers(0, 12),
+)
+def test_damaged_bytes(tmp_path_factory, name, position, content, cut):
+    whole = (FILES / name).read_bytes()
+    start = int(position * len(whole))
+    loads_or_says_why(written(tmp_path_factory.getbasetemp() / name, whole[:start] + content + whole[start + cut :]))
+
+
+@settings(max_examples=600)
+@given(
+    content=st.binary(max_size=200) | st.text(max_size=100).map(lambda text: text.encode("utf-8", "surrogatepass")),
+    suffix=st.sampled_from(["yaml", "json", "xml", "txt", "bin", "cameramodel"]),
+    start=st.sampled_from([b"", b"{", b"<", b"{'lensmodel':", b"cam0:\n", b"1 PINHOLE 640 480 ", b"\x01" + b"\0" * 7]),
+)
+def test_random_bytes(tmp_path_factory, content, suffix, start):
+    loads_or_says_why(written(tmp_path_factory.getbasetemp() / f"bytes.{suffix}", start + content))
+
+
+junk = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.sampled_from(["1e400", "NaN"]),
+    lambda inner: st.lists(inner, max_size=6) | st.dictionaries(st.sampled_from(["rows", "data", "cam0"]), inner),
+    max_leaves=8,
+)
+STRUCTURED = [name for name in SAMPLES if name.endswith(".json")]
+
+
+@settings(max_examples=800)
+@given(data=st.data(), name=st.sampled_from(STRUCTURED))
+def test_wrong_values(tmp_path_factory, data, name):
+    """One value of a good file, anywhere in it, becomes something else, or goes."""
+    whole = json.loads((FILES / name).read_text())
+    inside = whole
+    while True:
+        keys = list(inside) if isinstance(inside, dict) else list(range(len(inside)))
+        if not keys:
+            break
+        key = data.draw(st.sampled_from(keys))
+        if isinstance(inside[key], (dict, list)) and data.draw(st.integers(0, 4)):
+            inside = inside[key]
+            continue
+        if data.draw(st.booleans()):
+            inside[key] = data.draw(junk)
+        else:
+            del inside[key]
+        break
+    loads_or_says_why(written(tmp_path_factory.getbasetemp() / name, json.dumps(whole)))
+
+
+# -- what someone would do on purpose
+
+K = "[500, 0, 320, 0, 500, 240, 0, 0, 1]"
+CAM = "{camera_model: pinhole, distortion_model: none, intrinsics: [1, 1, 0, 0], resolution: [4, 4]}"
+LAUGHS = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))
+XML = "<opencv_storage>{}</opencv_storage>"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("a.yaml", "K: !!python/object/apply:os.system ['true']", "line 1: .*nothing is constructed"),
+        ("a.yaml", "K: !!python/name:os.system", "nothing is constructed"),
+        ("a.yaml", "K: !!binary aGVsbG8=", "nothing is constructed"),
+        ("a.yaml", "a0: &a0 [1, 2]\n" + LAUGHS, "too many values"),
+        ("a.yaml", "a: &a {b: *a}", "recursive"),
+        ("a.yaml", "a: *b", "undefined alias|nothing is called"),
+        ("a.yaml", "[" * 100_000, "deep"),
+        ("a.yaml", "a: " * 300, "line 1"),
+        ("a.yaml", "? [a]\n: 1", "a key that is no text"),
+        ("a.yaml", f"K: {K}\n---\nK: {K}", "a second document"),
+        ("a.yaml", f"K: {K[:-2]}{'9' * 1_000_000}]", "no finite number"),
+        ("a.yaml", f"cam0: {CAM}\ncam0: {CAM}", "line 2: the key 'cam0' stands there twice"),
+        ("a.yaml", f"cam0: {CAM}\ncam2: {CAM}", "not numbered from cam0 on: cam0, cam2"),
+        ("a.yaml", f"cam0: {CAM.replace('pinhole', 'fish')}", "cam0: 'fish-none' is not known here; known are pin"),
+        (
+            "a.yaml",
+            f"cam0: {CAM.replace('[4, 4]', '[4, 1e30]')}",
+            r"cam0.resolution\[1\]: 1e\+30 is no number of pixels",
+        ),
+        ("a.yaml", f"cam0: {CAM.replace('[1, 1,', '[1, .nan,')}", r"cam0.intrinsics\[1\]: '.nan' is no finite number"),
+        ("a.json", '{"a":' * 100_000, "deep"),
+        ("a.json", '{"camtorch": 1, "cameras": {}}', "cameras: none"),
+        ("a.json", '{"camtorch": 2, "cameras": {}}', "2 is no version that this camtorch reads"),
+        (
+            "a.json",
+            '{"camtorch": 1, "cameras": {"a": {"model": "x", "intrinsics": [1]}}}',
+            "needs the camera model 'x'",
+        ),
+        ("a.json", '{"camtorch": 1, "cameras": {"a": 1, "a": 2}}', "the key 'a' stands there twice"),
+        ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
+        ("a.json", '{"\\n\\u0000": {"K": 1}}', "no format that is known here"),
+        ("a.xml", '<!DOCTYPE x [<!ENTITY a "b">]>' + XML.format("&a;"), "line 1: a document type"),
+        ("a.xml", XML.format("&a;"), "line 1: not XML"),
+        ("a.xml", XML.format("<a>" * 100_000), "deep"),
+        ("a.xml", XML.format(f"<K>{K[1:-1]}</K><K>1</K>"), "line 1: the key 'K' stands there twice"),
+        ("a.xml", "<html></html>", "<html> where <opencv_storage> belongs"),
+        ("a.cameramodel", "{'lensmodel': __import__('os').system('true')}", "line 1"),
+        ("a.cameramodel", "{'lensmodel': " + "[" * 100_000, "deep"),
+        (
+            "a.cameramodel",
+            "{'lensmodel': 'LENSMODEL_CAHVOR', 'imagersize': [4, 4]}",
+            "'LENSMODEL_CAHVOR' is not known here",
+        ),
+        ("a.cameramodel", "{'lensmodel': 1, 'lensmodel': 2}", "stands there twice"),
+        ("a.cameramodel", "{'lensmodel': 'x'", "ends before its last brace"),
+        ("a.cameramodel", "{'lensmodel': 'x'}}", "does not belong|nothing is to be closed"),
+        ("cameras.txt", CAMERA * 2, "line 2: a second camera has the id 1"),
+        (
+            "cameras.txt",
+            CAMERA.replace("PINHOLE", "FISH"),
+            "the model 'FISH' is not known here; known are SIMPLE_PINHOLE",
+        ),
+        ("cameras.txt", CAMERA.replace("240", ""), "line 1: 3 parameters; PINHOLE has 4"),
+        ("cameras.txt", CAMERA.replace("240", "1e400"), "line 1.*'1e400' is no finite number"),
+        (
+            "cameras.bin",
+            struct.pack("<Q", 1 << 60),
+            "byte 0: 1152921504606846976 cameras, for which the file is too small",
+        ),
+        ("cameras.bin", struct.pack("<QIiQQ", 1, 1, 99, 4, 4), "byte 8: the model 99 is not known here"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, math.nan, 1), "not finite"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 1 << 60, 4, 1, 1, 1, 1), "no number of pixels"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, 1, 1) + b"x", "1 bytes after the last camera"),
+    ],
+)
+def test_faults(name, content, reason, tmp_path):
+    path = written(tmp_path / name, content)
+    with pytest.raises(ct.CameraFileError, match=reason):
+        ct.load(path)
+    assert not loads_or_says_why(path)
+
+
+@pytest.mark.parametrize(
+    ("images", "reason"),
+    [
+        (IMAGE * 2, "line 3: a second image is called 'a.jpg'"),
+        (IMAGE.replace(" 1 a", " 7 a"), "line 1: its camera 7 is not in cameras.txt"),
+        (IMAGE.replace("1 1 0", "1 2 0"), "line 1: a quaternion of length 2, which is no rotation"),
+        (IMAGE.replace("0 1 a", "1e300 1 a"), "line 1: a number beyond 1e[+]100"),
+        ("1 1 0 0\n", "line 1: less than IMAGE_ID"),
+        (b"\xff\xfe\n", "line 1: not text"),
+    ],
+)
+def test_faults_of_images(images, reason, tmp_path):
+    written(tmp_path / "cameras.txt", CAMERA)
+    written(tmp_path / "images.txt", images)
+    with pytest.raises(ct.CameraFileError, match=reason):
+        ct.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [struct.pack("<Q", 1 << 60), struct.pack("<QI7dI", 1, 1, 1, *[0] * 6, 1) + b"a\0" + struct.pack("<Q", 1 << 60)],
+)
+def test_gigantic_counts_of_images(content, tmp_path):
+    written(tmp_path / "cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, 1, 1))
+    written(tmp_path / "images.bin", content)
+    with pytest.raises(ct.CameraFileError, match="for which the file is too small"):
+        ct.load(tmp_path)
+
+
+LARGE = {
+    "blank.txt": b"\n" * (1 << 22),
+    "spaces.cameramodel": b" " * (1 << 22),
+    "comments.cameramodel": b"#\n" * (1 << 21),
+    "lists.yaml": b"a: [" + b"[]," * (1 << 20) + b"]",
+    "keys.yaml": b"".join(b"k%d: 1\n" % i for i in range(1 << 18)),
+    "anchors.yaml": b"a: [" + b"&a [], *a," * (1 << 17) + b"]",
+    "literal.cameramodel": b"{'lensmodel': [" + b"[]," * (1 << 20) + b"]}",
+    "lists.json": b'{"a": [' + b"[]," * (1 << 22) + b"[]]}",
+    "cameras.json": b'{"a": 1' + b"".join(b',"K%d":[5,0,3,0,5,2,0,0,1]' % i for i in range(1 << 17)) + b"}",
+    "words.xml": b"<opencv_storage><K>" + b"1 " * (1 << 22) + b"</K></opencv_storage>",
+    "elements.xml": b"<opencv_storage>" + b"<K/>" * (1 << 21) + b"</opencv_storage>",
+    "digits.json": b'{"fl_x": ' + b"9" * (1 << 22) + b"}",
+    "numbers.txt": b"1 PINHOLE 640 480" + b" 1" * (1 << 20),
+    "quotes.xml": b"<opencv_storage><a>" + b'" ' * (1 << 20) + b"</a></opencv_storage>",
+    "size.json": b"{" + b" " * (1 << 24) + b"}",
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_large_files_cost_little(name, tmp_path):
+    path = written(tmp_path / name, LARGE[name])
+    start = time.process_time()
+    assert not loads_or_says_why(path)
+    assert time.process_time() - start < 10
+
+
+def test_memory(tmp_path):
+    path = written(tmp_path / "anchors.yaml", b"a: [" + b"&a [], *a," * (1 << 14) + b"]")
+    tracemalloc.start()
+    try:
+        assert not loads_or_says_why(path)
+        assert tracemalloc.get_traced_memory()[1] < 200 * path.stat().st_size
+    finally:
+        tracemalloc.stop()
