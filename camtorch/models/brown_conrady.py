@@ -26,6 +26,7 @@ class BrownConrady(Camera):
     distortion_names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
     default_count = 5
     counts = (4, 5, 8, 12, 14)
+    special_cases = (("pinhole", ()),)
     odd_in_x = frozenset({"p2", "s1", "s2", "tau_y"})
     odd_in_y = frozenset({"p1", "s3", "s4", "tau_x"})
 
