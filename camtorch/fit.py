@@ -17,8 +17,8 @@ FURTHEST = 20.0
 """The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
 _MOST_STEPS = 100
 _ROUNDS = 3
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
-_SETTLED = 1e-9  # the relative decrease of the cost that ends the search
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e-14, 1e8
+_SETTLED = 1e-8  # the relative decrease of the cost that ends the search
 _NOTHING = 1e-11  # px
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
 
@@ -73,11 +73,13 @@ def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tenso
         parameters = torch.cat((_intrinsics(camera, start, slopes), start), -1)
         low, high = _bounds(camera, parameters)
         parameters = parameters.clamp(low, high)
+        within = sights._replace(weights=torch.zeros_like(sights.weights))
         for _ in range(_ROUNDS):
             # a chart may cover more once its coefficients fit what it covered before
-            covered = see(camera, parameters[:, 4:], sights.rays).covered
-            within = sights._replace(weights=sights.weights * covered)
-            parameters = _refine(camera, within, parameters, low, high)
+            weights = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
+            more = (weights != within.weights).any(-1)
+            within = sights._replace(weights=weights)
+            parameters = _refine(camera, within, parameters, low, high, more)
         score = _cost(camera, within, parameters)
         score = score + (sights.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
         if best is None:
@@ -147,13 +149,13 @@ def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
     return torch.func.vmap(along, out_dims=1)(torch.eye(k.shape[-1], dtype=k.dtype, device=k.device))
 
 
-def _refine(camera: Camera, sights: Sights, parameters: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """The parameters (C, P) of least cost near those given."""
+def _refine(camera: Camera, sights: Sights, parameters: Tensor, low: Tensor, high: Tensor, going: Tensor) -> Tensor:
+    """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
     parameters = parameters.clone()
     cost = _cost(camera, sights, parameters)
     damping = torch.full_like(cost, _FIRST_DAMPING)
     tiny = _NOTHING**2 * sights.weights.sum(-1)
-    going = torch.isfinite(cost) & (cost > tiny)
+    going = going & torch.isfinite(cost) & (cost > tiny)
     for _ in range(_MOST_STEPS):
         rows = going.nonzero()[:, 0]
         if len(rows) == 0:
