@@ -1,4 +1,4 @@
-"""The command line: `camtorch dewarp`, `augment` and `demo`. Degrees and WIDTHxHEIGHT here, and only here."""
+"""The command line: `camtorch dewarp`, `augment`, `convert`, `show` and `demo`. Degrees and WIDTHxHEIGHT here, and only here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from camtorch import __version__
+from camtorch import __version__, convert_cli
 
 _LARGEST_SIDE = 32768
 _STRIP_PIXELS = 1 << 21
@@ -85,6 +85,8 @@ def _parser() -> argparse.ArgumentParser:
     augment.add_argument("--size", type=_size, metavar="WxH", help="of the new pictures; by default the old one's")
     for name in ("yaw", "pitch", "roll", "zoom", "fov"):
         augment.add_argument(f"--{name}", type=_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
+
+    convert_cli.add(commands)
 
     demo = commands.add_parser("demo", help="render, dewarp and measure a room seen by five lenses", allow_abbrev=False)
     demo.set_defaults(run=_demo)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -146,7 +147,10 @@ def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
     def along(direction: Tensor) -> Tensor:
         return torch.func.jvp(function, (k,), (direction.expand_as(k),))[1]
 
-    return torch.func.vmap(along, out_dims=1)(torch.eye(k.shape[-1], dtype=k.dtype, device=k.device))
+    with warnings.catch_warnings():
+        # on its first use forward mode loads what calls the deprecated torch.jit.script
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return torch.func.vmap(along, out_dims=1)(torch.eye(k.shape[-1], dtype=k.dtype, device=k.device))
 
 
 def _refine(camera: Camera, sights: Sights, parameters: Tensor, low: Tensor, high: Tensor, going: Tensor) -> Tensor:

@@ -1,0 +1,127 @@
+"""The commands `camtorch convert` and `camtorch show`. Degrees here, and only here."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+
+def add(commands) -> None:
+    """Add both to the subparsers of a command line."""
+    convert = commands.add_parser(
+        "convert",
+        help="write a calibration as another camera model, or in another format",
+        description="Write the cameras of a calibration file as cameras of another model, and print how good that is.",
+        allow_abbrev=False,
+    )
+    convert.set_defaults(run=_convert)
+    convert.add_argument("input", type=Path, metavar="IN", help="a calibration file")
+    convert.add_argument("output", type=Path, metavar="OUT", help="the new one")
+    convert.add_argument("--model", metavar="KEY", help="the new model; by default the model stays")
+    convert.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
+    convert.add_argument("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")
+    convert.add_argument("--format", help="of OUT; by default what its name says")
+    show = commands.add_parser("show", help="what a calibration says, in numbers and in a picture", allow_abbrev=False)
+    show.set_defaults(run=_show)
+    show.add_argument("input", type=Path, metavar="FILE", help="a calibration file")
+    show.add_argument(
+        "--against", type=Path, metavar="OTHER", help="another calibration of the same camera, to compare"
+    )
+    show.add_argument("-o", "--output", type=Path, metavar="OUT", help="a picture: distortion, radius over angle")
+    for command in (convert, show):
+        command.add_argument("--name", help="which camera, in a file with several")
+        command.add_argument("--from-model", metavar="KEY", help="the model in the file, where that does not say it")
+        command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
+
+
+def _read(path: Path, name: str | None, model: str | None) -> dict[str, Camera]:
+    """The cameras of a file, or the one of that name."""
+    from camtorch.io import opencv
+
+    return {name or "camera": opencv.read(path, model, name=name).requires_grad_(False)}
+
+
+def _write(cameras: dict[str, Camera], path: Path, format: str | None) -> None:
+    """A file of these cameras."""
+    import camtorch
+
+    if not hasattr(camtorch, "save"):
+        raise ValueError(f"{path}: this version of camtorch writes no calibration files")
+    held = next(iter(cameras.values())) if len(cameras) == 1 else camtorch.Rig(cameras)
+    camtorch.save(held, path, format=format)
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    path = arguments.output
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder")
+    if path.exists() and not arguments.force:
+        raise ValueError(f"{path}: exists already; --force overwrites it")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{path}: the folder {path.parent} cannot be written to")
+    angle = arguments.max_angle
+    if angle is not None and not 0 < angle <= 180:
+        raise ValueError(f"--max-angle must be above 0 and at most 180 degrees; got {angle:g}")
+    cameras, notes = {}, []
+    for name, camera in _read(arguments.input, arguments.name, arguments.from_model).items():
+        model = arguments.model or camera.key
+        result = camera.convert(model, count=arguments.count, max_angle=None if angle is None else math.radians(angle))
+        cameras[name] = result.camera
+        part = "the picture" if camera.image_size else "its rays"
+        degrees, covered = math.degrees(float(result.max_angle)), 100 * float(result.valid_fraction)
+        errors = "exact" if bool(result.exact) else f"rms {result.rms:.3g} px, at most {result.max_error:.3g} px"
+        notes.append(
+            f"{path}: {name}, {camera.key} to {result.camera.key}: {errors}, up to {degrees:.1f} degrees from the axis, "
+            f"{covered:.4g} % of {part}"
+        )
+    _write(cameras, path, arguments.format)
+    print("\n".join(notes))
+
+
+def _show(arguments: argparse.Namespace) -> None:
+    from camtorch import image_files
+    from camtorch.summary import summarise
+
+    if arguments.output is not None:
+        image_files.check_target(arguments.output, force=arguments.force)
+    elif arguments.against is not None:
+        raise ValueError("--against needs -o OUT, a picture for the difference")
+    cameras = _read(arguments.input, arguments.name, arguments.from_model)
+    for name, camera in cameras.items():
+        print(f"{arguments.input}: {name}", *summarise(camera).lines(), sep="\n")
+    if arguments.output is None:
+        return
+    if len(cameras) > 1:
+        raise ValueError(f"{arguments.input}: --name which camera the picture is to show: {', '.join(cameras)}")
+    other = None
+    if arguments.against is not None:
+        other = next(iter(_read(arguments.against, arguments.name, arguments.from_model).values()))
+    camera = next(iter(cameras.values()))
+    if camera.image_size is None:
+        raise ValueError(f"{arguments.input} states no image size, which the picture needs")
+    height, width = camera.image_size
+    _draw(arguments.output, camera, other, f"{arguments.input.name}: {camera.key}, {width} x {height}")
+    print(f"{arguments.output}: distortion, radius over angle{', difference' if other is not None else ''}")
+
+
+def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
+    from PIL import Image
+
+    from camtorch import image_files, plot
+
+    figure = plot.portrait(camera, other, title=title)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # after `portrait` said what to install
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image_files.write(path, Image.fromarray(numpy.array(canvas.buffer_rgba())[..., :3]))
