@@ -1,4 +1,4 @@
-"""The command line: `camtorch dewarp`, `augment`, `convert`, `show` and `demo`. Degrees and WIDTHxHEIGHT here, and only here."""
+"""The command line, `camtorch dewarp` and the others. Degrees and WIDTHxHEIGHT here, and only here."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class Conversion:
     valid_fraction: Tensor
     """The part of the picture, of what the old camera has rays for, that lies within `max_angle`."""
     exact: Tensor
-    """Bool: the models are related, and the numbers were taken over as they are."""
+    """Bool: the models are related, and the numbers were taken over bit by bit; what differs is rounding."""
     source_name: str = "camera"
 
     def __repr__(self) -> str:
@@ -55,7 +55,8 @@ class Conversion:
             worst = "at worst " if self.rms.ndim else ""
             text = f"{worst}rms {float(self.rms.max()):.3g} px, max {float(self.max_error.max()):.3g} px"
         angle, part = math.degrees(float(self.max_angle.min())), 100 * float(self.valid_fraction.min())
-        return f"Conversion({head}{text}, up to {angle:.1f} degrees, {part:.4g} % of the picture)"
+        what = "the picture" if self.camera.image_size else "the rays"
+        return f"Conversion({head}{text}, up to {angle:.1f} degrees, {part:.4g} % of {what})"
 
 
 @torch.no_grad()

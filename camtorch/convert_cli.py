@@ -32,9 +32,7 @@ def add(commands) -> None:
     show = commands.add_parser("show", help="what a calibration says, in numbers and in a picture", allow_abbrev=False)
     show.set_defaults(run=_show)
     show.add_argument("input", type=Path, metavar="FILE", help="a calibration file")
-    show.add_argument(
-        "--against", type=Path, metavar="OTHER", help="another calibration of the same camera, to compare"
-    )
+    show.add_argument("--against", type=Path, metavar="OTHER", help="another calibration of the camera, to compare")
     show.add_argument("-o", "--output", type=Path, metavar="OUT", help="a picture: distortion, radius over angle")
     for command in (convert, show):
         command.add_argument("--name", help="which camera, in a file with several")
@@ -81,8 +79,8 @@ def _convert(arguments: argparse.Namespace) -> None:
         degrees, covered = math.degrees(float(result.max_angle)), 100 * float(result.valid_fraction)
         errors = "exact" if bool(result.exact) else f"rms {result.rms:.3g} px, at most {result.max_error:.3g} px"
         notes.append(
-            f"{path}: {name}, {camera.key} to {result.camera.key}: {errors}, up to {degrees:.1f} degrees from the axis, "
-            f"{covered:.4g} % of {part}"
+            f"{path}: {name}, {camera.key} to {result.camera.key}: {errors}, "
+            f"up to {degrees:.1f} degrees from the axis, {covered:.4g} % of {part}"
         )
     _write(cameras, path, arguments.format)
     print("\n".join(notes))

@@ -167,7 +167,10 @@ def _refine(camera: Camera, sights: Sights, parameters: Tensor, low: Tensor, hig
         # rows that have settled are left alone, so that each goes the way that it would go alone
         these, old, weight = sights.of(rows), parameters[rows], damping[rows]
         residuals, slopes = _linearised(camera, these, old)
-        step = _step(residuals, slopes, weight)
+        # what would leave its bounds stays there, so that the others can move on
+        slope = (slopes @ residuals[..., None])[..., 0]
+        held = (old <= low[rows]) & (slope > 0) | (old >= high[rows]) & (slope < 0)
+        step = _step(residuals, torch.where(held[..., None], 0.0, slopes), weight)
         new = (old + step).clamp(low[rows], high[rows])
         new_cost = _cost(camera, these, new)
         better = new_cost < cost[rows]
