@@ -17,8 +17,8 @@ from camtorch.related import carried, default_count
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
-_FIT_SIDE, _CHECK_SIDE = 41, 97  # of the lattices of pixels to fit to, and to check with
-_ANGLES, _AZIMUTHS = 180, 16  # at which a camera is looked at as a whole
+_FIT_SIDE, _CHECK_SIDE = 33, 97  # of the lattices of pixels to fit to, and to check with
+_ANGLES, _AZIMUTHS, _RADII = 181, 16, 64  # at which a camera is looked at as a whole
 _END_AHEAD = math.radians(87)  # of rays, for a camera without a picture that does not see sideways
 _ROWS = 64  # of a batch that are worked on at a time
 
@@ -113,7 +113,8 @@ def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Cam
 def _converted(source: Camera, model, names, made, image_size, limit: float) -> tuple[Tensor, ...]:
     """Parameters (C, 4 + n), and the numbers of a `Conversion`, (C,) each."""
     slopes = _slopes(source)
-    starts = model.fit_start(names, *_radii(source, slopes))
+    view = _view(source, image_size, _FIT_SIDE, limit)
+    starts = model.fit_start(names, *_radii(source, slopes, torch.where(view.valid, view.angles, 0.0).amax(-1)))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
@@ -124,7 +125,6 @@ def _converted(source: Camera, model, names, made, image_size, limit: float) -> 
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
     rows = (~exact).nonzero()[:, 0]
     if len(rows):
-        view = _view(source, image_size, _FIT_SIDE, limit)
         sights = Sights(view.rays, view.pixels, view.valid.to(slopes.dtype)).of(rows)
         parameters[rows] = fit(made(parameters), sights, starts[:, rows], slopes[rows])
     target = made(parameters)
@@ -172,7 +172,7 @@ class _View(NamedTuple):
 def _view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> _View:
     """side^2 rays on the picture, or in all directions, of which those count that the camera has up to an angle."""
     if image_size is None:
-        rays = _directions(_reach(camera, limit) * torch.linspace(0, 1, side).to(camera.intrinsics), side)
+        rays = _directions(_reach(camera, limit) * torch.linspace(0, 1, side, **_like(camera)), side)
         rays, found = rays.flatten(1, 2), True
     else:
         rays, found = camera.unproject(_lattice(camera, image_size, side, limit))
@@ -193,7 +193,7 @@ def _lattice(camera: Camera, image_size: tuple[int, int], side: int, limit: floa
         least, most = (torch.where(closed, end, whole) for end, whole in ((ring.amin(1), low), (ring.amax(1), high)))
         inside = (least < high) & (most > low)
         low, high = torch.where(inside, least.clamp(min=low), low), torch.where(inside, most.clamp(max=high), high)
-    steps = torch.linspace(0, 1, side).to(low)[:, None]
+    steps = torch.linspace(0, 1, side, **_like(camera))[:, None]
     u, v = (low[:, None] + (high - low)[:, None] * steps).unbind(-1)
     return torch.stack(torch.broadcast_tensors(u[:, None, :], v[:, :, None]), -1).flatten(1, 2)
 
@@ -208,7 +208,7 @@ def _directions(angles: Tensor, azimuths: int) -> Tensor:
 
 def _reach(camera: Camera, limit: float) -> Tensor:
     """(C, 1): the angle up to which a camera has rays on some azimuth."""
-    angles = torch.linspace(0, math.pi, _ANGLES).to(camera.intrinsics)
+    angles = torch.linspace(0, math.pi, _ANGLES, **_like(camera))
     rays = _directions(angles.expand(len(camera.intrinsics), -1), _AZIMUTHS)
     sees = camera.project(rays)[1].any(-1).long().cumprod(-1)
     reach = (angles * sees).amax(-1, keepdim=True)
@@ -228,16 +228,22 @@ def _slopes(camera: Camera) -> Tensor:
     return torch.where(good[:, None], torch.cat((focal, seen[:, 0]), -1), otherwise)
 
 
-def _radii(camera: Camera, slopes: Tensor) -> tuple[Tensor, Tensor]:
-    """Angles and radii as `Convertible.fit_start` gets them."""
-    angles = (torch.arange(1, _ANGLES) * (math.pi / _ANGLES)).to(slopes)
-    pixels, valid = camera.project(_directions(angles.expand(len(slopes), -1), _AZIMUTHS))
+def _radii(camera: Camera, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+    """Angles and radii as `Convertible.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
+    steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
+    angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
+    pixels, valid = camera.project(_directions(angles, _AZIMUTHS))
     plane = (pixels - slopes[:, None, None, 2:]) / slopes[:, None, None, :2]
     radii = (torch.linalg.vector_norm(plane, dim=-1) * valid).sum(-1) / valid.sum(-1).clamp(min=1)
-    steps = radii.diff(dim=-1, prepend=torch.zeros_like(radii[:, :1]))
-    seen = valid.any(-1).long().cumprod(-1) * (steps > 0).long().cumprod(-1)
+    growth = radii.diff(dim=-1, prepend=torch.zeros_like(radii[:, :1]))
+    seen = valid.any(-1).long().cumprod(-1) * (growth > 0).long().cumprod(-1)
     last = seen.sum(-1, keepdim=True)
     at = (last - 1).clamp(min=0)
-    end, slope = ((torch.where(last > 0, t.gather(-1, at), angles[0])) for t in (radii, steps))
-    index = torch.arange(len(angles), device=slopes.device)
+    end, slope = (torch.where(last > 0, t.gather(-1, at), angles[:, :1]) for t in (radii, growth))
+    index = torch.arange(_RADII, device=slopes.device)
     return angles, torch.where(seen > 0, radii, end + slope * (index - at))
+
+
+def _like(camera: Camera) -> dict:
+    # steps of float32 would go past half a circle
+    return {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}

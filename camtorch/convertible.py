@@ -36,10 +36,10 @@ class Convertible:
 
         Args:
             names: of the n coefficients.
-            angles: (K,) radians from the axis, ascending from above 0 to below pi.
-            radii: (C, K) the distance from the principal point at which the camera to be fitted sees them, in
-                units of its focal length at the axis and averaged over the azimuths. Where it sees nothing the line
-                from the axis goes on straight.
+            angles: (C, K) radians from the axis, evenly from above 0 to the last one that is to be fitted.
+            radii: (C, K) the distance from the principal point at which the camera to be fitted sees them, in units of
+                its focal length at the axis and averaged over the azimuths; ascending. Where it sees nothing the
+                line goes on straight.
 
         Returns:
             (S, C, n): S alternatives, of which the one that ends best is kept.

@@ -18,7 +18,7 @@ FURTHEST = 20.0
 """The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
 _MOST_STEPS = 100
 _ROUNDS = 3
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e-14, 1e8
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
 _SETTLED = 1e-8  # the relative decrease of the cost that ends the search
 _NOTHING = 1e-11  # px
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
