@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -23,16 +23,24 @@ class Convertible:
     special_cases: ClassVar[tuple[tuple[str, tuple[str, ...]], ...]] = ()
     """The models that this one generalises: the key of each, and the names here of its coefficients in its order.
 
-    A special case is this model, at the same intrinsics, with all other coefficients neutral.
+    A special case is this model, at the same intrinsics, with all other coefficients as in `ideal`.
     """
-    neutral: ClassVar[Mapping[str, float]] = {}
-    """The values at which coefficients do nothing, where that is not 0."""
     fit_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """The least and the greatest value of coefficients that a fit tries, where there are such."""
 
     @classmethod
+    def ideal(cls, count: int) -> Sequence[float]:
+        """That many coefficients that do nothing: zeros, unless the model says otherwise."""
+        return (0.0,) * count
+
+    @staticmethod
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
+        """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
+        return None
+
+    @classmethod
     def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
-        """Coefficients to start a fit from, float64; by default neutral ones.
+        """Coefficients to start a fit from, float64; by default those of `ideal`.
 
         Args:
             names: of the n coefficients.
@@ -44,8 +52,8 @@ class Convertible:
         Returns:
             (S, C, n): S alternatives, of which the one that ends best is kept.
         """
-        neutral = torch.tensor([cls.neutral.get(name, 0.0) for name in names], dtype=radii.dtype, device=radii.device)
-        return neutral.expand(1, len(radii), len(names))
+        ideal = torch.tensor(cls.ideal(len(names)), dtype=radii.dtype, device=radii.device)
+        return ideal.expand(1, len(radii), len(names))
 
     def convert(
         self,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FURTHEST = 20.0
 """The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
-_MOST_STEPS = 100
+_MOST_STEPS = 60
 _ROUNDS = 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
 _SETTLED = 1e-8  # the relative decrease of the cost that ends the search
@@ -118,10 +118,13 @@ def _residuals(sights: Sights, parameters: Tensor, seen: Seen) -> Tensor:
 
 
 def _cost(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
-    """(C,) the sum of squares; infinite where a ray that counts is not covered."""
+    """(C,) the sum of squares; infinite where a ray that counts is not covered, or the coefficients make no camera."""
     seen = see(camera, parameters[:, 4:], sights.rays)
     lost = (~seen.covered & (sights.weights > 0)).any(-1)
     cost = _residuals(sights, parameters, seen).square().sum((1, 2))
+    defined = camera.defined(parameters[:, 4:].unbind(-1))
+    if defined is not None:
+        lost = lost | ~(defined > 0)
     return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
 
 

@@ -37,15 +37,14 @@ def carried(source: Camera, values: Tensor, model: Model, names: tuple[str, ...]
     steps = _path(type(source), model)
     if steps is None:
         return None
-    neutral = model.neutral
-    result = values.new_tensor([neutral.get(name, 0.0) for name in names]).repeat(len(values), 1)
+    result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
     lossless = torch.ones(len(values), dtype=torch.bool, device=values.device)
     for i, old in enumerate(source.distortion_names):
         name = _renamed(old, steps)
         if name in names:
             result[:, names.index(name)] = values[:, i]
         else:
-            lossless &= values[:, i] == _neutral_value(type(source), old, steps)
+            lossless &= values[:, i] == _ideal_value(source, old, steps)
     return result, lossless
 
 
@@ -88,13 +87,14 @@ def _renamed(name: str, steps: list[Step]) -> str | None:
     return name
 
 
-def _neutral_value(model: Model, name: str, steps: list[Step]) -> float:
-    """The value at which the coefficient may be lost: the neutral one of the last model that has it."""
+def _ideal_value(source: Camera, name: str, steps: list[Step]) -> float:
+    """The value at which the coefficient may be lost: the ideal one of the last model that has it."""
+    model, known = type(source), source.distortion_names
     for later, names in steps:
         if name not in names:
             break
-        model, name = later, names[name]
-    return model.neutral.get(name, 0.0)
+        model, name, known = later, names[name], _all_names(later)
+    return dict(zip(known, model.ideal(len(known)), strict=True))[name]
 
 
 def _all_names(model: Model) -> tuple[str, ...]:

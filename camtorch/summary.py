@@ -78,8 +78,8 @@ def ideal(camera: Camera) -> Camera:
     """The same camera with coefficients that do nothing."""
     if not camera.distortion_names:
         return camera
-    neutral = [camera.neutral.get(name, 0.0) for name in camera.distortion_names]
-    return type(camera)(camera.intrinsics.detach(), camera.distortion.new_tensor(neutral), image_size=camera.image_size)
+    values = camera.distortion.new_tensor(camera.ideal(len(camera.distortion_names)))
+    return type(camera)(camera.intrinsics.detach(), values, image_size=camera.image_size)
 
 
 def lattice(camera: Camera, rows: int, columns: int) -> Tensor:

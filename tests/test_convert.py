@@ -112,7 +112,7 @@ CLOSE = [
     (lambda: golden("brown_conrady__d5_dms_ir_62deg"), "fisheye624", {}, 0.1),
     (lambda: golden("brown_conrady__d4_smartphone_tele"), "fisheye62", {}, 0.1),
     (lambda: golden("pinhole__smartphone_main"), "kannala_brandt", {}, 0.01),
-    (lambda: golden("kannala_brandt__dms_130deg_a"), "brown_conrady", {"count": 8}, 5.0),
+    (lambda: golden("kannala_brandt__dms_130deg_a"), "brown_conrady", {"count": 8}, 1.0),
     (lambda: golden("fisheye624__aria_slam_left_online"), "fisheye62", {}, 0.5),
     (lambda: make("double_sphere", torch.tensor([350.0, 350, 320, 240]), torch.tensor([-0.2, 0.59]),
                   image_size=SIZE), "kannala_brandt", {}, 0.1),
@@ -132,7 +132,7 @@ def test_close_conversions(make_source, target, options, limit):
     result = source.convert(model, **options)
     check(source, result)
     assert float(result.max_error) <= limit
-    assert float(result.valid_fraction) == 1 or "max_angle" in options
+    assert float(result.valid_fraction) > 0.999 or "max_angle" in options
 
 
 # -- related models
@@ -203,13 +203,16 @@ def test_models_say_what_they_generalise(monkeypatch):
     class Scaled(ct.KannalaBrandt):
         distortion_names = ("stretch", "k1")
         default_count = 2
-        neutral = {"stretch": 1.0}  # noqa: RUF012
         special_cases = (("short", ("k1",)),)
         fit_bounds = {"stretch": (0.5, 2.0)}  # noqa: RUF012
 
         @classmethod
         def names_of(cls, count):
             return cls.distortion_names if count == 2 else None
+
+        @classmethod
+        def ideal(cls, count):
+            return 1.0, 0.0
 
         @staticmethod
         def optics(k):

@@ -44,9 +44,9 @@ class BrownConrady(Camera):
 
     @classmethod
     def fit_start(cls, names, angles, radii):
-        neutral = super().fit_start(names, angles, radii)
+        zeros = super().fit_start(names, angles, radii)
         if "k6" not in names:
-            return neutral
+            return zeros
         # N - R D = 0 is linear in the coefficients; the first weights are those of a D that follows the tangent
         ahead = angles < math.radians(85)
         tangent = torch.tan(torch.where(ahead, angles, 0.1))
@@ -62,10 +62,10 @@ class BrownConrady(Camera):
             right = q.mT @ ((ratio - 1) * weight)[..., None]
             k = (torch.linalg.solve_triangular(damped, right, upper=True) / scale.mT)[..., 0]
             denominator = (1 + (powers * k[:, None, 3:]).sum(-1)).clamp(min=1e-3)
-        start = neutral.clone()
+        start = zeros.clone()
         for i, name in enumerate(("k1", "k2", "k3", "k4", "k5", "k6")):
             start[..., names.index(name)] = k[:, i].nan_to_num(0.0, 0.0, 0.0)
-        return torch.cat((neutral, start))
+        return torch.cat((zeros, start))
 
     @staticmethod
     def optics(k):
