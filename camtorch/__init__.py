@@ -2,6 +2,7 @@
 
 from camtorch import augment, io
 from camtorch.camera import MODELS, Camera
+from camtorch.conversion import Conversion
 from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save
@@ -25,6 +26,7 @@ __all__ = [
     "BrownConrady",
     "Camera",
     "CameraFileError",
+    "Conversion",
     "Cylindrical",
     "Dewarp",
     "Equirectangular",

@@ -11,6 +11,7 @@ from torch import Tensor
 from camtorch import mapping, opaque
 from camtorch.blocks import Cameras, Project, Unproject
 from camtorch.charts import Chart
+from camtorch.convertible import Convertible
 from camtorch.domain import Domain
 from camtorch.lens import Lens
 from camtorch.opaque import finish, positive, tables, to_planes, without_keeping
@@ -36,7 +37,7 @@ MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
 
-class Camera(Picture):
+class Camera(Convertible, Picture):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
     A model states its `key`, its `distortion_names` and its `optics`; all else is done here.

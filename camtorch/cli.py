@@ -1,4 +1,4 @@
-"""The command line: `camtorch dewarp`, `augment` and `demo`. Degrees and WIDTHxHEIGHT here, and only here."""
+"""The command line, `camtorch dewarp` and the others. Degrees and WIDTHxHEIGHT here, and only here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from camtorch import __version__
+from camtorch import __version__, convert_cli
 
 _LARGEST_SIDE = 32768
 _STRIP_PIXELS = 1 << 21
@@ -86,6 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     for name in ("yaw", "pitch", "roll", "zoom", "fov"):
         augment.add_argument(f"--{name}", type=_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
 
+    convert_cli.add(commands)
+
     demo = commands.add_parser("demo", help="render, and measure what camtorch makes of it", allow_abbrev=False)
     demo.set_defaults(run=_demo)
     demo.add_argument(
@@ -97,7 +99,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     for command in (dewarp, augment):
         needed = command is dewarp
-        command.add_argument("--camera", type=Path, required=needed, metavar="FILE", help="OpenCV's YAML or JSON")
+        command.add_argument(
+            "--camera", type=Path, required=needed, metavar="FILE", help="its calibration, of any format"
+        )
         command.add_argument(
             "--model",
             metavar="KEY",
@@ -140,10 +144,10 @@ def _range(text: str) -> float | tuple[float, float]:
 def _photograph(arguments: argparse.Namespace):
     """The picture, its Exif orientation, and its camera."""
     from camtorch import image_files
-    from camtorch.io import opencv
+    from camtorch.camera_files import read_camera
 
     picture, orientation = image_files.read(arguments.image)
-    camera = opencv.read(arguments.camera, arguments.model, name=arguments.name).requires_grad_(False)
+    camera = read_camera(arguments.camera, arguments.name, arguments.model)
     size = tuple(picture.shape[-2:])
     if camera.image_size is None:
         camera.image_size = size
@@ -225,7 +229,7 @@ def _degrees(target) -> float:
 
 def _augment(arguments: argparse.Namespace) -> None:
     from camtorch import image_files, labels, sheet, views
-    from camtorch.io import opencv
+    from camtorch.camera_files import read_camera
 
     if arguments.list:
         print("\n".join(views.presets()))
@@ -250,7 +254,7 @@ def _augment(arguments: argparse.Namespace) -> None:
         known = None if arguments.labels is None else labels.read(arguments.labels, camera)
         before = views.photograph(picture, camera, known, arguments.image.name)
     elif arguments.camera is not None:
-        camera = opencv.read(arguments.camera, arguments.model, name=arguments.name).requires_grad_(False)
+        camera = read_camera(arguments.camera, arguments.name, arguments.model)
         if camera.image_size is None:
             raise ValueError(f"{arguments.camera} states no image size, which a rendered picture needs")
         before = views.scene(camera)

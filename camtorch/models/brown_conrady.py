@@ -1,5 +1,9 @@
 """The Brown-Conrady camera with OpenCV's rational, thin-prism and tilt terms."""
 
+import math
+
+import torch
+
 from camtorch.camera import Camera
 from camtorch.charts import Perspective
 from camtorch.lens import Lens, Planar, Polynomial, Rational, Tilt
@@ -26,6 +30,7 @@ class BrownConrady(Camera):
     distortion_names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
     default_count = 5
     counts = (4, 5, 8, 12, 14)
+    special_cases = (("pinhole", ()),)
     odd_in_x = frozenset({"p2", "s1", "s2", "tau_y"})
     odd_in_y = frozenset({"p1", "s3", "s4", "tau_x"})
 
@@ -36,6 +41,31 @@ class BrownConrady(Camera):
     @classmethod
     def counts_text(cls):
         return "n = 4, 5, 8, 12 or 14 (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]])"
+
+    @classmethod
+    def fit_start(cls, names, angles, radii):
+        zeros = super().fit_start(names, angles, radii)
+        if "k6" not in names:
+            return zeros
+        # N - R D = 0 is linear in the coefficients; the first weights are those of a D that follows the tangent
+        ahead = angles < math.radians(85)
+        tangent = torch.tan(torch.where(ahead, angles, 0.1))
+        t, ratio = tangent**2, radii / tangent
+        powers = torch.stack((t, t**2, t**3), -1)
+        terms = torch.cat((powers, -ratio[..., None] * powers), -1)
+        denominator = 1 + t
+        for _ in range(3):
+            weight = ahead * tangent / denominator
+            scale = (terms * weight[..., None]).square().sum(-2, keepdim=True).sqrt().clamp(min=1e-30)
+            q, r = torch.linalg.qr(terms * weight[..., None] / scale)
+            damped = r + 1e-10 * torch.eye(6, dtype=r.dtype, device=r.device)
+            right = q.mT @ ((ratio - 1) * weight)[..., None]
+            k = (torch.linalg.solve_triangular(damped, right, upper=True) / scale.mT)[..., 0]
+            denominator = (1 + (powers * k[:, None, 3:]).sum(-1)).clamp(min=1e-3)
+        start = zeros.clone()
+        for i, name in enumerate(("k1", "k2", "k3", "k4", "k5", "k6")):
+            start[..., names.index(name)] = k[:, i].nan_to_num(0.0, 0.0, 0.0)
+        return torch.cat((zeros, start))
 
     @staticmethod
     def optics(k):

@@ -1,0 +1,49 @@
+"""What the command line reads: the cameras of a calibration file, by the options --name and --model."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from camtorch.camera import Camera
+from camtorch.io import load, opencv
+from camtorch.rig import Rig
+
+
+def read_rig(path: Path, name: str | None = None, model: str | None = None) -> Rig:
+    """The cameras of a file, none of which learns.
+
+    Args:
+        path: a file of any format.
+        name: the only camera wanted.
+        model: a key of `camtorch.MODELS`, for OpenCV's files, which may not say it.
+
+    Raises:
+        CameraFileError: the file cannot be used. ValueError: no camera of that name.
+    """
+    with warnings.catch_warnings():
+        if model is not None:  # then it does not matter what the file might mean
+            warnings.simplefilter("ignore")
+        rig = load(path, None if model is None else "opencv")
+    if model is not None:
+        rig = Rig({n: opencv.read(path, model, name=None if n == "camera" else n) for n in rig.cameras}, rig.extrinsics)
+    if name is not None:
+        if name not in rig.cameras and name not in rig.images:
+            raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig.cameras)}")
+        pose = {name: rig.extrinsics[name]} if name in rig.extrinsics else {}
+        rig = Rig({name: rig.camera_of(name)}, pose, format=rig.format)
+    for camera in rig.cameras.values():
+        camera.requires_grad_(False)
+    return rig
+
+
+def read_camera(path: Path, name: str | None = None, model: str | None = None) -> Camera:
+    """The one camera of a file, or the one of that name; see `read_rig`.
+
+    Raises:
+        ValueError: there are several.
+    """
+    rig = read_rig(path, name, model)
+    if len(rig.cameras) > 1:
+        raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
+    return rig.camera

@@ -1,0 +1,115 @@
+"""The commands `camtorch convert` and `camtorch show`. Degrees here, and only here."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+
+def add(commands) -> None:
+    """Add both to the subparsers of a command line."""
+    convert = commands.add_parser(
+        "convert",
+        help="write a calibration as another camera model, or in another format",
+        description="Write the cameras of a calibration file as cameras of another model, and print how good that is.",
+        allow_abbrev=False,
+    )
+    convert.set_defaults(run=_convert)
+    convert.add_argument("input", type=Path, metavar="IN", help="a calibration file")
+    convert.add_argument("output", type=Path, metavar="OUT", help="the new one")
+    convert.add_argument("--model", metavar="KEY", help="the new model; by default the model stays")
+    convert.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
+    convert.add_argument("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")
+    convert.add_argument("--format", help="of OUT; by default what its name says")
+    show = commands.add_parser("show", help="what a calibration says, in numbers and in a picture", allow_abbrev=False)
+    show.set_defaults(run=_show)
+    show.add_argument("input", type=Path, metavar="FILE", help="a calibration file")
+    show.add_argument("--against", type=Path, metavar="OTHER", help="another calibration of the camera, to compare")
+    show.add_argument("-o", "--output", type=Path, metavar="OUT", help="a picture: distortion, radius over angle")
+    for command in (convert, show):
+        command.add_argument("--name", help="which camera, in a file with several")
+        command.add_argument("--from-model", metavar="KEY", help="the model in the file, where that does not say it")
+        command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    from camtorch.camera_files import read_rig
+    from camtorch.io import save
+    from camtorch.rig import Rig
+
+    path = arguments.output
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder")
+    if path.exists() and not arguments.force:
+        raise ValueError(f"{path}: exists already; --force overwrites it")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{path}: the folder {path.parent} cannot be written to")
+    angle = arguments.max_angle
+    if angle is not None and not 0 < angle <= 180:
+        raise ValueError(f"--max-angle must be above 0 and at most 180 degrees; got {angle:g}")
+    rig, notes = read_rig(arguments.input, arguments.name, arguments.from_model), []
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        model = arguments.model or camera.key
+        result = camera.convert(model, count=arguments.count, max_angle=None if angle is None else math.radians(angle))
+        cameras[name] = result.camera
+        part = "the picture" if camera.image_size else "its rays"
+        degrees, covered = math.degrees(float(result.max_angle)), 100 * float(result.valid_fraction)
+        errors = "exact" if bool(result.exact) else f"rms {result.rms:.3g} px, at most {result.max_error:.3g} px"
+        notes.append(
+            f"{path}: {name}, {camera.key} to {result.camera.key}: {errors}, "
+            f"up to {degrees:.1f} degrees from the axis, {covered:.4g} % of {part}"
+        )
+    changed = Rig(cameras, rig.extrinsics, images=rig.images, format=rig.format)
+    save(changed, path, format=arguments.format)
+    print("\n".join(notes))
+
+
+def _show(arguments: argparse.Namespace) -> None:
+    from camtorch import image_files
+    from camtorch.camera_files import read_camera, read_rig
+    from camtorch.summary import summarise
+
+    if arguments.output is not None:
+        image_files.check_target(arguments.output, force=arguments.force)
+    elif arguments.against is not None:
+        raise ValueError("--against needs -o OUT, a picture for the difference")
+    cameras = read_rig(arguments.input, arguments.name, arguments.from_model).cameras
+    for name, camera in cameras.items():
+        print(f"{arguments.input}: {name}", *summarise(camera).lines(), sep="\n")
+    if arguments.output is None:
+        return
+    if len(cameras) > 1:
+        raise ValueError(f"{arguments.input}: --name which camera the picture is to show: {', '.join(cameras)}")
+    other = None
+    if arguments.against is not None:
+        other = read_camera(arguments.against, arguments.name, arguments.from_model)
+    camera = next(iter(cameras.values()))
+    if camera.image_size is None:
+        raise ValueError(f"{arguments.input} states no image size, which the picture needs")
+    height, width = camera.image_size
+    _draw(arguments.output, camera, other, f"{arguments.input.name}: {camera.key}, {width} x {height}")
+    print(f"{arguments.output}: distortion, radius over angle{', difference' if other is not None else ''}")
+
+
+def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
+    from PIL import Image
+
+    from camtorch import image_files, plot
+
+    figure = plot.portrait(camera, other, title=title)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # after `portrait` said what to install
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image_files.write(path, Image.fromarray(numpy.array(canvas.buffer_rgba())[..., :3]))

@@ -1,0 +1,92 @@
+"""What a camera model may say of itself for conversion, and `convert`. Used through `Camera`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+    from camtorch.conversion import Conversion
+
+
+class Convertible:
+    """Conversion works for every model as it is; these hooks make it exact, or start it better.
+
+    A chart that depends on coefficients wants a `fit_start` at which it covers many rays, and `fit_bounds` that keep
+    its formulas defined.
+    """
+
+    special_cases: ClassVar[tuple[tuple[str, tuple[str, ...]], ...]] = ()
+    """The models that this one generalises: the key of each, and the names here of its coefficients in its order.
+
+    A special case is this model, at the same intrinsics, with all other coefficients as in `ideal`.
+    """
+    fit_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """The least and the greatest value of coefficients that a fit tries, where there are such."""
+
+    @classmethod
+    def ideal(cls, count: int) -> Sequence[float]:
+        """That many coefficients that do nothing: zeros, unless the model says otherwise."""
+        return (0.0,) * count
+
+    @staticmethod
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
+        """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
+        return None
+
+    @classmethod
+    def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
+        """Coefficients to start a fit from, float64; by default those of `ideal`.
+
+        Args:
+            names: of the n coefficients.
+            angles: (C, K) radians from the axis, evenly from above 0 to the last one that is to be fitted.
+            radii: (C, K) the distance from the principal point at which the camera to be fitted sees them, in units of
+                its focal length at the axis and averaged over the azimuths; ascending. Where it sees nothing the
+                line goes on straight.
+
+        Returns:
+            (S, C, n): S alternatives, of which the one that ends best is kept.
+        """
+        ideal = torch.tensor(cls.ideal(len(names)), dtype=radii.dtype, device=radii.device)
+        return ideal.expand(1, len(radii), len(names))
+
+    def convert(
+        self,
+        model: type[Camera] | str,
+        *,
+        count: int | None = None,
+        image_size: tuple[int, int] | None = None,
+        max_angle: float | None = None,
+        **options,
+    ) -> Conversion:
+        """The camera of another model, or number of coefficients, that comes closest to this one.
+
+        Where the models are related and the numbers allow, it is this camera exactly: its coefficients are taken over
+        bit by bit. Otherwise the squared pixel errors are least over the rays of this camera's picture (without a size:
+        over all its rays) that are within `max_angle` and that the new model can express. The result says
+        how good that is; a bad conversion raises no error. Rows of a batch are converted independently.
+
+        Args:
+            model: a class of cameras, or its key in `ct.MODELS`.
+            count: of coefficients, for models that leave a choice. By default the model's own, or the least number
+                above it that holds what a related camera has.
+            image_size: (height, width) of the picture, for a camera that does not say or to look at another part.
+            max_angle: radians from the optical axis up to which rays matter; by default all do.
+            options: passed on to the model.
+
+        Returns:
+            A `Conversion`: camera (float64, with parameters of its own, frozen if this camera is), rms and max_error in
+            pixels, max_angle in radians, valid_fraction of the picture.
+
+        Raises:
+            TypeError: no camera model. ValueError: an unknown key, a count that the model does not take, a
+                `max_angle` that is not positive.
+        """
+        from camtorch.conversion import convert
+
+        return convert(self, model, count=count, image_size=image_size, max_angle=max_angle, **options)

@@ -1,0 +1,198 @@
+"""Cameras fitted to pixels of rays, by Levenberg and Marquardt's method, each row of a batch for itself."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.parameters import columns
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+FURTHEST = 20.0
+"""The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
+_MOST_STEPS = 60
+_ROUNDS = 3
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
+_SETTLED = 1e-8  # the relative decrease of the cost that ends the search
+_NOTHING = 1e-11  # px
+_LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
+
+
+class Sights(NamedTuple):
+    """What a camera shall see: rays (C, N, 3), pixels (C, N, 2) and weights (C, N), which are 1 or 0."""
+
+    rays: Tensor
+    pixels: Tensor
+    weights: Tensor
+
+    def of(self, rows: Tensor) -> Sights:
+        """Those of some rows."""
+        return Sights(*(t[rows] for t in self))
+
+
+class Seen(NamedTuple):
+    """Planes (C, N): points on the plane of the sensor, the centre where there is none, and whether there is one."""
+
+    a: Tensor
+    b: Tensor
+    covered: Tensor
+
+
+def see(camera: Camera, k: Tensor, rays: Tensor) -> Seen:
+    """Rays through the chart and the lens of coefficients (C, n), whether or not they lie before a fold."""
+    chart, lens = camera.optics(columns(k))
+    x, y, z = rays.unbind(-1)
+    covered = (chart.margin(x, y, z) > 0).expand_as(x)
+    x, y, z = torch.where(covered, x, 0.0), torch.where(covered, y, 0.0), torch.where(covered, z, 1.0)
+    a, b = chart.to_plane(x, y, z, order=1)
+    covered = covered & (torch.maximum(a.abs(), b.abs()) <= FURTHEST)
+    if lens.stages:
+        a, b = lens(a, b)
+    covered = covered & torch.isfinite(a) & torch.isfinite(b)
+    return Seen(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
+
+
+def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tensor:
+    """The parameters (C, 4 + n) at which a camera sees the pixels of the rays as nearly as it can.
+
+    Rays that the camera's chart never covers do not count. No row depends on another.
+
+    Args:
+        camera: gives its optics, not its numbers.
+        sights: what it shall see.
+        starts: (S, C, n) coefficients to start from; of what becomes of them the best is kept.
+        slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
+    """
+    best = best_score = None
+    for start in starts:
+        parameters = torch.cat((_intrinsics(camera, start, slopes), start), -1)
+        low, high = _bounds(camera, parameters)
+        parameters = parameters.clamp(low, high)
+        within = sights._replace(weights=torch.zeros_like(sights.weights))
+        for _ in range(_ROUNDS):
+            # a chart may cover more once its coefficients fit what it covered before
+            weights = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
+            more = (weights != within.weights).any(-1)
+            within = sights._replace(weights=weights)
+            parameters = _refine(camera, within, parameters, low, high, more)
+        score = _cost(camera, within, parameters)
+        score = score + (sights.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
+        if best is None:
+            best, best_score = parameters, score
+        better = score < best_score
+        best, best_score = torch.where(better[:, None], parameters, best), torch.where(better, score, best_score)
+    return best
+
+
+def _intrinsics(camera: Camera, k: Tensor, slopes: Tensor) -> Tensor:
+    """The (C, 4) intrinsics at which lenses of coefficients (C, n) have these slopes at the axis."""
+    h = 1e-3
+    around = slopes.new_tensor([[h, 0, 1], [-h, 0, 1], [0, h, 1], [0, -h, 1]])
+    seen = see(camera, k, (around / around.norm(dim=-1, keepdim=True)).expand(len(k), 4, 3))
+    mine = torch.stack((seen.a[:, 0] - seen.a[:, 1], seen.b[:, 2] - seen.b[:, 3]), -1) / (2 * h)
+    mine = torch.where(mine > 1e-3, mine, 1.0)
+    return torch.cat((slopes[:, :2] / mine, slopes[:, 2:]), -1)
+
+
+def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
+    low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
+    low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
+    for i, name in enumerate(camera.distortion_names):
+        if name in camera.fit_bounds:
+            low[:, 4 + i], high[:, 4 + i] = camera.fit_bounds[name]
+    return low, high
+
+
+def _residuals(sights: Sights, parameters: Tensor, seen: Seen) -> Tensor:
+    """(C, 2, N) pixels."""
+    fx, fy, cx, cy = columns(parameters[:, :4])
+    u, v = sights.pixels.unbind(-1)
+    return torch.stack((fx * seen.a + cx - u, fy * seen.b + cy - v), 1) * sights.weights[:, None]
+
+
+def _cost(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
+    """(C,) the sum of squares; infinite where a ray that counts is not covered, or the coefficients make no camera."""
+    seen = see(camera, parameters[:, 4:], sights.rays)
+    lost = (~seen.covered & (sights.weights > 0)).any(-1)
+    cost = _residuals(sights, parameters, seen).square().sum((1, 2))
+    defined = camera.defined(parameters[:, 4:].unbind(-1))
+    if defined is not None:
+        lost = lost | ~(defined > 0)
+    return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
+
+
+def _linearised(camera: Camera, sights: Sights, parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """The residuals (C, 2 N), and their derivatives (C, 4 + n, 2 N) by the parameters."""
+    k = parameters[:, 4:]
+    seen = see(camera, k, sights.rays)
+    fx, fy, _, _ = columns(parameters[:, :4])
+    zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
+    derivatives = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
+    slopes = torch.stack([torch.stack(pair, 1) for pair in derivatives], 1)
+    if k.shape[-1]:
+        by_k = _derivatives(lambda k: torch.stack(see(camera, k, sights.rays)[:2], 1), k)
+        slopes = torch.cat((slopes, by_k * torch.stack((fx, fy), 1)[:, None]), 1)
+    # where a derivative is no number, as at the end of a chart, a step goes without it
+    slopes = slopes.nan_to_num(0.0, 0.0, 0.0) * sights.weights[:, None, None]
+    return _residuals(sights, parameters, seen).flatten(1), slopes.flatten(2)
+
+
+def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
+    """(C, n, ...) of a function (C, n) -> (C, ...) whose rows have nothing to do with each other."""
+
+    def along(direction: Tensor) -> Tensor:
+        return torch.func.jvp(function, (k,), (direction.expand_as(k),))[1]
+
+    with warnings.catch_warnings():
+        # on its first use forward mode loads what calls the deprecated torch.jit.script
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return torch.func.vmap(along, out_dims=1)(torch.eye(k.shape[-1], dtype=k.dtype, device=k.device))
+
+
+def _refine(camera: Camera, sights: Sights, parameters: Tensor, low: Tensor, high: Tensor, going: Tensor) -> Tensor:
+    """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
+    parameters = parameters.clone()
+    cost = _cost(camera, sights, parameters)
+    damping = torch.full_like(cost, _FIRST_DAMPING)
+    tiny = _NOTHING**2 * sights.weights.sum(-1)
+    going = going & torch.isfinite(cost) & (cost > tiny)
+    for _ in range(_MOST_STEPS):
+        rows = going.nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        # rows that have settled are left alone, so that each goes the way that it would go alone
+        these, old, weight = sights.of(rows), parameters[rows], damping[rows]
+        residuals, slopes = _linearised(camera, these, old)
+        # what would leave its bounds stays there, so that the others can move on
+        slope = (slopes @ residuals[..., None])[..., 0]
+        held = (old <= low[rows]) & (slope > 0) | (old >= high[rows]) & (slope < 0)
+        step = _step(residuals, torch.where(held[..., None], 0.0, slopes), weight)
+        new = (old + step).clamp(low[rows], high[rows])
+        new_cost = _cost(camera, these, new)
+        better = new_cost < cost[rows]
+        settled = better & (cost[rows] - new_cost <= _SETTLED * cost[rows]) & (weight <= 1e-6)
+        stuck = ~better & (weight >= _MOST_DAMPING)
+        parameters[rows] = torch.where(better[:, None], new, old)
+        cost[rows] = torch.where(better, new_cost, cost[rows])
+        damping[rows] = torch.where(better, weight / 10, weight * 10).clamp(_LEAST_DAMPING, _MOST_DAMPING)
+        going[rows] = ~(settled | stuck | (cost[rows] <= tiny[rows]))
+    return parameters
+
+
+def _step(residuals: Tensor, slopes: Tensor, damping: Tensor) -> Tensor:
+    """(C, P): the damped step of Gauss and Newton; none where its equations have no solution."""
+    # the columns differ by many orders of magnitude
+    scale = slopes.square().sum(-1).sqrt()
+    scale = torch.where(scale > 0, scale, 1.0)
+    slopes = slopes / scale[..., None]
+    matrix = slopes @ slopes.mT + torch.diag_embed(damping[:, None].expand(scale.shape))
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    step = torch.cholesky_solve(slopes @ -residuals[..., None], factor)[..., 0] / scale
+    return torch.where((failed == 0)[:, None] & torch.isfinite(step), step, 0.0)

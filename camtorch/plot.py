@@ -1,0 +1,279 @@
+"""Pictures of cameras, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and returns them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from camtorch.summary import fan, ideal, lattice
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from torch import Tensor
+
+    from camtorch.camera import Camera
+
+_INK, _GREY, _PALE = "#2b2a2e", "#8a8378", "#efe9dd"
+_COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
+_AZIMUTHS, _ANGLES = 32, 721
+_LONG = 400  # px across a heat map
+
+
+@torch.no_grad()
+def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21) -> Axes:
+    """Arrows from where an ideal lens would show what the picture shows, to where it does; grey: pixels without rays.
+
+    The ideal lens has the same intrinsics and coefficients that do nothing: Kannala-Brandt's is equidistant,
+    Brown-Conrady's perspective. Short arrows are drawn longer, and the title
+    says so. What the ideal lens shows nowhere has a cross.
+
+    Args:
+        camera: one camera with an image size.
+        ax: by default new ones.
+        count: of arrows along the longer side.
+
+    Raises:
+        ValueError: a batch, or a camera without image size. ImportError: no matplotlib.
+    """
+    height, width = _size(camera)
+    ax = _axes(ax)
+    step = max(width, height) / count
+    inner = lattice(camera, max(2, round(height / step)) + 1, max(2, round(width / step)) + 1)
+    pixels = (inner[1:, 1:] + inner[:-1, :-1]) / 2
+    rays, valid = camera.unproject(pixels)
+    undistorted, covered = ideal(camera).project(rays)
+    moved = (pixels - undistorted).double()
+    _frame(ax, height, width)
+    _shade_without_rays(ax, camera)
+    both, lost = valid & covered, valid & ~covered
+    if bool(lost.any()):
+        ax.plot(*pixels[lost].double().T.tolist(), "x", color=_GREY, markersize=4)
+    longer = 1
+    if bool(both.any()):
+        end, along = pixels[both].double(), moved[both]
+        length = torch.linalg.vector_norm(along, dim=-1)
+        longer = _magnification(0.7 * step / max(float(length.quantile(0.9)), 1e-9))
+        arrows = ax.quiver(
+            *[plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)],
+            **{"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0024, "headwidth": 4, "headlength": 5},
+            cmap=_without_palest("viridis_r"),
+            zorder=3,
+        )
+        extend = _limit(arrows, length)
+        ax.figure.colorbar(arrows, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
+    cx, cy = camera.intrinsics[2:].tolist()
+    ax.plot([cx], [cy], "+", color=_COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
+    times = f", {longer} times as long" if longer > 1 else ""
+    ax.set_title(f"distortion, from the ideal pixel to the actual one{times}")
+    return ax
+
+
+@torch.no_grad()
+def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
+    """The distance from the principal point over the angle from the axis, as far as it is valid; then a dot.
+
+    A band shows the azimuths where they differ. Dashed is the ideal lens. The pale part are the angles that the first
+    camera's picture has.
+
+    Args:
+        cameras: single cameras.
+        ax: by default new ones.
+        labels: of the cameras; by default their models.
+
+    Raises:
+        ValueError: a batch, or not as many labels as cameras. ImportError: no matplotlib.
+    """
+    cameras = [cameras] if not isinstance(cameras, (list, tuple)) else cameras
+    labels = labels or [camera.key for camera in cameras]
+    if len(labels) != len(cameras):
+        raise ValueError(f"{len(cameras)} cameras, and labels for {len(labels)}")
+    ax = _axes(ax)
+    shown = seen = 0.0
+    for i, (camera, label, colour) in enumerate(zip(cameras, labels, _cycle(len(cameras)), strict=True)):
+        _single(camera)
+        angles, low, high = _radii(camera)
+        ax.fill_between(np.degrees(angles), low, high, color=colour, alpha=0.25, linewidth=0, zorder=2)
+        middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+        # the later ones thinner, to show what they cover
+        ax.plot(
+            np.degrees(angles), middle, color=colour, label=label, linewidth=3.2 if i == 0 < len(cameras) - 1 else 1.5
+        )
+        ax.plot(np.degrees(angles[-1:]), middle[-1:], "o", color=colour, markersize=5, zorder=3)
+        if i == 0 and camera.distortion_names:
+            angles, low, _ = _radii(ideal(camera))
+            ax.plot(np.degrees(angles), low, "--", color=_GREY, linewidth=1, label="ideal", zorder=1)
+        if camera.image_size is not None:
+            rays, valid = camera.unproject(lattice(camera, 65, 65))
+            angle = torch.atan2(torch.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+            far = float(angle[valid].max()) if bool(valid.any()) else 0.0
+            seen = max(seen, math.degrees(far))
+            if i == 0:
+                ax.axvspan(0, seen, color=_PALE, zorder=0)
+            corners = lattice(camera, 2, 2).flatten(0, 1) - camera.intrinsics[2:]
+            shown = max(shown, float(torch.linalg.vector_norm(corners, dim=-1).max()))
+    if shown:
+        # tangents grow without end
+        ax.set_ylim(0, 1.15 * shown)
+    ax.set_xlim(0, 1.15 * seen if seen else None)
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("angle from the axis, degrees")
+    ax.set_ylabel("distance from the principal point, px")
+    ax.set_title("radius over angle, as far as valid")
+    ax.legend(frameon=False, loc="lower right")
+    return ax
+
+
+@torch.no_grad()
+def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation: bool = False) -> Axes:
+    """How far apart two cameras show the same ray, in pixels, over the picture of the first; grey: one shows nothing.
+
+    Args:
+        a: the camera whose picture is shown.
+        b: the other camera, of a picture of the same size, or of none stated.
+        ax: by default new ones.
+        remove_rotation: whether the rays are turned first, by the one rotation that brings those of the cameras
+            closest: two calibrations of one camera may differ by where they look.
+
+    Raises:
+        ValueError: a batch, no image size, or two different ones. ImportError: no matplotlib.
+    """
+    height, width = _size(a)
+    _single(b)
+    if b.image_size not in (None, a.image_size):
+        raise ValueError(f"the cameras' pictures differ in size: {a.image_size} and {b.image_size}")
+    ax = _axes(ax)
+    scale = _LONG / max(height, width)
+    pixels = lattice(a, max(2, round(height * scale)), max(2, round(width * scale))).double()
+    rays, seen = a.unproject(pixels)
+    turn = _rotation(rays, b.unproject(pixels), seen) if remove_rotation else torch.eye(3, dtype=torch.float64)
+    others, shown = b.project(rays.double() @ turn.to(rays.device).mT)
+    both = seen & shown
+    apart = torch.linalg.vector_norm(others.double() - pixels, dim=-1)
+    values = np.ma.masked_array(apart.numpy(force=True), ~both.numpy(force=True))
+    _frame(ax, height, width)
+    ax.set_facecolor("#d9d4ca")
+    largest = float(apart[both].max()) if bool(both.any()) else 0.0
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    image = ax.imshow(values, extent=edges, cmap="magma_r", interpolation="nearest")
+    extend = _limit(image, apart[both])
+    ax.figure.colorbar(image, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
+    rms = float(apart[both].square().mean().sqrt()) if bool(both.any()) else math.nan
+    turned = f", turned by {math.degrees(_angle(turn)):.3g} degrees" if remove_rotation else ""
+    ax.set_title(f"{a.key} and {b.key}: rms {rms:.3g} px, at most {largest:.3g} px{turned}")
+    return ax
+
+
+def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") -> Figure:
+    """What `camtorch show -o` draws: the distortion field, the radius curve, and the difference to another camera."""
+    _pyplot()
+    from matplotlib.figure import Figure
+
+    height, width = _size(camera)
+    panels = 2 if other is None else 3
+    panel = min(6.0, max(3.2, 6.2 * height / width))
+    figure = Figure(figsize=(7.4 * panels, panel + 1.3), dpi=120, layout="constrained")
+    axes = figure.subplots(1, panels)
+    distortion_field(camera, axes[0])
+    radius_curve([camera] if other is None else [camera, other], axes[1])
+    if other is not None:
+        difference(camera, other, axes[2])
+    figure.suptitle(title or f"{type(camera).__name__}, {width} x {height}", color=_INK, fontsize=15)
+    return figure
+
+
+# -- what they share
+
+
+def _pyplot():
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        raise ImportError("plots need matplotlib: pip install 'camtorch[plot]'") from None
+    return pyplot
+
+
+def _axes(ax: Axes | None) -> Axes:
+    return _pyplot().subplots(layout="constrained")[1] if ax is None else ax
+
+
+def _single(camera: Camera) -> None:
+    if camera.batch_shape:
+        raise ValueError(f"a plot shows single cameras; got batch dims {tuple(camera.batch_shape)}")
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    _single(camera)
+    return camera._size("a plot")
+
+
+def _frame(ax: Axes, height: int, width: int) -> None:
+    margin = 0.02 * max(height, width)
+    ax.set_xlim(-0.5 - margin, width - 0.5 + margin)
+    ax.set_ylim(height - 0.5 + margin, -0.5 - margin)
+    ax.set_aspect("equal")
+    ax.plot([-0.5, width - 0.5, width - 0.5, -0.5, -0.5], [-0.5, -0.5, height - 0.5, height - 0.5, -0.5], color=_INK)
+
+
+def _shade_without_rays(ax: Axes, camera: Camera) -> None:
+    height, width = camera.image_size
+    valid = camera.unproject(lattice(camera, 200, 200))[1]
+    shade = np.ma.masked_array(np.ones((200, 200)), valid.numpy(force=True))
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    ax.imshow(shade, extent=edges, cmap="Greys", vmin=0, vmax=5, interpolation="nearest", zorder=0)
+
+
+def _magnification(most: float) -> int:
+    """1, 2, 5, 10, ... up to a number."""
+    if not 1 < most < 1e9:
+        return 1
+    power = 10 ** math.floor(math.log10(most))
+    return power * max(n for n in (1, 2, 5) if n * power <= most)
+
+
+def _without_palest(name: str):
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colormaps[name](np.linspace(0.15, 1, 256)))
+
+
+def _limit(mappable, values: Tensor) -> str:
+    """Give what is coloured its range, without the few largest values if they are far from the others."""
+    most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)
+    cut = most > 4 * many > 0
+    mappable.set_clim(0, (1.5 * many if cut else most) or 1.0)
+    return "max" if cut else "neither"
+
+
+def _radii(camera: Camera) -> tuple[np.ndarray, list[float], list[float]]:
+    """Angles, and the least and the greatest radius over the azimuths that are valid up to there."""
+    angles = torch.linspace(0, math.pi, _ANGLES).to(camera.intrinsics)
+    pixels, valid = camera.project(fan(angles, _AZIMUTHS))
+    valid = valid.long().cumprod(0).bool()
+    radius = torch.linalg.vector_norm(pixels - camera.intrinsics[2:], dim=-1)
+    some = valid.any(-1)
+    low, high = (torch.where(valid, radius, end) for end in (torch.inf, -torch.inf))
+    return angles[some].numpy(force=True), low.amin(-1)[some].tolist(), high.amax(-1)[some].tolist()
+
+
+def _cycle(count: int) -> list[str]:
+    return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
+
+
+def _rotation(rays: Tensor, others: tuple[Tensor, Tensor], seen: Tensor) -> Tensor:
+    """The rotation R of least squares of `R ray - other`, by Kabsch's method."""
+    use = seen & others[1]
+    u, _, vh = torch.linalg.svd(others[0][use].double().mT @ rays[use].double())
+    sign = torch.ones(3, dtype=torch.float64, device=u.device)
+    sign[2] = torch.linalg.det(u @ vh)
+    return u @ torch.diag(sign) @ vh
+
+
+def _angle(rotation: Tensor) -> float:
+    sine = torch.linalg.matrix_norm(rotation - rotation.mT) / math.sqrt(8)
+    return math.atan2(float(sine), (float(rotation.trace()) - 1) / 2)

@@ -1,0 +1,102 @@
+"""Which models are special cases of which, and what becomes of coefficients on the way from one to another."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+    Model = type[Camera]
+
+_MANY = 33
+
+
+def default_count(model: Model, source: Camera) -> int:
+    """How many coefficients the model takes to hold those of a related camera, and its own number at least."""
+    if isinstance(source, model):
+        return len(source.distortion_names)
+    steps = _path(type(source), model)
+    if steps is None:
+        return model.default_count
+    needed = {_renamed(name, steps) for name in source.distortion_names}
+    held = {n: len(needed & set(model.names_of(n))) for n in range(model.default_count, _MANY) if model.names_of(n)}
+    return min((n for n, number in held.items() if number == max(held.values())), default=model.default_count)
+
+
+def carried(source: Camera, values: Tensor, model: Model, names: tuple[str, ...]) -> tuple[Tensor, Tensor] | None:
+    """The coefficients (C, n) of a camera as those of a related model, and whether nothing is lost: bool (C,).
+
+    values: (C, its own n). None: the models are not related.
+    """
+    steps = _path(type(source), model)
+    if steps is None:
+        return None
+    result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
+    lossless = torch.ones(len(values), dtype=torch.bool, device=values.device)
+    for i, old in enumerate(source.distortion_names):
+        name = _renamed(old, steps)
+        if name in names:
+            result[:, names.index(name)] = values[:, i]
+        else:
+            lossless &= values[:, i] == _ideal_value(source, old, steps)
+    return result, lossless
+
+
+Step = tuple["Model", Mapping[str, str]]
+"""A model, and what the coefficients of the one before are called there; those left out are lost."""
+
+
+def _path(start: Model, end: Model) -> list[Step] | None:
+    """The shortest way from a model to a related one."""
+    queue, seen = deque([(start, [])]), {start}
+    while queue:
+        model, steps = queue.popleft()
+        if model is end or (model is start and issubclass(start, end)):
+            return steps
+        for step in _neighbours(model):
+            if step[0] not in seen:
+                seen.add(step[0])
+                queue.append((step[0], [*steps, step]))
+    return None
+
+
+def _neighbours(model: Model) -> Iterator[Step]:
+    from camtorch.camera import MODELS
+
+    for general in (model, *MODELS.values()):
+        for key, names in general.special_cases:
+            special = MODELS.get(key)
+            if special is not None and general is model:
+                yield special, dict(zip(names, _all_names(special), strict=False))
+            elif special is model:
+                yield general, dict(zip(_all_names(model), names, strict=False))
+
+
+def _renamed(name: str, steps: list[Step]) -> str | None:
+    """What a coefficient is called at the end of the way; None where it is lost on it."""
+    for _, names in steps:
+        if name not in names:
+            return None
+        name = names[name]
+    return name
+
+
+def _ideal_value(source: Camera, name: str, steps: list[Step]) -> float:
+    """The value at which the coefficient may be lost: the ideal one of the last model that has it."""
+    model, known = type(source), source.distortion_names
+    for later, names in steps:
+        if name not in names:
+            break
+        model, name, known = later, names[name], _all_names(later)
+    return dict(zip(known, model.ideal(len(known)), strict=True))[name]
+
+
+def _all_names(model: Model) -> tuple[str, ...]:
+    """The names of as many coefficients as the model takes, or of many."""
+    return max((names for names in map(model.names_of, range(_MANY)) if names is not None), key=len, default=())

@@ -1,0 +1,361 @@
+"""Any camera as a camera of any model: exact where models are related, close where they are not, honest otherwise."""
+
+import math
+from math import radians
+
+import pytest
+import torch
+from cameras import GOLDEN, KEYS, drawn, golden_camera, make, one
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import camtorch as ct
+
+F64 = {"dtype": torch.float64}
+SIZE = (480, 640)
+ROUNDING = 1e-11  # px
+
+
+def golden(name):
+    return golden_camera(GOLDEN[f"mpmath__{name}"])
+
+
+def fisheye(batch=(), seed=0, **options):
+    """Plausible Kannala-Brandt cameras of about 130 degrees."""
+    draw = torch.rand(*batch, 8, generator=torch.Generator().manual_seed(seed), **F64) - 0.5
+    intrinsics = torch.tensor([300.0, 300, 319.5, 239.5], **F64) + 20 * draw[..., :4]
+    return ct.KannalaBrandt(
+        intrinsics, draw[..., 4:] * torch.tensor([0.1, 0.02, 0.01, 0.002]), image_size=SIZE, **options
+    )
+
+
+def pixels_apart(source, result, count=2000, seed=1):
+    """The distances at random pixels of the picture that the result speaks for, measured anew; and which those are."""
+    height, width = source.image_size
+    draw = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), **F64)
+    pixels = draw * torch.tensor([width, height], **F64) - 0.5
+    with torch.no_grad():
+        rays, valid = source.double().unproject(pixels)
+        angle = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
+        use = valid & (angle < result.max_angle)
+        new, mapped = result.camera.project(rays[use])
+    assert bool(mapped.all())
+    return (new - pixels[use]).norm(dim=-1), valid, use
+
+
+def check(source, result):
+    """What holds for every conversion, good or bad."""
+    numbers = result.rms, result.max_error, result.max_angle, result.valid_fraction
+    parameters = torch.cat([p.detach().reshape(-1) for p in (result.camera.intrinsics, result.camera.distortion)])
+    assert parameters.dtype == torch.float64
+    assert bool(torch.isfinite(parameters).all())
+    assert all(number.shape == source.batch_shape and not bool(number.isnan().any()) for number in numbers)
+    assert result.camera.batch_shape == source.batch_shape
+    assert result.camera.image_size == source.image_size
+    assert bool((result.rms <= result.max_error).all())
+    assert bool(((result.valid_fraction >= 0) & (result.valid_fraction <= 1)).all())
+    assert bool(((result.max_angle >= 0) & (result.max_angle <= math.pi + 1e-9)).all())
+    assert "nan" not in repr(result)
+
+
+# -- every model
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_to_the_same_model_is_a_copy(key):
+    source = one(key)
+    result = source.convert(key)
+    check(source, result)
+    assert bool(result.exact)
+    assert float(result.max_error) == 0
+    assert torch.equal(result.camera.intrinsics, source.intrinsics)
+    assert torch.equal(result.camera.distortion, source.distortion)
+    assert result.camera.intrinsics is not source.intrinsics
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_from_every_model_as_the_numbers_say(key):
+    source = one(key)
+    result = source.convert(ct.KannalaBrandt)
+    check(source, result)
+    errors, valid, use = pixels_apart(source, result)
+    assert float(errors.max()) <= 1.05 * float(result.max_error) + 1e-9
+    assert float(errors.square().mean().sqrt()) == pytest.approx(float(result.rms), rel=0.1, abs=1e-9)
+    assert float(use.sum() / valid.sum()) == pytest.approx(float(result.valid_fraction), abs=0.03)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_to_every_model_as_the_numbers_say(key):
+    source = ct.KannalaBrandt([300.0, 305, 321, 238], [0.02, -0.01, 0.003, -0.001], image_size=SIZE)
+    result = source.convert(key, max_angle=radians(40))
+    check(source, result)
+    errors, _, _ = pixels_apart(source, result)
+    assert float(errors.max()) <= 1.05 * float(result.max_error) + 1e-9
+    assert float(result.max_angle) == pytest.approx(radians(40), abs=0.02)
+    # what has coefficients can follow a lens, what has none cannot
+    assert float(result.max_error) < (60 if not one(key).distortion_names else 20)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_conversion_back_finds_the_camera(key):
+    source = one(key)
+    there = source.convert(ct.Fisheye624, max_angle=radians(35))
+    back = there.camera.convert(key, max_angle=radians(35), count=len(source.distortion_names))
+    assert float(back.max_error) <= 1.2 * float(there.max_error) + 0.01
+
+
+CLOSE = [
+    (lambda: golden("kannala_brandt__auto_190deg_a"), "fisheye624", {}, ROUNDING),
+    (lambda: golden("kannala_brandt__auto_190deg_a"), "brown_conrady", {"count": 8, "max_angle": radians(75)}, 0.1),
+    (lambda: make("brown_conrady", torch.tensor([500.0, 500, 320, 240]), torch.tensor([-0.1, 0.02, 0, 0]),
+                  image_size=SIZE), "kannala_brandt", {}, 0.01),
+    (lambda: golden("brown_conrady__d5_dms_ir_62deg"), "fisheye624", {}, 0.1),
+    (lambda: golden("brown_conrady__d4_smartphone_tele"), "fisheye62", {}, 0.1),
+    (lambda: golden("pinhole__smartphone_main"), "kannala_brandt", {}, 0.01),
+    (lambda: golden("kannala_brandt__dms_130deg_a"), "brown_conrady", {"count": 8}, 1.0),
+    (lambda: golden("fisheye624__aria_slam_left_online"), "fisheye62", {}, 0.5),
+    (lambda: make("double_sphere", torch.tensor([350.0, 350, 320, 240]), torch.tensor([-0.2, 0.59]),
+                  image_size=SIZE), "kannala_brandt", {}, 0.1),
+    (lambda: one("woodscape"), "kannala_brandt", {}, 0.1),
+    (lambda: golden("fisheye624__aria_slam_left_online").convert("kannala_brandt").camera, "tabulated", {}, 0.1),
+    (lambda: golden("kannala_brandt__tumvi_cam0"), "double_sphere", {"max_angle": radians(90)}, 1.0),
+    (lambda: one("ucm"), "mei", {}, 0.1),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make_source", "target", "options", "limit"), CLOSE)
+def test_close_conversions(make_source, target, options, limit):
+    try:
+        source, model = make_source(), ct.MODELS[target]
+    except KeyError as error:
+        pytest.skip(f"there is no model {error} yet")
+    result = source.convert(model, **options)
+    check(source, result)
+    assert float(result.max_error) <= limit
+    assert float(result.valid_fraction) > 0.999 or "max_angle" in options
+
+
+# -- related models
+
+
+def same_numbers(a, b):
+    return torch.equal(a.intrinsics, b.intrinsics) and torch.equal(a.distortion, b.distortion)
+
+
+@pytest.mark.parametrize("names", [("kannala_brandt", "fisheye62", "fisheye624")])
+def test_special_cases_are_padded_and_come_back_bit_by_bit(names):
+    source = golden("kannala_brandt__auto_190deg_a")
+    camera = source
+    for name in names[1:]:
+        result = camera.convert(name)
+        assert bool(result.exact)
+        assert float(result.max_error) < ROUNDING
+        assert float(result.valid_fraction) == 1
+        camera = result.camera
+    assert torch.equal(camera.distortion[:4], source.distortion)
+    assert not bool(camera.distortion[4:].any())
+    back = camera.convert("kannala_brandt", count=4)
+    assert bool(back.exact)
+    assert same_numbers(back.camera, source)
+    assert same_numbers(camera.convert("fisheye62").camera.convert("kannala_brandt", count=4).camera, source)
+
+
+def test_every_number_of_opencv_coefficients():
+    camera = ct.Pinhole([500.0, 501, 320, 240], image_size=SIZE).double()
+    pinhole = camera
+    for count in (4, 5, 8, 12, 14, 12, 8, 5, 4):
+        result = camera.convert(ct.BrownConrady, count=count)
+        assert bool(result.exact)
+        assert float(result.max_error) == 0
+        camera = result.camera
+        assert camera.distortion.shape == (count,)
+    assert same_numbers(camera.convert("pinhole").camera, pinhole)
+    distorted = ct.BrownConrady([500.0, 501, 320, 240], [-0.1, 0.02, 1e-3, 0, 0, 0, 0, 0], image_size=SIZE)
+    assert distorted.convert(ct.BrownConrady).camera.distortion.shape == (8,)
+    assert bool(distorted.convert(ct.BrownConrady, count=4).exact)
+    assert not bool(distorted.convert("pinhole").exact)
+
+
+def test_what_would_be_lost_is_fitted_row_by_row():
+    k = torch.zeros(3, 12, **F64)
+    k[:, 0] = 0.02
+    k[1, 8] = 1e-3
+    source = ct.Fisheye624(torch.tensor([300.0, 300, 320, 240], **F64).expand(3, 4), k, image_size=SIZE)
+    result = source.convert(ct.Fisheye62)
+    assert result.exact.tolist() == [True, False, True]
+    assert result.max_error[[0, 2]].tolist() == [0, 0]
+    assert 0 < float(result.max_error[1]) < 0.6
+    assert "at worst" in repr(result)
+
+
+def test_a_related_model_gets_as_many_coefficients_as_it_needs():
+    aria = golden("fisheye624__aria_slam_left_online")
+    assert aria.convert("kannala_brandt").camera.distortion.shape == (6,)
+    assert aria.convert("kannala_brandt", count=4).camera.distortion.shape == (4,)
+    assert golden("pinhole__dms_ir_62deg").convert("kannala_brandt").camera.distortion.shape == (4,)
+    long = ct.KannalaBrandt([300.0, 300, 320, 240], [0.01] * 6 + [0.0] * 4, image_size=SIZE)
+    assert bool(long.convert("fisheye62").exact)
+    longer = ct.KannalaBrandt([300.0, 300, 320, 240], [0.01] * 6 + [0.001] * 4, image_size=SIZE)
+    assert not bool(longer.convert("fisheye62").exact)
+
+
+def test_models_say_what_they_generalise(monkeypatch):
+    class Scaled(ct.KannalaBrandt):
+        distortion_names = ("stretch", "k1")
+        default_count = 2
+        special_cases = (("short", ("k1",)),)
+        fit_bounds = {"stretch": (0.5, 2.0)}  # noqa: RUF012
+
+        @classmethod
+        def names_of(cls, count):
+            return cls.distortion_names if count == 2 else None
+
+        @classmethod
+        def ideal(cls, count):
+            return 1.0, 0.0
+
+        @staticmethod
+        def optics(k):
+            return ct.KannalaBrandt.optics((k[1] * k[0],))
+
+    class Short(ct.KannalaBrandt):
+        @classmethod
+        def names_of(cls, count):
+            return ("k1",) if count == 1 else None
+
+        default_count = 1
+
+    monkeypatch.setitem(ct.MODELS, "short", Short)
+    monkeypatch.setitem(ct.MODELS, "scaled", Scaled)
+    short = Short([300.0, 300, 320, 240], [0.02], image_size=SIZE)
+    result = short.convert("scaled")
+    assert bool(result.exact)
+    assert result.camera.distortion.tolist() == pytest.approx([1.0, 0.02])
+    assert bool(result.camera.convert("short").exact)
+    stretched = Scaled([300.0, 300, 320, 240], [1.5, 0.02], image_size=SIZE)
+    back = stretched.convert("short")
+    assert not bool(back.exact)
+    assert float(back.max_error) < 1e-6
+    assert back.camera.distortion.item() == pytest.approx(0.03, abs=1e-6)
+
+
+# -- batches
+
+
+@pytest.mark.parametrize(("target", "options"), [("brown_conrady", {"max_angle": 0.8}), ("equirectangular", {})])
+def test_a_batch_is_its_rows_one_by_one(target, options):
+    source = fisheye((4, 8))
+    together = source.convert(target, **options)
+    check(source, together)
+    for i, j in ((i, j) for i in range(4) for j in range(8)):
+        row = ct.KannalaBrandt(source.intrinsics[i, j].detach(), source.distortion[i, j].detach(), image_size=SIZE)
+        alone = row.convert(target, **options)
+        for name in ("rms", "max_error", "max_angle", "valid_fraction"):
+            torch.testing.assert_close(getattr(together, name)[i, j], getattr(alone, name), rtol=1e-7, atol=1e-9)
+        for name in ("intrinsics", "distortion"):
+            torch.testing.assert_close(
+                getattr(together.camera, name)[i, j], getattr(alone.camera, name), rtol=1e-7, atol=1e-8
+            )
+
+
+def test_a_row_that_is_no_camera_leaves_the_others_alone():
+    source = fisheye((3,))
+    before = source.convert("brown_conrady", max_angle=0.8)
+    with torch.no_grad():
+        source.intrinsics[1, 0] = math.nan
+    after = source.convert("brown_conrady", max_angle=0.8)
+    assert bool(torch.isfinite(after.camera.intrinsics).all() & torch.isfinite(after.camera.distortion).all())
+    assert float(after.max_error[1]) == float(after.rms[1]) == math.inf
+    assert float(after.valid_fraction[1]) == float(after.max_angle[1]) == 0
+    torch.testing.assert_close(after.camera.distortion[[0, 2]], before.camera.distortion[[0, 2]], rtol=1e-7, atol=1e-8)
+
+
+def test_a_shared_lens_serves_the_batch():
+    lens = torch.nn.Parameter(torch.tensor([0.02, -0.01, 0.003, -0.001], **F64))
+    source = ct.KannalaBrandt(
+        torch.tensor([[300.0, 300, 320, 240], [280, 280, 320, 240]], **F64), lens, image_size=SIZE
+    )
+    result = source.convert("fisheye624")
+    assert result.camera.distortion.shape == (2, 12)
+    assert result.exact.tolist() == [True, True]
+
+
+# -- what is asked for
+
+
+def test_a_bad_conversion_says_so():
+    source = golden("kannala_brandt__auto_190deg_a")
+    result = source.convert(ct.Pinhole)
+    check(source, result)
+    assert float(result.max_error) > 100
+    assert float(result.max_angle) < radians(90)
+    assert float(result.valid_fraction) < 0.9
+    narrow = source.convert(ct.Pinhole, max_angle=radians(20))
+    assert float(narrow.max_error) < 10
+    assert float(narrow.max_angle) == pytest.approx(radians(20), abs=1e-3)
+    assert 0 < float(narrow.valid_fraction) < 0.1
+
+
+def test_without_a_picture_all_rays_count():
+    source = ct.KannalaBrandt([300.0, 300, 320, 240], [0.02, -0.01, 0.003, -0.001])
+    result = source.convert("fisheye624")
+    assert result.camera.image_size is None
+    assert "of the rays" in repr(result)
+    wide = ct.Pinhole([300.0, 300, 320, 240]).convert("kannala_brandt", max_angle=radians(50))
+    assert float(wide.max_angle) == pytest.approx(radians(50), abs=1e-6)
+    assert float(wide.max_error) < 0.05
+    sized = source.convert("fisheye624", image_size=(100, 200))
+    assert sized.camera.image_size == (100, 200)
+
+
+def test_the_new_camera_learns_as_the_old_one_did():
+    learning = fisheye()
+    result = learning.convert("brown_conrady", max_angle=0.6)
+    assert all(isinstance(p, torch.nn.Parameter) and p.requires_grad for p in result.camera.parameters())
+    assert result.rms.requires_grad is False
+    frozen = learning.requires_grad_(False).convert("brown_conrady", max_angle=0.6).camera
+    assert not any(p.requires_grad for p in frozen.parameters())
+    predicted = 300 * torch.ones(4, requires_grad=True)
+    result = ct.KannalaBrandt(predicted, torch.zeros(4), image_size=SIZE).convert("fisheye62")
+    assert bool(result.exact)
+    assert result.camera.intrinsics.is_leaf
+    half = fisheye().float().convert("fisheye62")
+    assert half.camera.intrinsics.dtype == torch.float64
+    assert bool(half.exact)
+
+
+def test_edited_pictures():
+    source = golden("brown_conrady__d5_dms_ir_62deg")
+    for edited in (source.crop(300, 700, 200, 300), source.hflip(), source.resize(100, 160)):
+        result = edited.convert("fisheye624")
+        check(edited, result)
+        assert float(result.max_error) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "error", "text"),
+    [
+        (("fisheye63",), {}, ValueError, "known are brown_conrady"),
+        ((3,), {}, TypeError, "takes a camera model"),
+        ((torch.nn.Linear,), {}, TypeError, "takes a camera model"),
+        ((ct.Camera,), {}, TypeError, "takes a camera model"),
+        (("brown_conrady",), {"count": 6}, ValueError, "n = 4, 5, 8, 12 or 14 .*; got count=6"),
+        (("brown_conrady",), {"count": -1}, ValueError, "got count=-1"),
+        (("pinhole",), {"count": 1}, ValueError, "got count=1"),
+        (("pinhole",), {"max_angle": 0.0}, ValueError, "max_angle must be positive"),
+        (("pinhole",), {"max_angle": math.nan}, ValueError, "max_angle must be positive"),
+        (("pinhole",), {"image_size": (0, 3)}, ValueError, "image_size must be positive"),
+    ],
+)
+def test_the_door(arguments, options, error, text):
+    with pytest.raises(error, match=text):
+        fisheye().convert(*arguments, **options)
+
+
+@pytest.mark.parametrize("key", KEYS)
+@given(data=st.data())
+@settings(max_examples=4)
+def test_wild_cameras_become_something_finite(key, data):
+    source = data.draw(drawn(key, wild=True))
+    result = source.convert(data.draw(st.sampled_from(KEYS)))
+    check(source, result)

@@ -1,0 +1,121 @@
+"""Pictures of cameras: what they show is what the cameras say."""
+
+import numpy as np
+import pytest
+import torch
+from cameras import GOLDEN, KEYS, golden_camera, one
+
+import camtorch as ct
+
+matplotlib = pytest.importorskip("matplotlib")
+matplotlib.use("Agg")
+
+from matplotlib.figure import Figure  # noqa: E402
+
+from camtorch import plot  # noqa: E402
+from camtorch.summary import fan, ideal, summarise  # noqa: E402
+
+SIZE = (480, 640)
+
+
+def fisheye(**changes):
+    values = {"intrinsics": [300.0, 300, 320, 240], "distortion": [-0.02, -0.01, 0.003, -0.001], "image_size": SIZE}
+    return ct.KannalaBrandt(**(values | changes)).double()
+
+
+def axes():
+    return Figure(layout="constrained").add_subplot()
+
+
+def drawn(ax):
+    ax.figure.canvas.draw()
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_model_has_a_portrait(key):
+    camera = one(key)
+    figure = plot.portrait(camera, camera.convert("kannala_brandt").camera)
+    figure.set_dpi(30)
+    figure.canvas.draw()
+    assert len([ax for ax in figure.axes if ax.get_title()]) == 3
+
+
+def test_each_function_draws_on_the_axes_it_gets():
+    camera = fisheye()
+    for draw in (plot.distortion_field, plot.radius_curve, lambda c, ax: plot.difference(c, c, ax)):
+        ax = axes()
+        assert draw(camera, ax) is ax
+        drawn(ax)
+    ax = plot.difference(camera, camera)
+    matplotlib.pyplot.close(ax.figure)
+
+
+def test_the_field_goes_from_the_ideal_pixel_to_the_actual_one():
+    camera = fisheye(distortion=[-0.2, 0.0, 0.0, 0.0])
+    ax = plot.distortion_field(camera, axes())
+    (arrows,) = (c for c in ax.collections if hasattr(c, "U"))
+    start, along = np.stack([arrows.X, arrows.Y], -1), np.stack([arrows.U, arrows.V], -1)
+    assert "as long" not in ax.get_title()
+    rays, valid = camera.unproject(torch.from_numpy(start + along))
+    assert bool(valid.all())
+    np.testing.assert_allclose(ideal(camera).project(rays)[0].detach(), start, atol=1e-6)
+    mild = plot.distortion_field(fisheye(distortion=[-0.001, 0.0, 0.0, 0.0]), axes())
+    assert "times as long" in mild.get_title()
+
+
+def test_the_curve_is_the_radius_and_ends_where_rays_do():
+    camera = golden_camera(GOLDEN["mpmath__fisheye624__aria_slam_left_online"])
+    ax = plot.radius_curve([camera, fisheye()], axes(), labels=["aria", "mine"])
+    drawn(ax)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["aria", "ideal", "mine"]
+    curve = ax.lines[0]
+    angles = torch.from_numpy(np.radians(curve.get_xdata()))
+    assert float(angles[-1]) == pytest.approx(summarise(camera).valid_angle[1], abs=0.01)
+    pixels, _ = camera.project(fan(angles[100:101], 256)[0])
+    radius = (pixels - camera.intrinsics[2:]).norm(dim=-1).detach()
+    assert float(radius.min()) <= curve.get_ydata()[100] <= float(radius.max())
+
+
+def test_a_difference_is_that_of_pixels():
+    a, b = fisheye(), fisheye(intrinsics=[300.0, 300, 323, 244])
+    ax = plot.difference(a, b, axes())
+    assert "rms 5 px, at most 5 px" in ax.get_title()
+    values = ax.images[0].get_array()
+    np.testing.assert_allclose(values.compressed(), 5.0, atol=1e-9)
+    assert "rms 0 px" in plot.difference(a, a, axes()).get_title() or "e-" in plot.difference(a, a, axes()).get_title()
+
+
+def test_a_common_rotation_is_removed_only_if_asked():
+    a = ct.Equirectangular([300.0, 300, 320, 240], image_size=SIZE).double()
+    b = ct.Equirectangular([300.0, 300, 350, 240], image_size=SIZE).double()  # a turn by a tenth around the vertical
+    assert "rms 30 px" in plot.difference(a, b, axes()).get_title()
+    turned = plot.difference(a, b, axes(), remove_rotation=True)
+    assert float(turned.images[0].get_array().max()) < 1e-6
+    assert "turned by 5.73 degrees" in turned.get_title()
+
+
+def test_what_shows_nothing_is_left_out():
+    wide, ahead = fisheye(distortion=[0.0] * 4), ct.Pinhole([300.0, 300, 320, 240]).double()
+    ax = plot.difference(wide.pad(400, 400, 400, 400), ahead, axes())
+    drawn(ax)
+    assert ax.images[0].get_array().mask.mean() > 0.3
+    field = plot.distortion_field(ct.BrownConrady([300.0, 300, 320, 240], [-0.5, 0, 0, 0], image_size=SIZE), axes())
+    drawn(field)
+    nothing = ct.BrownConrady([300.0, 300, 9e5, 240], [-0.5, 0, 0, 0], image_size=SIZE)
+    drawn(plot.distortion_field(nothing, axes()))
+    drawn(plot.radius_curve(nothing, axes()))
+    drawn(plot.difference(nothing, nothing, axes()))
+
+
+def test_the_door():
+    batch = ct.Pinhole(torch.ones(2, 4), image_size=SIZE)
+    for draw in (plot.distortion_field, plot.radius_curve, lambda c: plot.difference(c, c)):
+        with pytest.raises(ValueError, match="a plot shows single cameras"):
+            draw(batch)
+    with pytest.raises(ValueError, match="needs the camera's image_size"):
+        plot.distortion_field(ct.Pinhole([1.0, 1, 0, 0]))
+    with pytest.raises(ValueError, match="differ in size"):
+        plot.difference(fisheye(), fisheye(image_size=(10, 10)))
+    with pytest.raises(ValueError, match="1 cameras, and labels for 2"):
+        plot.radius_curve(fisheye(), labels=["a", "b"])
+    matplotlib.pyplot.close("all")

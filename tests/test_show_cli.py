@@ -1,0 +1,197 @@
+"""`camtorch show` and `camtorch convert`."""
+
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from cameras import KEYS, one
+from PIL import Image
+
+import camtorch as ct
+from camtorch.cli import main
+from camtorch.summary import summarise
+
+FILES = Path(__file__).parent / "files"
+FISHEYE = (
+    "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
+    "K: [28, 0, 47, 0, 28, 32, 0, 0, 1]\nD: [-0.02, 0.004, -0.003, 0.0006]\n"
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, with a camera."""
+    monkeypatch.chdir(tmp_path)
+    Path("camera.yml").write_text(FISHEYE)
+    return tmp_path
+
+
+@pytest.fixture
+def saved(monkeypatch):
+    """What `ct.save` was asked to write; the file gets one line."""
+    calls = []
+
+    def save(held, path, format=None):
+        calls.append((held, format))
+        Path(path).write_text("saved\n")
+
+    monkeypatch.setattr(ct, "save", save, raising=False)
+    return calls
+
+
+def command(*words, expect=0):
+    assert main([str(word) for word in words]) == expect
+
+
+def refused(capsys, *words):
+    """The one line of the error."""
+    command(*words, expect=2)
+    captured = capsys.readouterr()
+    assert captured.err.startswith("camtorch: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def opened(path):
+    """A picture that keeps no file open."""
+    with Image.open(path) as image:
+        image.load()
+        return image
+
+
+# -- show
+
+
+def test_show_prints_a_summary(folder, capsys):
+    command("show", "camera.yml")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "camera.yml: camera"
+    table = dict(line.split(maxsplit=1) for line in lines[1:6] if not line.startswith(("focal", "principal")))
+    assert table["model"] == "KannalaBrandt (kannala_brandt)"
+    assert table["picture"] == "96 x 64"
+    text = "\n".join(lines)
+    assert "fx 28, fy 28 px" in text
+    assert "k1 -0.02, k2 0.004, k3 -0.003, k4 0.0006" in text
+    for label in ("valid rays", "field of view", "has rays", "distortion, px"):
+        assert f"\n{label} " in text
+
+
+def test_show_draws_a_picture(folder, capsys):
+    pytest.importorskip("matplotlib")
+    command("show", "camera.yml", "-o", "out.png")
+    assert "out.png: distortion, radius over angle\n" in capsys.readouterr().out
+    two = opened("out.png")
+    command("show", "camera.yml", "--against", "camera.yml", "-o", "out.png", "--force")
+    three = opened("out.png")
+    assert "out.png: distortion, radius over angle, difference\n" in capsys.readouterr().out
+    assert three.width > two.width
+    assert len(three.convert("L").histogram()) > 100
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["show"], "required: FILE"),
+        (["show", "none.yml"], "none.yml: No such file"),
+        (["show", "bad.yml"], "bad.yml: K: a camera matrix has 3 x 3"),
+        (["show", "camera.yml", "-o", "camera.yml"], "camera.yml: exists already; --force"),
+        (["show", "camera.yml", "-o", "o.docx"], "written as .docx"),
+        (["show", "camera.yml", "-o", "none/o.png"], "there is no folder none"),
+        (["show", "camera.yml", "--against", "camera.yml"], "--against needs -o OUT"),
+        (["show", "bare.yml", "-o", "o.png"], "bare.yml states no image size"),
+        (["show", FILES / "opencv_stereo.yml"], "several cameras"),
+        (["convert", "camera.yml"], "required: OUT"),
+        (["convert", "none.yml", "o.yml"], "none.yml: No such file"),
+        (["convert", "camera.yml", "camera.yml", "--model", "fisheye624"], "camera.yml: exists already; --force"),
+        (["convert", "camera.yml", ".", "--force"], "is a folder"),
+        (["convert", "camera.yml", "none/o.yml"], "none/o.yml: there is no folder none"),
+        (["convert", "camera.yml", "o.yml", "--model", "fisheye63"], "known are brown_conrady"),
+        (["convert", "camera.yml", "o.yml", "--model", "brown_conrady", "--count", "6"], "got count=6"),
+        (["convert", "camera.yml", "o.yml", "--max-angle", "0"], "--max-angle must be above 0"),
+        (["convert", "camera.yml", "o.yml", "--max-angle", "nan"], "--max-angle must be above 0"),
+        (["convert", "camera.yml", "o.yml", "--count", "many"], "--count: invalid int"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(folder, saved, capsys, words, text):
+    Path("bad.yml").write_text("K: [1, 2]")
+    Path("bare.yml").write_text("K: [28, 0, 47, 0, 28, 32, 0, 0, 1]")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert text in refused(capsys, *words)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert not saved
+
+
+def test_show_without_matplotlib(folder, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert "pip install 'camtorch[plot]'" in refused(capsys, "show", "camera.yml", "-o", "out.png")
+    assert not Path("out.png").exists()
+
+
+# -- convert
+
+
+def test_convert_writes_the_new_camera(folder, saved, capsys):
+    command("convert", "camera.yml", "out.json", "--model", "fisheye624", "--format", "aria")
+    assert capsys.readouterr().out == (
+        "out.json: camera, kannala_brandt to fisheye624: exact, "
+        "up to 123.1 degrees from the axis, 100 % of the picture\n"
+    )
+    ((held, format),) = saved
+    camera = held if isinstance(held, ct.Camera) else next(iter(held.cameras.values()))
+    assert (type(camera), camera.image_size, format) == (ct.Fisheye624, (64, 96), "aria")
+    assert camera.distortion[:4].tolist() == [-0.02, 0.004, -0.003, 0.0006]
+
+
+def test_convert_says_how_good_it_is(folder, saved, capsys):
+    command("convert", "camera.yml", "out.yml", "--model", "brown_conrady", "--count", "8", "--max-angle", "60")
+    out = capsys.readouterr().out
+    assert "kannala_brandt to brown_conrady: rms " in out
+    assert "px, at most " in out
+    assert "up to 60.0 degrees from the axis" in out
+    command("convert", "camera.yml", "out.yml", "--force")
+    assert "kannala_brandt to kannala_brandt: exact" in capsys.readouterr().out
+    assert len(saved) == 2
+
+
+# -- the numbers of a summary
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_model_has_a_summary(key):
+    camera = one(key)
+    summary = summarise(camera)
+    assert 0 < summary.valid_angle[0] <= summary.valid_angle[1] <= math.pi + 1e-6
+    assert all(0 < angle < 2 * math.pi for angle in summary.fov)
+    assert 0.5 < summary.seen <= 1
+    assert not any("nan" in line or "inf" in line for line in summary.lines())
+
+
+def test_the_summary_of_a_pinhole_is_known():
+    camera = ct.Pinhole([320.0, 240.0, 319.5, 239.5], image_size=(480, 640)).double()
+    summary = summarise(camera)
+    assert summary.fov == pytest.approx((math.pi / 2, math.pi / 2, 2 * math.atan(2**0.5)))
+    assert summary.valid_angle == pytest.approx((math.pi / 2,) * 2, abs=0.002)
+    assert (summary.seen, summary.corners) == (1, ((0, 0),) * 4)
+    right = summarise(camera.crop(0, 320, 480, 320))
+    assert right.fov[0] == pytest.approx(math.pi / 4)
+
+
+def test_the_summary_of_a_wide_fisheye_passes_half_a_circle():
+    camera = ct.KannalaBrandt([100.0, 100.0, 199.5, 99.5], [0.0] * 4, image_size=(200, 400)).double()
+    summary = summarise(camera)
+    assert summary.fov[:2] == pytest.approx((4.0, 2.0))
+    assert summary.fov[2] == pytest.approx(20**0.5, abs=1e-3)
+
+
+def test_a_summary_says_what_it_cannot_know():
+    bare = summarise(ct.Pinhole([320.0, 240.0, 319.5, 239.5]))
+    assert bare.fov is None
+    assert any("not stated" in line for line in bare.lines())
+    folded = ct.BrownConrady([300.0, 300, 320, 240], [-0.5, 0, 0, 0], image_size=(480, 640))
+    assert summarise(folded).corners == ("no ray",) * 4
+    lost = ct.BrownConrady([300.0, 300, 9e5, 240], [-0.5, 0, 0, 0], image_size=(480, 640))
+    assert summarise(lost).fov == (0, 0, 0)
+    with pytest.raises(ValueError, match="one camera"):
+        summarise(ct.Pinhole(torch.ones(2, 4)))
