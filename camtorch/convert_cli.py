@@ -70,7 +70,9 @@ def _convert(arguments: argparse.Namespace) -> None:
             f"{path}: {name}, {camera.key} to {result.camera.key}: {errors}, "
             f"up to {degrees:.1f} degrees from the axis, {covered:.4g} % of {part}"
         )
-    changed = Rig(cameras, rig.extrinsics, images=rig.images, format=rig.format)
+    # camtorch's own JSON holds every model; the format that the rig comes from may not
+    stays = rig.format if arguments.model is None or path.suffix != ".json" else None
+    changed = Rig(cameras, rig.extrinsics, images=rig.images, format=stays)
     save(changed, path, format=arguments.format)
     print("\n".join(notes))
 
