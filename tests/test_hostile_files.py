@@ -154,6 +154,7 @@ XML = "<opencv_storage>{}</opencv_storage>"
             "needs the camera model 'x'",
         ),
         ("a.json", '{"camtorch": 1, "cameras": {"a": 1, "a": 2}}', "the key 'a' stands there twice"),
+        ("a.json", '{"camera_angle_x": 5e-324, "w": 4, "h": 4}', "camera_angle_x: 4.94066e-324 is no angle"),
         ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
         ("a.json", '{"\\n\\u0000": {"K": 1}}', "no format that is known here"),
         ("a.xml", '<!DOCTYPE x [<!ENTITY a "b">]>' + XML.format("&a;"), "line 1: a document type"),

@@ -180,6 +180,8 @@ def test_what_the_name_does_not_say_is_asked_for(tmp_path):
         ct.load(tmp_path / "a.yaml", "ply")
     with pytest.raises(TypeError, match="takes a Rig or a Camera; got list"):
         ct.save([camera()], tmp_path / "a.json")
+    with pytest.raises(ValueError, match="a rig without cameras"):
+        ct.save(ct.Rig({}), tmp_path / "a.json")
     ct.save(load("ros_plumb_bob.yaml"), tmp_path / "a.yaml")
     assert ct.load(tmp_path / "a.yaml").format == "ros"
     with pytest.raises(ct.CameraFileError, match=r"folder: has none of cameras.bin, cameras.txt, transforms.json"):

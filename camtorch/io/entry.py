@@ -63,7 +63,7 @@ def load(path, format: str | None = None) -> Rig:
         path = found[0]
     try:
         rig, format = _load(path, format)
-    except (OverflowError, RecursionError, MemoryError) as error:
+    except (ArithmeticError, RecursionError, MemoryError) as error:
         raise CameraFileError(path, "content", f"cannot be read: {type(error).__name__}: {error}") from None
     if not rig.cameras:
         raise CameraFileError(path, "cameras", "none")
@@ -104,6 +104,8 @@ def save(rig: Rig | Camera, path, format: str | None = None) -> None:
         rig = Rig({"camera": rig})
     if not isinstance(rig, Rig):
         raise TypeError(f"save takes a Rig or a Camera; got {type(rig).__name__}")
+    if not rig.cameras:
+        raise ValueError(f"{path}: a rig without cameras, which no format holds")
     _known(format)
     format = format or _format_of(rig, os.fspath(path))
     files = colmap.write(rig, path) if format == "colmap" else {path: _BY_KEYS[format].render(rig, path).encode()}

@@ -76,7 +76,7 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
         fx = merged["fl_x"].number()
     else:
         angle = merged["camera_angle_x"].number()
-        if not 0 < angle < math.pi:
+        if not 1e-6 < angle < math.pi:
             merged["camera_angle_x"].fail(f"{angle:g} is no angle of a pinhole camera")
         fx = merged["w"].side() / 2 / math.tan(angle / 2)
     fy = merged["fl_y"].number() if "fl_y" in merged else fx

@@ -146,7 +146,7 @@ class _File:
             warnings.warn(
                 f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
                 "If they come from cv2.fisheye, the model is kannala_brandt",
-                stacklevel=5,
+                stacklevel=4,
             )
         return "brown_conrady" if distortion else "pinhole"
 
