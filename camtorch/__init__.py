@@ -6,13 +6,17 @@ from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError
 from camtorch.models import (
+    EUCM,
+    UCM,
     BrownConrady,
     Cylindrical,
+    DoubleSphere,
     Equirectangular,
     Fisheye62,
     Fisheye624,
     FisheyeRadTanThinPrism,
     KannalaBrandt,
+    Mei,
     Pinhole,
 )
 from camtorch.warp import Warp
@@ -20,18 +24,22 @@ from camtorch.warp import Warp
 __version__ = "0.1.0"
 
 __all__ = [
+    "EUCM",
     "MODELS",
+    "UCM",
     "BrownConrady",
     "Camera",
     "CameraFileError",
     "Cylindrical",
     "Dewarp",
+    "DoubleSphere",
     "Equirectangular",
     "Extrinsics",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
+    "Mei",
     "Pinhole",
     "Warp",
     "augment",

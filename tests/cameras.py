@@ -16,8 +16,12 @@ import camtorch as ct
 GOLDEN = {path.stem: json.loads(path.read_text()) for path in sorted((Path(__file__).parent / "golden").glob("*.json"))}
 KEYS = sorted(ct.MODELS)
 
-# Largest coefficient drawn, plausible and wild, by the first letters of its name
+# Coefficients drawn, plausible and wild, by the first letters of their names: up to that size, or between two numbers
 RANGES = {
+    "ucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5))},
+    "eucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5)), "beta": ((0.5, 1.5), (0.01, 20.0))},
+    "double_sphere": {"alpha": ((0.0, 1.0), (-0.5, 1.5)), "xi": ((-0.3, 0.6), (-0.9, 3.0))},
+    "mei": {"xi": ((0.0, 2.0), (-0.9, 4.0)), "k": (0.3, 1.0), "p": (2e-3, 0.05)},
     "brown_conrady": {"k": (0.3, 1.0), "p": (2e-3, 0.05), "s": (2e-3, 0.05), "tau": (0.05, 0.3)},
     "kannala_brandt": {"k": (0.05, 0.5)},
     "fisheye62": {"k": (0.05, 0.5), "p": (2e-3, 0.05)},
@@ -81,15 +85,17 @@ def spread(key, dtype=torch.float64):
     """A camera with every coefficient away from zero, so that no term of the formula can be forgotten."""
     count = len(one(key).distortion_names)
     sign = torch.tensor([1.0, -1.0]).repeat(count)[:count]
-    widths = torch.tensor([_width(key, name, wild=False) for name in one(key).distortion_names])
+    limits = torch.tensor([_limits(key, name, wild=False) for name in one(key).distortion_names]).view(-1, 2)
+    middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2
     intrinsics = torch.tensor([301.0, 310.5, 318.25, 243.5], dtype=dtype)
-    return make(key, intrinsics, (0.3 * sign * widths).to(dtype), image_size=(480, 640))
+    return make(key, intrinsics, (middle + 0.3 * sign * half).to(dtype), image_size=(480, 640))
 
 
-def _width(key, name, wild):
+def _limits(key, name, wild):
     ranges = RANGES.get(key, {})
     letters = max((letters for letters in ranges if name.startswith(letters)), key=len, default=None)
-    return ranges[letters][wild] if letters else 0.0
+    limits = ranges[letters][wild] if letters else 0.0
+    return limits if isinstance(limits, tuple) else (-limits, limits)
 
 
 @st.composite
@@ -104,8 +110,7 @@ def drawn(draw, key, wild):
     names = model.names_of(draw(st.sampled_from(counts))) if counts else ()
     focal = number(150, 600)
     intrinsics = [focal, focal * number(0.9, 1.1), 320 + number(-20, 20), 240 + number(-20, 20)]
-    widths = [_width(key, name, wild) for name in names]
-    distortion = [number(-width, width) for width in widths]
+    distortion = [number(*_limits(key, name, wild)) for name in names]
     intrinsics, distortion = (torch.tensor(v, dtype=torch.float64) for v in (intrinsics, distortion))
     return make(key, intrinsics, distortion, image_size=(480, 640))
 
