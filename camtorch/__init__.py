@@ -7,17 +7,23 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError
 from camtorch.models import (
     EUCM,
+    FOV,
     UCM,
     BrownConrady,
     Cylindrical,
+    Division,
     DoubleSphere,
     Equirectangular,
+    Equisolid,
     Fisheye62,
     Fisheye624,
     FisheyeRadTanThinPrism,
     KannalaBrandt,
     Mei,
+    OrthographicFisheye,
     Pinhole,
+    Stereographic,
+    ThinPrismFisheye,
 )
 from camtorch.warp import Warp
 
@@ -25,6 +31,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "EUCM",
+    "FOV",
     "MODELS",
     "UCM",
     "BrownConrady",
@@ -32,15 +39,20 @@ __all__ = [
     "CameraFileError",
     "Cylindrical",
     "Dewarp",
+    "Division",
     "DoubleSphere",
     "Equirectangular",
+    "Equisolid",
     "Extrinsics",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
     "Mei",
+    "OrthographicFisheye",
     "Pinhole",
+    "Stereographic",
+    "ThinPrismFisheye",
     "Warp",
     "augment",
     "io",

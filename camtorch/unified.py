@@ -55,10 +55,24 @@ class Unified(Chart):
         around = rho2 if beta is None else rho2 * beta
         return rho2, z, torch.addcmul(around, z, z).sqrt(), distance
 
+    def _below(self, rho2: Tensor, z: Tensor, sphere: Tensor) -> Tensor:
+        """The denominator, of x^2 + y^2, z' and d'."""
+        _, alpha, beta = self._parts()
+        if self.fixed_alpha == 0:
+            return z
+        if self.fixed_alpha == 1:
+            return sphere
+        # behind the camera its terms cancel, all the more for alpha near 1/2
+        ahead = z > 0
+        around = rho2 if beta is None else rho2 * beta
+        behind = alpha * alpha * around + (2 * alpha - 1) * (z * z)
+        behind = behind / torch.where(ahead, 1.0, alpha * sphere - (1 - alpha) * z)
+        return torch.where(ahead, z + alpha * (sphere - z), behind)
+
     def margin(self, x, y, z):
         xi, alpha, _ = self._parts()
-        _, shifted, sphere, distance = self._shifted(x, y, z)
-        below = alpha * sphere + (1 - alpha) * shifted
+        rho2, shifted, sphere, distance = self._shifted(x, y, z)
+        below = self._below(rho2, shifted, sphere)
         margin = self._most(z.dtype) * below - torch.maximum(x.abs(), y.abs())
         margin = torch.minimum(margin, alpha * shifted + (1 - alpha) * sphere)
         return margin if xi is None else torch.minimum(margin, torch.addcmul(distance, xi, z))
@@ -67,9 +81,8 @@ class Unified(Chart):
         return self._is_tame and self._most(dtype) * nearest > extent
 
     def scale(self, x, y, z, order=2):
-        _, alpha, _ = self._parts()
-        _, z, sphere, _ = self._shifted(x, y, z)
-        return (z + alpha * (sphere - z)).reciprocal()
+        rho2, shifted, sphere, _ = self._shifted(x, y, z)
+        return self._below(rho2, shifted, sphere).reciprocal()
 
     def pull_point(self, x, y, z, ga, gb, scale, want_parameters):
         xi, alpha, beta = self._parts()
