@@ -7,14 +7,24 @@ from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save
 from camtorch.models import (
+    EUCM,
+    FOV,
+    UCM,
     BrownConrady,
     Cylindrical,
+    Division,
+    DoubleSphere,
     Equirectangular,
+    Equisolid,
     Fisheye62,
     Fisheye624,
     FisheyeRadTanThinPrism,
     KannalaBrandt,
+    Mei,
+    OrthographicFisheye,
     Pinhole,
+    Stereographic,
+    ThinPrismFisheye,
 )
 from camtorch.rig import Rig
 from camtorch.warp import Warp
@@ -22,21 +32,31 @@ from camtorch.warp import Warp
 __version__ = "0.1.0"
 
 __all__ = [
+    "EUCM",
+    "FOV",
     "MODELS",
+    "UCM",
     "BrownConrady",
     "Camera",
     "CameraFileError",
     "Conversion",
     "Cylindrical",
     "Dewarp",
+    "Division",
+    "DoubleSphere",
     "Equirectangular",
+    "Equisolid",
     "Extrinsics",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
+    "Mei",
+    "OrthographicFisheye",
     "Pinhole",
     "Rig",
+    "Stereographic",
+    "ThinPrismFisheye",
     "Warp",
     "augment",
     "io",

@@ -40,6 +40,7 @@ def _root(square: Tensor) -> Tensor:
 _COS = [(-1) ** n / math.factorial(2 * n) for n in range(8)]
 _SINC = [(-1) ** n / math.factorial(2 * n + 1) for n in range(8)]
 _COSC = [(-1) ** n / math.factorial(2 * n + 2) for n in range(8)]
+_TANC = [1, 1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1382 / 155925, 21844 / 6081075, 929569 / 638512875]
 _ATAN = [(-1) ** n / (2 * n + 1) for n in range(8)]
 
 
@@ -79,3 +80,8 @@ def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
     near = reciprocal * _series(torch.where(small, rho2, 0.0) * reciprocal * reciprocal, _ATAN)
     rho = torch.where(small, 1.0, rho2).sqrt()
     return torch.where(small, near, torch.atan2(rho, z) / rho)
+
+
+def tanc_root(t: Tensor) -> Tensor:
+    """tan(angle) / angle of t = angle^2."""
+    return _blend(t, _TANC, lambda angle: torch.tan(angle) / angle)

@@ -8,7 +8,7 @@ import pickle
 import kornia
 import pytest
 import torch
-from cameras import KEYS, spread
+from cameras import KEYS, PAIRS, spread
 
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
@@ -64,8 +64,11 @@ def likes():
     return [*PRESETS, *(source(key) for key in KEYS)]
 
 
-@pytest.mark.parametrize("key", KEYS)
-@pytest.mark.parametrize("which", range(len(PRESETS) + len(KEYS)))
+# every preset with every model, and some pairs of models
+@pytest.mark.parametrize(
+    ("which", "key"),
+    [*itertools.product(range(len(PRESETS)), KEYS), *((len(PRESETS) + KEYS.index(like), key) for like, key in PAIRS)],
+)
 def test_every_field_moves_together_between_any_two_models(key, which):
     """Keypoints sit on the discs, 3D points project onto keypoints through the camera that comes out, gaze is R g."""
     camera, like = source(key), likes()[which]
