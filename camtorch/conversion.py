@@ -17,7 +17,7 @@ from camtorch.related import carried, default_count
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
-_FIT_SIDE, _CHECK_SIDE = 33, 97  # of the lattices of pixels to fit to, and to check with
+_FIT_SIDE, _CHECK_SIDE = 33, 193  # of the lattices of pixels to fit to, and to check with
 _ANGLES, _AZIMUTHS, _RADII = 181, 16, 64  # at which a camera is looked at as a whole
 _END_AHEAD = math.radians(87)  # of rays, for a camera without a picture that does not see sideways
 _ROWS = 64  # of a batch that are worked on at a time
