@@ -12,6 +12,7 @@ import torch
 from hypothesis import strategies as st
 
 import camtorch as ct
+from camtorch.models.colmap import from_colmap
 
 GOLDEN = {path.stem: json.loads(path.read_text()) for path in sorted((Path(__file__).parent / "golden").glob("*.json"))}
 KEYS = sorted(ct.MODELS)
@@ -83,6 +84,10 @@ def golden_camera(case):
     """The camera of a file; a brown_conrady vector loses no coefficient, be it zero."""
     parameters = tensor(case["parameters"])
     size = tuple(case["image_size"])
+    if "colmap" in case:
+        key, *numbers = from_colmap(case["colmap"], case["parameters"])
+        assert key == case["family"]
+        return make(key, *(tensor(list(v)) for v in numbers), image_size=size)
     if case["family"] == "kannala_brandt_general":
         return ct.KannalaBrandt.from_general(parameters[:4], parameters[4:], image_size=size)
     return make(case["family"], parameters[:4], parameters[4:], image_size=size)

@@ -9,7 +9,7 @@ from cameras import KEYS, fan, make, one, pixel_lattice, spread
 from torch.autograd import gradcheck
 
 import camtorch as ct
-from camtorch import blocks, opaque, sampling, warp
+from camtorch import blocks, opaque, positions, sampling
 from camtorch.charts import Perspective
 from camtorch.solve import invert
 
@@ -160,7 +160,7 @@ def test_strips_of_a_map_change_nothing(cameras, monkeypatch):
     for one_camera in (source, target):
         one_camera.requires_grad_(False)
     whole = ct.Warp(source, target)
-    monkeypatch.setattr(warp, "_STRIP", 7 * 63)
+    monkeypatch.setattr(positions, "_STRIP", 7 * 63)
     strips = ct.Warp(source, target)
     assert torch.equal(strips.grid(), whole.grid())
     assert torch.equal(strips.valid_mask(), whole.valid_mask())
