@@ -18,12 +18,14 @@ from camtorch.models import (
     Fisheye62,
     Fisheye624,
     FisheyeRadTanThinPrism,
+    FTheta,
     KannalaBrandt,
     Mei,
     OrthographicFisheye,
     Pinhole,
     Stereographic,
     ThinPrismFisheye,
+    WoodScape,
 )
 from camtorch.warp import Warp
 
@@ -44,6 +46,7 @@ __all__ = [
     "Equirectangular",
     "Equisolid",
     "Extrinsics",
+    "FTheta",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",
@@ -54,6 +57,7 @@ __all__ = [
     "Stereographic",
     "ThinPrismFisheye",
     "Warp",
+    "WoodScape",
     "augment",
     "io",
 ]
