@@ -19,12 +19,14 @@ from camtorch.models import (
     Fisheye62,
     Fisheye624,
     FisheyeRadTanThinPrism,
+    FTheta,
     KannalaBrandt,
     Mei,
     OrthographicFisheye,
     Pinhole,
     Stereographic,
     ThinPrismFisheye,
+    WoodScape,
 )
 from camtorch.rig import Rig
 from camtorch.warp import Warp
@@ -47,6 +49,7 @@ __all__ = [
     "Equirectangular",
     "Equisolid",
     "Extrinsics",
+    "FTheta",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",
@@ -58,6 +61,7 @@ __all__ = [
     "Stereographic",
     "ThinPrismFisheye",
     "Warp",
+    "WoodScape",
     "augment",
     "io",
     "load",

@@ -12,6 +12,7 @@ import torch
 from hypothesis import strategies as st
 
 import camtorch as ct
+from camtorch.models.colmap import from_colmap
 
 GOLDEN = {path.stem: json.loads(path.read_text()) for path in sorted((Path(__file__).parent / "golden").glob("*.json"))}
 KEYS = sorted(ct.MODELS)
@@ -24,6 +25,8 @@ RANGES = {
     "stereographic": {"k": (0.02, 0.3)},
     "orthographic_fisheye": {"k": (0.05, 0.5)},
     "thin_prism_fisheye": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
+    "f_theta": {"k": (0.1, 0.5)},
+    "woodscape": {"k": (0.1, 0.5)},
     "ucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5))},
     "eucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5)), "beta": ((0.5, 1.5), (0.01, 20.0))},
     "double_sphere": {"alpha": ((0.0, 1.0), (-0.5, 1.5)), "xi": ((-0.3, 0.6), (-0.9, 3.0))},
@@ -37,12 +40,22 @@ RANGES = {
 # Real calibrations of models that no reference file is of: intrinsics, distortion, picture size
 CALIBRATIONS = {
     # KITTI-360, calibration/image_02.yaml
+    # WoodScape, as its polynomial in pixels: 339.749, -31.988, 48.275, -7.201, and an offset of (3.942, -3.093)
+    "woodscape": (
+        (339.749, 339.749, 643.442, 479.407),
+        (-31.988 / 339.749, 48.275 / 339.749, -7.201 / 339.749),
+        (966, 1280),
+    ),
     "mei": (
         (1336.3220825849971, 1335.7883350012958, 716.94323510126321, 705.76498308221585),
         (2.2134047507854890, 1.6798235660113681e-2, 1.6548773243373522, 4.2223943394772046e-4, 4.2462134260997584e-4),
         (1400, 1400),
     ),
 }
+
+
+# Cameras with one continuous derivative on the axis, and no second one
+NOT_ANALYTIC = {"f_theta", "woodscape"}
 
 
 def axis_slope(key, k):
@@ -83,6 +96,10 @@ def golden_camera(case):
     """The camera of a file; a brown_conrady vector loses no coefficient, be it zero."""
     parameters = tensor(case["parameters"])
     size = tuple(case["image_size"])
+    if "colmap" in case:
+        key, *numbers = from_colmap(case["colmap"], case["parameters"])
+        assert key == case["family"]
+        return make(key, *(tensor(list(v)) for v in numbers), image_size=size)
     if case["family"] == "kannala_brandt_general":
         return ct.KannalaBrandt.from_general(parameters[:4], parameters[4:], image_size=size)
     return make(case["family"], parameters[:4], parameters[4:], image_size=size)

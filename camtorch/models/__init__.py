@@ -7,6 +7,7 @@ from camtorch.models.double_sphere import DoubleSphere
 from camtorch.models.equirectangular import Equirectangular
 from camtorch.models.equisolid import Equisolid
 from camtorch.models.eucm import EUCM
+from camtorch.models.f_theta import FTheta
 from camtorch.models.fisheye62 import Fisheye62
 from camtorch.models.fisheye624 import Fisheye624, FisheyeRadTanThinPrism
 from camtorch.models.fov import FOV
@@ -17,6 +18,7 @@ from camtorch.models.pinhole import Pinhole
 from camtorch.models.stereographic import Stereographic
 from camtorch.models.thin_prism_fisheye import ThinPrismFisheye
 from camtorch.models.ucm import UCM
+from camtorch.models.woodscape import WoodScape
 
 __all__ = [
     "EUCM",
@@ -28,6 +30,7 @@ __all__ = [
     "DoubleSphere",
     "Equirectangular",
     "Equisolid",
+    "FTheta",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",
@@ -37,4 +40,5 @@ __all__ = [
     "Pinhole",
     "Stereographic",
     "ThinPrismFisheye",
+    "WoodScape",
 ]
