@@ -9,10 +9,10 @@ import math
 from pathlib import Path
 
 import torch
+from colmap_models import from_colmap
 from hypothesis import strategies as st
 
 import camtorch as ct
-from camtorch.models.colmap import from_colmap
 
 GOLDEN = {path.stem: json.loads(path.read_text()) for path in sorted((Path(__file__).parent / "golden").glob("*.json"))}
 KEYS = sorted(ct.MODELS)

@@ -1,6 +1,6 @@
 """COLMAP's camera models as what they are: ours, with some coefficients tied or zero.
 
-Numbers only: COLMAP's pixel centres lie at 0.5, and whoever reads or writes its files shifts by that.
+Written apart from what reads COLMAP's files, and without its half pixel, to try the models on COLMAP's numbers.
 """
 
 from __future__ import annotations
@@ -37,13 +37,6 @@ _MODELS = {
     "EUCM": ("eucm", "fx fy cx cy alpha beta", "alpha beta"),
     "EQUIRECTANGULAR": ("equirectangular", "w h", ""),
 }
-NAMES = tuple(_MODELS)
-"""COLMAP's names of the models that are here."""
-
-
-def parameter_names(name: str) -> tuple[str, ...]:
-    """COLMAP's parameters of a model, in its order."""
-    return tuple(_MODELS[name][1].split())
 
 
 def from_colmap(name: str, parameters: Sequence[float]) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
@@ -61,26 +54,3 @@ def from_colmap(name: str, parameters: Sequence[float]) -> tuple[str, tuple[floa
         return key, (width / (2 * math.pi), height / math.pi, width / 2, height / 2), ()
     focal = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
     return key, (*focal, given["cx"], given["cy"]), tuple(given.get(k, 0.0) for k in distortion.split())
-
-
-def to_colmap(name: str, key: str, intrinsics: Sequence[float], distortion: Sequence[float]) -> tuple[float, ...]:
-    """COLMAP's parameters of one of our cameras, pixel centres at 0.5: the inverse of `from_colmap`.
-
-    Raises:
-        KeyError: an unknown model. ValueError: it cannot hold this camera.
-    """
-    model, names, tied = _MODELS[name]
-    given = dict(zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True))
-    slots = tied.split() + ["0"] * (len(distortion) - len(tied.split()))
-    lost = [value for slot, value in zip(slots, distortion, strict=False) if slot == "0" and value]
-    if model != key:
-        raise ValueError(f"{name} is our {model}; got {key}")
-    if lost or ("f" in names.split() and given["fx"] != given["fy"]):
-        raise ValueError(f"{name} has the parameters {names}: it cannot hold {[*intrinsics]}, {[*distortion]}")
-    if key == "equirectangular":
-        size = 2 * math.pi * given["fx"], math.pi * given["fy"]
-        if not all(math.isclose(2 * c, side, rel_tol=1e-9) for c, side in zip(intrinsics[2:], size, strict=True)):
-            raise ValueError(f"{name} shows the whole sphere, with the forward direction in its middle; got {given}")
-        return size
-    given |= {"f": given["fx"]} | dict(zip(slots, (*distortion, *[0.0] * len(slots)), strict=False))
-    return tuple(given[n] for n in names.split())
