@@ -158,9 +158,10 @@ def drawn(draw, key, wild):
     model = ct.MODELS[key]
     counts = [n for n in range(1, 15) if RANGES.get(key) and model.names_of(n)]
     names = model.names_of(draw(st.sampled_from(counts))) if counts else ()
+    focal, aspect, across, down = number(150, 600), number(0.9, 1.1), number(-20, 20), number(-20, 20)
     distortion = [number(*_limits(key, name, wild)) for name in names]
-    focal = number(150, 600) / axis_slope(key, distortion)
-    intrinsics = [focal, focal * number(0.9, 1.1), 320 + number(-20, 20), 240 + number(-20, 20)]
+    focal /= axis_slope(key, distortion)
+    intrinsics = [focal, focal * aspect, 320 + across, 240 + down]
     intrinsics, distortion = (torch.tensor(v, dtype=torch.float64) for v in (intrinsics, distortion))
     return make(key, intrinsics, distortion, image_size=(480, 640))
 

@@ -85,7 +85,9 @@ def test_every_field_moves_together_between_any_two_models(key, which):
     use = inner(keypoints, out["keypoints_valid"] & seen)
     assert use.sum() > 5
     error = (centroids(out["image"])[use] - keypoints[use]).norm(dim=-1)
-    assert error.max() < 0.1
+    # on the rim of these the scale falls to nothing along the azimuth, and a disc is no longer one
+    steep = {key, getattr(like, "key", "")} & {"orthographic_fisheye", "division"}
+    assert error.max() < (0.2 if steep else 0.1)
     projected, valid = target.project(out["points"])
     assert valid[use].all()
     assert (projected - keypoints)[use].norm(dim=-1).max() < 1e-2

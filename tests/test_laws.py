@@ -405,7 +405,8 @@ def check_fold(camera, azimuths=12, samples=900):
     valid, pixels = valid.view(samples, azimuths), pixels.detach().view(samples, azimuths, 2)
     most = before_fold(camera, rays, samples, azimuths)
     least = most.clone()
-    for turn in (-2 * math.pi / 256, 2 * math.pi / 256):
+    # a finger of what lies beyond the fold may be narrower than the wedge
+    for turn in (share * 2 * math.pi / 256 for share in (-1, -0.5, -0.25, 0.25, 0.5, 1)):
         about_z = torch.linalg.matrix_exp(torch.tensor([[0, -turn, 0], [turn, 0, 0], [0, 0, 0]], dtype=rays.dtype))
         least &= before_fold(camera, rays @ about_z.T, samples, azimuths)
     wrong = (valid & ~most) | (least & ~valid)
