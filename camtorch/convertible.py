@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -23,24 +23,14 @@ class Convertible:
     special_cases: ClassVar[tuple[tuple[str, tuple[str, ...]], ...]] = ()
     """The models that this one generalises: the key of each, and the names here of its coefficients in its order.
 
-    A special case is this model, at the same intrinsics, with all other coefficients as in `ideal`.
+    A special case is this model, at the same intrinsics, with all other coefficients as in `Camera.ideal`.
     """
     fit_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """The least and the greatest value of coefficients that a fit tries, where there are such."""
 
     @classmethod
-    def ideal(cls, count: int) -> Sequence[float]:
-        """That many coefficients that do nothing: zeros, unless the model says otherwise."""
-        return (0.0,) * count
-
-    @staticmethod
-    def defined(k: Sequence[Tensor]) -> Tensor | None:
-        """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
-        return None
-
-    @classmethod
     def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
-        """Coefficients to start a fit from, float64; by default those of `ideal`.
+        """Coefficients to start a fit from, float64; by default those of `Camera.ideal`.
 
         Args:
             names: of the n coefficients.

@@ -133,9 +133,7 @@ class _Search:
 
     def __init__(self, domain: Domain, camera: Tensor):
         self.domain, self.camera, self.azimuths = domain, camera, domain.azimuths
-        # a single camera serves all points
-        k = domain.k[0].unsqueeze(-1) if len(domain.k) == 1 else domain.k[camera].mT
-        self.chart, self.lens = domain.optics(k.unbind(0))
+        self.chart, self.lens = domain.optics_of(camera)
 
     def __call__(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, b = self.radial(u, v) if self.lens.is_radial else self.planar(u, v)

@@ -101,7 +101,8 @@ def test_a_conversion_back_finds_the_camera(key):
     source = one(key)
     there = source.convert(ct.Fisheye624, max_angle=radians(35))
     back = there.camera.convert(key, max_angle=radians(35), count=len(source.distortion_names))
-    assert float(back.max_error) <= 1.2 * float(there.max_error) + 0.01
+    # 0.03 px: xi and the radial coefficients of Mei do nearly the same, and fits end along that valley
+    assert float(back.max_error) <= 1.2 * float(there.max_error) + 0.03
 
 
 CLOSE = [

@@ -1,0 +1,75 @@
+"""The f-theta fisheye camera: a free polynomial of the angle."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from camtorch.camera import Camera
+from camtorch.charts import Equidistant
+from camtorch.lens import Lens, Planar
+from camtorch.parameters import as_batch, as_real, is_concrete
+from camtorch.radial import RadiusPolynomial
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class FTheta(Camera):
+    """The radially symmetric fisheye with a free polynomial: r = theta (1 + k2 theta + k3 theta^2 + ...).
+
+    theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real; (u, v) = f r (cos phi, sin phi) + c. The
+    coefficients are dimensionless: a polynomial in pixels comes in through `from_polynomial`, which folds its linear
+    coefficient into the focal lengths. A ray is valid before the first root of dr/dtheta.
+
+    With even powers of theta the camera has one continuous derivative on the axis, and no second one: that depends on
+    the azimuth. The first one is exact there, and the second one is given as zero; everywhere else all are exact.
+
+    Distortion: k2 k3 ... by the power of theta, any number of them, at least one; 3 if left out. The same as
+    `WoodScape`, which has three. NVIDIA DriveWorks `ftheta` where its polynomial gives pixels of angles; one that
+    gives angles of pixels has to be fitted. See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "f_theta"
+    distortion_names = ("k2", "k3", "k4")
+    default_count = 3
+
+    @classmethod
+    def names_of(cls, count):
+        return tuple(f"k{i}" for i in range(2, count + 2)) or None
+
+    @classmethod
+    def counts_text(cls):
+        return "n >= 1 (k2 k3 ...)"
+
+    @staticmethod
+    def optics(k):
+        return Equidistant(), Lens(Planar(RadiusPolynomial(k)))
+
+    @classmethod
+    def from_polynomial(cls, centre, coefficients, *, aspect_ratio: float = 1.0, image_size=None) -> Self:
+        """From the radius in pixels, k1 theta + k2 theta^2 + ..., which has no leading 1.
+
+        Args:
+            centre: (*B, 2) cx, cy, the pixel of the axis.
+            coefficients: (*B, n), n >= 2: k1, k2, ... in pixels; k1 > 0 becomes the focal length.
+            aspect_ratio: fy / fx.
+            image_size: (height, width) in pixels.
+
+        Raises:
+            ValueError: fewer than two coefficients, or a first one that is not positive.
+        """
+        centre, coefficients = (
+            as_real(v, n, cls.__name__) for v, n in ((centre, "centre"), (coefficients, "coefficients"))
+        )
+        if centre.ndim == 0 or centre.shape[-1] != 2:
+            raise ValueError(f"{cls.__name__}: centre must be (*B, 2) = cx, cy; got shape {tuple(centre.shape)}")
+        if coefficients.ndim == 0 or coefficients.shape[-1] < 2:
+            raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 2; got {tuple(coefficients.shape)}")
+        first = coefficients[..., :1]
+        if is_concrete(first) and not bool((first > 0).all()):
+            raise ValueError(f"{cls.__name__}: the first coefficient must be positive; got {first.tolist()}")
+        as_batch(cls.__name__, centre=centre.shape, coefficients=coefficients.shape)
+        focal, centre = torch.broadcast_tensors(torch.cat((first, first * aspect_ratio), -1), centre)
+        return cls(torch.cat((focal, centre), -1), coefficients[..., 1:] / first, image_size=image_size)

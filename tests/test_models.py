@@ -1,0 +1,131 @@
+"""What models are of each other, the constructors of some, and coefficients for which a formula does not exist."""
+
+import math
+
+import pytest
+import torch
+from cameras import fan, one, pixel_lattice, spread
+
+import camtorch as ct
+
+INTRINSICS = torch.tensor([310.0, 315.0, 318.5, 242.25], dtype=torch.float64)
+
+
+def camera(model, *coefficients, scale=1.0):
+    intrinsics = INTRINSICS * torch.tensor([scale, scale, 1, 1])
+    return model(intrinsics, *([torch.tensor(coefficients, dtype=torch.float64)] if coefficients else []))
+
+
+def radius(model, *coefficients):
+    """r of theta at half of the angles of `fan`, and theta."""
+    theta = torch.linspace(0.01, 1.5, 40, dtype=torch.float64)
+    rays = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1)
+    pixels, valid = camera(model, *coefficients).project(rays)
+    assert valid.all()
+    return (pixels[:, 0] - INTRINSICS[2]) / INTRINSICS[0], theta
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (camera(ct.UCM, 0.6), camera(ct.EUCM, 0.6, 1.0)),
+        (camera(ct.UCM, 0.6), camera(ct.DoubleSphere, 0.0, 0.6)),
+        (camera(ct.UCM, 0.6), camera(ct.Mei, 1.5, 0.0, 0.0, 0.0, 0.0, scale=2.5)),
+        (camera(ct.DoubleSphere, 1.5, 0.0), camera(ct.Mei, 1.5, 0.0, 0.0, 0.0, 0.0)),
+        (camera(ct.Mei, 0.0, -0.1, 0.02, 1e-3, 2e-3), camera(ct.BrownConrady, -0.1, 0.02, 1e-3, 2e-3)),
+        (camera(ct.UCM, 0.5), camera(ct.Stereographic, 0.0)),
+        (camera(ct.UCM, 1.0), camera(ct.OrthographicFisheye, 0.0)),
+        (camera(ct.UCM, 0.0), camera(ct.Pinhole)),
+        (camera(ct.FOV, 0.0), camera(ct.Pinhole)),
+        (camera(ct.Division, 0.0), camera(ct.Pinhole)),
+        (camera(ct.Division, -0.25), camera(ct.Stereographic, 0.0)),
+        (camera(ct.FTheta, 0.0, 0.02, 0.0, -0.003), camera(ct.KannalaBrandt, 0.02, -0.003)),
+        (camera(ct.FTheta, 0.1, 0.02, -0.003), camera(ct.WoodScape, 0.1, 0.02, -0.003)),
+        (camera(ct.ThinPrismFisheye, 0.02, 0.01, 0, 0, 0, 0, 0, 0), camera(ct.KannalaBrandt, 0.02, 0.01)),
+    ],
+    ids=lambda c: type(c).__name__,
+)
+def test_the_same_camera(first, second):
+    rays = fan(170)
+    (pixels, valid), (others, other_valid) = (c.project(rays) for c in (first, second))
+    assert torch.equal(valid, other_valid)
+    assert valid.sum() > 100
+    torch.testing.assert_close(pixels, others, rtol=1e-11, atol=1e-10)
+    pixels = pixels[valid & (pixels.norm(dim=-1) < 3000)].detach()
+    (rays, valid), (others, other_valid) = (c.unproject(pixels) for c in (first, second))
+    assert torch.equal(valid, other_valid)
+    torch.testing.assert_close(rays, others, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "formula"),
+    [
+        (ct.Equisolid, [0.0], lambda t: 2 * (t / 2).sin()),
+        (ct.Equisolid, [0.03], lambda t: 2 * (t / 2).sin() * (1 + 0.03 * (2 * (t / 2).sin()) ** 2)),
+        (ct.Stereographic, [0.03], lambda t: 2 * (t / 2).tan() * (1 + 0.03 * (2 * (t / 2).tan()) ** 2)),
+        (ct.OrthographicFisheye, [0.03], lambda t: t.sin() * (1 + 0.03 * t.sin() ** 2)),
+        (ct.FOV, [0.9], lambda t: (2 * math.tan(0.45) * t.tan()).atan() / 0.9),
+        (ct.FTheta, [-0.09, 0.14, -0.02], lambda t: t - 0.09 * t**2 + 0.14 * t**3 - 0.02 * t**4),
+    ],
+)
+def test_radius(model, coefficients, formula):
+    r, theta = radius(model, *coefficients)
+    torch.testing.assert_close(r, formula(theta), rtol=1e-13, atol=1e-14)
+
+
+def test_division_sees_along_its_polynomial():
+    pixels = pixel_lattice(spread("division"))
+    rays, valid = camera(ct.Division, -0.3).unproject(pixels)
+    assert valid.all()
+    a, b = ((pixels - INTRINSICS[2:]) / INTRINSICS[:2]).unbind(-1)
+    expected = torch.stack((a, b, 1 - 0.3 * (a * a + b * b)), -1)
+    torch.testing.assert_close(rays, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-15)
+
+
+def test_woodscape_from_its_numbers():
+    k = [339.749, -31.988, 48.275, -7.201]
+    made = ct.WoodScape.from_woodscape(torch.tensor(k).double(), (3.942, -3.093), image_size=(966, 1280))
+    published = one("woodscape")
+    torch.testing.assert_close(made.intrinsics, published.intrinsics)
+    torch.testing.assert_close(made.distortion, published.distortion)
+    theta = torch.tensor([0.2, 0.9, 1.6], dtype=torch.float64)
+    pixels, valid = made.project(torch.stack((0 * theta, theta.sin(), theta.cos()), -1))
+    assert valid.all()
+    expected = sum(c * theta ** (i + 1) for i, c in enumerate(k))
+    torch.testing.assert_close(pixels[:, 1], 479.407 + expected)
+
+
+@pytest.mark.parametrize(
+    ("centre", "coefficients", "text"),
+    [([1.0], [1.0, 2], "centre"), ([1.0, 2], [1.0], "n >= 2"), ([1.0, 2], [-1.0, 2], "must be positive")],
+)
+def test_bad_polynomials_are_refused(centre, coefficients, text):
+    with pytest.raises(ValueError, match=text):
+        ct.FTheta.from_polynomial(centre, coefficients)
+
+
+BREAKS = [
+    (ct.EUCM, (0.5, 0.0), "beta > 0"),
+    (ct.DoubleSphere, (-1.0, 0.5), "xi > -1"),
+    (ct.Mei, (-1.5, 0.0, 0.0, 0.0, 0.0), "xi > -1"),
+    (ct.FOV, (math.pi,), "omega < pi"),
+]
+
+
+@pytest.mark.parametrize(("model", "coefficients", "text"), BREAKS)
+def test_coefficients_without_a_formula(model, coefficients, text):
+    """Refused at the door; where learning ended there, all is invalid, and finite."""
+    with pytest.raises(ValueError, match=text):
+        camera(model, *coefficients)
+    learnt = model(INTRINSICS)
+    with torch.no_grad():
+        learnt.distortion.copy_(torch.tensor(coefficients))
+    for method, values in (("project", fan(60)), ("unproject", pixel_lattice(spread("pinhole")))):
+        result, valid = getattr(learnt, method)(values)
+        assert not valid.any()
+        gradients = torch.autograd.grad(result.sum(), list(learnt.parameters()))
+        assert all((g == 0).all() for g in gradients)
+
+
+def test_a_camera_made_without_coefficients_is_an_ideal_one():
+    torch.testing.assert_close(ct.EUCM(INTRINSICS).project(fan(80))[0], ct.Pinhole(INTRINSICS).project(fan(80))[0])
