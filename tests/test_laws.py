@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from cameras import KEYS, NOT_ANALYTIC, RANGES, REAL, axis_slope, drawn, fan, make, one, pixel_lattice, real, spread
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 from torch.func import jacfwd, jacrev, jvp, vmap
@@ -351,6 +351,7 @@ def test_bad_pixels(key, dtype):
 @every_model
 @both_precisions
 @pytest.mark.parametrize("method", ["project", "unproject"])
+@settings(max_examples=10)
 @given(data=st.data())
 def test_any_number_gives_finite_results(key, dtype, method, data):
     """Also the largest and smallest numbers there are; an invalid row has no gradient."""
@@ -438,6 +439,7 @@ def test_fold_of_calibrations(key, name):
 
 
 @drawn_models
+@settings(max_examples=10)  # the dearest law of all
 @given(data=st.data())
 def test_fold_of_drawn_cameras(key, wild, data):
     check_no_shared_pixels(*check_fold(data.draw(drawn(key, wild)), azimuths=6))

@@ -45,11 +45,12 @@ def parameters_of(module):
 
 # -- compile, export, transforms
 
+TRACED = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sphere", "fov", "division", "f_theta"}
+
 
 def backend(key, method):
-    """Down to aten, but for unprojection through lenses that are not radial: that long trace is the same for all."""
-    lens = one(key).optics(one(key).distortion.unbind(-1))[1]
-    short = method == "project" or not lens.stages or lens.is_radial or key == "fisheye624"
+    """Down to aten for one model of each chart and lens: those long traces are the same for the others."""
+    short = key in TRACED or (key == "fisheye62" and method == "project")
     return "aot_eager" if short else "eager"
 
 

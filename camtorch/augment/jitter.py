@@ -56,9 +56,12 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     left = torch.ones(step.shape[:-1], dtype=torch.bool, device=step.device)
     for halving in range(_HALVINGS):
         candidate = base + step / 2**halving
+        defined = camera.defined(candidate.unbind(-1))
+        known = torch.ones_like(left) if defined is None else defined > 0
+        candidate = torch.where(known.unsqueeze(-1), candidate, base)
         numbers = (t.expand(*step.shape[:-1], -1) for t in (camera.intrinsics, candidate))
         lens = remade(camera, *numbers, camera.image_size)
-        invertible = (lens.unproject(lattice.expand(*lens.batch_shape, *lattice.shape))[1] | ~wanted).all(-1)
+        invertible = (lens.unproject(lattice.expand(*lens.batch_shape, *lattice.shape))[1] | ~wanted).all(-1) & known
         result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
         left = left & ~invertible
         if not bool(left.any()):
