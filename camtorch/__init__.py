@@ -24,6 +24,7 @@ from camtorch.models import (
     OrthographicFisheye,
     Pinhole,
     Stereographic,
+    Tabulated,
     ThinPrismFisheye,
     WoodScape,
 )
@@ -55,6 +56,7 @@ __all__ = [
     "OrthographicFisheye",
     "Pinhole",
     "Stereographic",
+    "Tabulated",
     "ThinPrismFisheye",
     "Warp",
     "WoodScape",

@@ -99,10 +99,10 @@ class Camera(Picture):
             raise ValueError(
                 f"{owner}: distortion must be (*B, n) with {self.counts_text()}; got shape {tuple(distortion.shape)}"
             )
+        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
         defined = self.defined(distortion.unbind(-1))
         if defined is not None and is_concrete(distortion) and not bool((defined > 0).all()):
             raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
-        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
         self._memo = Memo()

@@ -412,7 +412,8 @@ def test_jittered_lenses_stay_invertible_and_bounded():
         if target.distortion.shape[-1] and amount < 1:
             shift = (moved - edge).norm(dim=-1)[valid & seen].max() / math.hypot(SIZE[0] / 2, SIZE[1] / 2)
             assert amount / 50 < shift < 1.5 * amount, key
-            assert (change.target.distortion.std(0) > 0).all()
+            moved = change.target.distortion.std(0) > 0
+            assert moved.any() if key == "tabulated" else moved.all()  # a table goes on beyond the picture
 
 
 def test_a_family_has_the_field_of_view_that_is_asked_for():
