@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,9 +28,6 @@ from camtorch.parameters import (
 )
 from camtorch.picture import Picture
 from camtorch.solve import invert
-
-if TYPE_CHECKING:
-    pass
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
@@ -87,11 +84,7 @@ class Camera(Picture):
         if is_concrete(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
             raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
         if distortion is None:
-            ideal = torch.tensor(
-                self.ideal(self.default_count),
-                dtype=intrinsics.dtype,
-                device=intrinsics.device,
-            )
+            ideal = intrinsics.new_tensor(self.ideal(self.default_count))
             distortion = ideal.expand(*intrinsics.shape[:-1], self.default_count)
         distortion = as_real(distortion, "distortion", owner)
         names = self.names_of(distortion.shape[-1]) if distortion.ndim else None
