@@ -22,6 +22,11 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "thin_prism_fisheye": (0.02, -0.01, 1e-3, -5e-4, 0.003, -0.001, 1e-3, 5e-4),
     "f_theta": (-0.09, 0.14, -0.02),
     "woodscape": (-0.09, 0.14, -0.02),
+    # theta (1 + 0.02 theta^2 - 0.01 theta^4 + ...) every 15 degrees
+    "tabulated": (
+        *(math.radians(15 * i) for i in range(1, 9)),
+        *(0.26214, 0.52610, 0.79234, 1.05939, 1.32257, 1.57240, 1.79311, 1.96014),
+    ),
     "ucm": (0.6,),
     "eucm": (0.6, 1.1),
     "double_sphere": (-0.1, 0.6),

@@ -25,6 +25,7 @@ from camtorch.models import (
     OrthographicFisheye,
     Pinhole,
     Stereographic,
+    Tabulated,
     ThinPrismFisheye,
     WoodScape,
 )
@@ -59,6 +60,7 @@ __all__ = [
     "Pinhole",
     "Rig",
     "Stereographic",
+    "Tabulated",
     "ThinPrismFisheye",
     "Warp",
     "WoodScape",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -29,9 +29,6 @@ from camtorch.parameters import (
 )
 from camtorch.picture import Picture
 from camtorch.solve import invert
-
-if TYPE_CHECKING:
-    pass
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
@@ -88,11 +85,7 @@ class Camera(Convertible, Picture):
         if is_concrete(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
             raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
         if distortion is None:
-            ideal = torch.tensor(
-                self.ideal(self.default_count),
-                dtype=intrinsics.dtype,
-                device=intrinsics.device,
-            )
+            ideal = intrinsics.new_tensor(self.ideal(self.default_count))
             distortion = ideal.expand(*intrinsics.shape[:-1], self.default_count)
         distortion = as_real(distortion, "distortion", owner)
         names = self.names_of(distortion.shape[-1]) if distortion.ndim else None
@@ -100,10 +93,10 @@ class Camera(Convertible, Picture):
             raise ValueError(
                 f"{owner}: distortion must be (*B, n) with {self.counts_text()}; got shape {tuple(distortion.shape)}"
             )
+        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
         defined = self.defined(distortion.unbind(-1))
         if defined is not None and is_concrete(distortion) and not bool((defined > 0).all()):
             raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
-        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
         self._memo = Memo()

@@ -207,6 +207,16 @@ class Equidistant(Chart):
         return even_steps_and_ratios(count, math.pi, math.pi, like, torch.positive)
 
 
+class EquidistantUpTo(Equidistant):
+    """The equidistant chart of a lens that is known up to some angle."""
+
+    def __init__(self, last: Tensor):
+        self.last = last.detach()
+
+    def end(self, dtype):
+        return self.last.clamp(max=math.pi)
+
+
 def _half_turn(dtype: torch.dtype) -> float:
     # pi rounded to float32 is larger than pi, and seen from the other side
     return math.pi * (1 - torch.finfo(dtype).eps)

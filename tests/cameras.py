@@ -25,6 +25,8 @@ RANGES = {
     "stereographic": {"k": (0.02, 0.3)},
     "orthographic_fisheye": {"k": (0.05, 0.5)},
     "thin_prism_fisheye": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
+    # steps from one node to the next
+    "tabulated": {"theta": ((0.2, 0.4), (0.2, 0.8)), "r": ((0.15, 0.4), (-0.1, 1.0))},
     "f_theta": {"k": (0.1, 0.5)},
     "woodscape": {"k": (0.1, 0.5)},
     "ucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5))},
@@ -55,11 +57,18 @@ CALIBRATIONS = {
 
 
 # Cameras with one continuous derivative on the axis, and no second one
-NOT_ANALYTIC = {"f_theta", "woodscape"}
+NOT_ANALYTIC = {"f_theta", "woodscape", "tabulated"}
+
+
+def constants(camera):
+    """How many coefficients, the first ones, do not learn."""
+    return camera.distortion.shape[-1] // 2 if camera.key == "tabulated" else 0
 
 
 def axis_slope(key, k):
-    """d(r)/d(theta) of the chart on the axis."""
+    """d(r)/d(theta) on the axis."""
+    if key == "tabulated":
+        return k[len(k) // 2] / k[0]
     slopes = {
         "double_sphere": lambda xi, _: 1 / (1 + xi),
         "mei": lambda xi, *_: 1 / (1 + xi),
@@ -125,7 +134,7 @@ def one(key):
 
 
 # Every model with some of the others: all pairs would be too many
-PAIRS = [(key, KEYS[(i + step) % len(KEYS)]) for i, key in enumerate(KEYS) for step in (0, 1, 3, 6)]
+PAIRS = [(key, KEYS[(i + step) % len(KEYS)]) for i, key in enumerate(KEYS) for step in (0, 1, 6)]
 REAL = [(key, name) for key in KEYS for name in real(key)]
 
 
@@ -135,7 +144,7 @@ def spread(key, dtype=torch.float64):
     sign = torch.tensor([1.0, -1.0]).repeat(count)[:count]
     limits = torch.tensor([_limits(key, name, wild=False) for name in one(key).distortion_names]).view(-1, 2)
     middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2
-    distortion = middle + 0.3 * sign * half
+    distortion = _summed(key, middle + 0.3 * sign * half)
     slope = axis_slope(key, distortion.tolist())
     intrinsics = torch.tensor([301.0 / slope, 310.5 / slope, 318.25, 243.5], dtype=dtype)
     return make(key, intrinsics, distortion.to(dtype), image_size=(480, 640))
@@ -146,6 +155,15 @@ def _limits(key, name, wild):
     letters = max((letters for letters in ranges if name.startswith(letters)), key=len, default=None)
     limits = ranges[letters][wild] if letters else 0.0
     return limits if isinstance(limits, tuple) else (-limits, limits)
+
+
+def _summed(key, numbers):
+    """The nodes of steps; a table begins to ascend."""
+    if key != "tabulated":
+        return numbers
+    angles, radii = numbers.chunk(2)
+    first = radii[:1].abs().clamp(min=0.05)
+    return torch.cat((angles.cumsum(0), torch.cat((first, radii[1:])).cumsum(0)))
 
 
 @st.composite
@@ -160,6 +178,7 @@ def drawn(draw, key, wild):
     names = model.names_of(draw(st.sampled_from(counts))) if counts else ()
     focal, aspect, across, down = number(150, 600), number(0.9, 1.1), number(-20, 20), number(-20, 20)
     distortion = [number(*_limits(key, name, wild)) for name in names]
+    distortion = _summed(key, torch.tensor(distortion, dtype=torch.float64)).tolist()
     focal /= axis_slope(key, distortion)
     intrinsics = [focal, focal * aspect, 320 + across, 240 + down]
     intrinsics, distortion = (torch.tensor(v, dtype=torch.float64) for v in (intrinsics, distortion))

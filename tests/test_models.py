@@ -129,3 +129,44 @@ def test_coefficients_without_a_formula(model, coefficients, text):
 
 def test_a_camera_made_without_coefficients_is_an_ideal_one():
     torch.testing.assert_close(ct.EUCM(INTRINSICS).project(fan(80))[0], ct.Pinhole(INTRINSICS).project(fan(80))[0])
+
+
+def test_a_table_of_millimetres():
+    """The published table of a lens: r at the nodes, and between them what SciPy's PchipInterpolator gives."""
+    degrees = torch.arange(0, 100, 10, dtype=torch.float64)
+    heights = torch.tensor([0, 0.52, 1.03, 1.55, 2.08, 2.6, 3.1, 3.57, 3.97, 4.26], dtype=torch.float64)
+    made = ct.Tabulated.from_table(INTRINSICS[2:], degrees.deg2rad(), heights, pixels_per_unit=1 / 0.003)
+    theta = torch.tensor([10.0, 40, 80, 3, 15, 47, 89], dtype=torch.float64).deg2rad()
+    pixels, valid = made.project(torch.stack((0 * theta, theta.sin(), theta.cos()), -1))
+    assert valid.all()
+    r = (pixels[:, 1] - INTRINSICS[3]) * 0.003
+    torch.testing.assert_close(r[:3], heights[[1, 4, 8]])
+    torch.testing.assert_close(
+        r[3:],
+        torch.tensor(
+            [0.1563180582524272, 0.7749999999999999, 2.4458108235294116, 4.235871086956522], dtype=torch.float64
+        ),
+        rtol=1e-12,
+        atol=0,
+    )
+    beyond = torch.tensor([1.58, 2.0], dtype=torch.float64)
+    assert not made.project(torch.stack((0 * beyond, beyond.sin(), beyond.cos()), -1))[1].any()
+
+
+def test_the_angles_of_a_table_do_not_learn():
+    made = spread("tabulated")
+    made.project(fan(60))[0].sum().backward()
+    angles, radii = made.distortion.grad.chunk(2)
+    assert (angles == 0).all()
+    assert (radii != 0).any()
+
+
+@pytest.mark.parametrize(
+    ("angles", "radii", "text"),
+    [([0.1], [1.0], "two nodes"), ([0, 0.1, 0.2], [0.1, 1, 2], "two nodes"), ([0.1, 0.2], [1.0], "shapes")],
+)
+def test_bad_tables_are_refused(angles, radii, text):
+    with pytest.raises(ValueError, match=text):
+        ct.Tabulated.from_table([1.0, 2.0], angles, radii)
+    with pytest.raises(ValueError, match="ascend"):
+        camera(ct.Tabulated, 0.3, 0.2, 1.0, 2.0)

@@ -1,4 +1,9 @@
-"""The camera models, one file each."""
+"""The camera models, one file each.
+
+The camera of parallel rays (orthographic, telecentric) is none of them: its rays do not pass one point, and a camera
+here is a map between the directions from one point and pixels. `OrthographicFisheye` has r = sin(theta), which is
+another thing.
+"""
 
 from camtorch.models.brown_conrady import BrownConrady
 from camtorch.models.cylindrical import Cylindrical
@@ -16,6 +21,7 @@ from camtorch.models.mei import Mei
 from camtorch.models.orthographic_fisheye import OrthographicFisheye
 from camtorch.models.pinhole import Pinhole
 from camtorch.models.stereographic import Stereographic
+from camtorch.models.tabulated import Tabulated
 from camtorch.models.thin_prism_fisheye import ThinPrismFisheye
 from camtorch.models.ucm import UCM
 from camtorch.models.woodscape import WoodScape
@@ -39,6 +45,7 @@ __all__ = [
     "OrthographicFisheye",
     "Pinhole",
     "Stereographic",
+    "Tabulated",
     "ThinPrismFisheye",
     "WoodScape",
 ]
