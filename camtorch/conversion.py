@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from camtorch.fit import Sights, fit, see
+from camtorch.fit import Sights, even_out, fit, see
 from camtorch.parameters import as_image_size, as_whole
 from camtorch.related import carried, default_count
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
-_FIT_SIDE, _CHECK_SIDE = 33, 193  # of the lattices of pixels to fit to, and to check with
+_FIT_SIDE, _EVEN_SIDE, _CHECK_SIDE = 33, 65, 193  # of the lattices of pixels to fit to, and to check with
+_EVEN_UP_TO = 10  # times the tolerance: where more is wrong, errors are not evened out
 _ANGLES, _AZIMUTHS, _RADII = 181, 16, 64  # at which a camera is looked at as a whole
 _END_AHEAD = math.radians(87)  # of rays, for a camera without a picture that does not see sideways
 _ROWS = 64  # of a batch that are worked on at a time
@@ -60,33 +62,41 @@ class Conversion:
 
 
 @torch.no_grad()
-def convert(source: Camera, model: type[Camera] | str, *, count, image_size, max_angle, **options) -> Conversion:
+def convert(
+    source: Camera, model: type[Camera] | str, *, count, image_size, max_angle, tolerance, **options
+) -> Conversion:
     """See `Camera.convert`."""
     model = _model(model)
     owner = f"{type(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
-    if max_angle is not None and not float(max_angle) > 0:
-        raise ValueError(f"{owner}: max_angle must be positive radians; got {max_angle}")
-    count = default_count(model, source) if count is None else as_whole(count, "count", owner)
-    names = model.names_of(count) if count >= 0 else None
-    if names is None:
+    for name, value in (("max_angle must be positive radians", max_angle), ("tolerance must be positive", tolerance)):
+        if value is not None and not float(value) > 0:
+            raise ValueError(f"{owner}: {name}; got {value}")
+    if count is None:
+        least = default_count(model, source)
+        counts = least, *(n for n in model.fit_counts if n > least)
+    else:
+        counts = (as_whole(count, "count", owner),)
+    if counts[0] < 0 or model.names_of(counts[0]) is None:
         raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}; got count={count}")
 
     def made(parameters: Tensor) -> Camera:
         intrinsics, distortion = parameters[..., :4], parameters[..., 4:]
-        arguments = (intrinsics, distortion) if count else (intrinsics,)
+        arguments = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
         return model(*arguments, image_size=image_size, **options).double()
 
     limit = math.pi if max_angle is None else min(math.pi, float(max_angle))
     batch = source.batch_shape
     tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
     parts = [
-        _converted(_with_numbers(source, *numbers), model, names, made, image_size, limit)
+        _by_counts(_Task(_with_numbers(source, *numbers), model, made, image_size, limit, float(tolerance)), counts)
         for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True)
     ]
-    parameters, *numbers = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
-    camera = made(parameters.reshape(*batch, -1)).freeze_like(source)
-    return Conversion(camera, *(n.reshape(batch) for n in numbers), type(source).__name__)
+    parameters, *numbers = zip(*parts, strict=True)
+    most = max(p.shape[-1] for p in parameters)
+    parameters = torch.cat([_padded(p, most) for p in parameters])
+    camera = made(parameters.reshape(*batch, most)).freeze_like(source)
+    return Conversion(camera, *(torch.cat(n).reshape(batch) for n in numbers), type(source).__name__)
 
 
 def _model(model) -> type[Camera]:
@@ -110,11 +120,72 @@ def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Cam
     return camera.requires_grad_(False)
 
 
-def _converted(source: Camera, model, names, made, image_size, limit: float) -> tuple[Tensor, ...]:
+class _Task(NamedTuple):
+    """Some rows to convert."""
+
+    source: Camera
+    model: type[Camera]
+    made: Callable[[Tensor], Camera]
+    image_size: tuple[int, int] | None
+    limit: float
+    tolerance: float
+
+    def of(self, rows: Tensor) -> _Task:
+        """Those of the rows."""
+        return self._replace(source=_with_numbers(self.source, *(t[rows] for t in self.source._tensors)))
+
+
+class _Result(NamedTuple):
     """Parameters (C, 4 + n), and the numbers of a `Conversion`, (C,) each."""
+
+    parameters: Tensor
+    rms: Tensor
+    max_error: Tensor
+    max_angle: Tensor
+    valid_fraction: Tensor
+    exact: Tensor
+
+    def replaced(self, rows: Tensor, other: _Result) -> _Result:
+        """With other results in the place of these rows."""
+        if len(rows) == 0:
+            return self
+        width = max(self.parameters.shape[-1], other.parameters.shape[-1])
+        results = [_padded(self.parameters, width).clone(), *(t.clone() for t in self[1:])]
+        for result, new in zip(results, (_padded(other.parameters, width), *other[1:]), strict=True):
+            result[rows] = new
+        return _Result(*results)
+
+    def of(self, rows: Tensor) -> _Result:
+        """Those of the rows."""
+        return _Result(*(t[rows] for t in self))
+
+
+def _padded(parameters: Tensor, width: int) -> Tensor:
+    return torch.nn.functional.pad(parameters, (0, max(width - parameters.shape[-1], 0)))
+
+
+def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
+    """Each row with the first number of coefficients that keeps the tolerance; with the first of all if none does."""
+    result = _converted(task, counts[0])
+    for count in counts[1:]:
+        rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        other = _converted(task.of(rows), count)
+        (good,) = ((other.max_error <= task.tolerance) & (other.max_angle >= result.max_angle[rows])).nonzero(
+            as_tuple=True
+        )
+        result = result.replaced(rows[good], other.of(good))
+    return result
+
+
+def _converted(task: _Task, count: int) -> _Result:
+    source, model, made = task.source, task.model, task.made
+    names = model.names_of(count)
     slopes = _slopes(source)
-    view = _view(source, image_size, _FIT_SIDE, limit)
-    starts = model.fit_start(names, *_radii(source, slopes, torch.where(view.valid, view.angles, 0.0).amax(-1)))
+    view = _view(source, task.image_size, _FIT_SIDE, task.limit)
+    fine = _view(source, task.image_size, _CHECK_SIDE, task.limit)
+    starts = model.fit_start(names, *_radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
@@ -125,12 +196,25 @@ def _converted(source: Camera, model, names, made, image_size, limit: float) -> 
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
     rows = (~exact).nonzero()[:, 0]
     if len(rows):
-        sights = Sights(view.rays, view.pixels, view.valid.to(slopes.dtype)).of(rows)
-        parameters[rows] = fit(made(parameters), sights, starts[:, rows], slopes[rows])
-    target = made(parameters)
-    check = _view(source, image_size, _CHECK_SIDE, limit)
-    whole = check if limit == math.pi else _view(source, image_size, _CHECK_SIDE, math.pi)
-    return parameters, *_numbers(target, parameters[:, 4:], exact, check, whole), exact
+        parameters[rows] = fit(made(parameters), view.sights.of(rows), starts[:, rows], slopes[rows])
+    result = _measured(task, parameters, exact)
+    off = result.max_error / task.tolerance
+    rows = ((off > 1) & (off <= _EVEN_UP_TO)).nonzero()[:, 0]
+    if len(rows):
+        sights = _view(task.of(rows).source, task.image_size, _EVEN_SIDE, task.limit).sights
+        evened = _measured(task.of(rows), even_out(made(parameters), sights, parameters[rows]), exact[rows])
+        (better,) = (
+            (evened.max_error < result.max_error[rows]) & (evened.max_angle >= result.max_angle[rows])
+        ).nonzero(as_tuple=True)
+        result = result.replaced(rows[better], evened.of(better))
+    return result
+
+
+def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
+    check = _view(task.source, task.image_size, _CHECK_SIDE, task.limit)
+    whole = check if task.limit == math.pi else _view(task.source, task.image_size, _CHECK_SIDE, math.pi)
+    numbers = _numbers(task.made(parameters), parameters[:, 4:], exact, check, whole)
+    return _Result(parameters, *numbers, exact)
 
 
 def _numbers(target: Camera, k: Tensor, exact: Tensor, check: _View, whole: _View) -> tuple[Tensor, ...]:
@@ -163,6 +247,11 @@ class _View(NamedTuple):
     rays: Tensor
     pixels: Tensor
     valid: Tensor
+
+    @property
+    def sights(self) -> Sights:
+        """What a camera fitted to it shall see."""
+        return Sights(self.rays, self.pixels, self.valid.to(self.pixels.dtype))
 
     @property
     def angles(self) -> Tensor:

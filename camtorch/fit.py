@@ -19,13 +19,14 @@ FURTHEST = 20.0
 _MOST_STEPS = 60
 _ROUNDS = 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
+_EVENINGS, _EVENING_STEPS = 40, 2
 _SETTLED = 1e-8  # the relative decrease of the cost that ends the search
-_NOTHING = 1e-11  # px
+_NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
 
 
 class Sights(NamedTuple):
-    """What a camera shall see: rays (C, N, 3), pixels (C, N, 2) and weights (C, N), which are 1 or 0."""
+    """What a camera shall see: rays (C, N, 3), pixels (C, N, 2) and weights of the errors (C, N), 0 for no ray."""
 
     rays: Tensor
     pixels: Tensor
@@ -70,6 +71,7 @@ def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tenso
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
     """
     best = best_score = None
+    tiny = _NEARLY_NOTHING**2 * sights.weights.sum(-1)
     for start in starts:
         parameters = torch.cat((_intrinsics(camera, start, slopes), start), -1)
         low, high = _bounds(camera, parameters)
@@ -79,15 +81,49 @@ def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tenso
             # a chart may cover more once its coefficients fit what it covered before
             weights = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
             more = (weights != within.weights).any(-1)
+            if best is not None:
+                more = more & (best_score > tiny)
             within = sights._replace(weights=weights)
             parameters = _refine(camera, within, parameters, low, high, more)
         score = _cost(camera, within, parameters)
         score = score + (sights.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
         if best is None:
             best, best_score = parameters, score
-        better = score < best_score
+        better = (score < best_score) & (best_score > tiny)
         best, best_score = torch.where(better[:, None], parameters, best), torch.where(better, score, best_score)
     return best
+
+
+def even_out(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
+    """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
+
+    Lawson's algorithm: least squares over and over, the weight of a square multiplied by its error each time, approach
+    what has the least largest error.
+    """
+    low, high = _bounds(camera, parameters)
+    covered = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
+    sights = sights._replace(weights=covered)
+    best, weights = parameters, covered
+    error = _distances(sights, camera, parameters)
+    least = error.amax(-1)
+    for _ in range(_EVENINGS):
+        # of the error itself, the weight in a square is that of its root
+        weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
+        weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
+        going = torch.ones_like(least, dtype=torch.bool)
+        parameters = _refine(
+            camera, sights._replace(weights=weights), parameters, low, high, going, _EVENING_STEPS, _LEAST_DAMPING
+        )
+        error = _distances(sights, camera, parameters)
+        better = error.amax(-1) < least
+        best = torch.where(better[:, None], parameters, best)
+        least = torch.where(better, error.amax(-1), least)
+    return best
+
+
+def _distances(sights: Sights, camera: Camera, parameters: Tensor) -> Tensor:
+    """(C, N) pixels."""
+    return torch.linalg.vector_norm(_residuals(sights, parameters, see(camera, parameters[:, 4:], sights.rays)), dim=1)
 
 
 def _intrinsics(camera: Camera, k: Tensor, slopes: Tensor) -> Tensor:
@@ -156,14 +192,23 @@ def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
         return torch.func.vmap(along, out_dims=1)(torch.eye(k.shape[-1], dtype=k.dtype, device=k.device))
 
 
-def _refine(camera: Camera, sights: Sights, parameters: Tensor, low: Tensor, high: Tensor, going: Tensor) -> Tensor:
+def _refine(
+    camera: Camera,
+    sights: Sights,
+    parameters: Tensor,
+    low: Tensor,
+    high: Tensor,
+    going: Tensor,
+    steps: int = _MOST_STEPS,
+    first_damping: float = _FIRST_DAMPING,
+) -> Tensor:
     """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
     parameters = parameters.clone()
     cost = _cost(camera, sights, parameters)
-    damping = torch.full_like(cost, _FIRST_DAMPING)
+    damping = torch.full_like(cost, first_damping)
     tiny = _NOTHING**2 * sights.weights.sum(-1)
     going = going & torch.isfinite(cost) & (cost > tiny)
-    for _ in range(_MOST_STEPS):
+    for _ in range(steps):
         rows = going.nonzero()[:, 0]
         if len(rows) == 0:
             break
@@ -191,8 +236,10 @@ def _step(residuals: Tensor, slopes: Tensor, damping: Tensor) -> Tensor:
     # the columns differ by many orders of magnitude
     scale = slopes.square().sum(-1).sqrt()
     scale = torch.where(scale > 0, scale, 1.0)
-    slopes = slopes / scale[..., None]
-    matrix = slopes @ slopes.mT + torch.diag_embed(damping[:, None].expand(scale.shape))
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    step = torch.cholesky_solve(slopes @ -residuals[..., None], factor)[..., 0] / scale
-    return torch.where((failed == 0)[:, None] & torch.isfinite(step), step, 0.0)
+    # the columns of high powers are nearly the same: normal equations would square that
+    damped = torch.diag_embed(damping.sqrt()[:, None].expand(scale.shape))
+    q, r = torch.linalg.qr(torch.cat((slopes / scale[..., None], damped), -1).mT)
+    count = residuals.shape[-1]
+    right = q[:, :count].mT @ -residuals[..., None]
+    step = torch.linalg.solve_triangular(r, right, upper=True)[..., 0] / scale
+    return torch.where(torch.isfinite(step).all(-1, keepdim=True), step, 0.0)

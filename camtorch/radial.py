@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -48,24 +47,34 @@ class RadiusPolynomial:
 class RadiusTable:
     """The radial factor R(t) = r(s) / s of s = radius = sqrt(t), r a monotone cubic spline through (0, 0) and a table.
 
-    Slopes at the nodes as Fritsch and Butland choose them (PCHIP), of the table and its mirror image through the
-    origin. Behind its last node r turns back, so that the lens folds there. At the centre see `RadiusPolynomial`.
+    The spline has two continuous derivatives, but for nodes at which Hyman's filter keeps it monotone (Hyman, "Accurate
+    monotonicity preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983). Behind its last node r turns back, so
+    that the lens folds there.
     """
 
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
         """nodes: ascending radii. values: r at the nodes, as many, two at least."""
         zero = torch.zeros_like(values[0])
         self.nodes, self.end = (zero, *nodes[:-1]), nodes[-1]
-        steps = [after - before for before, after in pairwise((zero, *nodes))]
-        secants = [
-            (after - before) / step for (before, after), step in zip(pairwise((zero, *values)), steps, strict=True)
-        ]
+        nodes, values = (torch.stack(torch.broadcast_tensors(zero, *w), -1) for w in (nodes, values))
+        steps = nodes.diff(dim=-1)
+        secants = values.diff(dim=-1) / steps
         slopes = _slopes(steps, secants)
-        squares, cubes = [], []
-        for (before, after), secant, step in zip(pairwise(slopes), secants, steps, strict=True):
-            squares.append((3 * secant - 2 * before - after) / step)
-            cubes.append((before + after - 2 * secant) / (step * step))
-        self.cubics = (zero, *values[:-1]), slopes[:-1], squares, cubes
+        before, after = slopes[..., :-1], slopes[..., 1:]
+        squares = (3 * secants - 2 * before - after) / steps
+        # of the first piece it is zero, unless the filter was at work; not rounding, which near the axis is divided by 0
+        first = (squares * steps).abs() < 64 * torch.finfo(steps.dtype).eps * secants.abs()
+        start = nodes[..., :-1]
+        squares = torch.where(first & (start == 0), 0.0, squares)
+        cubes = (before + after - 2 * secants) / (steps * steps)
+        # by powers of the radius itself: on the first piece the factor is a polynomial of t
+        cubics = (
+            values[..., :-1] - start * (before - start * (squares - start * cubes)),
+            before - start * (2 * squares - 3 * start * cubes),
+            squares - 3 * start * cubes,
+            cubes,
+        )
+        self.cubics = tuple(power.unbind(-1) for power in cubics)
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
@@ -75,39 +84,48 @@ class RadiusTable:
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
 
-    def _at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The radius, whether it lies behind the end (-1, or 1), the place in the table, its piece, the node before."""
+    def _at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The radius, whether it lies behind the end, where it is mirrored to, its piece."""
         radius = root(t)
         behind = radius > self.end
         place = torch.where(behind, (2 * self.end - radius).clamp(min=0), radius)
-        piece = sum((place >= node).long() for node in self.nodes[1:])
-        return radius, torch.where(behind, -1.0, 1.0), place, piece, _pick(self.nodes, piece)
+        return radius, behind, place, _piece(self.nodes[1:], place)
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
         """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
-        radius, sign, place, piece, node = self._at(t)
-        constant, first, second, third = (_pick(power, piece) for power in self.cubics)
-        v = place - node
-        factor = (constant + v * (first + v * (second + v * third))) / radius
+        radius, behind, place, piece = self._at(t)
+        zeroth, first, second, third = (_pick(power, piece) for power in self.cubics)
+        # before the end neither division nor root has a part in the derivatives of the outer terms
+        share, square = torch.where(behind, place / radius, 1.0), torch.where(behind, place * place, t)
+        factor = zeroth / radius + share * (first + place * second + square * third)
         if not order:
             return (factor,)
-        by_radius = (sign * (first + v * (2 * second + 3 * v * third)) - factor) / radius
+        sense = torch.where(behind, -1.0, 1.0)
+        by_radius = (sense * (first + 2 * place * second + 3 * square * third) - factor) / radius
         slope = by_radius / (2 * radius)
         if order == 1:
             return factor, slope
-        twice = (2 * second + 6 * v * third - 2 * by_radius) / radius
+        twice = (2 * second + 6 * place * third - 2 * by_radius) / radius
         return factor, slope, (twice - 2 * slope) / (4 * radius * radius)
 
     def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
-        radius, _, place, piece, node = self._at(t)
-        weight, v = weight / radius, place - node
-        sums = []
+        radius, _, place, piece = self._at(t)
+        weight, sums = weight / radius, []
         for _ in self.cubics:
             table = weight.new_zeros(*weight.shape[:-1], len(self.nodes)).scatter_add(-1, piece, weight)
             sums += table.split(1, -1)
-            weight = weight * v
+            weight = weight * place
         return sums
+
+
+def _piece(nodes: Sequence[Tensor], place: Tensor) -> Tensor:
+    """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
+    table = torch.stack(nodes, -1).contiguous()
+    if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own
+        return torch.searchsorted(table, place.unsqueeze(-1).contiguous(), right=True).squeeze(-1)
+    table = table.squeeze(-2).expand(*place.shape[:-1], -1)
+    return torch.searchsorted(table.contiguous(), place.contiguous(), right=True)
 
 
 def _pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
@@ -117,16 +135,27 @@ def _pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
     return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
 
 
-def _slopes(steps: Sequence[Tensor], secants: Sequence[Tensor]) -> list[Tensor]:
-    """PCHIP's, at the nodes before, between and behind the pieces."""
-    slopes = [secants[0]]  # the mirror image has the same secant
-    for (h, step), (before, after) in zip(pairwise(steps), pairwise(secants), strict=True):
-        some = before * after > 0
-        left, right = 2 * step + h, step + 2 * h
-        mean = left / torch.where(some, before, 1.0) + right / torch.where(some, after, 1.0)
-        slopes.append(torch.where(some, (left + right) / torch.where(some, mean, 1.0), 0.0))
-    (h, step), (before, after) = steps[-2:], secants[-2:]
-    last = ((2 * step + h) * after - step * before) / (step + h)
-    last = torch.where(last * after > 0, last, 0.0)
-    bounded = (before * after <= 0) & (last.abs() > 3 * after.abs())
-    return [*slopes, torch.where(bounded, 3 * after, last)]
+def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
+    """(*B, N) of the pieces -> (*B, N + 1): the slopes of the cubic spline at the nodes, made to ascend where it does.
+
+    The equations of a spline with two continuous derivatives; at the origin its second one is zero, as its mirror
+    image wants it, and the last two pieces are one polynomial. Then Hyman's filter.
+    """
+    before, after = steps[..., :-1], steps[..., 1:]
+    both = before[..., -1:] + after[..., -1:]
+    one, zero = torch.ones_like(both), torch.zeros_like(both)
+    main = torch.cat((2 * one, 2 * (before + after), before[..., -1:]), -1)
+    above, below = torch.cat((one, before), -1), torch.cat((after, both), -1)
+    matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
+    last, last_but_one = after[..., -1:], before[..., -1:]
+    end = (last * last * secants[..., -2:-1] + (2 * both + last) * last_but_one * secants[..., -1:]) / both
+    middle = 3 * (after * secants[..., :-1] + before * secants[..., 1:])
+    right = torch.cat((3 * secants[..., :1], middle, end), -1)
+    slopes = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
+    # between pieces of different sense there is no slope
+    turns = torch.cat((zero > 1, secants[..., :-1] * secants[..., 1:] <= 0, zero > 1), -1)
+    neighbours = torch.stack((torch.cat((secants[..., :1], secants), -1), torch.cat((secants, secants[..., -1:]), -1)))
+    sense, least = neighbours[0].sign(), neighbours.abs().amin(0)
+    # from 0 to 3 a piece is monotone; a little less, and it is flat nowhere
+    ascending = torch.minimum(torch.maximum(slopes * sense, 0.25 * least), 2.5 * least) * sense
+    return torch.where(turns, 0.0, ascending)

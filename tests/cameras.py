@@ -28,6 +28,7 @@ RANGES = {
     # steps from one node to the next
     "tabulated": {"theta": ((0.2, 0.4), (0.2, 0.8)), "r": ((0.15, 0.4), (-0.1, 1.0))},
     "f_theta": {"k": (0.1, 0.5)},
+    "f_theta_backward": {"k": (0.1, 0.5)},
     "woodscape": {"k": (0.1, 0.5)},
     "ucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5))},
     "eucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5)), "beta": ((0.5, 1.5), (0.01, 20.0))},
@@ -57,7 +58,7 @@ CALIBRATIONS = {
 
 
 # Cameras with one continuous derivative on the axis, and no second one
-NOT_ANALYTIC = {"f_theta", "woodscape", "tabulated"}
+NOT_ANALYTIC = {"f_theta", "f_theta_backward", "woodscape"}
 
 
 def constants(camera):

@@ -26,6 +26,7 @@ from torch.func import jacfwd, jacrev, jvp, vmap
 
 import camtorch as ct
 from camtorch.charts import CylinderChart, Perspective, SphereChart
+from camtorch.inverted import Inverted
 from camtorch.lens import Lens
 
 EPS = torch.finfo(torch.float64).eps
@@ -52,12 +53,17 @@ def pixel_limit(pixels, px=1e-9, per=1000):
     return px * (pixels.norm(dim=-1) / per).clamp(min=1)
 
 
-def rad_per_px(camera, rays):
-    """1 / smallest singular value of d(pixel)/d(angle): how far a pixel's error turns the ray."""
+def px_per_rad(camera, rays):
+    """The singular values (*N, 2) of d(pixel)/d(angle)."""
     rays = rays.detach().requires_grad_()
     u, v = camera.project(rays)[0].unbind(-1)
     rows = [torch.autograd.grad(plane.sum(), rays, retain_graph=True)[0] for plane in (u, v)]
-    return 1 / torch.linalg.svdvals(torch.stack(rows, -2))[..., 1]
+    return torch.linalg.svdvals(torch.stack(rows, -2))
+
+
+def rad_per_px(camera, rays):
+    """How far a pixel's error turns the ray."""
+    return 1 / px_per_rad(camera, rays)[..., 1]
 
 
 # -- both directions
@@ -67,7 +73,9 @@ def check_pixels_return(camera, pixels):
     rays, valid = camera.unproject(pixels)
     again, reachable = camera.project(rays)
     assert reachable[valid].all(), pixels[valid & ~reachable][:3].tolist()
-    error = (again - pixels).norm(dim=-1)[valid] / pixel_limit(pixels[valid])
+    # where an angle ceases to ascend with the radius, as in a division camera, its rounding moves the pixel far
+    limit = pixel_limit(pixels[valid]) + 8 * EPS * px_per_rad(camera, rays[valid])[..., 0]
+    error = (again - pixels).norm(dim=-1)[valid] / limit
     assert (error < 1).all(), (error.max().item(), pixels[valid][error.argmax()].tolist())
     return valid
 
@@ -408,6 +416,12 @@ def before_fold(camera, rays, samples, azimuths):
     chart, lens = optics(camera)
     if not chart.has_scale:
         return (chart.margin(*rays.unbind(-1)) > 0).view(samples, azimuths)
+    if isinstance(chart, Inverted):  # its formula leads from the radius to the angle
+        radius = torch.linspace(0, chart.end(torch.float64), 1_000_001, dtype=torch.float64)
+        x, _, z = chart.to_ray(radius, torch.zeros_like(radius))
+        theta = torch.atan2(x, z)
+        rises = torch.cat((torch.ones(1, dtype=torch.bool), theta[1:] > theta[:-1])).cummin(0).values
+        return (torch.atan2(rays[:, :2].norm(dim=-1), rays[:, 2]) < theta[rises].max()).view(samples, azimuths)
     a, b = chart.to_plane(*(rays / rays.abs().amax(-1, keepdim=True)).unbind(-1))
     # outwards along the azimuth, which a pole turns round
     radius = ((a * rays[:, 0] + b * rays[:, 1]) / rays[:, :2].norm(dim=-1).clamp(min=1e-30)).view(samples, azimuths)

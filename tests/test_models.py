@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from cameras import fan, one, pixel_lattice, spread
@@ -40,6 +41,7 @@ def radius(model, *coefficients):
         (camera(ct.Division, 0.0), camera(ct.Pinhole)),
         (camera(ct.Division, -0.25), camera(ct.Stereographic, 0.0)),
         (camera(ct.FTheta, 0.0, 0.02, 0.0, -0.003), camera(ct.KannalaBrandt, 0.02, -0.003)),
+        (camera(ct.FThetaBackward, 0.0, 0.0), camera(ct.KannalaBrandt, 0.0)),
         (camera(ct.FTheta, 0.1, 0.02, -0.003), camera(ct.WoodScape, 0.1, 0.02, -0.003)),
         (camera(ct.ThinPrismFisheye, 0.02, 0.01, 0, 0, 0, 0, 0, 0), camera(ct.KannalaBrandt, 0.02, 0.01)),
     ],
@@ -80,6 +82,39 @@ def test_division_sees_along_its_polynomial():
     a, b = ((pixels - INTRINSICS[2:]) / INTRINSICS[:2]).unbind(-1)
     expected = torch.stack((a, b, 1 - 0.3 * (a * a + b * b)), -1)
     torch.testing.assert_close(rays, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-15)
+
+    more = camera(ct.Division, -0.3, 0.05, -0.02)
+    r2 = a * a + b * b
+    expected = torch.stack((a, b, 1 - 0.3 * r2 + 0.05 * r2**2 - 0.02 * r2**3), -1)
+    rays, valid = more.unproject(pixels)
+    assert valid.all()
+    torch.testing.assert_close(rays, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-15)
+
+
+def test_f_theta_from_the_polynomial_of_angles():
+    """Of pixels, as DriveWorks has it; and its inverse by bisection."""
+    bw = torch.tensor([3.3e-3, 2.0e-8, -1.5e-10, 1.0e-13], dtype=torch.float64)
+    made = ct.FThetaBackward.from_polynomial(INTRINSICS[2:], bw)
+    distance = torch.tensor([1e-3, 10, 200, 500], dtype=torch.float64)
+    theta = sum(c * distance ** (i + 1) for i, c in enumerate(bw))
+    rays, valid = made.unproject(INTRINSICS[2:] + torch.stack((distance, 0 * distance), -1))
+    assert valid.all()
+    torch.testing.assert_close(torch.atan2(rays[:, 0], rays[:, 2]), theta, rtol=1e-13, atol=0)
+    pixels, valid = made.project(torch.stack((theta.sin(), 0 * theta, theta.cos()), -1))
+    assert valid.all()
+    torch.testing.assert_close(pixels[:, 0] - INTRINSICS[2], distance, rtol=1e-12, atol=1e-12)
+
+
+def test_the_inverse_of_an_angle_is_valid_before_it_turns_back():
+    """Theta = r (1 - 0.1 r^2) ascends up to r^2 = 1 / 0.3, where it is 2 r / 3."""
+    made = camera(ct.FThetaBackward, 0.0, -0.1)
+    end = (1 / 0.3) ** 0.5
+    r = torch.tensor([end - 1e-6, end + 1e-6], dtype=torch.float64)
+    assert made.unproject(INTRINSICS[2:] + INTRINSICS[:1] * torch.stack((r, 0 * r), -1))[1].tolist() == [True, False]
+    theta = torch.tensor([2 / 3 * end - 1e-12, 2 / 3 * end + 1e-12], dtype=torch.float64)
+    pixels, valid = made.project(torch.stack((theta.sin(), 0 * theta, theta.cos()), -1))
+    assert valid.tolist() == [True, False]
+    assert pixels[0, 0] == pytest.approx(INTRINSICS[2] + INTRINSICS[0] * end, abs=1e-2)
 
 
 def test_woodscape_from_its_numbers():
@@ -131,26 +166,59 @@ def test_a_camera_made_without_coefficients_is_an_ideal_one():
     torch.testing.assert_close(ct.EUCM(INTRINSICS).project(fan(80))[0], ct.Pinhole(INTRINSICS).project(fan(80))[0])
 
 
+def spline(nodes, values):
+    """The cubics (pieces, 4) through (0, 0) and a table: all conditions of an odd spline at once, not-a-knot at the end."""
+    nodes, values = np.concatenate(([0], nodes)), np.concatenate(([0], values))
+    pieces = len(nodes) - 1
+    rows, right = [], []
+
+    def row(*terms, equals=0.0):
+        made = np.zeros((pieces, 4))
+        for piece, powers, sign in terms:
+            made[piece] += sign * np.array(powers)
+        rows.append(made.ravel())
+        right.append(equals)
+
+    for i, h in enumerate(np.diff(nodes)):
+        row((i, (1, 0, 0, 0), 1), equals=values[i])
+        row((i, (1, h, h**2, h**3), 1), equals=values[i + 1])
+        if i < pieces - 1:
+            row((i, (0, 1, 2 * h, 3 * h**2), 1), (i + 1, (0, 1, 0, 0), -1))
+            row((i, (0, 0, 2, 6 * h), 1), (i + 1, (0, 0, 2, 0), -1))
+    row((0, (0, 0, 1, 0), 1))
+    row((pieces - 2, (0, 0, 0, 1), 1), (pieces - 1, (0, 0, 0, 1), -1))
+    return np.linalg.solve(np.stack(rows), right).reshape(pieces, 4)
+
+
 def test_a_table_of_millimetres():
-    """The published table of a lens: r at the nodes, and between them what SciPy's PchipInterpolator gives."""
     degrees = torch.arange(0, 100, 10, dtype=torch.float64)
     heights = torch.tensor([0, 0.52, 1.03, 1.55, 2.08, 2.6, 3.1, 3.57, 3.97, 4.26], dtype=torch.float64)
     made = ct.Tabulated.from_table(INTRINSICS[2:], degrees.deg2rad(), heights, pixels_per_unit=1 / 0.003)
-    theta = torch.tensor([10.0, 40, 80, 3, 15, 47, 89], dtype=torch.float64).deg2rad()
-    pixels, valid = made.project(torch.stack((0 * theta, theta.sin(), theta.cos()), -1))
+    theta = torch.tensor([10.0, 40, 80, 3, 15, 47, 89], dtype=torch.float64)
+    sight = theta.deg2rad()
+    pixels, valid = made.project(torch.stack((0 * sight, sight.sin(), sight.cos()), -1))
     assert valid.all()
     r = (pixels[:, 1] - INTRINSICS[3]) * 0.003
     torch.testing.assert_close(r[:3], heights[[1, 4, 8]])
-    torch.testing.assert_close(
-        r[3:],
-        torch.tensor(
-            [0.1563180582524272, 0.7749999999999999, 2.4458108235294116, 4.235871086956522], dtype=torch.float64
-        ),
-        rtol=1e-12,
-        atol=0,
-    )
+    cubics = spline(degrees[1:].numpy(), heights[1:].numpy())
+    expected = [np.polyval(cubics[int(t // 10)][::-1], t % 10) for t in theta.tolist()]
+    torch.testing.assert_close(r, torch.tensor(expected), rtol=1e-12, atol=0)
     beyond = torch.tensor([1.58, 2.0], dtype=torch.float64)
     assert not made.project(torch.stack((0 * beyond, beyond.sin(), beyond.cos()), -1))[1].any()
+
+
+def test_a_table_stays_monotone():
+    """A spline through a step would swing; and a table that turns back is valid up to there."""
+    angles = torch.linspace(0.2, 1.4, 7, dtype=torch.float64)
+    step = torch.tensor([0.2, 0.21, 0.22, 0.6, 0.98, 0.99, 1.0], dtype=torch.float64)
+    theta = torch.linspace(0.001, 1.399, 500, dtype=torch.float64)
+    rays = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1)
+    pixels, valid = ct.Tabulated.from_table([0.0, 0], angles, step).project(rays)
+    assert valid.all()
+    assert (pixels[:, 0].diff() > 0).all()
+    back = torch.tensor([0.2, 0.4, 0.6, 0.8, 0.7, 0.6, 0.5], dtype=torch.float64)
+    valid = ct.Tabulated.from_table([0.0, 0], angles, back).project(rays)[1]
+    assert torch.equal(valid, theta < 0.8)
 
 
 def test_the_angles_of_a_table_do_not_learn():

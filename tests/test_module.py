@@ -45,7 +45,7 @@ def parameters_of(module):
 
 # -- compile, export, transforms
 
-TRACED = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sphere", "division"}
+TRACED = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sphere", "division", "f_theta_backward"}
 
 
 def backend(key, method):

@@ -13,6 +13,7 @@ from camtorch.models.equirectangular import Equirectangular
 from camtorch.models.equisolid import Equisolid
 from camtorch.models.eucm import EUCM
 from camtorch.models.f_theta import FTheta
+from camtorch.models.f_theta_backward import FThetaBackward
 from camtorch.models.fisheye62 import Fisheye62
 from camtorch.models.fisheye624 import Fisheye624, FisheyeRadTanThinPrism
 from camtorch.models.fov import FOV
@@ -37,6 +38,7 @@ __all__ = [
     "Equirectangular",
     "Equisolid",
     "FTheta",
+    "FThetaBackward",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",

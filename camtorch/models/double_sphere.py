@@ -22,6 +22,7 @@ class DoubleSphere(Camera):
     distortion_names = ("xi", "alpha")
     default_count = 2
     special_cases = (("ucm", ("alpha",)),)
+    fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"xi": -0.2, "alpha": 0.6})
     defined_text = "xi > -1"
 
     @staticmethod

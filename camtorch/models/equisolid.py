@@ -18,6 +18,7 @@ class Equisolid(Camera):
     key = "equisolid"
     distortion_names = ("k1", "k2", "k3", "k4")
     default_count = 4
+    fit_counts = (4, 6, 8, 10)
 
     @classmethod
     def names_of(cls, count):

@@ -22,6 +22,7 @@ class EUCM(Camera):
     distortion_names = ("alpha", "beta")
     default_count = 2
     special_cases = (("ucm", ("alpha",)),)
+    fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"alpha": 0.7})
     defined_text = "beta > 0"
 
     @classmethod

@@ -22,6 +22,9 @@ class FOV(Camera):
     key = "fov"
     distortion_names = ("omega",)
     default_count = 1
+    special_cases = (("pinhole", ()),)
+    # even in omega: zero is no start
+    fit_starts = ({"omega": 0.3}, {"omega": 0.9})
     defined_text = "-pi < omega < pi"
 
     @staticmethod

@@ -29,6 +29,7 @@ class KannalaBrandt(Camera):
     key = "kannala_brandt"
     distortion_names = ("k1", "k2", "k3", "k4")
     default_count = 4
+    fit_counts = (4, 6, 8, 10)
 
     @classmethod
     def names_of(cls, count):

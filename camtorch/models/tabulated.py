@@ -20,22 +20,21 @@ if TYPE_CHECKING:
 class Tabulated(Camera):
     """A radially symmetric camera whose r(theta) is a table: (u, v) = f r (cos phi, sin phi) + c.
 
-    theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real. Between the nodes r is the monotone cubic
-    spline of Fritsch and Butland (PCHIP), of the table and its mirror image through (0, 0), which is no node of its
-    own. A ray is valid up to the last angle, and before r ceases to ascend.
-
-    The camera has one continuous derivative on the axis and at the nodes, and no second one there.
+    theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real. Between the nodes, and (0, 0), r is a cubic
+    spline with two continuous derivatives, odd in theta, and kept monotone by Hyman's filter where the table is; at
+    nodes where the filter is at work only the first derivative is continuous. A ray is valid up to the last angle, and
+    before r ceases to ascend.
 
     Distortion: theta1 ... thetaN r1 ... rN, N >= 2: the angles in radians, ascending, which stay as they are (their
     gradient is zero), and the radii in units of the focal length, which learn. Equidistant, up to 90 degrees, if left
-    out. A table in millimetres comes in through `from_table`. Source: Fritsch and Butland, "A method for
-    constructing local monotone piecewise cubic interpolants", SIAM J. Sci. Stat. Comput. 1984. See `Camera` for
-    shapes, conventions and errors.
+    out. A table in millimetres comes in through `from_table`. Source of the filter: Hyman, "Accurate monotonicity
+    preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983. See `Camera` for shapes, conventions and errors.
     """
 
     key = "tabulated"
     distortion_names = (*(f"theta{i}" for i in range(1, 7)), *(f"r{i}" for i in range(1, 7)))
     default_count = 12
+    fit_counts = (128,)
     defined_text = "angles that ascend from above 0"
 
     @classmethod
@@ -62,6 +61,17 @@ class Tabulated(Camera):
     def optics(k):
         angles, radii = [w.detach() for w in k[: len(k) // 2]], k[len(k) // 2 :]
         return EquidistantUpTo(angles[-1]), Lens(Planar(RadiusTable(angles, radii)))
+
+    @classmethod
+    def fit_start(cls, names, angles, radii):
+        count = len(names) // 2
+        # a ray at the last node itself would be lost to rounding
+        nodes = angles[:, -1:] * (1 + 1e-9) * torch.arange(1, count + 1).to(angles) / count
+        place = nodes / angles[:, :1]
+        before = place.long().clamp(max=angles.shape[-1] - 1)
+        table = torch.cat((torch.zeros_like(radii[:, :1]), radii), -1)
+        low, high = table.gather(-1, before), table.gather(-1, before + 1)
+        return torch.cat((nodes.clamp(max=math.pi), low + (place - before) * (high - low)), -1)[None]
 
     @classmethod
     def from_table(cls, centre, angles, radii, *, pixels_per_unit: float = 1.0, image_size=None) -> Self:

@@ -24,6 +24,7 @@ class UCM(Camera):
     distortion_names = ("alpha",)
     default_count = 1
     special_cases = (("pinhole", ()),)
+    fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"alpha": 0.7})
 
     @staticmethod
     def optics(k):

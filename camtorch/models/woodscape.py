@@ -21,6 +21,8 @@ class WoodScape(FTheta):
     """
 
     key = "woodscape"
+    special_cases = ()
+    fit_counts = ()
 
     @classmethod
     def names_of(cls, count):
