@@ -21,6 +21,7 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "fisheye624": (*_FISHEYE, 1e-4, 0.0, 1e-3, -5e-4, 1e-3, -1e-4, 5e-4, 1e-4),
     "thin_prism_fisheye": (0.02, -0.01, 1e-3, -5e-4, 0.003, -0.001, 1e-3, 5e-4),
     "f_theta": (-0.09, 0.14, -0.02),
+    "f_theta_backward": (0.02, -0.03, 0.004),
     "woodscape": (-0.09, 0.14, -0.02),
     # theta (1 + 0.02 theta^2 - 0.01 theta^4 + ...) every 15 degrees
     "tabulated": (

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from camtorch.fit import Sights, even_out, fit, see
+from camtorch import survey
+from camtorch.fit import even_out, fit, see
 from camtorch.parameters import as_image_size, as_whole
 from camtorch.related import carried, default_count
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 _FIT_SIDE, _EVEN_SIDE, _CHECK_SIDE = 33, 65, 193  # of the lattices of pixels to fit to, and to check with
 _EVEN_UP_TO = 10  # times the tolerance: where more is wrong, errors are not evened out
-_ANGLES, _AZIMUTHS, _RADII = 181, 16, 64  # at which a camera is looked at as a whole
-_END_AHEAD = math.radians(87)  # of rays, for a camera without a picture that does not see sideways
 _ROWS = 64  # of a batch that are worked on at a time
 
 
@@ -182,10 +181,10 @@ def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
 def _converted(task: _Task, count: int) -> _Result:
     source, model, made = task.source, task.model, task.made
     names = model.names_of(count)
-    slopes = _slopes(source)
-    view = _view(source, task.image_size, _FIT_SIDE, task.limit)
-    fine = _view(source, task.image_size, _CHECK_SIDE, task.limit)
-    starts = model.fit_start(names, *_radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
+    slopes = survey.slopes_at_axis(source)
+    view = survey.view(source, task.image_size, _FIT_SIDE, task.limit)
+    fine = survey.view(source, task.image_size, _CHECK_SIDE, task.limit)
+    starts = model.fit_start(names, *survey.radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
@@ -201,7 +200,7 @@ def _converted(task: _Task, count: int) -> _Result:
     off = result.max_error / task.tolerance
     rows = ((off > 1) & (off <= _EVEN_UP_TO)).nonzero()[:, 0]
     if len(rows):
-        sights = _view(task.of(rows).source, task.image_size, _EVEN_SIDE, task.limit).sights
+        sights = survey.view(task.of(rows).source, task.image_size, _EVEN_SIDE, task.limit).sights
         evened = _measured(task.of(rows), even_out(made(parameters), sights, parameters[rows]), exact[rows])
         (better,) = (
             (evened.max_error < result.max_error[rows]) & (evened.max_angle >= result.max_angle[rows])
@@ -211,16 +210,16 @@ def _converted(task: _Task, count: int) -> _Result:
 
 
 def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
-    check = _view(task.source, task.image_size, _CHECK_SIDE, task.limit)
-    whole = check if task.limit == math.pi else _view(task.source, task.image_size, _CHECK_SIDE, math.pi)
+    check = survey.view(task.source, task.image_size, _CHECK_SIDE, task.limit)
+    whole = check if task.limit == math.pi else survey.view(task.source, task.image_size, _CHECK_SIDE, math.pi)
     numbers = _numbers(task.made(parameters), parameters[:, 4:], exact, check, whole)
     return _Result(parameters, *numbers, exact)
 
 
-def _numbers(target: Camera, k: Tensor, exact: Tensor, check: _View, whole: _View) -> tuple[Tensor, ...]:
+def _numbers(target: Camera, k: Tensor, exact: Tensor, check: survey.View, whole: survey.View) -> tuple[Tensor, ...]:
     """rms, max_error, max_angle and valid_fraction, (C,) each."""
 
-    def compared(view: _View) -> tuple[Tensor, Tensor]:
+    def compared(view: survey.View) -> tuple[Tensor, Tensor]:
         pixels, valid = target.project(view.rays)
         # what was out of the reach of the fit is no part of its result
         reached = see(target, k, view.rays).covered | exact[:, None]
@@ -236,103 +235,3 @@ def _numbers(target: Camera, k: Tensor, exact: Tensor, check: _View, whole: _Vie
     mapped = mapped if whole is check else compared(whole)[1]
     shown = whole.valid & mapped & (whole.angles <= max_angle[:, None]) & some[:, None]
     return rms, max_error, max_angle, shown.sum(-1) / whole.valid.sum(-1).clamp(min=1)
-
-
-# -- what a camera sees
-
-
-class _View(NamedTuple):
-    """Rays (C, N, 3) of a camera, its pixels (C, N, 2) of them, and whether it has them, bool (C, N)."""
-
-    rays: Tensor
-    pixels: Tensor
-    valid: Tensor
-
-    @property
-    def sights(self) -> Sights:
-        """What a camera fitted to it shall see."""
-        return Sights(self.rays, self.pixels, self.valid.to(self.pixels.dtype))
-
-    @property
-    def angles(self) -> Tensor:
-        return torch.atan2(torch.hypot(self.rays[..., 0], self.rays[..., 1]), self.rays[..., 2])
-
-
-def _view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> _View:
-    """side^2 rays on the picture, or in all directions, of which those count that the camera has up to an angle."""
-    if image_size is None:
-        rays = _directions(_reach(camera, limit) * torch.linspace(0, 1, side, **_like(camera)), side)
-        rays, found = rays.flatten(1, 2), True
-    else:
-        rays, found = camera.unproject(_lattice(camera, image_size, side, limit))
-    pixels, valid = camera.project(rays)
-    view = _View(rays, pixels, valid & found)
-    return view._replace(valid=view.valid & (view.angles <= limit * (1 + 1e-12)))
-
-
-def _lattice(camera: Camera, image_size: tuple[int, int], side: int, limit: float) -> Tensor:
-    """(C, side^2, 2): pixels of the part of the picture that an angle leaves, its edges included."""
-    height, width = image_size
-    count = len(camera.intrinsics)
-    low = camera.intrinsics.new_full((count, 2), -0.5)
-    high = camera.intrinsics.new_tensor([width - 0.5, height - 0.5]).expand(count, 2)
-    if limit < math.pi:
-        ring, valid = camera.project(_directions(low.new_full((count, 1), limit), 64).flatten(1, 2))
-        closed = valid.all(-1)[:, None] & (limit < math.pi / 2)
-        least, most = (torch.where(closed, end, whole) for end, whole in ((ring.amin(1), low), (ring.amax(1), high)))
-        inside = (least < high) & (most > low)
-        low, high = torch.where(inside, least.clamp(min=low), low), torch.where(inside, most.clamp(max=high), high)
-    steps = torch.linspace(0, 1, side, **_like(camera))[:, None]
-    u, v = (low[:, None] + (high - low)[:, None] * steps).unbind(-1)
-    return torch.stack(torch.broadcast_tensors(u[:, None, :], v[:, :, None]), -1).flatten(1, 2)
-
-
-def _directions(angles: Tensor, azimuths: int) -> Tensor:
-    """(C, K) angles from the axis -> (C, K, azimuths, 3) rays; none of them where panoramas are cut."""
-    phi = (torch.arange(azimuths).to(angles) + 0.25) * (2 * math.pi / azimuths)
-    theta = angles[..., None]
-    z = theta.cos().expand(*angles.shape, azimuths)
-    return torch.stack((theta.sin() * phi.cos(), theta.sin() * phi.sin(), z), -1)
-
-
-def _reach(camera: Camera, limit: float) -> Tensor:
-    """(C, 1): the angle up to which a camera has rays on some azimuth."""
-    angles = torch.linspace(0, math.pi, _ANGLES, **_like(camera))
-    rays = _directions(angles.expand(len(camera.intrinsics), -1), _AZIMUTHS)
-    sees = camera.project(rays)[1].any(-1).long().cumprod(-1)
-    reach = (angles * sees).amax(-1, keepdim=True)
-    return torch.where(reach < math.pi / 2, reach.clamp(max=_END_AHEAD), reach).clamp(max=limit)
-
-
-def _slopes(camera: Camera) -> Tensor:
-    """(C, 4): the focal lengths at the axis, and the pixel of the axis."""
-    h = 1e-3
-    around = camera.intrinsics.new_tensor([[0, 0, 1], [h, 0, 1], [-h, 0, 1], [0, h, 1], [0, -h, 1]])
-    seen, valid = camera.project(around.expand(len(camera.intrinsics), 5, 3))
-    focal = torch.stack((seen[:, 1, 0] - seen[:, 2, 0], seen[:, 3, 1] - seen[:, 4, 1]), -1) / (2 * h)
-    stated = camera.intrinsics
-    good = valid.all(-1) & (focal > 0).all(-1)
-    fair = torch.isfinite(stated).all(-1) & (stated[:, :2] > 0).all(-1)
-    otherwise = torch.where(fair[:, None], stated, stated.new_tensor([1.0, 1, 0, 0]))
-    return torch.where(good[:, None], torch.cat((focal, seen[:, 0]), -1), otherwise)
-
-
-def _radii(camera: Camera, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Angles and radii as `Convertible.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
-    steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
-    angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
-    pixels, valid = camera.project(_directions(angles, _AZIMUTHS))
-    plane = (pixels - slopes[:, None, None, 2:]) / slopes[:, None, None, :2]
-    radii = (torch.linalg.vector_norm(plane, dim=-1) * valid).sum(-1) / valid.sum(-1).clamp(min=1)
-    growth = radii.diff(dim=-1, prepend=torch.zeros_like(radii[:, :1]))
-    seen = valid.any(-1).long().cumprod(-1) * (growth > 0).long().cumprod(-1)
-    last = seen.sum(-1, keepdim=True)
-    at = (last - 1).clamp(min=0)
-    end, slope = (torch.where(last > 0, t.gather(-1, at), angles[:, :1]) for t in (radii, growth))
-    index = torch.arange(_RADII, device=slopes.device)
-    return angles, torch.where(seen > 0, radii, end + slope * (index - at))
-
-
-def _like(camera: Camera) -> dict:
-    # steps of float32 would go past half a circle
-    return {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}

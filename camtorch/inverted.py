@@ -13,8 +13,7 @@ from camtorch.analytic import angle_per_radius
 from camtorch.charts import Chart, Equidistant, Perspective, even_steps_and_ratios
 from camtorch.domain import Domain, Optics
 from camtorch.lens import Lens, Planar, Polynomial
-from camtorch.local import total
-from camtorch.parameters import columns, may_look
+from camtorch.parameters import may_look
 
 FURTHEST = math.tan(math.radians(87))
 """The radius, in focal lengths, up to which pixels have rays."""

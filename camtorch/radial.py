@@ -48,8 +48,8 @@ class RadiusTable:
     """The radial factor R(t) = r(s) / s of s = radius = sqrt(t), r a monotone cubic spline through (0, 0) and a table.
 
     The spline has two continuous derivatives, but for nodes at which Hyman's filter keeps it monotone (Hyman, "Accurate
-    monotonicity preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983). Behind its last node r turns back, so
-    that the lens folds there.
+    monotonicity preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983). Behind its last node r turns back,
+    so that the lens folds there.
     """
 
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
@@ -62,7 +62,7 @@ class RadiusTable:
         slopes = _slopes(steps, secants)
         before, after = slopes[..., :-1], slopes[..., 1:]
         squares = (3 * secants - 2 * before - after) / steps
-        # of the first piece it is zero, unless the filter was at work; not rounding, which near the axis is divided by 0
+        # of the first piece it is zero, unless the filter was at work; not rounding, which the axis divides by zero
         first = (squares * steps).abs() < 64 * torch.finfo(steps.dtype).eps * secants.abs()
         start = nodes[..., :-1]
         squares = torch.where(first & (start == 0), 0.0, squares)

@@ -66,25 +66,17 @@ def test_kalibr_models(tmp_path):
         ("omni", "radtan"): ("mei", 1, 4),
         ("eucm", "none"): ("eucm", 2, 0),
         ("ds", "none"): ("double_sphere", 2, 0),
+        ("pinhole", "fov"): ("fov", 0, 1),
     }
-    models[("pinhole", "fov")] = ("fov", 0, 1)
-    tried = 0
     for (projection, lens), (key, before, after) in models.items():
         first, last = [0.5, 0.6][:before], [0.01, 0.02, 0.003, 0.004][:after]
         text = f"cam0:\n  camera_model: {projection}\n  distortion_model: {lens}\n  resolution: [640, 480]\n"
         path.write_text(f"{text}  intrinsics: {[*first, 500.0, 501.0, 320.0, 240.0]}\n  distortion_coeffs: {last}\n")
-        if key not in ct.MODELS:
-            with pytest.raises(ct.CameraFileError, match=f"needs the camera model '{key}'"):
-                ct.load(path)
-            continue
         camera = ct.load(path).camera
         assert camera.intrinsics.tolist() == [500, 501, 320, 240]
         assert camera.distortion.tolist() == first + last
         ct.save(camera, path, "kalibr")
         assert_same(ct.load(path), ct.Rig({"cam0": camera}))
-        tried += 1
-    if not tried:
-        pytest.skip("model not in ct.MODELS: none of mei, eucm, double_sphere, fov")
 
 
 @pytest.mark.parametrize("name", ["aria_device_calibration.json", "basalt_calibration.json"])

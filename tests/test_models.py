@@ -167,7 +167,7 @@ def test_a_camera_made_without_coefficients_is_an_ideal_one():
 
 
 def spline(nodes, values):
-    """The cubics (pieces, 4) through (0, 0) and a table: all conditions of an odd spline at once, not-a-knot at the end."""
+    """The cubics (pieces, 4) through (0, 0) and a table: all conditions of an odd spline, not-a-knot at the end."""
     nodes, values = np.concatenate(([0], nodes)), np.concatenate(([0], values))
     pieces = len(nodes) - 1
     rows, right = [], []

@@ -81,6 +81,28 @@ def test_json_flag_is_a_boolean_too(path):
         assert type(opencv.read(path)) is model
 
 
+@pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
+@pytest.mark.parametrize("xi", ["1.25", "[1.25]", "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1.25]}"])
+def test_omnidir(tmp_path, suffix, xi):
+    """What cv2.omnidir calibrates has an xi beside it, a number or a matrix."""
+    path = written(tmp_path / "omnidir.yml", f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\nxi: {xi}\n")
+    camera = ct.load(path).camera
+    assert type(camera) is ct.Mei
+    assert camera.distortion.tolist() == [1.25, 0.1, 0.01, 0.001, 0.0001]
+    ct.save(camera, tmp_path / f"again{suffix}", "opencv")
+    again = ct.load(tmp_path / f"again{suffix}").camera
+    assert type(again) is ct.Mei
+    assert torch.equal(again.distortion, camera.distortion)
+
+
+def test_one_xi_for_all(tmp_path):
+    one = ct.Mei([500.0, 500, 320, 240], [1.0, 0, 0, 0, 0])
+    other = ct.Mei([500.0, 500, 320, 240], [1.5, 0, 0, 0, 0])
+    for rig in ({"1": one, "2": other}, {"1": one, "2": ct.Pinhole([500.0, 500, 320, 240])}, {"1": one, "2": one}):
+        with pytest.raises(CameraFileError, match="xi"):
+            ct.save(ct.Rig(rig), tmp_path / "pair.yml", "opencv")
+
+
 def test_model_argument_decides(path):
     written(path, f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\n")
     assert type(opencv.read(path, "kannala_brandt")) is ct.KannalaBrandt
@@ -136,7 +158,8 @@ def test_stereo_file_asks_for_a_name():
         (f"K: {K}\nimage_width: 640.5\nimage_height: 480", "image_width", "no number of pixels"),
         (f"K: {K}\nfisheye_model: [1]", "fisheye_model", "neither true nor false"),
         (f"K: {K}\nD: [0, 0, 0, 0]\ndistortion_model: equidistant", "distortion_model", "another model"),
-        (f"K: {K}\nxi: 1.2", "xi", "another model"),
+        (f"K: {K}\nxi: 1.2", "xi", "1 coefficients; Mei takes n = 5"),
+        (f"K: {K}\nxi: soon", "xi", "'soon' is no finite number"),
         ("<?xml version='1.0'?>", "line 1", "XML"),
         (b"\xff\xd8\xff\xe0", "byte 0", "not text"),
         ("a\0b: 1", "content", "not allowed"),

@@ -15,6 +15,7 @@ from camtorch.rig import Rig
 _MODELS = {
     "LENSMODEL_PINHOLE": ("pinhole", 0),
     "LENSMODEL_LONLAT": ("equirectangular", 0),
+    "LENSMODEL_STEREOGRAPHIC": ("stereographic", 0),
     **{f"LENSMODEL_OPENCV{count}": ("brown_conrady", count) for count in (4, 5, 8, 12, 14)},
 }
 _TOKEN = re.compile(
@@ -92,6 +93,8 @@ def render(rig: Rig, path) -> str:
     height, width = lossy.size(name, camera)
     key = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
     intrinsics, distortion = lossy.numbers(name, camera)
+    if key == "stereographic":  # without the polynomial
+        distortion = lossy.at_most(name, camera, distortion, (0,))
     model = next(model for model, (k, count) in _MODELS.items() if k == key and count == len(distortion))
     rotation, translation = [0.0] * 3, [0.0] * 3
     if name in rig.extrinsics:

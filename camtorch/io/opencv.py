@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import warnings
@@ -13,9 +12,10 @@ import torch
 from camtorch.camera import MODELS, Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, poses
+from camtorch.io.filestorage import Value, as_json, as_xml, as_yaml
 from camtorch.io.record import Record
 from camtorch.io.text import read_mapping
-from camtorch.io.write import Lossy, number
+from camtorch.io.write import Lossy
 from camtorch.rig import Rig
 
 # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
@@ -25,7 +25,7 @@ _DISTORTION = re.compile(rf"(?:D|(?i:dist(?:ortion)?(?:_?coeff?s|_?coefficients)
 _WIDTH = re.compile(r"(?i:(?:image_?)?width)")
 _HEIGHT = re.compile(r"(?i:(?:image_?)?height)")
 _FISHEYE = re.compile(r"(?i:(?:is_?)?fisheye(?:_?model)?)")
-_OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model|xi)")
+_OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model)")
 _FISHEYE_COUNT = 4  # of cv2.fisheye, and one of the counts of cv2.calibrateCamera
 _PAIRS = (["1", "2"], ["left", "right"])
 
@@ -37,7 +37,8 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`) and, where it has them,
             distortion coefficients (`distortion_coefficients`, `distCoeffs`, `D`), `image_width` and `image_height`.
         model: a key of `camtorch.MODELS`. If left out: without coefficients a pinhole, with a true `fisheye_model` a
-            Kannala-Brandt, else a Brown-Conrady camera, with a warning where 4 coefficients could be either.
+            Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning where 4 coefficients could be
+            of two models.
         name: which camera of a file with several: the end of its keys, "1" for `M1` and `D1`.
 
     Raises:
@@ -88,11 +89,15 @@ class _File:
         if below or bottom != [0, 0, 1]:
             self.fail(key, "is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
         distortion = self.numbers(distortion_key) if distortion_key else []
+        if "xi" in self.keys:  # cv2.omnidir
+            xi = self.record["xi"]
+            distortion = [*(self.numbers("xi") if isinstance(xi.value, (dict, list)) else [xi.number()]), *distortion]
         kind = MODELS[model or self.model(distortion)]
         arguments = [torch.tensor([fx, fy, cx, cy], dtype=torch.float64)]
         if distortion:
             if kind.names_of(len(distortion)) is None or not kind.distortion_names:
-                self.fail(distortion_key, f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
+                place = distortion_key or "xi"
+                self.fail(place, f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
             arguments.append(torch.tensor(distortion, dtype=torch.float64))
         try:
             return kind(*arguments, image_size=self.image_size())
@@ -136,6 +141,8 @@ class _File:
                 "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
                 "or --model kannala_brandt",
             )
+        if "xi" in self.keys:
+            return "mei"
         key = self.find(_FISHEYE)
         flag = "0" if key is None else self.record[key].value
         if not isinstance(flag, (str, bool)):
@@ -206,16 +213,16 @@ def render(rig: Rig, path) -> str:
         ends = [names[0] if re.fullmatch(_NAMES, names[0]) else ""]
     elif not all(name and re.fullmatch(_NAMES, name) for name in names):
         ends = [str(i + 1) for i in range(len(names))]
-    values: dict[str, int | list[list[float]]] = {}
+    values: dict[str, Value] = {}
     for name, end in zip(names, ends, strict=True):
         _add_camera(lossy, values, name, rig.cameras[name], end)
     _add_pose(lossy, values, rig, sorted(zip(ends, names, strict=True)))
     suffix = os.path.splitext(str(path))[1].lower()
-    return {".json": _json, ".xml": _xml}.get(suffix, _yaml)(values)
+    return {".json": as_json, ".xml": as_xml}.get(suffix, as_yaml)(values)
 
 
 def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str) -> None:
-    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt"))
+    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt", "mei"))
     (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
     if camera.image_size is not None:
         values_of_size = {"image_width": camera.image_size[1], "image_height": camera.image_size[0]}
@@ -226,6 +233,10 @@ def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str)
         lossy.fail(name, "no image_size, unlike the cameras before it; OpenCV's file has one for all")
     if key == "kannala_brandt":
         distortion = lossy.at_most(name, camera, distortion, (_FISHEYE_COUNT,))
+    if values.get("xi", "none") != (distortion[0] if key == "mei" else "none") and (end or "xi" in values):
+        lossy.fail(name, "an xi unlike that of other cameras; OpenCV's file has one for all")
+    if key == "mei":
+        values["xi"], *distortion = distortion
     fisheye = int(key == "kannala_brandt")
     # with one flag for all, several cameras must agree, be it on a flag that is not needed
     says = fisheye or len(distortion) == _FISHEYE_COUNT or end
@@ -250,46 +261,3 @@ def _add_pose(lossy: Lossy, values: dict, rig: Rig, ends_and_names: list[tuple[s
         values["T"] = [row[3:] for row in rows[:3]]
     else:
         lossy.no_pose(rig)
-
-
-def _words(matrix: list[list[float]], separator: str) -> str:
-    return separator.join(number(value) for row in matrix for value in row)
-
-
-def _yaml(values: dict) -> str:
-    lines = ["%YAML:1.0", "---"]
-    for key, value in values.items():
-        if isinstance(value, int):
-            lines.append(f"{key}: {value}")
-        else:
-            lines += [f"{key}: !!opencv-matrix", f"   rows: {len(value)}", f"   cols: {len(value[0])}", "   dt: d"]
-            lines.append(f"   data: [ {_words(value, ', ')} ]")
-    return "\n".join(lines) + "\n"
-
-
-def _json(values: dict) -> str:
-    whole = {
-        key: value
-        if isinstance(value, int)
-        else {
-            "type_id": "opencv-matrix",
-            "rows": len(value),
-            "cols": len(value[0]),
-            "dt": "d",
-            "data": [v for row in value for v in row],
-        }
-        for key, value in values.items()
-    }
-    return json.dumps(whole, indent=4, allow_nan=False) + "\n"
-
-
-def _xml(values: dict) -> str:
-    lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
-    for key, value in values.items():
-        if isinstance(value, int):
-            lines.append(f"<{key}>{value}</{key}>")
-        else:
-            lines += [f'<{key} type_id="opencv-matrix">', f"  <rows>{len(value)}</rows>"]
-            lines += [f"  <cols>{len(value[0])}</cols>", "  <dt>d</dt>", "  <data>"]
-            lines.append(f"    {_words(value, ' ')}</data></{key}>")
-    return "\n".join([*lines, "</opencv_storage>"]) + "\n"

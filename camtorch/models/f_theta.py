@@ -79,8 +79,8 @@ class FTheta(FreePolynomial):
     the azimuth. The first one is exact there, and the second one is given as zero; everywhere else all are exact.
 
     Distortion: k2 k3 ... by the power of theta, any number of them, at least one; 3 if left out. The same as
-    `WoodScape`, which has three, and NVIDIA DriveWorks `ftheta` where its polynomial gives pixels of angles (`fw-poly`);
-    one that gives angles of pixels is `FThetaBackward`. See `Camera` for shapes, conventions and errors.
+    `WoodScape`, which has three, and NVIDIA DriveWorks `ftheta` where its polynomial gives pixels of angles
+    (`fw-poly`); one that gives angles of pixels is `FThetaBackward`. See `Camera` for shapes, conventions and errors.
     """
 
     key = "f_theta"
