@@ -26,9 +26,9 @@ class Tabulated(Camera):
     before r ceases to ascend.
 
     Distortion: theta1 ... thetaN r1 ... rN, N >= 2: the angles in radians, ascending, which stay as they are (their
-    gradient is zero), and the radii in units of the focal length, which learn. Equidistant, up to 90 degrees, if left
-    out. A table in millimetres comes in through `from_table`. Source of the filter: Hyman, "Accurate monotonicity
-    preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983. See `Camera` for shapes, conventions and errors.
+    gradient is zero), and the radii in units of the focal length, which learn. Equidistant if left out. A table in
+    millimetres comes in through `from_table`. Source of the filter: Hyman, "Accurate monotonicity preserving cubic
+    interpolation", SIAM J. Sci. Stat. Comput. 1983. See `Camera` for shapes, conventions and errors.
     """
 
     key = "tabulated"
@@ -49,7 +49,7 @@ class Tabulated(Camera):
 
     @classmethod
     def ideal(cls, count):
-        angles = tuple(math.pi * i / count for i in range(1, count // 2 + 1))
+        angles = tuple(2 * math.pi * i / count for i in range(1, count // 2 + 1))
         return angles + angles
 
     @staticmethod
