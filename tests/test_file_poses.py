@@ -68,11 +68,12 @@ def test_kalibr_models(tmp_path):
         ("ds", "none"): ("double_sphere", 2, 0),
         ("pinhole", "fov"): ("fov", 0, 1),
     }
-    for (projection, lens), (key, before, after) in models.items():
+    for (projection, lens), (model, before, after) in models.items():
         first, last = [0.5, 0.6][:before], [0.01, 0.02, 0.003, 0.004][:after]
         text = f"cam0:\n  camera_model: {projection}\n  distortion_model: {lens}\n  resolution: [640, 480]\n"
         path.write_text(f"{text}  intrinsics: {[*first, 500.0, 501.0, 320.0, 240.0]}\n  distortion_coeffs: {last}\n")
         camera = ct.load(path).camera
+        assert camera.key == model
         assert camera.intrinsics.tolist() == [500, 501, 320, 240]
         assert camera.distortion.tolist() == first + last
         ct.save(camera, path, "kalibr")

@@ -115,7 +115,7 @@ def test_the_inverse_of_an_angle_is_valid_before_it_turns_back():
     theta = torch.tensor([2 / 3 * end - 1e-12, 2 / 3 * end + 1e-12], dtype=torch.float64)
     pixels, valid = made.project(torch.stack((theta.sin(), 0 * theta, theta.cos()), -1))
     assert valid.tolist() == [True, False]
-    assert float(pixels[0, 0]) == pytest.approx(float(INTRINSICS[2] + INTRINSICS[0] * end), abs=1e-2)
+    assert pixels[0, 0].item() == pytest.approx((INTRINSICS[2] + INTRINSICS[0] * end).item(), abs=1e-2)
 
 
 def test_woodscape_from_its_numbers():
