@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from camtorch.camera import Camera
 
 _FIT_SIDE, _EVEN_SIDE, _CHECK_SIDE = 33, 65, 193  # of the lattices of pixels to fit to, and to check with
-_EVEN_UP_TO = 10  # times the tolerance: where more is wrong, errors are not evened out
 _ROWS = 64  # of a batch that are worked on at a time
 
 
@@ -197,8 +196,8 @@ def _converted(task: _Task, count: int) -> _Result:
     if len(rows):
         parameters[rows] = fit(made(parameters), view.sights.of(rows), starts[:, rows], slopes[rows])
     result = _measured(task, parameters, exact)
-    off = result.max_error / task.tolerance
-    rows = ((off > 1) & (off <= _EVEN_UP_TO)).nonzero()[:, 0]
+    # no camera of the model has a largest error below the least root of the mean square
+    rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
         sights = survey.view(task.of(rows).source, task.image_size, _EVEN_SIDE, task.limit).sights
         evened = _measured(task.of(rows), even_out(made(parameters), sights, parameters[rows]), exact[rows])

@@ -64,9 +64,9 @@ class Convertible:
 
         Where the models are related and the numbers allow, it is this camera exactly: its coefficients are taken over
         bit by bit. Otherwise the squared pixel errors are least over the rays of this camera's picture (without a size:
-        over all its rays) that are within `max_angle` and that the new model can express; where the largest error is
-        then up to ten times the tolerance, it is brought down at the expense of smaller ones. The result says
-        how good that is; a bad conversion raises no error. Rows of a batch are converted independently.
+        over all its rays) that are within `max_angle` and that the new model can express; where the largest error then
+        is above the tolerance, and their root mean square below, it is brought down at the expense of smaller ones. The
+        result says how good that is; a bad conversion raises no error. Rows of a batch are converted independently.
 
         Args:
             model: a class of cameras, or its key in `ct.MODELS`.

@@ -19,7 +19,7 @@ FURTHEST = 20.0
 _MOST_STEPS = 60
 _ROUNDS = 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
-_EVENINGS, _EVENING_STEPS = 40, 2
+_EVENINGS, _EVENING_STEPS, _PATIENCE = 40, 2, 6
 _SETTLED = 1e-8  # the relative decrease of the cost that ends the search
 _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
@@ -105,18 +105,20 @@ def even_out(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
     sights = sights._replace(weights=covered)
     best, weights = parameters, covered
     error = _distances(sights, camera, parameters)
-    least = error.amax(-1)
+    least, stale = error.amax(-1), torch.zeros_like(error[:, 0])
     for _ in range(_EVENINGS):
+        going = stale < _PATIENCE
+        if not bool(going.any()):
+            break
         # of the error itself, the weight in a square is that of its root
         weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
         weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
-        going = torch.ones_like(least, dtype=torch.bool)
-        parameters = _refine(
-            camera, sights._replace(weights=weights), parameters, low, high, going, _EVENING_STEPS, _LEAST_DAMPING
-        )
+        weighted = sights._replace(weights=weights)
+        parameters = _refine(camera, weighted, parameters, low, high, going, _EVENING_STEPS, _LEAST_DAMPING)
         error = _distances(sights, camera, parameters)
-        better = error.amax(-1) < least
+        better = going & (error.amax(-1) < least)
         best = torch.where(better[:, None], parameters, best)
+        stale = torch.where(error.amax(-1) < 0.999 * least, 0.0, stale + 1)
         least = torch.where(better, error.amax(-1), least)
     return best
 

@@ -353,7 +353,7 @@ def test_the_door(arguments, options, error, text):
 
 @pytest.mark.parametrize("key", KEYS)
 @given(data=st.data())
-@settings(max_examples=4)
+@settings(max_examples=2)
 def test_wild_cameras_become_something_finite(key, data):
     source = data.draw(drawn(key, wild=True))
     result = source.convert(data.draw(st.sampled_from(KEYS)))

@@ -417,7 +417,7 @@ def before_fold(camera, rays, samples, azimuths):
     if not chart.has_scale:
         return (chart.margin(*rays.unbind(-1)) > 0).view(samples, azimuths)
     if isinstance(chart, Inverted):  # its formula leads from the radius to the angle
-        radius = torch.linspace(0, chart.end(torch.float64), 1_000_001, dtype=torch.float64)
+        radius = torch.linspace(0, chart.end(torch.float64), 100_001, dtype=torch.float64)
         x, _, z = chart.to_ray(radius, torch.zeros_like(radius))
         theta = torch.atan2(x, z)
         rises = torch.cat((torch.ones(1, dtype=torch.bool), theta[1:] > theta[:-1])).cummin(0).values

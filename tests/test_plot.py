@@ -34,7 +34,7 @@ def drawn(ax):
 @pytest.mark.parametrize("key", KEYS)
 def test_every_model_has_a_portrait(key):
     camera = one(key)
-    figure = plot.portrait(camera, camera.convert("kannala_brandt").camera)
+    figure = plot.portrait(camera, camera.convert("kannala_brandt", count=4).camera)
     figure.set_dpi(30)
     figure.canvas.draw()
     assert len([ax for ax in figure.axes if ax.get_title()]) == 3
