@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 _FIT_SIDE, _EVEN_SIDE, _CHECK_SIDE = 33, 65, 193  # of the lattices of pixels to fit to, and to check with
 _ROWS = 64  # of a batch that are worked on at a time
+
+
+_WORTH_IT = 0.5  # of the largest error before: then more coefficients are taken
 
 
 @dataclass
@@ -67,9 +71,10 @@ def convert(
     model = _model(model)
     owner = f"{type(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
-    for name, value in (("max_angle must be positive radians", max_angle), ("tolerance must be positive", tolerance)):
-        if value is not None and not float(value) > 0:
-            raise ValueError(f"{owner}: {name}; got {value}")
+    if max_angle is not None and not 0 < float(max_angle) <= math.pi * (1 + 1e-6):
+        raise ValueError(f"{owner}: max_angle must be positive radians, up to pi; got {max_angle}")
+    if not float(tolerance) > 0:
+        raise ValueError(f"{owner}: tolerance must be positive; got {tolerance}")
     if count is None:
         least = default_count(model, source)
         counts = least, *(n for n in model.fit_counts if n > least)
@@ -102,7 +107,11 @@ def _model(model) -> type[Camera]:
 
     if isinstance(model, str):
         if model not in MODELS:
-            raise ValueError(f"there is no camera model {model!r}; known are {', '.join(sorted(MODELS))}")
+            by_name = {cls.__name__: key for key, cls in MODELS.items()}
+            close = difflib.get_close_matches(model.lower(), [*MODELS, *map(str.lower, by_name)], 1)
+            lower = {name.lower(): key for name, key in by_name.items()}
+            meant = f"did you mean {lower.get(close[0], close[0])!r}? Known" if close else "known"
+            raise ValueError(f"there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")
         return MODELS[model]
     if not (isinstance(model, type) and issubclass(model, Camera) and hasattr(model, "key")):
         raise TypeError(f"convert takes a camera model, or its key in ct.MODELS; got {model!r}")
@@ -163,16 +172,15 @@ def _padded(parameters: Tensor, width: int) -> Tensor:
 
 
 def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
-    """Each row with the first number of coefficients that keeps the tolerance; with the first of all if none does."""
+    """Each row with the first number of coefficients that keeps the tolerance; or, if none does, that is worth it."""
     result = _converted(task, counts[0])
     for count in counts[1:]:
         rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]
         if len(rows) == 0:
             break
         other = _converted(task.of(rows), count)
-        (good,) = ((other.max_error <= task.tolerance) & (other.max_angle >= result.max_angle[rows])).nonzero(
-            as_tuple=True
-        )
+        enough = (_WORTH_IT * result.max_error[rows]).clamp(min=task.tolerance)
+        (good,) = ((other.max_error <= enough) & (other.max_angle >= result.max_angle[rows])).nonzero(as_tuple=True)
         result = result.replaced(rows[good], other.of(good))
     return result
 

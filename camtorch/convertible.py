@@ -71,8 +71,9 @@ class Convertible:
         Args:
             model: a class of cameras, or its key in `ct.MODELS`.
             count: of coefficients, for models that leave a choice. By default the least number that holds what a
-                related camera has, the model's own at least; or, where that keeps the tolerance and the former
-                does not, the least of `fit_counts`. Rows of a batch that need less have zeros.
+                related camera has, the model's own at least; where that does not keep the tolerance, those of
+                `fit_counts` are tried, and taken if they keep it or halve the largest error. Rows of a batch that need
+                less have zeros.
             image_size: (height, width) of the picture, for a camera that does not say or to look at another part.
             max_angle: radians from the optical axis up to which rays matter; by default all do.
             tolerance: the largest error in pixels that is good enough.
@@ -84,7 +85,7 @@ class Convertible:
 
         Raises:
             TypeError: no camera model. ValueError: an unknown key, a count that the model does not take, a
-                `max_angle` or a `tolerance` that is not positive.
+                `max_angle` that is not positive or beyond pi, a `tolerance` that is not positive.
         """
         from camtorch.conversion import convert
 

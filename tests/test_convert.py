@@ -281,6 +281,20 @@ def test_a_shared_lens_serves_the_batch():
 # -- what is asked for
 
 
+def test_more_coefficients_where_they_are_worth_it():
+    wide = golden("kannala_brandt__dms_130deg_a")
+    assert wide.convert("brown_conrady").camera.distortion.shape == (8,)
+    pair = ct.KannalaBrandt(
+        torch.stack((wide.intrinsics.detach(), torch.tensor([900.0, 900, 640, 400], **F64))),
+        torch.stack((wide.distortion.detach(), torch.zeros(4, **F64))),
+        image_size=wide.image_size,
+    )
+    few = pair.convert("brown_conrady", max_angle=radians(30))
+    both = pair.convert("brown_conrady")
+    assert few.camera.distortion.shape == (2, 5)
+    assert both.camera.distortion.shape == (2, 8)
+
+
 def test_a_bad_conversion_says_so():
     source = golden("kannala_brandt__auto_190deg_a")
     result = source.convert(ct.Pinhole)
@@ -333,7 +347,7 @@ def test_edited_pictures():
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "text"),
     [
-        (("fisheye63",), {}, ValueError, "known are brown_conrady"),
+        (("fisheye63",), {}, ValueError, "did you mean 'fisheye62'. Known are brown_conrady"),
         ((3,), {}, TypeError, "takes a camera model"),
         ((torch.nn.Linear,), {}, TypeError, "takes a camera model"),
         ((ct.Camera,), {}, TypeError, "takes a camera model"),
@@ -341,6 +355,8 @@ def test_edited_pictures():
         (("brown_conrady",), {"count": -1}, ValueError, "got count=-1"),
         (("pinhole",), {"count": 1}, ValueError, "got count=1"),
         (("pinhole",), {"max_angle": 0.0}, ValueError, "max_angle must be positive"),
+        (("pinhole",), {"max_angle": 60.0}, ValueError, "radians, up to pi; got 60"),
+        (("Pinhole",), {}, ValueError, "did you mean 'pinhole'"),
         (("pinhole",), {"max_angle": math.nan}, ValueError, "max_angle must be positive"),
         (("pinhole",), {"tolerance": 0.0}, ValueError, "tolerance must be positive"),
         (("pinhole",), {"image_size": (0, 3)}, ValueError, "image_size must be positive"),

@@ -178,8 +178,29 @@ def test_colmap_points_are_not_lost(tmp_path):
     rig.extrinsics["a.jpg"] = rig.extrinsics["b.jpg"]
     with pytest.raises(ct.CameraFileError, match="points of images, which would be lost"):
         ct.save(rig, tmp_path / "cameras.txt")
-    with pytest.raises(ct.CameraFileError, match="camera 1: missing, while"):
-        ct.save(ct.Rig({"2": rig.camera}), tmp_path / "cameras.txt")
+    # nor would other cameras get the poses of these images
+    with pytest.raises(ct.CameraFileError, match=r"extrinsics: none, while .*images.txt has poses of images"):
+        ct.save(ct.Rig({"1": rig.camera}), tmp_path / "cameras.txt")
+
+
+@pytest.mark.parametrize("suffix", ["txt", "bin"])
+def test_a_folder_of_colmap(suffix, tmp_path):
+    rig = load("nerfstudio_transforms.json")
+    folder = tmp_path / "sparse" / "0"
+    folder.parent.mkdir()
+    if suffix == "bin":
+        folder.mkdir()
+        ct.save(rig, folder / "cameras.bin")
+    ct.save(rig, folder, "colmap")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        f"{n}.{suffix}" for n in ("cameras", "images", "points3D")
+    ]
+    again = ct.load(folder)
+    assert list(again.extrinsics) == list(rig.extrinsics)
+    ct.save(again, folder)
+    assert_same(ct.load(folder), again)
+    with pytest.raises(ValueError, match="is a folder; basalt is one file"):
+        ct.save(again.camera, folder, "basalt")
 
 
 rotations = st.lists(st.floats(-3, 3), min_size=3, max_size=3).filter(lambda v: math.hypot(*v) < 3.1)

@@ -64,7 +64,6 @@ def test_colmap(suffix, tmp_path):
     named = {str(i): camera for i, camera in enumerate(cameras(), 3)}
     poses = {f"{name}.jpg": PLACED for name in named}
     ct.save(ct.Rig(named, poses, images={f"{name}.jpg": name for name in named}), tmp_path / f"cameras.{suffix}")
-    (tmp_path / f"points3D.{suffix}").write_bytes(bytes(8) if suffix == "bin" else b"")
     reconstruction = pycolmap.Reconstruction(str(tmp_path))
     assert {str(i) for i in reconstruction.cameras} == set(named)
     for image in reconstruction.images.values():

@@ -237,5 +237,7 @@ def test_the_angles_of_a_table_do_not_learn():
 def test_bad_tables_are_refused(angles, radii, text):
     with pytest.raises(ValueError, match=text):
         ct.Tabulated.from_table([1.0, 2.0], angles, radii)
+    with pytest.raises(ValueError, match=r"radians, up to pi; got up to 90.0. Degrees"):
+        ct.Tabulated.from_table([1.0, 2.0], [10.0, 90.0], [1.0, 2.0])
     with pytest.raises(ValueError, match="ascend"):
         camera(ct.Tabulated, 0.3, 0.2, 1.0, 2.0)

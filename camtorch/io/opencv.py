@@ -152,7 +152,7 @@ class _File:
         if len(distortion) == _FISHEYE_COUNT and key is None:
             warnings.warn(
                 f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
-                "If they come from cv2.fisheye, the model is kannala_brandt",
+                "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt')",
                 stacklevel=4,
             )
         return "brown_conrady" if distortion else "pinhole"

@@ -56,7 +56,10 @@ class FreePolynomial(Camera):
             raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 2; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
         if is_concrete(first) and not bool((first > 0).all()):
-            raise ValueError(f"{cls.__name__}: the first coefficient must be positive; got {first.tolist()}")
+            raise ValueError(
+                f"{cls.__name__}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
+                "A constant before it, which is zero, is left out"
+            )
         as_batch(cls.__name__, centre=centre.shape, coefficients=coefficients.shape)
         focal, distortion = cls._scaled(coefficients)
         focal, centre = torch.broadcast_tensors(torch.cat((focal, focal * aspect_ratio), -1), centre)

@@ -87,7 +87,8 @@ class Tabulated(Camera):
             image_size: (height, width) in pixels.
 
         Raises:
-            ValueError: the table has another shape, or does not begin to ascend from the origin.
+            ValueError: the table has another shape, does not begin to ascend from the origin, or goes beyond half a
+                turn.
         """
         centre, angles, radii = (
             as_real(v, n, cls.__name__) for v, n in ((centre, "centre"), (angles, "angles"), (radii, "radii"))
@@ -102,6 +103,8 @@ class Tabulated(Camera):
                 f"{cls.__name__}: the table needs two nodes that ascend from the origin; got angles {angles.tolist()} "
                 f"and radii {radii.tolist()}"
             )
+        if angles[-1] > math.pi * (1 + 1e-6):
+            raise ValueError(f"{cls.__name__}: angles are radians, up to pi; got up to {float(angles[-1])}. Degrees?")
         focal = radii[:1] / angles[:1]
         intrinsics = torch.cat((focal * pixels_per_unit, focal * pixels_per_unit, centre))
         return cls(intrinsics, torch.cat((angles, radii / focal)), image_size=image_size)
