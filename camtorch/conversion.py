@@ -20,7 +20,7 @@ from camtorch.related import carried, default_count
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
-_FIT_SIDE, _EVEN_SIDE, _CHECK_SIDE = 33, 65, 193  # of the lattices of pixels to fit to, and to check with
+_FIT_SIDE, _CHECK_SIDE = 33, 193  # of the lattices of pixels to fit to, and to check with
 _ROWS = 64  # of a batch that are worked on at a time
 
 
@@ -180,9 +180,15 @@ def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
             break
         other = _converted(task.of(rows), count)
         enough = (_WORTH_IT * result.max_error[rows]).clamp(min=task.tolerance)
-        (good,) = ((other.max_error <= enough) & (other.max_angle >= result.max_angle[rows])).nonzero(as_tuple=True)
+        (good,) = ((other.max_error <= enough) & _as_far(other.max_angle, result.max_angle[rows])).nonzero(
+            as_tuple=True
+        )
         result = result.replaced(rows[good], other.of(good))
     return result
+
+
+def _as_far(angle: Tensor, before: Tensor) -> Tensor:
+    return angle >= before * (1 - 1e-9)  # measured on another batch, it is rounded otherwise
 
 
 def _converted(task: _Task, count: int) -> _Result:
@@ -207,10 +213,10 @@ def _converted(task: _Task, count: int) -> _Result:
     # no camera of the model has a largest error below the least root of the mean square
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
-        sights = survey.view(task.of(rows).source, task.image_size, _EVEN_SIDE, task.limit).sights
+        sights = survey.rings(task.of(rows).source, task.image_size, _FIT_SIDE, task.limit).sights
         evened = _measured(task.of(rows), even_out(made(parameters), sights, parameters[rows]), exact[rows])
         (better,) = (
-            (evened.max_error < result.max_error[rows]) & (evened.max_angle >= result.max_angle[rows])
+            (evened.max_error < result.max_error[rows]) & _as_far(evened.max_angle, result.max_angle[rows])
         ).nonzero(as_tuple=True)
         result = result.replaced(rows[better], evened.of(better))
     return result

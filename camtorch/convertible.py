@@ -24,8 +24,8 @@ class Convertible:
 
     A special case is this model, at the same intrinsics, with all other coefficients as in `Camera.ideal`.
     """
-    fit_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
-    """The least and the greatest value of coefficients that a fit tries, where there are such."""
+    fit_bounds: ClassVar[Mapping[str, tuple[float, float] | None]] = {}
+    """The least and the greatest value of coefficients that a fit tries, where there are such; None: as it starts."""
     fit_starts: ClassVar[tuple[Mapping[str, float], ...]] = ({},)
     """Alternatives to start a fit from: the values of some coefficients, while the others are as in `Camera.ideal`."""
     fit_counts: ClassVar[tuple[int, ...]] = ()

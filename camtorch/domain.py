@@ -98,7 +98,7 @@ class Domain:
         """(C, 1): that of the radial factor of the first stage, in double precision where there is one."""
         k = _precise(self.k)
         chart, lens = self.optics(columns(k))
-        return _fold(lens.radial, chart, k, chart.end(self.k.dtype))
+        return _fold(lens.radial, chart, k, chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25)
 
     @_per_camera
     def table(self) -> Tensor:
@@ -133,10 +133,18 @@ def _precise(k: Tensor) -> Tensor:
     return k if k.device.type == "mps" else k.double()
 
 
-def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float | Tensor) -> Tensor:
-    """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end of the chart."""
+def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float | Tensor, most: float) -> Tensor:
+    """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end of the chart.
+
+    most: the largest image that is a number to calculate with.
+    """
+
+    def sense(radius: Tensor) -> Tensor:
+        found, image = radial_sense(radial, radius), radius * radial(radius * radius)
+        return torch.where(image < most, found, -1.0)
+
     nodes = chart.radii(2 * _RADII, k).clamp(max=end).expand(len(k), -1)
-    lost = first_loss(radial_sense(radial, nodes)).unsqueeze(-1)
+    lost = first_loss(sense(nodes)).unsqueeze(-1)
     some = lost < nodes.shape[-1]
 
     def node(index: Tensor) -> Tensor:
@@ -149,11 +157,10 @@ def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float | T
     steps = torch.linspace(0, 1, _PARTS + 1, dtype=k.dtype, device=k.device)
     for _ in range(2):
         inner = low + (high - low) * steps
-        sense = radial_sense(radial, inner)
         # the upper end counts as lost, whatever rounding says of it
-        first = (sense > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
+        first = (sense(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
         low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
-    before, after = radial_sense(radial, low), radial_sense(radial, high)
+    before, after = sense(low), sense(high)
     crossing = (before > 0) & (after < 0)
     fraction = torch.where(crossing, before / torch.where(crossing, before - after, 1.0), 0.0)
     return torch.where(some, low + fraction * (high - low), end)

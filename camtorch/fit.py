@@ -142,9 +142,9 @@ def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
     """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
     low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
     low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
-    for i, name in enumerate(camera.distortion_names):
+    for i, name in enumerate(camera.distortion_names, 4):
         if name in camera.fit_bounds:
-            low[:, 4 + i], high[:, 4 + i] = camera.fit_bounds[name]
+            low[:, i], high[:, i] = camera.fit_bounds[name] or (parameters[:, i], parameters[:, i])
     return low, high
 
 
@@ -166,24 +166,25 @@ def _cost(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
     return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
 
 
-def _linearised(camera: Camera, sights: Sights, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """The residuals (C, 2 N), and their derivatives (C, 4 + n, 2 N) by the parameters."""
+def _linearised(camera: Camera, sights: Sights, parameters: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+    """The residuals (C, 2 N), and their derivatives (C, F, 2 N) by the parameters of indices (F,), 0 to 3 first."""
     k = parameters[:, 4:]
     seen = see(camera, k, sights.rays)
     fx, fy, _, _ = columns(parameters[:, :4])
     zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
     derivatives = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
     slopes = torch.stack([torch.stack(pair, 1) for pair in derivatives], 1)
-    if k.shape[-1]:
-        by_k = _derivatives(lambda k: torch.stack(see(camera, k, sights.rays)[:2], 1), k)
+    if len(free) > 4:
+        along = torch.eye(k.shape[-1], dtype=k.dtype, device=k.device)[free[4:] - 4]
+        by_k = _derivatives(lambda k: torch.stack(see(camera, k, sights.rays)[:2], 1), k, along)
         slopes = torch.cat((slopes, by_k * torch.stack((fx, fy), 1)[:, None]), 1)
     # where a derivative is no number, as at the end of a chart, a step goes without it
     slopes = slopes.nan_to_num(0.0, 0.0, 0.0) * sights.weights[:, None, None]
     return _residuals(sights, parameters, seen).flatten(1), slopes.flatten(2)
 
 
-def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
-    """(C, n, ...) of a function (C, n) -> (C, ...) whose rows have nothing to do with each other."""
+def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor, directions: Tensor) -> Tensor:
+    """(C, D, ...) along (D, n) of a function (C, n) -> (C, ...) whose rows have nothing to do with each other."""
 
     def along(direction: Tensor) -> Tensor:
         return torch.func.jvp(function, (k,), (direction.expand_as(k),))[1]
@@ -191,7 +192,7 @@ def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
     with warnings.catch_warnings():
         # on its first use forward mode loads what calls the deprecated torch.jit.script
         warnings.simplefilter("ignore", DeprecationWarning)
-        return torch.func.vmap(along, out_dims=1)(torch.eye(k.shape[-1], dtype=k.dtype, device=k.device))
+        return torch.func.vmap(along, out_dims=1)(directions)
 
 
 def _refine(
@@ -210,17 +211,20 @@ def _refine(
     damping = torch.full_like(cost, first_damping)
     tiny = _NOTHING**2 * sights.weights.sum(-1)
     going = going & torch.isfinite(cost) & (cost > tiny)
+    (free,) = (low < high).any(0).nonzero(as_tuple=True)
     for _ in range(steps):
         rows = going.nonzero()[:, 0]
         if len(rows) == 0:
             break
         # rows that have settled are left alone, so that each goes the way that it would go alone
         these, old, weight = sights.of(rows), parameters[rows], damping[rows]
-        residuals, slopes = _linearised(camera, these, old)
+        residuals, slopes = _linearised(camera, these, old, free)
         # what would leave its bounds stays there, so that the others can move on
         slope = (slopes @ residuals[..., None])[..., 0]
-        held = (old <= low[rows]) & (slope > 0) | (old >= high[rows]) & (slope < 0)
-        step = _step(residuals, torch.where(held[..., None], 0.0, slopes), weight)
+        at_low, at_high = ((old <= low[rows])[:, free], (old >= high[rows])[:, free])
+        held = at_low & (slope > 0) | at_high & (slope < 0)
+        step = torch.zeros_like(old)
+        step[:, free] = _step(residuals, torch.where(held[..., None], 0.0, slopes), weight)
         new = (old + step).clamp(low[rows], high[rows])
         new_cost = _cost(camera, these, new)
         better = new_cost < cost[rows]

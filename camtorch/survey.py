@@ -47,6 +47,18 @@ def view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: f
     return seen._replace(valid=seen.valid & (seen.angles <= limit * (1 + 1e-12)))
 
 
+def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> View:
+    """`view`, and rays on circles around the axis, over which the errors of a radial lens change."""
+    whole = view(camera, image_size, side, limit)
+    reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
+    rays = _directions(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS).flatten(1, 2)
+    pixels, valid = camera.project(rays)
+    if image_size is not None:
+        height, width = image_size
+        valid = valid & (pixels >= -0.5).all(-1) & (pixels <= pixels.new_tensor([width - 0.5, height - 0.5])).all(-1)
+    return View(*(torch.cat(pair, 1) for pair in zip(whole, (rays, pixels, valid), strict=True)))
+
+
 def _lattice(camera: Camera, image_size: tuple[int, int], side: int, limit: float) -> Tensor:
     """(C, side^2, 2): pixels of the part of the picture that an angle leaves, its edges included."""
     height, width = image_size

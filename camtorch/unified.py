@@ -115,7 +115,10 @@ class Unified(Chart):
             return margin
         ahead = self._ahead(around, alpha)
         before = torch.addcmul(ahead * ahead, (1 - xi) * (1 + xi), rho2)
-        return torch.minimum(margin, before - floor * torch.addcmul(rho2, ahead, ahead))
+        margin = torch.minimum(margin, before - floor * torch.addcmul(rho2, ahead, ahead))
+        # the line from the shifted centre meets the sphere ahead; from outside of it, xi > 1, it may do so behind
+        reach = torch.addcmul(before.clamp(min=0).sqrt(), xi, ahead)
+        return torch.minimum(margin, reach - floor * ahead.abs())
 
     def to_ray(self, a, b, order=2):
         xi, alpha, beta = self._parts()

@@ -203,6 +203,33 @@ def test_a_folder_of_colmap(suffix, tmp_path):
         ct.save(again.camera, folder, "basalt")
 
 
+def test_poses_of_colmap_stay_together(tmp_path):
+    rig = load("nerfstudio_transforms.json")
+    with pytest.raises(ct.CameraFileError, match=r"so call the file cameras.txt, or name a folder"):
+        ct.save(rig, tmp_path / "left.txt", "colmap")
+    ct.save(rig, tmp_path, "colmap")
+    (tmp_path / "frames.txt").write_text("")
+    moved = ct.load(tmp_path)
+    name = next(iter(moved.extrinsics))
+    moved.extrinsics[name] = ct.Extrinsics(float64([0.1, 0, 0]), float64([0, 0, 0]))
+    with pytest.raises(ct.CameraFileError, match=r"would contradict frames.txt"):
+        ct.save(moved, tmp_path)
+    ct.save(ct.Rig({"1": rig.camera}), tmp_path / "alone.txt", "colmap")
+    assert not ct.load(tmp_path / "alone.txt").extrinsics
+
+
+@pytest.mark.parametrize(("keys", "focal"), [
+    ({"camera_angle_x": 1.0, "camera_angle_y": 0.5}, (320 / math.tan(0.5), 240 / math.tan(0.25))),
+    ({"camera_angle_y": 0.5}, (240 / math.tan(0.25), 240 / math.tan(0.25))),
+    ({"fl_x": 500, "camera_angle_y": 0.5}, (500.0, 240 / math.tan(0.25))),
+    ({"x_fov": 57.29577951308232, "y_fov": 28.64788975654116}, (320 / math.tan(0.5), 240 / math.tan(0.25))),
+])  # fmt: skip
+def test_angles_of_nerfstudio(keys, focal, tmp_path):
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 640, "h": 480, "frames": [], **keys}))
+    camera = ct.load(tmp_path / "transforms.json").camera
+    assert camera.intrinsics[:2].tolist() == pytest.approx(focal, rel=1e-12)
+
+
 rotations = st.lists(st.floats(-3, 3), min_size=3, max_size=3).filter(lambda v: math.hypot(*v) < 3.1)
 
 

@@ -163,6 +163,34 @@ def test_coefficients_without_a_formula(model, coefficients, text):
         assert all((g == 0).all() for g in gradients)
 
 
+@pytest.mark.parametrize(("xi", "alpha"), [(1.0, 0.5), (1.01, 0.6), (1.1, 0.55), (1.5, 0.5), (0.999, 0.6), (2.0, 0.6)])
+def test_a_double_sphere_from_outside_of_the_sphere(xi, alpha):
+    """Far out the line of a pixel meets the sphere only behind the shifted centre."""
+    made = camera(ct.DoubleSphere, xi, alpha)
+    steps = torch.linspace(-5000, 5000, 501, dtype=torch.float64)
+    pixels = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
+    rays, valid = made.unproject(pixels)
+    again, reachable = made.project(rays)
+    assert reachable[valid].all()
+    assert 100 < valid.sum() < valid.numel()
+    torch.testing.assert_close(again[valid], pixels[valid], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_powers_that_overflow_are_not_valid(dtype):
+    for made in (
+        ct.Stereographic(INTRINSICS.to(dtype), torch.full((20,), 0.01, dtype=dtype)),
+        ct.KannalaBrandt(INTRINSICS.to(dtype), torch.full((40,), 0.01, dtype=dtype)),
+        ct.FTheta(INTRINSICS.to(dtype), torch.full((100,), 0.01, dtype=dtype)),
+    ):
+        theta = math.pi - torch.logspace(-9, 0, 200, dtype=torch.float64)
+        points = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1).to(dtype).requires_grad_()
+        pixels, _ = made.project(points)
+        assert pixels.isfinite().all()
+        gradients = torch.autograd.grad(pixels.sum(), (points, *made.parameters()))
+        assert all(g.isfinite().all() for g in gradients), type(made)
+
+
 def test_a_camera_made_without_coefficients_is_an_ideal_one():
     torch.testing.assert_close(ct.EUCM(INTRINSICS).project(fan(80))[0], ct.Pinhole(INTRINSICS).project(fan(80))[0])
 

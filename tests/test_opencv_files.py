@@ -95,12 +95,54 @@ def test_omnidir(tmp_path, suffix, xi):
     assert torch.equal(again.distortion, camera.distortion)
 
 
-def test_one_xi_for_all(tmp_path):
-    one = ct.Mei([500.0, 500, 320, 240], [1.0, 0, 0, 0, 0])
-    other = ct.Mei([500.0, 500, 320, 240], [1.5, 0, 0, 0, 0])
-    for rig in ({"1": one, "2": other}, {"1": one, "2": ct.Pinhole([500.0, 500, 320, 240])}, {"1": one, "2": one}):
-        with pytest.raises(CameraFileError, match="xi"):
-            ct.save(ct.Rig(rig), tmp_path / "pair.yml", "opencv")
+def test_an_omnidir_pair_as_opencv_writes_it(tmp_path):
+    text = "".join(
+        f"camera_matrix_{i}: {K}\ndistortion_coefficients_{i}: [0.1, 0.01, 0.001, {i}]\nxi_{i}: {i}.5\n" for i in (1, 2)
+    )
+    path = written(tmp_path / "pair.yml", text + "rvec: [0.1, 0.2, 0.3]\ntvec: [1, 2, 3]\n")
+    rig = ct.load(path)
+    assert [camera.distortion.tolist() for camera in rig.cameras.values()] == [
+        [1.5, 0.1, 0.01, 0.001, 1.0],
+        [2.5, 0.1, 0.01, 0.001, 2.0],
+    ]
+    assert rig.extrinsics["2"].rotation.tolist() == [0.1, 0.2, 0.3]
+    assert rig.extrinsics["2"].translation.tolist() == [1, 2, 3]
+    ct.save(rig, path)
+    for name, camera in ct.load(path).cameras.items():
+        assert torch.equal(camera.distortion, rig.cameras[name].distortion)
+
+
+@pytest.mark.parametrize("key", ["dist_coeff", "distCoeff", "dist_coef", "distortion_coefficient", "d", "distCoeffsMat",
+                                 "distortion_params", "distortion_parameters", "dist"])  # fmt: skip
+def test_distortion_by_many_names(path, key):
+    assert ct.load(written(path, f"K: {K}\n{key}: [[0.3, 0.1, 0, 0, 0]]")).camera.distortion.shape == (5,)
+
+
+@pytest.mark.parametrize("key", ["D1", "distCoeffs1", "camera_distortion", "distorsion", "coeffs", "d2", "xi_1"])
+def test_what_looks_like_distortion_is_not_passed_over(path, key):
+    with pytest.raises(CameraFileError, match=rf"camera.yml: {key}: looks like the distortion of a camera"):
+        ct.load(written(path, f"camera_matrix: {K}\n{key}: [0.3, 0.1, 0, 0, 0]"))
+
+
+def test_arrays_of_one_dimension(tmp_path):
+    """As OpenCV 5 writes them."""
+    yaml = f"%YAML:1.0\n---\nK: {K}\nD: !!opencv-nd-matrix\n   sizes: [ 5 ]\n   dt: d\n   data: [ 0.3, 0.1, 0, 0, 0 ]\n"
+    whole = {"K": K, "D": {"type_id": "opencv-nd-matrix", "sizes": [5], "dt": "d", "data": [0.3, 0.1, 0, 0, 0]}}
+    xml = (
+        "<?xml version='1.0'?><opencv_storage><K type_id='opencv-matrix'><rows>3</rows><cols>3</cols><dt>d</dt>"
+        f"<data>{' '.join(map(str, K))}</data></K><D type_id='opencv-nd-matrix'><sizes>5</sizes><dt>d</dt>"
+        "<data>0.3 0.1 0 0 0</data></D></opencv_storage>"
+    )
+    for suffix, text in ((".yml", yaml), (".json", json.dumps(whole)), (".xml", xml)):
+        camera = ct.load(written(tmp_path / f"camera{suffix}", text)).camera
+        assert camera.distortion.tolist() == [0.3, 0.1, 0, 0, 0]
+    with pytest.raises(CameraFileError, match=r"D.data: 5 numbers, where sizes say 6"):
+        ct.load(written(tmp_path / "camera.yml", yaml.replace("[ 5 ]", "[ 6 ]")))
+
+
+def test_many_cameras_in_the_order_of_their_numbers(path):
+    text = "".join(f"K{i}: {K}\n" for i in (10, 2, 1))
+    assert list(ct.load(written(path, text)).cameras) == ["1", "2", "10"]
 
 
 def test_model_argument_decides(path):

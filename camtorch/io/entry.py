@@ -123,11 +123,12 @@ def rendered(rig: Rig | Camera, path, format: str | None = None) -> dict[str, by
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
     path = os.fspath(path)
     format = _known(format) or _format_of(rig, path)
-    if format == "colmap":
-        return colmap.write(rig, path)
-    if os.path.isdir(path):
+    if format != "colmap" and os.path.isdir(path):
         raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
-    return {path: _BY_KEYS[format].render(rig, path).encode()}
+    try:
+        return colmap.write(rig, path) if format == "colmap" else {path: _BY_KEYS[format].render(rig, path).encode()}
+    except UnicodeEncodeError as error:
+        raise CameraFileError(path, "names", f"{error.object!r:.60} is no text that a file can hold") from None
 
 
 def _known(format: str | None) -> str | None:

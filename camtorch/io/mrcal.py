@@ -18,6 +18,7 @@ _MODELS = {
     "LENSMODEL_STEREOGRAPHIC": ("stereographic", 0),
     **{f"LENSMODEL_OPENCV{count}": ("brown_conrady", count) for count in (4, 5, 8, 12, 14)},
 }
+_START = 1 << 16
 _TOKEN = re.compile(
     r"""\s+|\#[^\n]*|(?P<mark>[][{}(),:])|b?(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|(?P<word>[^][\s{}(),:'"#]+)"""
 )
@@ -25,7 +26,9 @@ _TOKEN = re.compile(
 
 def matches_text(text: str) -> bool:
     """Whether this is the start of such a file: comments, a brace, a key in Python's quotes."""
-    return re.match(r"(?:\s|#[^\n]*\n)*\{(?:\s|#[^\n]*\n)*(?:'|\"(?:lens_?model|distortion_model)\")", text) is not None
+    # Python's regular expressions remember every repetition
+    start = re.sub(r"#[^\n]*", "", text[:_START]).split()[:2]
+    return re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)) is not None
 
 
 def parse_literal(path, text: str) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import torch
@@ -35,6 +36,8 @@ class Tabulated(Camera):
     distortion_names = (*(f"theta{i}" for i in range(1, 7)), *(f"r{i}" for i in range(1, 7)))
     default_count = 12
     fit_counts = (128,)
+    # a fit samples the curve; near the axis few pixels would determine so many nodes
+    fit_bounds = MappingProxyType({f"{c}{i}": None for c in ("theta", "r") for i in range(1, 1001)})
     defined_text = "angles that ascend from above 0"
 
     @classmethod
