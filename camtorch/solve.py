@@ -54,10 +54,8 @@ def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
 def radial_scale(domain: Domain, r2: Tensor) -> tuple[Tensor, Tensor]:
     """The factor s by which the inverse of a radial lens scales points of squared radius r2, and whether that is it.
 
-    Newton's method for s R(r2 s^2) = 1, which does not know of an axis. The second is positive where the last step was
-    so short that the next one would be nothing.
-
-    r2: not beyond `RadialInverse.most2`.
+    Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `RadialInverse.most2`. The second is
+    positive where the last step was so short that the next one would be nothing.
     """
     radial, table = domain.lens.radial, domain.inverse
     scale = table(r2)

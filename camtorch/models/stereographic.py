@@ -1,33 +1,21 @@
 """The stereographic fisheye."""
 
-from camtorch.camera import Camera
 from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.models.odd_polynomial import OddPolynomial
 from camtorch.unified import Unified
 
 
-class Stereographic(Camera):
+class Stereographic(OddPolynomial):
     """The stereographic fisheye with a polynomial: r = q (1 + k1 q^2 + k2 q^4 + ...), q = 2 tan(theta / 2).
 
     theta = atan2(hypot(x, y), z), (u, v) = f r (cos phi, sin phi) + c. Angles go up to 180 degrees; the chart is that
-    of `UCM` with alpha = 1/2. A
-    ray is valid before the first root of dr/dq.
+    of `UCM` with alpha = 1/2. A ray is valid before the first root of dr/dq.
 
     Distortion: k1 k2 ..., any number of coefficients, at least one; 4 if left out. Source of the projection: Kannala
     and Brandt, PAMI 2006, equations (2) to (5). See `Camera` for shapes, conventions and errors.
     """
 
     key = "stereographic"
-    distortion_names = ("k1", "k2", "k3", "k4")
-    default_count = 4
-    fit_counts = (4, 6, 8, 10)
-
-    @classmethod
-    def names_of(cls, count):
-        return tuple(f"k{i}" for i in range(1, count + 1)) or None
-
-    @classmethod
-    def counts_text(cls):
-        return "n >= 1 (k1 k2 ...)"
 
     @staticmethod
     def optics(k):
