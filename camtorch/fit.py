@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from camtorch.parameters import columns
 
@@ -176,23 +176,27 @@ def _linearised(camera: Camera, sights: Sights, parameters: Tensor, free: Tensor
     slopes = torch.stack([torch.stack(pair, 1) for pair in derivatives], 1)
     if len(free) > 4:
         along = torch.eye(k.shape[-1], dtype=k.dtype, device=k.device)[free[4:] - 4]
-        by_k = _derivatives(lambda k: torch.stack(see(camera, k, sights.rays)[:2], 1), k, along)
+        by_k = _derivatives(camera, k, sights.rays, along)
         slopes = torch.cat((slopes, by_k * torch.stack((fx, fy), 1)[:, None]), 1)
     # where a derivative is no number, as at the end of a chart, a step goes without it
     slopes = slopes.nan_to_num(0.0, 0.0, 0.0) * sights.weights[:, None, None]
     return _residuals(sights, parameters, seen).flatten(1), slopes.flatten(2)
 
 
-def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor, directions: Tensor) -> Tensor:
-    """(C, D, ...) along (D, n) of a function (C, n) -> (C, ...) whose rows have nothing to do with each other."""
+def _derivatives(camera: Camera, k: Tensor, rays: Tensor, directions: Tensor) -> Tensor:
+    """(C, D, 2, N): of `see` by the coefficients (C, n), along directions (D, n).
 
-    def along(direction: Tensor) -> Tensor:
-        return torch.func.jvp(function, (k,), (direction.expand_as(k),))[1]
-
-    with warnings.catch_warnings():
+    The directions are rows more: vmap over the derivatives of one would take Python's word for many operations.
+    """
+    count = len(directions)
+    with warnings.catch_warnings(), forward_ad.dual_level():
         # on its first use forward mode loads what calls the deprecated torch.jit.script
         warnings.simplefilter("ignore", DeprecationWarning)
-        return torch.func.vmap(along, out_dims=1)(directions)
+        dual = forward_ad.make_dual(k.repeat_interleave(count, 0), directions.repeat(len(k), 1))
+        seen = see(camera, dual, rays.repeat_interleave(count, 0))
+        tangents = [forward_ad.unpack_dual(plane).tangent for plane in seen[:2]]
+    planes = [torch.zeros_like(seen.a) if t is None else t for t in tangents]
+    return torch.stack(planes, 1).unflatten(0, (len(k), count))
 
 
 def _refine(

@@ -13,7 +13,7 @@ from camtorch.analytic import angle_per_radius
 from camtorch.charts import Chart, Equidistant, Perspective, even_steps_and_ratios
 from camtorch.domain import Domain, Optics
 from camtorch.lens import Lens, Planar, Polynomial
-from camtorch.parameters import may_look
+from camtorch.parameters import has_tangent, may_look
 
 FURTHEST = math.tan(math.radians(87))
 """The radius, in focal lengths, up to which pixels have rays."""
@@ -108,7 +108,7 @@ class Inverted(Chart):
         theta2 = torch.minimum(torch.addcmul(x * x, y, y) * angle * angle, self._domain.inverse.most2)
         rows = theta2.detach().reshape(len(self._domain.k), -1)
         found = opaque.radial_scale(self.name, self._domain.k, rows).view_as(theta2)
-        if torch.is_grad_enabled() or not may_look(x):
+        if torch.is_grad_enabled() or not may_look(x) or any(map(has_tangent, (x, y, z, *self.parameters))):
             found = self._attached(found, theta2, order)
         return angle * found
 
