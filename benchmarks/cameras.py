@@ -19,13 +19,31 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "kannala_brandt": _FISHEYE,
     "fisheye62": (*_FISHEYE, 1e-4, 0.0, 1e-3, -5e-4),
     "fisheye624": (*_FISHEYE, 1e-4, 0.0, 1e-3, -5e-4, 1e-3, -1e-4, 5e-4, 1e-4),
+    "thin_prism_fisheye": (0.02, -0.01, 1e-3, -5e-4, 0.003, -0.001, 1e-3, 5e-4),
+    "f_theta": (-0.09, 0.14, -0.02),
+    "f_theta_backward": (0.02, -0.03, 0.004),
+    "woodscape": (-0.09, 0.14, -0.02),
+    # theta (1 + 0.02 theta^2 - 0.01 theta^4 + ...) every 15 degrees
+    "tabulated": (
+        *(math.radians(15 * i) for i in range(1, 9)),
+        *(0.26214, 0.52610, 0.79234, 1.05939, 1.32257, 1.57240, 1.79311, 1.96014),
+    ),
+    "ucm": (0.6,),
+    "eucm": (0.6, 1.1),
+    "double_sphere": (-0.1, 0.6),
+    "mei": (1.2, -0.05, 0.01, 1e-3, -5e-4),
+    "fov": (0.9,),
+    "division": (-0.2,),
+    "equisolid": _FISHEYE,
+    "stereographic": _FISHEYE,
+    "orthographic_fisheye": _FISHEYE,
     "cylindrical": (),
     "equirectangular": (),
 }
 """Of the size that calibrations of such lenses come out with; every term that a model has is at work."""
 
 TIMED_ANGLE = 75
-_PERSPECTIVE = ("pinhole", "brown_conrady")
+_WITHIN_90 = ("pinhole", "brown_conrady", "orthographic_fisheye")
 
 
 def angles(key: str) -> tuple[int, ...]:
@@ -33,7 +51,7 @@ def angles(key: str) -> tuple[int, ...]:
 
     The timed domain, and either one inside the picture of a perspective camera or one past its plane.
     """
-    return (45, TIMED_ANGLE) if key in _PERSPECTIVE else (TIMED_ANGLE, 100)
+    return (45, TIMED_ANGLE) if key in _WITHIN_90 else (TIMED_ANGLE, 100)
 
 
 def intrinsics(size: tuple[int, int]) -> tuple[float, float, float, float]:

@@ -32,7 +32,8 @@ def _blend(t: Tensor, series: list[float], closed_form) -> Tensor:
     )
 
 
-def _root(square: Tensor) -> Tensor:
+def root(square: Tensor) -> Tensor:
+    """The square root, with a finite derivative at zero."""
     # nothing beside 1, and 1 / root^4 is still a number
     return (square + torch.finfo(square.dtype).tiny ** 0.5).sqrt()
 
@@ -40,19 +41,20 @@ def _root(square: Tensor) -> Tensor:
 _COS = [(-1) ** n / math.factorial(2 * n) for n in range(8)]
 _SINC = [(-1) ** n / math.factorial(2 * n + 1) for n in range(8)]
 _COSC = [(-1) ** n / math.factorial(2 * n + 2) for n in range(8)]
+_TANC = [1, 1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1382 / 155925, 21844 / 6081075, 929569 / 638512875]
 _ATAN = [(-1) ** n / (2 * n + 1) for n in range(8)]
 
 
 def cos_root(t: Tensor, order: int = 2) -> Tensor:
     """cos(theta) of t = theta^2."""
-    return _blend(t, _COS, torch.cos) if order > 1 else torch.cos(_root(t))
+    return _blend(t, _COS, torch.cos) if order > 1 else torch.cos(root(t))
 
 
 def sinc_root(t: Tensor, order: int = 2) -> Tensor:
     """sin(theta) / theta of t = theta^2."""
     if order > 1:
         return _blend(t, _SINC, lambda angle: torch.sin(angle) / angle)
-    angle = _root(t)
+    angle = root(t)
     return torch.sin(angle) / angle
 
 
@@ -72,10 +74,15 @@ def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
     Needs rho2 > 0 where z <= 0: the exact backward direction has every azimuth at once.
     """
     if order <= 1:
-        rho = _root(rho2)
+        rho = root(rho2)
         return torch.atan2(rho, z) / rho
     small = (z > 0) & (rho2 < _SMALL_SLOPE2 * z * z)
     reciprocal = 1 / torch.where(small, z, 1.0)
     near = reciprocal * _series(torch.where(small, rho2, 0.0) * reciprocal * reciprocal, _ATAN)
     rho = torch.where(small, 1.0, rho2).sqrt()
     return torch.where(small, near, torch.atan2(rho, z) / rho)
+
+
+def tanc_root(t: Tensor) -> Tensor:
+    """tan(angle) / angle of t = angle^2."""
+    return _blend(t, _TANC, lambda angle: torch.tan(angle) / angle)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # on one azimuth, which stands for all where the lens is radial
 _SMOOTH, _BULGE = 0.02, 0.001
+_DIP = 65  # radii at which a dip between two nodes is looked at
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 
 
@@ -41,9 +42,30 @@ class Azimuths:
         at = lens.at(a.flatten(-2), b.flatten(-2))
         x, y = at.value
         shape = (self.count, self.radii.shape[-1])
-        lost = first_loss(at.sense.unflatten(-1, shape))
+        lost = self._lost(lens, at.sense.unflatten(-1, shape))
         self.limits = self._limits(lost)
         self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
+
+    def _lost(self, lens: Lens, sense: Tensor) -> Tensor:
+        """(C, azimuths): `first_loss`, where dips between coarse nodes count only if a closer look finds them."""
+        spared = torch.zeros_like(sense, dtype=torch.bool)
+        last = sense.shape[-1] - 1
+        a, b = (c.unsqueeze(-1) for c in _directions(self.count, sense))
+        steps = torch.linspace(-1, 1, _DIP, dtype=sense.dtype, device=sense.device)
+        while True:
+            lost = first_loss(sense, spared)
+            node = lost.round().long().clamp(max=last).unsqueeze(-1)
+            assumed = (lost <= last).unsqueeze(-1) & (sense.gather(-1, node) > 0)
+            if not bool(assumed.any()):
+                return lost
+            radius = _radius_at(self.radii.unsqueeze(-2), (node + steps).clamp(0, last).flatten(-2)).unflatten(
+                -1, (self.count, _DIP)
+            )
+            seen = lens.at((a * radius).flatten(-2), (b * radius).flatten(-2)).sense.unflatten(-1, (self.count, _DIP))
+            spared_now = assumed & (seen > 0).all(-1, keepdim=True)
+            if not bool(spared_now.any()):
+                return lost
+            spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
 
     def _limits(self, lost: Tensor) -> Tensor:
         """(C, azimuths): the radius, up to the next azimuth, before which the sense at the point itself decides."""
@@ -140,12 +162,16 @@ def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
     return torch.cummax(torch.where(before, reach, torch.inf), -1).values
 
 
-def first_loss(sense: Tensor) -> Tensor:
-    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where the sense is first lost; S where it never is."""
+def first_loss(sense: Tensor, spared: Tensor | None = None) -> Tensor:
+    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where the sense is first lost; S where it never is.
+
+    spared: bool, the nodes next to which no dip is assumed.
+    """
     before, here, after = sense[..., :-2], sense[..., 1:-1], sense[..., 2:]
     bend, tilt = before - 2 * here + after, before - after
     bend_safe = torch.where(bend > 0, bend, 1.0)
     dips = (bend > 0) & (tilt.abs() <= bend) & (here - tilt * tilt / (8 * bend_safe) <= 0)
+    dips = dips if spared is None else dips & ~spared[..., 1:-1]
     offset = torch.where(dips & (here > 0), tilt / (2 * bend_safe), 0.0)
     nodes = torch.arange(sense.shape[-1], dtype=sense.dtype, device=sense.device)
     inner = torch.where(dips | ~(here > 0), nodes[1:-1] + offset, torch.inf)

@@ -15,7 +15,9 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch import mapping
+from camtorch.charts import Chart
 from camtorch.domain import Domain
+from camtorch.lens import Lens
 from camtorch.parameters import columns
 from camtorch.solve import invert, newton_step, search
 
@@ -125,10 +127,14 @@ class Project(Function):
             scale = mapping.replace(mask, scales[here], 1.0) if scales.numel() else None
             at = block.domain.lens.at(*chart.to_plane(x, y, z, 1, scale))
             sums.add_intrinsics(block, gu, gv, *at.value)
-            (ga, gb), by_lens = at.pull(gu * block.intrinsics[0], gv * block.intrinsics[1], sums.wants_lens)
-            sums.add_lens(block, by_lens)
+            wanted = sums.wants_distortion
+            (ga, gb), by_lens = at.pull(gu * block.intrinsics[0], gv * block.intrinsics[1], wanted)
+            by_ray, by_chart = (), []
+            if by_points is not None or (wanted and chart.parameters):
+                by_ray, by_chart = chart.pull_point(x, y, z, ga, gb, scale, wanted)
+            sums.add_optics(block, by_chart + by_lens)
             if by_points is not None:
-                for i, w in enumerate(chart.pull_point(x, y, z, ga, gb, scale)):
+                for i, w in enumerate(by_ray):
                     by_points[here][..., i] = w if shrink is None else w * shrink
         return by_points, *sums.result(), None, None, None
 
@@ -152,7 +158,8 @@ class Unproject(Function):
             a, b, found = search(cameras.domain, camera, *target)
             (some,) = found.nonzero(as_tuple=True)
             here, a, b = (camera[some], point[some]), a[some], b[some]
-            _write(rays, here, cameras.domain.chart.to_ray(a, b, 1))
+            chart, _ = cameras.domain.optics_of(camera[some])
+            _write(rays, here, chart.to_ray(a, b, 1))
             _write(solution, here, (a, b))
             valid[here] = True
         if keeps:
@@ -178,13 +185,14 @@ class Unproject(Function):
             if not bool(valid[here].all()):
                 # what comes back of an invalid pixel need not be finite
                 gx, gy, gz = (torch.where(valid[here], g, 0.0) for g in (gx, gy, gz))
-            ga, gb = block.domain.chart.pull_ray(a, b, gx, gy, gz)
+            (ga, gb), by_optics = block.domain.chart.pull_ray(a, b, gx, gy, gz, sums.wants_distortion)
             at = block.domain.lens.at(a, b)
             if at.stages:
                 ua, ub, va, vb = at.jacobian
                 ga, gb = newton_step((ua, va, ub, vb), ga, gb)
-                if sums.wants_lens:
-                    sums.add_lens(block, at.pull(-ga, -gb)[1])
+                if sums.wants_distortion:
+                    by_optics = by_optics + at.pull(-ga, -gb)[1]
+            sums.add_optics(block, by_optics)
             focal_x, focal_y, _, _ = block.intrinsics
             ga, gb = ga / focal_x, gb / focal_y
             sums.add_intrinsics(block, -ga, -gb, *at.value)
@@ -236,10 +244,11 @@ class _Sums:
 
     def __init__(self, cameras: Cameras, needs_input_grad: tuple[bool, ...], like: Tensor):
         self.cameras = cameras
-        self.wants_intrinsics, self.wants_lens = needs_input_grad[1:3]
+        self.wants_intrinsics, self.wants_distortion = needs_input_grad[1:3]
         count = len(cameras.intrinsics)
         self.intrinsics = like.new_zeros(count, 4)
-        self.lens = [like.new_zeros(count, 1) for _ in cameras.domain.lens.parameters] if self.wants_lens else []
+        learning = _parameters(cameras.domain.chart, cameras.domain.lens) if self.wants_distortion else ()
+        self.optics = [like.new_zeros(count, 1) for _ in learning]
 
     def add_intrinsics(self, block: _Block, gu: Tensor, gv: Tensor, x: Tensor, y: Tensor) -> None:
         """gu, gv: the cotangents of pixels. x, y: the points on the plane of the lens."""
@@ -247,20 +256,25 @@ class _Sums:
             for i, plane in enumerate((gu * x, gv * y, gu, gv)):
                 self.intrinsics[block.cameras, i] += plane.sum(-1)
 
-    def add_lens(self, block: _Block, sums: list[Tensor]) -> None:
-        for total, part in zip(self.lens, sums, strict=True):
+    def add_optics(self, block: _Block, sums: list[Tensor]) -> None:
+        """sums: those of the chart's parameters, then those of the lens."""
+        for total, part in zip(self.optics, sums, strict=True):
             total[block.cameras] += part
 
     def result(self) -> tuple[Tensor | None, Tensor | None]:
-        """Those of the intrinsics and of the distortion, whose part in the lens is whatever the model says."""
+        """Those of the intrinsics and of the distortion, whose part in chart and lens is whatever the model says."""
         by_distortion = None
-        if self.wants_lens:
+        if self.wants_distortion:
             with torch.enable_grad():
                 k = self.cameras.domain.k.detach().requires_grad_()
-                pairs = zip(self.cameras.domain.optics(columns(k))[1].parameters, self.lens, strict=True)
+                pairs = zip(_parameters(*self.cameras.domain.optics(columns(k))), self.optics, strict=True)
                 outputs, sums = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
                 (by_distortion,) = torch.autograd.grad(outputs, k, sums, materialize_grads=True)
         return self.intrinsics if self.wants_intrinsics else None, by_distortion
+
+
+def _parameters(chart: Chart, lens: Lens) -> tuple[Tensor, ...]:
+    return *chart.parameters, *lens.parameters
 
 
 def _by_formulas(again: Callable, inputs: list[Tensor], needs_input_grad: tuple[bool, ...], cotangent: Tensor):

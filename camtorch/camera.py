@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -30,9 +30,6 @@ from camtorch.parameters import (
 from camtorch.picture import Picture
 from camtorch.solve import invert
 
-if TYPE_CHECKING:
-    pass
-
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
@@ -50,7 +47,8 @@ class Camera(Convertible, Picture):
 
     Args:
         intrinsics: (*B, 4) fx, fy, cx, cy in pixels.
-        distortion: (*B, n) coefficients in the order of `distortion_names`; zeros if left out.
+        distortion: (*B, n) coefficients in the order of `distortion_names`; those of `ideal`, which are zeros unless
+            the model says otherwise, if left out.
         image_size: (height, width) in pixels, shared by the batch; needed only where a picture is concerned.
 
     Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s of the shapes above. An `nn.Parameter`
@@ -58,14 +56,16 @@ class Camera(Convertible, Picture):
     them, and a lens shared by a batch stays one.
 
     Raises:
-        ValueError: a wrong shape or number of coefficients, NaN or infinite values, a focal length or an
-            image size that is not positive.
+        ValueError: a wrong shape or number of coefficients, NaN or infinite values, coefficients for which the
+            formula does not exist, a focal length or an image size that is not positive.
         TypeError: parameters that are not numbers, an image size that is not two integers.
     """
 
     key: ClassVar[str]
     default_count: ClassVar[int] = 0
-    """How many zero coefficients a camera has that is made without distortion."""
+    """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
+    defined_text: ClassVar[str] = ""
+    """In words, what `defined` asks for."""
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
@@ -85,7 +85,8 @@ class Camera(Convertible, Picture):
         if is_concrete(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
             raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
         if distortion is None:
-            distortion = intrinsics.detach().new_zeros((*intrinsics.shape[:-1], self.default_count))
+            ideal = intrinsics.new_tensor(self.ideal(self.default_count))
+            distortion = ideal.expand(*intrinsics.shape[:-1], self.default_count)
         distortion = as_real(distortion, "distortion", owner)
         names = self.names_of(distortion.shape[-1]) if distortion.ndim else None
         if names is None:
@@ -93,6 +94,9 @@ class Camera(Convertible, Picture):
                 f"{owner}: distortion must be (*B, n) with {self.counts_text()}; got shape {tuple(distortion.shape)}"
             )
         batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
+        defined = self.defined(distortion.unbind(-1))
+        if defined is not None and is_concrete(distortion) and not bool((defined > 0).all()):
+            raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
         self._memo = Memo()
@@ -110,6 +114,16 @@ class Camera(Convertible, Picture):
     def names_of(cls, count: int) -> tuple[str, ...] | None:
         """The names of that many coefficients, or None if the model does not take so many."""
         return tuple(cls.distortion_names) if count == len(cls.distortion_names) else None
+
+    @classmethod
+    def ideal(cls, count: int) -> tuple[float, ...]:
+        """That many coefficients of a camera that nothing is known of. They take the place of unusable ones too."""
+        return (0.0,) * count
+
+    @staticmethod
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
+        """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
+        return None
 
     @classmethod
     def counts_text(cls) -> str:
@@ -138,11 +152,10 @@ class Camera(Convertible, Picture):
 
     def _project_by_formulas(self, points: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
         intrinsics, distortion, domain, usable = self._traced(points, intrinsics, distortion)
-        chart = domain.chart
 
         def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-            ray = mapping.to_ray(chart, x, y, z)
-            a, b, mask = mapping.see(ray, chart, self.optics(columns(distortion))[1], domain, order)
+            ray = mapping.to_ray(domain.chart, x, y, z)
+            a, b, mask = mapping.see(ray, *self.optics(columns(distortion)), domain, order)
             mask = mapping.both(mask, usable)
             focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
             pixels = focal_x * a + centre_x, focal_y * b + centre_y
@@ -167,7 +180,6 @@ class Camera(Convertible, Picture):
 
     def _unproject_by_formulas(self, pixels: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
         intrinsics, distortion, domain, usable = self._traced(pixels, intrinsics, distortion)
-        chart = domain.chart
         u, v = to_planes(pixels)
         p, q, mask = mapping.to_target(u.detach(), v.detach(), columns(intrinsics.detach()))
         mask = mapping.both(mask, usable)
@@ -177,14 +189,14 @@ class Camera(Convertible, Picture):
             solved = mapping.to_mask(found.solved)
             solution = mapping.clean(solved, found)
         else:
-            solved = mapping.to_mask(chart.on_plane(p, q))
+            solved = mapping.to_mask(domain.chart.on_plane(p, q))
             solution = mapping.replace(solved, p, 0.0), mapping.replace(solved, q, 0.0)
         mask = mapping.both(mask, solved)
 
         def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
             target = mapping.to_target(u, v, columns(intrinsics))
-            lens = self.optics(columns(distortion))[1]
-            return torch.stack(mapping.rays_of(solution, target[:2], mask, chart, lens, order))
+            optics = self.optics(columns(distortion))
+            return torch.stack(mapping.rays_of(solution, target[:2], mask, *optics, order))
 
         if torch.compiler.is_compiling() and not any(t.requires_grad for t in (pixels, intrinsics, distortion)):
             order = 0
@@ -210,9 +222,9 @@ class Camera(Convertible, Picture):
 
         def look() -> Cameras:
             with torch.no_grad():
-                usable = _usable(intrinsics, distortion)
-                values = (torch.where(usable, t.detach(), ideal) for t, ideal in ((intrinsics, 1.0), (distortion, 0.0)))
-                values = [t.clone() for t in values]
+                usable = self._usable(intrinsics, distortion)
+                ideal = (intrinsics, 1.0), (distortion, self._ideal(distortion))
+                values = [torch.where(usable, t.detach(), w).clone() for t, w in ideal]
                 mask = None if may_look(usable) and bool(usable.all()) else usable.to(intrinsics.dtype)
                 return Cameras(values[0], opaque.domain_of(self._model, values[1], self.optics), mask)
 
@@ -221,22 +233,34 @@ class Camera(Convertible, Picture):
     def _traced(self, rows: Tensor, intrinsics: Tensor, distortion: Tensor):
         """The parameters that can be used, their domain, and the mask of the usable cameras, while values are traced.
 
-        A camera that learning drove to NaN or to a focal length that is not positive is replaced by
-        an ideal one, and all its results are invalid.
+        A camera that learning drove to NaN, to a focal length that is not positive or to coefficients without a
+        formula is replaced by an ideal one, and all its results are invalid.
         """
         if all(is_concrete(t) and not has_tangent(t) for t in (intrinsics, distortion)):
             cameras = self._cameras(intrinsics, distortion)
             domain, usable = cameras.domain, cameras.usable
         else:
-            finite = _usable(intrinsics.detach(), distortion.detach())
-            usable = finite.to(rows.dtype)
-            k = torch.where(finite, distortion.detach(), 0.0)
+            able = self._usable(intrinsics.detach(), distortion.detach())
+            usable = able.to(rows.dtype)
+            k = torch.where(able, distortion.detach(), self._ideal(distortion))
             domain = Domain(self.optics, k)
             if domain.lens.stages:
                 domain.with_tables(*tables(self._model, k))
         if usable is not None:
-            intrinsics, distortion = (torch.where(usable > 0, t, w) for t, w in ((intrinsics, 1.0), (distortion, 0.0)))
+            ideal = (intrinsics, 1.0), (distortion, self._ideal(distortion))
+            intrinsics, distortion = (torch.where(usable > 0, t, w) for t, w in ideal)
         return intrinsics, distortion, domain, usable
+
+    def _ideal(self, like: Tensor) -> float | Tensor:
+        ideal = self.ideal(like.shape[-1])
+        return torch.tensor(ideal, dtype=like.dtype, device=like.device) if any(ideal) else 0.0
+
+    def _usable(self, intrinsics: Tensor, distortion: Tensor) -> Tensor:
+        """Bool (C, 1): finite, with focal lengths that are positive, and coefficients for which the formula exists."""
+        finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
+        usable = finite & (intrinsics[..., :2] > 0).all(-1)
+        defined = self.defined(distortion.unbind(-1))
+        return (usable if defined is None else usable & (defined > 0)).unsqueeze(-1)
 
     @property
     def _tensors(self) -> tuple[Tensor, Tensor]:
@@ -262,12 +286,6 @@ class Camera(Convertible, Picture):
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
         return ", ".join(parts)
-
-
-def _usable(intrinsics: Tensor, distortion: Tensor) -> Tensor:
-    """Bool (C, 1): finite, and with focal lengths that are positive."""
-    finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
-    return (finite & (intrinsics[..., :2] > 0).all(-1)).unsqueeze(-1)
 
 
 def _per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

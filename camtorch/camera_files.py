@@ -10,16 +10,17 @@ from camtorch.io import load, opencv
 from camtorch.rig import Rig
 
 
-def read_rig(path: Path, name: str | None = None, model: str | None = None) -> Rig:
+def read_rig(path: Path, name: str | None = None, model: str | None = None, size: tuple[int, int] | None = None) -> Rig:
     """The cameras of a file, none of which learns.
 
     Args:
         path: a file of any format.
         name: the only camera wanted.
         model: a key of `camtorch.MODELS`, for OpenCV's files, which may not say it.
+        size: (height, width), for cameras whose file does not say it.
 
     Raises:
-        CameraFileError: the file cannot be used. ValueError: no camera of that name.
+        CameraFileError: the file cannot be used. ValueError: no camera of that name, or of another size.
     """
     with warnings.catch_warnings():
         if model is not None:  # then it does not matter what the file might mean
@@ -32,9 +33,19 @@ def read_rig(path: Path, name: str | None = None, model: str | None = None) -> R
             raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig.cameras)}")
         pose = {name: rig.extrinsics[name]} if name in rig.extrinsics else {}
         rig = Rig({name: rig.camera_of(name)}, pose, format=rig.format)
-    for camera in rig.cameras.values():
+    for found, camera in rig.cameras.items():
         camera.requires_grad_(False)
+        if size is not None and camera.image_size not in (None, size):
+            height, width = camera.image_size
+            raise ValueError(f"{path}: {found} is for {width}x{height}, not {size[1]}x{size[0]}")
+        camera.image_size = camera.image_size or size
     return rig
+
+
+def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
+    """The camera to compare with: the only one of its file, or the one of that name."""
+    only = len(read_rig(path, None, model).cameras) == 1
+    return read_camera(path, None if only else name, model)
 
 
 def read_camera(path: Path, name: str | None = None, model: str | None = None) -> Camera:

@@ -4,6 +4,7 @@ A chart works on component planes, not on interleaved triples. It states which r
 points of its plane are the image of a ray; the camera hands it nothing else, so no chart guards its own formulas.
 """
 
+import copy
 import math
 
 import torch
@@ -40,6 +41,12 @@ class Chart:
     has_scale = True
     """Whether the plane point is (x, y) times a `scale`."""
 
+    parameters: tuple[Tensor, ...] = ()
+    """What the formulas learn: columns that broadcast against planes, in the order of their cotangents.
+
+    The formulas read them here, and nothing else that depends on the coefficients.
+    """
+
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Positive for the rays that this chart has a point for."""
         raise NotImplementedError
@@ -60,9 +67,11 @@ class Chart:
         scale = self.scale(x, y, z, order) if scale is None else scale
         return x * scale, y * scale
 
-    def pull_point(self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None) -> Planes3:
-        """The cotangent of a covered ray, of the cotangent of its plane point."""
-        return _pull(lambda *ray: self.to_plane(*ray, order=1), (x, y, z), (ga, gb))
+    def pull_point(
+        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
+    ) -> tuple[Planes3, list[Tensor]]:
+        """The cotangents of a covered ray and of the parameters, these summed over the rays, of that of its point."""
+        return self._pull(type(self).to_plane, (x, y, z), (ga, gb), want_parameters)
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         """Positive for the points of the plane that are the image of a ray."""
@@ -72,15 +81,28 @@ class Chart:
         """The unit ray of points on the plane; see `to_plane`."""
         raise NotImplementedError
 
-    def pull_ray(self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor) -> Planes2:
-        """The cotangent of a point on the plane, of the cotangent of its ray."""
-        return _pull(lambda *point: self.to_ray(*point, order=1), (a, b), (gx, gy, gz))
+    def pull_ray(
+        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
+    ) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of a point on the plane and of the parameters, these summed, of the cotangent of its ray."""
+        return self._pull(type(self).to_ray, (a, b), (gx, gy, gz), want_parameters)
 
-    def end(self, dtype: torch.dtype) -> float:
-        """The radius on the plane at which the chart ends. Only charts that a lens follows need it."""
+    def _pull(self, formula, inputs: tuple[Tensor, ...], cotangents: tuple[Tensor, ...], want_parameters: bool):
+        """By autograd: for charts that leave their derivatives to it."""
+        with torch.enable_grad():
+            learning = copy.copy(self)
+            learning.parameters = tuple(w.detach().requires_grad_(want_parameters) for w in self.parameters)
+            leaves = [w.detach().requires_grad_() for w in inputs]
+            wanted = leaves + (list(learning.parameters) if want_parameters else [])
+            results = formula(learning, *leaves, order=1)
+            gradients = torch.autograd.grad(results, wanted, cotangents, materialize_grads=True)
+        return gradients[: len(inputs)], list(gradients[len(inputs) :])
+
+    def end(self, dtype: torch.dtype) -> float | Tensor:
+        """The radius on the plane at which the chart ends, one or (C, 1). Only charts that a lens follows need it."""
         raise NotImplementedError
 
-    def usual_end(self, dtype: torch.dtype) -> float:
+    def usual_end(self, dtype: torch.dtype) -> float | Tensor:
         """The radius beyond which no picture reaches; inverses are tabulated up to there."""
         return self.end(dtype)
 
@@ -92,13 +114,8 @@ class Chart:
         raise NotImplementedError
 
 
-def _pull(function, inputs: tuple[Tensor, ...], cotangents: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    with torch.enable_grad():
-        leaves = [w.detach().requires_grad_() for w in inputs]
-        return torch.autograd.grad(function(*leaves), leaves, cotangents)
-
-
-def _even_steps_and_ratios(count: int, steps_to: float, end: float, like: Tensor, bend) -> Tensor:
+def even_steps_and_ratios(count: int, steps_to: float, end: float, like: Tensor, bend) -> Tensor:
+    """(count,) radii for `Chart.radii`: bend makes radii of even steps up to `steps_to`; the ratios go on to `end`."""
     options = {"dtype": like.dtype, "device": like.device}
     steps = bend(torch.linspace(0, steps_to, count // 2, **options))
     ratios = torch.linspace(math.log(_SMALLEST_RADIUS), math.log(end), count - count // 2, **options).exp()
@@ -127,9 +144,9 @@ class Perspective(Chart):
     def scale(self, x, y, z, order=2):
         return z.reciprocal()
 
-    def pull_point(self, x, y, z, ga, gb, scale):
+    def pull_point(self, x, y, z, ga, gb, scale, want_parameters):
         gx, gy = ga * scale, gb * scale
-        return gx, gy, torch.addcmul(gx * x, gy, y) * -scale
+        return (gx, gy, torch.addcmul(gx * x, gy, y) * -scale), []
 
     def on_plane(self, a, b):
         return self.end(a.dtype) - torch.maximum(a.abs(), b.abs())
@@ -138,13 +155,13 @@ class Perspective(Chart):
         z = torch.addcmul(a * a + 1, b, b).rsqrt()
         return a * z, b * z, z
 
-    def pull_ray(self, a, b, gx, gy, gz):
+    def pull_ray(self, a, b, gx, gy, gz, want_parameters):
         z = torch.addcmul(a * a + 1, b, b).rsqrt()
         along = z * z * torch.addcmul(torch.addcmul(gz, gx, a), gy, b)
-        return z * (gx - along * a), z * (gy - along * b)
+        return (z * (gx - along * a), z * (gy - along * b)), []
 
     def radii(self, count, like):
-        return _even_steps_and_ratios(count, math.radians(88), self.end(like.dtype), like, torch.tan)
+        return even_steps_and_ratios(count, math.radians(88), self.end(like.dtype), like, torch.tan)
 
 
 class Equidistant(Chart):
@@ -161,13 +178,13 @@ class Equidistant(Chart):
     def scale(self, x, y, z, order=2):
         return angle_per_radius(torch.addcmul(x * x, y, y), z, order)
 
-    def pull_point(self, x, y, z, ga, gb, scale):
+    def pull_point(self, x, y, z, ga, gb, scale, want_parameters):
         rho2 = torch.addcmul(x * x, y, y)
         along = torch.addcmul(ga * x, gb, y)
         gz = -along / torch.addcmul(rho2, z, z)
         # along times twice the derivative of the scale by rho2; what cancels at the axis is multiplied by rho2
         outwards = torch.addcmul(gz * z, along, scale) / -(rho2 + floor_of(z.dtype))
-        return torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz
+        return (torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz), []
 
     def on_plane(self, a, b):
         return math.pi**2 - torch.addcmul(a * a, b, b)
@@ -177,17 +194,27 @@ class Equidistant(Chart):
         sinc = sinc_root(theta2, order)
         return a * sinc, b * sinc, cos_root(theta2, order)
 
-    def pull_ray(self, a, b, gx, gy, gz):
+    def pull_ray(self, a, b, gx, gy, gz, want_parameters):
         theta2 = torch.addcmul(a * a, b, b)
         sinc, cos = sinc_root(theta2, 1), cos_root(theta2, 1)
         along = torch.addcmul(gx * a, gy, b) * (cos - sinc) / (theta2 + floor_of(a.dtype)) - gz * sinc
-        return torch.addcmul(gx * sinc, a, along), torch.addcmul(gy * sinc, b, along)
+        return (torch.addcmul(gx * sinc, a, along), torch.addcmul(gy * sinc, b, along)), []
 
     def end(self, dtype):
         return math.pi
 
     def radii(self, count, like):
-        return _even_steps_and_ratios(count, math.pi, math.pi, like, torch.positive)
+        return even_steps_and_ratios(count, math.pi, math.pi, like, torch.positive)
+
+
+class EquidistantUpTo(Equidistant):
+    """The equidistant chart of a lens that is known up to some angle."""
+
+    def __init__(self, last: Tensor):
+        self.last = last.detach()
+
+    def end(self, dtype):
+        return self.last.clamp(max=math.pi)
 
 
 def _half_turn(dtype: torch.dtype) -> float:

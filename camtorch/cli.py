@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from camtorch import __version__, convert_cli
+from camtorch.picture_size import picture_size
 
-_LARGEST_SIDE = 32768
 _STRIP_PIXELS = 1 << 21
 _MOST_TILES = 100
 
@@ -63,7 +63,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DEGREES",
         help="horizontal field of view of the new picture; by default that of the old one, up to 120 in perspective",
     )
-    dewarp.add_argument("--size", type=_size, metavar="WxH", help="size of the new picture; by default the old one's")
+    dewarp.add_argument(
+        "--size", type=picture_size, metavar="WxH", help="size of the new picture; by default the old one's"
+    )
 
     augment = commands.add_parser(
         "augment",
@@ -82,7 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     augment.add_argument("--list", action="store_true", help="print the presets, and nothing else")
     augment.add_argument("-n", type=int, default=8, metavar="COUNT", help="how many other cameras; 8 by default")
     augment.add_argument("--seed", type=int, default=0, help="of what is drawn; 0 by default")
-    augment.add_argument("--size", type=_size, metavar="WxH", help="of the new pictures; by default the old one's")
+    augment.add_argument(
+        "--size", type=picture_size, metavar="WxH", help="of the new pictures; by default the old one's"
+    )
     for name in ("yaw", "pitch", "roll", "zoom", "fov"):
         augment.add_argument(f"--{name}", type=_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
 
@@ -117,17 +121,6 @@ def _parser() -> argparse.ArgumentParser:
 
 def _note(text: object) -> None:
     print("camtorch: note:", text, file=sys.stderr)
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) of "WIDTHxHEIGHT"."""
-    sides = text.lower().split("x")
-    if len(sides) != 2 or not all(side.isascii() and side.isdigit() and len(side) < 9 for side in sides):
-        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT, as in 1280x720")
-    width, height = map(int, sides)
-    if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
-        raise argparse.ArgumentTypeError(f"{text!r}: each side must be 1 to {_LARGEST_SIDE} pixels")
-    return height, width
 
 
 def _range(text: str) -> float | tuple[float, float]:

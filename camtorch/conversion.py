@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from camtorch.fit import Sights, fit, see
+from camtorch import survey
+from camtorch.fit import even_out, fit, see
 from camtorch.parameters import as_image_size, as_whole
 from camtorch.related import carried, default_count
 
@@ -18,9 +21,10 @@ if TYPE_CHECKING:
     from camtorch.camera import Camera
 
 _FIT_SIDE, _CHECK_SIDE = 33, 193  # of the lattices of pixels to fit to, and to check with
-_ANGLES, _AZIMUTHS, _RADII = 181, 16, 64  # at which a camera is looked at as a whole
-_END_AHEAD = math.radians(87)  # of rays, for a camera without a picture that does not see sideways
 _ROWS = 64  # of a batch that are worked on at a time
+
+
+_WORTH_IT = 0.5  # of the largest error before: then more coefficients are taken
 
 
 @dataclass
@@ -60,33 +64,42 @@ class Conversion:
 
 
 @torch.no_grad()
-def convert(source: Camera, model: type[Camera] | str, *, count, image_size, max_angle, **options) -> Conversion:
+def convert(
+    source: Camera, model: type[Camera] | str, *, count, image_size, max_angle, tolerance, **options
+) -> Conversion:
     """See `Camera.convert`."""
     model = _model(model)
     owner = f"{type(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
-    if max_angle is not None and not float(max_angle) > 0:
-        raise ValueError(f"{owner}: max_angle must be positive radians; got {max_angle}")
-    count = default_count(model, source) if count is None else as_whole(count, "count", owner)
-    names = model.names_of(count) if count >= 0 else None
-    if names is None:
+    if max_angle is not None and not 0 < float(max_angle) <= math.pi * (1 + 1e-6):
+        raise ValueError(f"{owner}: max_angle must be positive radians, up to pi; got {max_angle}")
+    if not float(tolerance) > 0:
+        raise ValueError(f"{owner}: tolerance must be positive; got {tolerance}")
+    if count is None:
+        least = default_count(model, source)
+        counts = least, *(n for n in model.fit_counts if n > least)
+    else:
+        counts = (as_whole(count, "count", owner),)
+    if counts[0] < 0 or model.names_of(counts[0]) is None:
         raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}; got count={count}")
 
     def made(parameters: Tensor) -> Camera:
         intrinsics, distortion = parameters[..., :4], parameters[..., 4:]
-        arguments = (intrinsics, distortion) if count else (intrinsics,)
+        arguments = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
         return model(*arguments, image_size=image_size, **options).double()
 
     limit = math.pi if max_angle is None else min(math.pi, float(max_angle))
     batch = source.batch_shape
     tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
     parts = [
-        _converted(_with_numbers(source, *numbers), model, names, made, image_size, limit)
+        _by_counts(_Task(_with_numbers(source, *numbers), model, made, image_size, limit, float(tolerance)), counts)
         for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True)
     ]
-    parameters, *numbers = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
-    camera = made(parameters.reshape(*batch, -1)).freeze_like(source)
-    return Conversion(camera, *(n.reshape(batch) for n in numbers), type(source).__name__)
+    parameters, *numbers = zip(*parts, strict=True)
+    most = max(p.shape[-1] for p in parameters)
+    parameters = torch.cat([_padded(p, most) for p in parameters])
+    camera = made(parameters.reshape(*batch, most)).freeze_like(source)
+    return Conversion(camera, *(torch.cat(n).reshape(batch) for n in numbers), type(source).__name__)
 
 
 def _model(model) -> type[Camera]:
@@ -94,7 +107,11 @@ def _model(model) -> type[Camera]:
 
     if isinstance(model, str):
         if model not in MODELS:
-            raise ValueError(f"there is no camera model {model!r}; known are {', '.join(sorted(MODELS))}")
+            by_name = {cls.__name__: key for key, cls in MODELS.items()}
+            close = difflib.get_close_matches(model.lower(), [*MODELS, *map(str.lower, by_name)], 1)
+            lower = {name.lower(): key for name, key in by_name.items()}
+            meant = f"did you mean {lower.get(close[0], close[0])!r}? Known" if close else "known"
+            raise ValueError(f"there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")
         return MODELS[model]
     if not (isinstance(model, type) and issubclass(model, Camera) and hasattr(model, "key")):
         raise TypeError(f"convert takes a camera model, or its key in ct.MODELS; got {model!r}")
@@ -110,11 +127,77 @@ def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Cam
     return camera.requires_grad_(False)
 
 
-def _converted(source: Camera, model, names, made, image_size, limit: float) -> tuple[Tensor, ...]:
+class _Task(NamedTuple):
+    """Some rows to convert."""
+
+    source: Camera
+    model: type[Camera]
+    made: Callable[[Tensor], Camera]
+    image_size: tuple[int, int] | None
+    limit: float
+    tolerance: float
+
+    def of(self, rows: Tensor) -> _Task:
+        """Those of the rows."""
+        return self._replace(source=_with_numbers(self.source, *(t[rows] for t in self.source._tensors)))
+
+
+class _Result(NamedTuple):
     """Parameters (C, 4 + n), and the numbers of a `Conversion`, (C,) each."""
-    slopes = _slopes(source)
-    view = _view(source, image_size, _FIT_SIDE, limit)
-    starts = model.fit_start(names, *_radii(source, slopes, torch.where(view.valid, view.angles, 0.0).amax(-1)))
+
+    parameters: Tensor
+    rms: Tensor
+    max_error: Tensor
+    max_angle: Tensor
+    valid_fraction: Tensor
+    exact: Tensor
+
+    def replaced(self, rows: Tensor, other: _Result) -> _Result:
+        """With other results in the place of these rows."""
+        if len(rows) == 0:
+            return self
+        width = max(self.parameters.shape[-1], other.parameters.shape[-1])
+        results = [_padded(self.parameters, width).clone(), *(t.clone() for t in self[1:])]
+        for result, new in zip(results, (_padded(other.parameters, width), *other[1:]), strict=True):
+            result[rows] = new
+        return _Result(*results)
+
+    def of(self, rows: Tensor) -> _Result:
+        """Those of the rows."""
+        return _Result(*(t[rows] for t in self))
+
+
+def _padded(parameters: Tensor, width: int) -> Tensor:
+    return torch.nn.functional.pad(parameters, (0, max(width - parameters.shape[-1], 0)))
+
+
+def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
+    """Each row with the first number of coefficients that keeps the tolerance; or, if none does, that is worth it."""
+    result = _converted(task, counts[0])
+    for count in counts[1:]:
+        rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        other = _converted(task.of(rows), count)
+        enough = (_WORTH_IT * result.max_error[rows]).clamp(min=task.tolerance)
+        (good,) = ((other.max_error <= enough) & _as_far(other.max_angle, result.max_angle[rows])).nonzero(
+            as_tuple=True
+        )
+        result = result.replaced(rows[good], other.of(good))
+    return result
+
+
+def _as_far(angle: Tensor, before: Tensor) -> Tensor:
+    return angle >= before * (1 - 1e-9)  # measured on another batch, it is rounded otherwise
+
+
+def _converted(task: _Task, count: int) -> _Result:
+    source, model, made = task.source, task.model, task.made
+    names = model.names_of(count)
+    slopes = survey.slopes_at_axis(source)
+    view = survey.view(source, task.image_size, _FIT_SIDE, task.limit)
+    fine = survey.view(source, task.image_size, _CHECK_SIDE, task.limit)
+    starts = model.fit_start(names, *survey.radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
@@ -125,18 +208,31 @@ def _converted(source: Camera, model, names, made, image_size, limit: float) -> 
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
     rows = (~exact).nonzero()[:, 0]
     if len(rows):
-        sights = Sights(view.rays, view.pixels, view.valid.to(slopes.dtype)).of(rows)
-        parameters[rows] = fit(made(parameters), sights, starts[:, rows], slopes[rows])
-    target = made(parameters)
-    check = _view(source, image_size, _CHECK_SIDE, limit)
-    whole = check if limit == math.pi else _view(source, image_size, _CHECK_SIDE, math.pi)
-    return parameters, *_numbers(target, parameters[:, 4:], exact, check, whole), exact
+        parameters[rows] = fit(made(parameters), view.sights.of(rows), starts[:, rows], slopes[rows])
+    result = _measured(task, parameters, exact)
+    # no camera of the model has a largest error below the least root of the mean square
+    rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
+    if len(rows):
+        sights = survey.rings(task.of(rows).source, task.image_size, _FIT_SIDE, task.limit).sights
+        evened = _measured(task.of(rows), even_out(made(parameters), sights, parameters[rows]), exact[rows])
+        (better,) = (
+            (evened.max_error < result.max_error[rows]) & _as_far(evened.max_angle, result.max_angle[rows])
+        ).nonzero(as_tuple=True)
+        result = result.replaced(rows[better], evened.of(better))
+    return result
 
 
-def _numbers(target: Camera, k: Tensor, exact: Tensor, check: _View, whole: _View) -> tuple[Tensor, ...]:
+def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
+    check = survey.view(task.source, task.image_size, _CHECK_SIDE, task.limit)
+    whole = check if task.limit == math.pi else survey.view(task.source, task.image_size, _CHECK_SIDE, math.pi)
+    numbers = _numbers(task.made(parameters), parameters[:, 4:], exact, check, whole)
+    return _Result(parameters, *numbers, exact)
+
+
+def _numbers(target: Camera, k: Tensor, exact: Tensor, check: survey.View, whole: survey.View) -> tuple[Tensor, ...]:
     """rms, max_error, max_angle and valid_fraction, (C,) each."""
 
-    def compared(view: _View) -> tuple[Tensor, Tensor]:
+    def compared(view: survey.View) -> tuple[Tensor, Tensor]:
         pixels, valid = target.project(view.rays)
         # what was out of the reach of the fit is no part of its result
         reached = see(target, k, view.rays).covered | exact[:, None]
@@ -152,98 +248,3 @@ def _numbers(target: Camera, k: Tensor, exact: Tensor, check: _View, whole: _Vie
     mapped = mapped if whole is check else compared(whole)[1]
     shown = whole.valid & mapped & (whole.angles <= max_angle[:, None]) & some[:, None]
     return rms, max_error, max_angle, shown.sum(-1) / whole.valid.sum(-1).clamp(min=1)
-
-
-# -- what a camera sees
-
-
-class _View(NamedTuple):
-    """Rays (C, N, 3) of a camera, its pixels (C, N, 2) of them, and whether it has them, bool (C, N)."""
-
-    rays: Tensor
-    pixels: Tensor
-    valid: Tensor
-
-    @property
-    def angles(self) -> Tensor:
-        return torch.atan2(torch.hypot(self.rays[..., 0], self.rays[..., 1]), self.rays[..., 2])
-
-
-def _view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> _View:
-    """side^2 rays on the picture, or in all directions, of which those count that the camera has up to an angle."""
-    if image_size is None:
-        rays = _directions(_reach(camera, limit) * torch.linspace(0, 1, side, **_like(camera)), side)
-        rays, found = rays.flatten(1, 2), True
-    else:
-        rays, found = camera.unproject(_lattice(camera, image_size, side, limit))
-    pixels, valid = camera.project(rays)
-    view = _View(rays, pixels, valid & found)
-    return view._replace(valid=view.valid & (view.angles <= limit * (1 + 1e-12)))
-
-
-def _lattice(camera: Camera, image_size: tuple[int, int], side: int, limit: float) -> Tensor:
-    """(C, side^2, 2): pixels of the part of the picture that an angle leaves, its edges included."""
-    height, width = image_size
-    count = len(camera.intrinsics)
-    low = camera.intrinsics.new_full((count, 2), -0.5)
-    high = camera.intrinsics.new_tensor([width - 0.5, height - 0.5]).expand(count, 2)
-    if limit < math.pi:
-        ring, valid = camera.project(_directions(low.new_full((count, 1), limit), 64).flatten(1, 2))
-        closed = valid.all(-1)[:, None] & (limit < math.pi / 2)
-        least, most = (torch.where(closed, end, whole) for end, whole in ((ring.amin(1), low), (ring.amax(1), high)))
-        inside = (least < high) & (most > low)
-        low, high = torch.where(inside, least.clamp(min=low), low), torch.where(inside, most.clamp(max=high), high)
-    steps = torch.linspace(0, 1, side, **_like(camera))[:, None]
-    u, v = (low[:, None] + (high - low)[:, None] * steps).unbind(-1)
-    return torch.stack(torch.broadcast_tensors(u[:, None, :], v[:, :, None]), -1).flatten(1, 2)
-
-
-def _directions(angles: Tensor, azimuths: int) -> Tensor:
-    """(C, K) angles from the axis -> (C, K, azimuths, 3) rays; none of them where panoramas are cut."""
-    phi = (torch.arange(azimuths).to(angles) + 0.25) * (2 * math.pi / azimuths)
-    theta = angles[..., None]
-    z = theta.cos().expand(*angles.shape, azimuths)
-    return torch.stack((theta.sin() * phi.cos(), theta.sin() * phi.sin(), z), -1)
-
-
-def _reach(camera: Camera, limit: float) -> Tensor:
-    """(C, 1): the angle up to which a camera has rays on some azimuth."""
-    angles = torch.linspace(0, math.pi, _ANGLES, **_like(camera))
-    rays = _directions(angles.expand(len(camera.intrinsics), -1), _AZIMUTHS)
-    sees = camera.project(rays)[1].any(-1).long().cumprod(-1)
-    reach = (angles * sees).amax(-1, keepdim=True)
-    return torch.where(reach < math.pi / 2, reach.clamp(max=_END_AHEAD), reach).clamp(max=limit)
-
-
-def _slopes(camera: Camera) -> Tensor:
-    """(C, 4): the focal lengths at the axis, and the pixel of the axis."""
-    h = 1e-3
-    around = camera.intrinsics.new_tensor([[0, 0, 1], [h, 0, 1], [-h, 0, 1], [0, h, 1], [0, -h, 1]])
-    seen, valid = camera.project(around.expand(len(camera.intrinsics), 5, 3))
-    focal = torch.stack((seen[:, 1, 0] - seen[:, 2, 0], seen[:, 3, 1] - seen[:, 4, 1]), -1) / (2 * h)
-    stated = camera.intrinsics
-    good = valid.all(-1) & (focal > 0).all(-1)
-    fair = torch.isfinite(stated).all(-1) & (stated[:, :2] > 0).all(-1)
-    otherwise = torch.where(fair[:, None], stated, stated.new_tensor([1.0, 1, 0, 0]))
-    return torch.where(good[:, None], torch.cat((focal, seen[:, 0]), -1), otherwise)
-
-
-def _radii(camera: Camera, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Angles and radii as `Convertible.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
-    steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
-    angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
-    pixels, valid = camera.project(_directions(angles, _AZIMUTHS))
-    plane = (pixels - slopes[:, None, None, 2:]) / slopes[:, None, None, :2]
-    radii = (torch.linalg.vector_norm(plane, dim=-1) * valid).sum(-1) / valid.sum(-1).clamp(min=1)
-    growth = radii.diff(dim=-1, prepend=torch.zeros_like(radii[:, :1]))
-    seen = valid.any(-1).long().cumprod(-1) * (growth > 0).long().cumprod(-1)
-    last = seen.sum(-1, keepdim=True)
-    at = (last - 1).clamp(min=0)
-    end, slope = (torch.where(last > 0, t.gather(-1, at), angles[:, :1]) for t in (radii, growth))
-    index = torch.arange(_RADII, device=slopes.device)
-    return angles, torch.where(seen > 0, radii, end + slope * (index - at))
-
-
-def _like(camera: Camera) -> dict:
-    # steps of float32 would go past half a circle
-    return {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}

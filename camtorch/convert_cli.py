@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy
 
+from camtorch.picture_size import picture_size
+
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
@@ -37,18 +39,19 @@ def add(commands) -> None:
     for command in (convert, show):
         command.add_argument("--name", help="which camera, in a file with several")
         command.add_argument("--from-model", metavar="KEY", help="the model in the file, where that does not say it")
+        command.add_argument(
+            "--size", type=picture_size, metavar="WxH", help="of pictures, where the file does not say"
+        )
         command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
 
 
 def _convert(arguments: argparse.Namespace) -> None:
     from camtorch.camera_files import read_rig
-    from camtorch.io import save
+    from camtorch.io import entry
     from camtorch.rig import Rig
 
     path = arguments.output
-    if path.is_dir():
-        raise ValueError(f"{path}: is a folder")
-    if path.exists() and not arguments.force:
+    if path.is_file() and not arguments.force:
         raise ValueError(f"{path}: exists already; --force overwrites it")
     if not path.parent.is_dir():
         raise ValueError(f"{path}: there is no folder {path.parent}")
@@ -57,13 +60,13 @@ def _convert(arguments: argparse.Namespace) -> None:
     angle = arguments.max_angle
     if angle is not None and not 0 < angle <= 180:
         raise ValueError(f"--max-angle must be above 0 and at most 180 degrees; got {angle:g}")
-    rig, notes = read_rig(arguments.input, arguments.name, arguments.from_model), []
+    rig, notes = read_rig(arguments.input, arguments.name, arguments.from_model, arguments.size), []
     cameras = {}
     for name, camera in rig.cameras.items():
         model = arguments.model or camera.key
         result = camera.convert(model, count=arguments.count, max_angle=None if angle is None else math.radians(angle))
         cameras[name] = result.camera
-        part = "the picture" if camera.image_size else "its rays"
+        part = "what the picture has rays for" if camera.image_size else "its rays"
         degrees, covered = math.degrees(float(result.max_angle)), 100 * float(result.valid_fraction)
         errors = "exact" if bool(result.exact) else f"rms {result.rms:.3g} px, at most {result.max_error:.3g} px"
         notes.append(
@@ -73,35 +76,40 @@ def _convert(arguments: argparse.Namespace) -> None:
     # camtorch's own JSON holds every model; the format that the rig comes from may not
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, rig.extrinsics, images=rig.images, format=stays)
-    save(changed, path, format=arguments.format)
+    there = [name for name in entry.rendered(changed, path, arguments.format) if os.path.exists(name)]
+    if there and not arguments.force:
+        raise ValueError(f"{', '.join(there)}: exists already; --force overwrites it")
+    entry.save(changed, path, arguments.format)
     print("\n".join(notes))
 
 
 def _show(arguments: argparse.Namespace) -> None:
     from camtorch import image_files
-    from camtorch.camera_files import read_camera, read_rig
+    from camtorch.camera_files import read_other, read_rig
+    from camtorch.difference import difference
     from camtorch.summary import summarise
 
     if arguments.output is not None:
         image_files.check_target(arguments.output, force=arguments.force)
-    elif arguments.against is not None:
-        raise ValueError("--against needs -o OUT, a picture for the difference")
-    cameras = read_rig(arguments.input, arguments.name, arguments.from_model).cameras
+    cameras = read_rig(arguments.input, arguments.name, arguments.from_model, arguments.size).cameras
+    single = arguments.output is not None or arguments.against is not None
+    if single and len(cameras) > 1:
+        raise ValueError(f"{arguments.input}: --name says which camera is meant: {', '.join(cameras)}")
+    ((name, camera), *_), other = cameras.items(), None
+    if single and camera.image_size is None:
+        raise ValueError(f"{arguments.input} states no image size; --size says which")
+    if arguments.against is not None:
+        other = read_other(arguments.against, arguments.name, arguments.from_model)
     for name, camera in cameras.items():
         print(f"{arguments.input}: {name}", *summarise(camera).lines(), sep="\n")
-    if arguments.output is None:
-        return
-    if len(cameras) > 1:
-        raise ValueError(f"{arguments.input}: --name which camera the picture is to show: {', '.join(cameras)}")
-    other = None
-    if arguments.against is not None:
-        other = read_camera(arguments.against, arguments.name, arguments.from_model)
-    camera = next(iter(cameras.values()))
-    if camera.image_size is None:
-        raise ValueError(f"{arguments.input} states no image size, which the picture needs")
-    height, width = camera.image_size
-    _draw(arguments.output, camera, other, f"{arguments.input.name}: {camera.key}, {width} x {height}")
-    print(f"{arguments.output}: distortion, radius over angle{', difference' if other is not None else ''}")
+    if other is not None:
+        compared = difference(camera, other)
+        print(f"against {arguments.against}: {compared}, over {100 * compared.part:.4g} % of the picture")
+    if arguments.output is not None:
+        height, width = camera.image_size
+        title = f"{arguments.input.name}: {name if name != 'camera' else camera.key}, {width} x {height}"
+        _draw(arguments.output, camera, other, title)
+        print(f"{arguments.output}: distortion, radius over angle{', difference' if other is not None else ''}")
 
 
 def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:

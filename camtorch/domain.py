@@ -59,6 +59,12 @@ class Domain:
             return self
         return Domain(self.optics, self.k[cameras], self, cameras)
 
+    def optics_of(self, camera: Tensor) -> tuple[Chart, Lens]:
+        """Of single points (M,), each seen by the camera of that index."""
+        # a single camera serves all points
+        k = self.k[0].unsqueeze(-1) if len(self.k) == 1 else self.k[camera].mT
+        return self.optics(k.unbind(0))
+
     def with_tables(self, inner2: Tensor, limits2: Tensor, table: Tensor) -> Domain:
         """The same domain with tables that were made elsewhere."""
         self.__dict__.update(inner2=inner2, limits2=limits2, table=table)
@@ -85,21 +91,21 @@ class Domain:
     @_per_camera
     def limits2(self) -> Tensor:
         """(C, azimuths): the squared radius, up to the next azimuth, before which the sense at the point decides."""
-        return self.azimuths.limits**2
+        return self.azimuths.limits.clamp(max=self.chart.end(self.k.dtype)) ** 2
 
     @_per_camera
     def _fold(self) -> Tensor:
         """(C, 1): that of the radial factor of the first stage, in double precision where there is one."""
         k = _precise(self.k)
-        return _fold(self.optics(columns(k))[1].radial, self.chart, k, self.chart.end(self.k.dtype))
+        chart, lens = self.optics(columns(k))
+        return _fold(lens.radial, chart, k, chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25)
 
     @_per_camera
     def table(self) -> Tensor:
         """(C, 2 + 2 nodes): what `inverse` is made of."""
         k = _precise(self.k)
-        return tabulate(self.optics(columns(k))[1].radial, self._fold, self.chart.usual_end(self.k.dtype)).to(
-            self.k.dtype
-        )
+        chart, lens = self.optics(columns(k))
+        return tabulate(lens.radial, self._fold, chart.usual_end(self.k.dtype)).to(self.k.dtype)
 
     @property
     def inverse(self) -> RadialInverse | None:
@@ -127,10 +133,18 @@ def _precise(k: Tensor) -> Tensor:
     return k if k.device.type == "mps" else k.double()
 
 
-def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float) -> Tensor:
-    """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end of the chart."""
+def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float | Tensor, most: float) -> Tensor:
+    """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end of the chart.
+
+    most: the largest image that is a number to calculate with.
+    """
+
+    def sense(radius: Tensor) -> Tensor:
+        found, image = radial_sense(radial, radius), radius * radial(radius * radius)
+        return torch.where(image < most, found, -1.0)
+
     nodes = chart.radii(2 * _RADII, k).clamp(max=end).expand(len(k), -1)
-    lost = first_loss(radial_sense(radial, nodes)).unsqueeze(-1)
+    lost = first_loss(sense(nodes)).unsqueeze(-1)
     some = lost < nodes.shape[-1]
 
     def node(index: Tensor) -> Tensor:
@@ -143,17 +157,16 @@ def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float) ->
     steps = torch.linspace(0, 1, _PARTS + 1, dtype=k.dtype, device=k.device)
     for _ in range(2):
         inner = low + (high - low) * steps
-        sense = radial_sense(radial, inner)
         # the upper end counts as lost, whatever rounding says of it
-        first = (sense > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
+        first = (sense(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
         low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
-    before, after = radial_sense(radial, low), radial_sense(radial, high)
+    before, after = sense(low), sense(high)
     crossing = (before > 0) & (after < 0)
     fraction = torch.where(crossing, before / torch.where(crossing, before - after, 1.0), 0.0)
     return torch.where(some, low + fraction * (high - low), end)
 
 
-def tabulate(radial: Polynomial | Rational, fold: Tensor, usual_end: float) -> Tensor:
+def tabulate(radial: Polynomial | Rational, fold: Tensor, usual_end: float | Tensor) -> Tensor:
     """(C, 2 + 2 nodes): the table of a `RadialInverse`, see there."""
     end = fold.clamp(max=usual_end)
     u = torch.linspace(0, 1, _NODES + 1, dtype=fold.dtype, device=fold.device)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from camtorch.parameters import columns
 
@@ -19,13 +19,14 @@ FURTHEST = 20.0
 _MOST_STEPS = 60
 _ROUNDS = 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
+_EVENINGS, _EVENING_STEPS, _PATIENCE = 40, 2, 6
 _SETTLED = 1e-8  # the relative decrease of the cost that ends the search
-_NOTHING = 1e-11  # px
+_NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
 
 
 class Sights(NamedTuple):
-    """What a camera shall see: rays (C, N, 3), pixels (C, N, 2) and weights (C, N), which are 1 or 0."""
+    """What a camera shall see: rays (C, N, 3), pixels (C, N, 2) and weights of the errors (C, N), 0 for no ray."""
 
     rays: Tensor
     pixels: Tensor
@@ -70,6 +71,7 @@ def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tenso
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
     """
     best = best_score = None
+    tiny = _NEARLY_NOTHING**2 * sights.weights.sum(-1)
     for start in starts:
         parameters = torch.cat((_intrinsics(camera, start, slopes), start), -1)
         low, high = _bounds(camera, parameters)
@@ -79,15 +81,51 @@ def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tenso
             # a chart may cover more once its coefficients fit what it covered before
             weights = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
             more = (weights != within.weights).any(-1)
+            if best is not None:
+                more = more & (best_score > tiny)
             within = sights._replace(weights=weights)
             parameters = _refine(camera, within, parameters, low, high, more)
         score = _cost(camera, within, parameters)
         score = score + (sights.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
         if best is None:
             best, best_score = parameters, score
-        better = score < best_score
+        better = (score < best_score) & (best_score > tiny)
         best, best_score = torch.where(better[:, None], parameters, best), torch.where(better, score, best_score)
     return best
+
+
+def even_out(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
+    """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
+
+    Lawson's algorithm: least squares over and over, the weight of a square multiplied by its error each time, approach
+    what has the least largest error.
+    """
+    low, high = _bounds(camera, parameters)
+    covered = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
+    sights = sights._replace(weights=covered)
+    best, weights = parameters, covered
+    error = _distances(sights, camera, parameters)
+    least, stale = error.amax(-1), torch.zeros_like(error[:, 0])
+    for _ in range(_EVENINGS):
+        going = stale < _PATIENCE
+        if not bool(going.any()):
+            break
+        # of the error itself, the weight in a square is that of its root
+        weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
+        weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
+        weighted = sights._replace(weights=weights)
+        parameters = _refine(camera, weighted, parameters, low, high, going, _EVENING_STEPS, _LEAST_DAMPING)
+        error = _distances(sights, camera, parameters)
+        better = going & (error.amax(-1) < least)
+        best = torch.where(better[:, None], parameters, best)
+        stale = torch.where(error.amax(-1) < 0.999 * least, 0.0, stale + 1)
+        least = torch.where(better, error.amax(-1), least)
+    return best
+
+
+def _distances(sights: Sights, camera: Camera, parameters: Tensor) -> Tensor:
+    """(C, N) pixels."""
+    return torch.linalg.vector_norm(_residuals(sights, parameters, see(camera, parameters[:, 4:], sights.rays)), dim=1)
 
 
 def _intrinsics(camera: Camera, k: Tensor, slopes: Tensor) -> Tensor:
@@ -104,9 +142,9 @@ def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
     """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
     low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
     low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
-    for i, name in enumerate(camera.distortion_names):
+    for i, name in enumerate(camera.distortion_names, 4):
         if name in camera.fit_bounds:
-            low[:, 4 + i], high[:, 4 + i] = camera.fit_bounds[name]
+            low[:, i], high[:, i] = camera.fit_bounds[name] or (parameters[:, i], parameters[:, i])
     return low, high
 
 
@@ -128,52 +166,69 @@ def _cost(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
     return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
 
 
-def _linearised(camera: Camera, sights: Sights, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """The residuals (C, 2 N), and their derivatives (C, 4 + n, 2 N) by the parameters."""
+def _linearised(camera: Camera, sights: Sights, parameters: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+    """The residuals (C, 2 N), and their derivatives (C, F, 2 N) by the parameters of indices (F,), 0 to 3 first."""
     k = parameters[:, 4:]
     seen = see(camera, k, sights.rays)
     fx, fy, _, _ = columns(parameters[:, :4])
     zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
     derivatives = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
     slopes = torch.stack([torch.stack(pair, 1) for pair in derivatives], 1)
-    if k.shape[-1]:
-        by_k = _derivatives(lambda k: torch.stack(see(camera, k, sights.rays)[:2], 1), k)
+    if len(free) > 4:
+        along = torch.eye(k.shape[-1], dtype=k.dtype, device=k.device)[free[4:] - 4]
+        by_k = _derivatives(camera, k, sights.rays, along)
         slopes = torch.cat((slopes, by_k * torch.stack((fx, fy), 1)[:, None]), 1)
     # where a derivative is no number, as at the end of a chart, a step goes without it
     slopes = slopes.nan_to_num(0.0, 0.0, 0.0) * sights.weights[:, None, None]
     return _residuals(sights, parameters, seen).flatten(1), slopes.flatten(2)
 
 
-def _derivatives(function: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
-    """(C, n, ...) of a function (C, n) -> (C, ...) whose rows have nothing to do with each other."""
+def _derivatives(camera: Camera, k: Tensor, rays: Tensor, directions: Tensor) -> Tensor:
+    """(C, D, 2, N): of `see` by the coefficients (C, n), along directions (D, n).
 
-    def along(direction: Tensor) -> Tensor:
-        return torch.func.jvp(function, (k,), (direction.expand_as(k),))[1]
-
-    with warnings.catch_warnings():
+    The directions are rows more: vmap over the derivatives of one would take Python's word for many operations.
+    """
+    count = len(directions)
+    with warnings.catch_warnings(), forward_ad.dual_level():
         # on its first use forward mode loads what calls the deprecated torch.jit.script
         warnings.simplefilter("ignore", DeprecationWarning)
-        return torch.func.vmap(along, out_dims=1)(torch.eye(k.shape[-1], dtype=k.dtype, device=k.device))
+        dual = forward_ad.make_dual(k.repeat_interleave(count, 0), directions.repeat(len(k), 1))
+        seen = see(camera, dual, rays.repeat_interleave(count, 0))
+        tangents = [forward_ad.unpack_dual(plane).tangent for plane in seen[:2]]
+    planes = [torch.zeros_like(seen.a) if t is None else t for t in tangents]
+    return torch.stack(planes, 1).unflatten(0, (len(k), count))
 
 
-def _refine(camera: Camera, sights: Sights, parameters: Tensor, low: Tensor, high: Tensor, going: Tensor) -> Tensor:
+def _refine(
+    camera: Camera,
+    sights: Sights,
+    parameters: Tensor,
+    low: Tensor,
+    high: Tensor,
+    going: Tensor,
+    steps: int = _MOST_STEPS,
+    first_damping: float = _FIRST_DAMPING,
+) -> Tensor:
     """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
     parameters = parameters.clone()
     cost = _cost(camera, sights, parameters)
-    damping = torch.full_like(cost, _FIRST_DAMPING)
+    damping = torch.full_like(cost, first_damping)
     tiny = _NOTHING**2 * sights.weights.sum(-1)
     going = going & torch.isfinite(cost) & (cost > tiny)
-    for _ in range(_MOST_STEPS):
+    (free,) = (low < high).any(0).nonzero(as_tuple=True)
+    for _ in range(steps):
         rows = going.nonzero()[:, 0]
         if len(rows) == 0:
             break
         # rows that have settled are left alone, so that each goes the way that it would go alone
         these, old, weight = sights.of(rows), parameters[rows], damping[rows]
-        residuals, slopes = _linearised(camera, these, old)
+        residuals, slopes = _linearised(camera, these, old, free)
         # what would leave its bounds stays there, so that the others can move on
         slope = (slopes @ residuals[..., None])[..., 0]
-        held = (old <= low[rows]) & (slope > 0) | (old >= high[rows]) & (slope < 0)
-        step = _step(residuals, torch.where(held[..., None], 0.0, slopes), weight)
+        at_low, at_high = ((old <= low[rows])[:, free], (old >= high[rows])[:, free])
+        held = at_low & (slope > 0) | at_high & (slope < 0)
+        step = torch.zeros_like(old)
+        step[:, free] = _step(residuals, torch.where(held[..., None], 0.0, slopes), weight)
         new = (old + step).clamp(low[rows], high[rows])
         new_cost = _cost(camera, these, new)
         better = new_cost < cost[rows]
@@ -191,8 +246,10 @@ def _step(residuals: Tensor, slopes: Tensor, damping: Tensor) -> Tensor:
     # the columns differ by many orders of magnitude
     scale = slopes.square().sum(-1).sqrt()
     scale = torch.where(scale > 0, scale, 1.0)
-    slopes = slopes / scale[..., None]
-    matrix = slopes @ slopes.mT + torch.diag_embed(damping[:, None].expand(scale.shape))
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    step = torch.cholesky_solve(slopes @ -residuals[..., None], factor)[..., 0] / scale
-    return torch.where((failed == 0)[:, None] & torch.isfinite(step), step, 0.0)
+    # the columns of high powers are nearly the same: normal equations would square that
+    damped = torch.diag_embed(damping.sqrt()[:, None].expand(scale.shape))
+    q, r = torch.linalg.qr(torch.cat((slopes / scale[..., None], damped), -1).mT)
+    count = residuals.shape[-1]
+    right = q[:, :count].mT @ -residuals[..., None]
+    step = torch.linalg.solve_triangular(r, right, upper=True)[..., 0] / scale
+    return torch.where(torch.isfinite(step).all(-1, keepdim=True), step, 0.0)

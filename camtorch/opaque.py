@@ -15,22 +15,29 @@ from torch.utils.checkpoint import checkpoint
 from camtorch.azimuths import AZIMUTHS
 from camtorch.domain import Domain, Optics, table_width
 from camtorch.parameters import columns, same
-from camtorch.solve import Found, search
+from camtorch.solve import Found, radial_scale_at_last, search
 
 Result = TypeVar("Result")
 
 MODELS: dict[str, Optics] = {}
-"""The optics of every class of cameras, by its full name: operators take no functions."""
+"""The optics of every class of cameras, by its full name, and others: operators take no functions."""
 CLASSES: dict[str, type] = {}
 """The classes."""
 
 
 def register(camera_class: type) -> str:
     """The name under which operators find the optics of a class."""
-    name, count = f"{camera_class.__module__}.{camera_class.__qualname__}", 2
+    name = register_optics(f"{camera_class.__module__}.{camera_class.__qualname__}", camera_class.optics)
+    CLASSES[name] = camera_class
+    return name
+
+
+def register_optics(wanted: str, optics: Optics) -> str:
+    """The name under which operators find these optics."""
+    name, count = wanted, 2
     while name in MODELS:  # a class of the same name, made by a function that was called again
-        name, count = f"{camera_class.__module__}.{camera_class.__qualname__}#{count}", count + 1
-    MODELS[name], CLASSES[name] = camera_class.optics, camera_class
+        name, count = f"{wanted}#{count}", count + 1
+    MODELS[name] = optics
     return name
 
 
@@ -69,6 +76,17 @@ def _(model, k):
     lens = MODELS[model](columns(k))[1]
     widths = 1, 0 if lens.is_radial else AZIMUTHS, table_width() if lens.radial else 0
     return tuple(k.new_empty(len(k), width) for width in widths)
+
+
+@torch.library.custom_op("camtorch::radial_scale", mutates_args=())
+def radial_scale(model: str, k: Tensor, r2: Tensor) -> Tensor:
+    """`radial_scale_at_last` of coefficients (C, n) and squared radii (C, N)."""
+    return radial_scale_at_last(domain_of(model, k), r2)
+
+
+@radial_scale.register_fake
+def _(model, k, r2):
+    return torch.empty_like(r2)
 
 
 @torch.library.custom_op("camtorch::search_", mutates_args=("a", "b", "solved"))
@@ -111,15 +129,26 @@ def _(info, in_dims, model, k):
     return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
 
 
+@radial_scale.register_vmap
+def _(info, in_dims, model, k, r2):
+    results, dims = _mapped(lambda *inputs: (radial_scale(*inputs),), info, in_dims, model, k, r2)
+    return results[0], dims[0]
+
+
 @search_open.register_vmap
 def _(info, in_dims, model, k, *planes):
-    # the mapped dim joins the cameras, or the points where the cameras are not mapped
+    return _mapped(search_open, info, in_dims, model, k, *planes)
+
+
+def _mapped(operator, info, in_dims, model: str, k: Tensor, *planes: Tensor):
+    """An operator of planes (C, N) of cameras (C, n), with a mapped dim."""
+    # it joins the cameras, or the points where the cameras are not mapped
     cameras = in_dims[1] is not None
     rows = []
     for plane, dim in zip(planes, in_dims[2:], strict=True):
         plane = plane.expand(info.batch_size, *plane.shape) if dim is None else plane.movedim(dim, 0)
         rows.append((plane if cameras else plane.movedim(0, 1)).flatten(*((0, 1) if cameras else (1, 2))))
-    results = search_open(model, k.movedim(in_dims[1], 0).flatten(0, 1) if cameras else k, *rows)
+    results = operator(model, k.movedim(in_dims[1], 0).flatten(0, 1) if cameras else k, *rows)
     if cameras:
         return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
     return tuple(r.unflatten(1, (info.batch_size, -1)) for r in results), (1, 1, 1)

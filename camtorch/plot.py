@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+import camtorch.difference
 from camtorch.summary import fan, ideal, lattice
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 _INK, _GREY, _PALE = "#2b2a2e", "#8a8378", "#efe9dd"
 _COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
 _AZIMUTHS, _ANGLES = 32, 721
-_LONG = 400  # px across a heat map
+_NOTHING = 1e-6  # px: what is less is rounding, and shown as none
 
 
 @torch.no_grad()
@@ -52,12 +53,16 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
     _shade_without_rays(ax, camera)
     both, lost = valid & covered, valid & ~covered
     if bool(lost.any()):
-        ax.plot(*pixels[lost].double().T.tolist(), "x", color=_GREY, markersize=4)
+        crosses = {"color": _GREY, "markersize": 4, "linestyle": "none", "label": "beyond the ideal lens"}
+        ax.plot(*pixels[lost].double().T.tolist(), marker="x", **crosses)
+        ax.legend(loc="lower right", framealpha=0.8)
     longer = 1
     if bool(both.any()):
         end, along = pixels[both].double(), moved[both]
         length = torch.linalg.vector_norm(along, dim=-1)
-        longer = _magnification(0.7 * step / max(float(length.quantile(0.9)), 1e-9))
+        longer = _magnification(0.7 * step / max(float(length.quantile(0.9)), _NOTHING))
+        if float(length.max()) < _NOTHING:
+            along, length, longer = 0 * along, 0 * length, 1
         arrows = ax.quiver(
             *[plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)],
             **{"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0024, "headwidth": 4, "headlength": 5},
@@ -69,7 +74,8 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
     cx, cy = camera.intrinsics[2:].tolist()
     ax.plot([cx], [cy], "+", color=_COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
     times = f", {longer} times as long" if longer > 1 else ""
-    ax.set_title(f"distortion, from the ideal pixel to the actual one{times}")
+    none = bool(both.any()) and not bool(length.any())
+    ax.set_title("no distortion" if none else f"distortion, from the ideal pixel to the actual one{times}")
     return ax
 
 
@@ -142,29 +148,20 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     Raises:
         ValueError: a batch, no image size, or two different ones. ImportError: no matplotlib.
     """
-    height, width = _size(a)
-    _single(b)
-    if b.image_size not in (None, a.image_size):
-        raise ValueError(f"the cameras' pictures differ in size: {a.image_size} and {b.image_size}")
+    compared = camtorch.difference.difference(a, b, remove_rotation=remove_rotation)
+    height, width = a.image_size
     ax = _axes(ax)
-    scale = _LONG / max(height, width)
-    pixels = lattice(a, max(2, round(height * scale)), max(2, round(width * scale))).double()
-    rays, seen = a.unproject(pixels)
-    turn = _rotation(rays, b.unproject(pixels), seen) if remove_rotation else torch.eye(3, dtype=torch.float64)
-    others, shown = b.project(rays.double() @ turn.to(rays.device).mT)
-    both = seen & shown
-    apart = torch.linalg.vector_norm(others.double() - pixels, dim=-1)
-    values = np.ma.masked_array(apart.numpy(force=True), ~both.numpy(force=True))
+    values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
     _frame(ax, height, width)
     ax.set_facecolor("#d9d4ca")
-    largest = float(apart[both].max()) if bool(both.any()) else 0.0
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
     image = ax.imshow(values, extent=edges, cmap="magma_r", interpolation="nearest")
-    extend = _limit(image, apart[both])
+    extend = _limit(image, compared.apart[compared.both])
     ax.figure.colorbar(image, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
-    rms = float(apart[both].square().mean().sqrt()) if bool(both.any()) else math.nan
-    turned = f", turned by {math.degrees(_angle(turn)):.3g} degrees" if remove_rotation else ""
-    ax.set_title(f"{a.key} and {b.key}: rms {rms:.3g} px, at most {largest:.3g} px{turned}")
+    turned = ""
+    if remove_rotation:
+        turned = f", turned by {math.degrees(camtorch.difference.angle(compared.rotation)):.3g} degrees"
+    ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
     return ax
 
 
@@ -179,7 +176,8 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
     figure = Figure(figsize=(7.4 * panels, panel + 1.3), dpi=120, layout="constrained")
     axes = figure.subplots(1, panels)
     distortion_field(camera, axes[0])
-    radius_curve([camera] if other is None else [camera, other], axes[1])
+    labels = [camera.key] if other is None else [camera.key, f"{other.key}, the other"]
+    radius_curve([camera] if other is None else [camera, other], axes[1], labels=labels)
     if other is not None:
         difference(camera, other, axes[2])
     figure.suptitle(title or f"{type(camera).__name__}, {width} x {height}", color=_INK, fontsize=15)
@@ -246,7 +244,10 @@ def _limit(mappable, values: Tensor) -> str:
     """Give what is coloured its range, without the few largest values if they are far from the others."""
     most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)
     cut = most > 4 * many > 0
-    mappable.set_clim(0, (1.5 * many if cut else most) or 1.0)
+    if most < _NOTHING:
+        mappable.set_clim(0, _NOTHING)
+        return "neither"
+    mappable.set_clim(0, 1.5 * many if cut else most)
     return "max" if cut else "neither"
 
 
@@ -263,17 +264,3 @@ def _radii(camera: Camera) -> tuple[np.ndarray, list[float], list[float]]:
 
 def _cycle(count: int) -> list[str]:
     return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
-
-
-def _rotation(rays: Tensor, others: tuple[Tensor, Tensor], seen: Tensor) -> Tensor:
-    """The rotation R of least squares of `R ray - other`, by Kabsch's method."""
-    use = seen & others[1]
-    u, _, vh = torch.linalg.svd(others[0][use].double().mT @ rays[use].double())
-    sign = torch.ones(3, dtype=torch.float64, device=u.device)
-    sign[2] = torch.linalg.det(u @ vh)
-    return u @ torch.diag(sign) @ vh
-
-
-def _angle(rotation: Tensor) -> float:
-    sine = torch.linalg.matrix_norm(rotation - rotation.mT) / math.sqrt(8)
-    return math.atan2(float(sine), (float(rotation.trace()) - 1) / 2)

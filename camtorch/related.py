@@ -23,7 +23,7 @@ def default_count(model: Model, source: Camera) -> int:
         return len(source.distortion_names)
     steps = _path(type(source), model)
     if steps is None:
-        return model.default_count
+        return model.fit_counts[0] if model.fit_counts else model.default_count
     needed = {_renamed(name, steps) for name in source.distortion_names}
     held = {n: len(needed & set(model.names_of(n))) for n in range(model.default_count, _MANY) if model.names_of(n)}
     return min((n for n, number in held.items() if number == max(held.values())), default=model.default_count)

@@ -63,7 +63,9 @@ class Rig:
         """
         found = self.cameras.get(self.images.get(name, name))
         if found is None:
-            raise ValueError(f"Rig: no camera and no image is called {name!r}; there are {list(self.cameras)}")
+            names = [*self.cameras, *self.images]
+            shown = ", ".join(map(repr, names[:8])) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+            raise ValueError(f"Rig: no camera and no image is called {name!r}; there are {shown}")
         return found
 
     def __repr__(self) -> str:
@@ -83,5 +85,5 @@ def _line(name: str, camera: Camera, extrinsics: Extrinsics | None) -> str:
         numbers = " ({:.7g}, {:.7g}, {:.7g}, {:.7g})".format(*camera.intrinsics.tolist())
     where = ""
     if extrinsics is not None and not extrinsics.batch_shape:
-        where = " at ({:.4g}, {:.4g}, {:.4g})".format(*extrinsics.position.tolist())
+        where = " at ({:.4g}, {:.4g}, {:.4g})".format(*(extrinsics.position + 0.0).tolist())
     return f"  {name}: {type(camera).__name__}{size}{numbers}{where}"

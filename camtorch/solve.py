@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -50,23 +51,49 @@ def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
     return (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v)
 
 
-def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    """Newton's method for the factor s that scales (u, v): s R(r2 s^2) = 1. It does not know of an axis."""
+def radial_scale(domain: Domain, r2: Tensor) -> tuple[Tensor, Tensor]:
+    """The factor s by which the inverse of a radial lens scales points of squared radius r2, and whether that is it.
+
+    Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `RadialInverse.most2`. The second is
+    positive where the last step was so short that the next one would be nothing.
+    """
     radial, table = domain.lens.radial, domain.inverse
-    r2 = torch.addcmul(u * u, v, v)
-    possible = table.most2 * (1 + 8 * torch.finfo(u.dtype).eps) - r2
-    r2 = torch.minimum(r2, table.most2)
     scale = table(r2)
     for count in range(1, _MOST_STEPS + 1):
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
         scale = scale + step
-        settled = _short(u) * scale - step.abs()
-        if count >= _STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
+        settled = _short(scale) * scale - step.abs()
+        if count >= _STEPS[r2.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
             break
+    return scale, settled
+
+
+def radial_scale_at_last(domain: Domain, r2: Tensor) -> Tensor:
+    """The factor of `radial_scale` (C, N), by bisection where Newton's method leaves it open."""
+    scale, settled = radial_scale(domain, r2)
+    camera, point = (~(settled > 0)).nonzero(as_tuple=True)
+    if len(camera):
+        radial, wanted = domain.optics_of(camera)[1].radial, r2[camera, point].sqrt()
+        low, high = torch.zeros_like(wanted), domain.inner2[camera, 0].sqrt()
+        for _ in range(2 * -int(math.log2(torch.finfo(r2.dtype).eps))):
+            middle = (low + high) / 2
+            short = middle * radial(middle * middle) < wanted
+            low, high = torch.where(short, middle, low), torch.where(short, high, middle)
+        # on the axis itself nothing is left open
+        scale[camera, point] = high / wanted.clamp(min=torch.finfo(r2.dtype).tiny)
+    return scale
+
+
+def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
+    r2 = torch.addcmul(u * u, v, v)
+    eps = torch.finfo(u.dtype).eps
+    possible = domain.inverse.most2 * (1 + 8 * eps) - r2
+    r2 = torch.minimum(r2, domain.inverse.most2)
+    scale, settled = radial_scale(domain, r2)
     # a ray's rounding must not carry it across the fold
-    inside = domain.inner2 * (1 - 32 * torch.finfo(u.dtype).eps) - r2 * scale * scale
+    inside = domain.inner2 * (1 - 32 * eps) - r2 * scale * scale
     return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
 
 
@@ -133,9 +160,7 @@ class _Search:
 
     def __init__(self, domain: Domain, camera: Tensor):
         self.domain, self.camera, self.azimuths = domain, camera, domain.azimuths
-        # a single camera serves all points
-        k = domain.k[0].unsqueeze(-1) if len(domain.k) == 1 else domain.k[camera].mT
-        self.chart, self.lens = domain.optics(k.unbind(0))
+        self.chart, self.lens = domain.optics_of(camera)
 
     def __call__(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, b = self.radial(u, v) if self.lens.is_radial else self.planar(u, v)

@@ -12,6 +12,7 @@ from camtorch.camera import Camera
 
 _POINTS, _SIDE = 513, 129  # along a line, and on the sides of a lattice over the picture
 _ANGLES, _AZIMUTHS = 3601, 32
+_MOST_COEFFICIENTS = 16
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 
@@ -41,7 +42,7 @@ class Summary:
             ("picture", size),
             ("focal length", f"fx {fx:.8g}, fy {fy:.8g} px"),
             ("principal point", f"cx {cx:.8g}, cy {cy:.8g} px"),
-            ("coefficients", ", ".join(f"{name} {value:.8g}" for name, value in named) or "none"),
+            ("coefficients", _shortened([f"{name} {value:.8g}" for name, value in named])),
         ]
         low, high = (math.degrees(angle) for angle in self.valid_angle)
         rows.append(
@@ -55,6 +56,12 @@ class Summary:
             texts = [f"{name} {move}" for name, move in zip(CORNERS, moves, strict=True)]
             rows.append(("distortion, px", ", ".join(texts) if len(set(moves)) > 1 else f"corners {moves[0]}"))
         return [f"{label:<16} {text}" for label, text in rows]
+
+
+def _shortened(texts: list[str]) -> str:
+    if len(texts) > _MOST_COEFFICIENTS:
+        return f"{', '.join(texts[:4])}, ... {texts[-1]} ({len(texts)} in all)"
+    return ", ".join(texts) or "none"
 
 
 @torch.no_grad()
@@ -75,11 +82,16 @@ def summarise(camera: Camera) -> Summary:
 
 
 def ideal(camera: Camera) -> Camera:
-    """The same camera with coefficients that do nothing."""
+    """The camera of the same pixels per radian at the axis, with coefficients that do nothing."""
     if not camera.distortion_names:
         return camera
     values = camera.distortion.new_tensor(camera.ideal(len(camera.distortion_names)))
-    return type(camera)(camera.intrinsics.detach(), values, image_size=camera.image_size)
+    axis = camera.intrinsics.new_tensor([0.0, 0.0, 1.0])
+    slopes = torch.func.jacrev(lambda ray: camera.project(ray)[0])(axis).diagonal().detach()
+    intrinsics = camera.intrinsics.detach()
+    # that a chart or a table has a slope of its own is no distortion
+    slopes = torch.where(((slopes / intrinsics[:2] - 1).abs() > 1e-9) & (slopes > 0), slopes, intrinsics[:2])
+    return type(camera)(torch.cat((slopes, intrinsics[2:])), values, image_size=camera.image_size)
 
 
 def lattice(camera: Camera, rows: int, columns: int) -> Tensor:

@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 
 import torch
+from colmap_models import from_colmap
 from hypothesis import strategies as st
 
 import camtorch as ct
@@ -16,13 +17,65 @@ import camtorch as ct
 GOLDEN = {path.stem: json.loads(path.read_text()) for path in sorted((Path(__file__).parent / "golden").glob("*.json"))}
 KEYS = sorted(ct.MODELS)
 
-# Largest coefficient drawn, plausible and wild, by the first letters of its name
+# Coefficients drawn, plausible and wild, by the first letters of their names: up to that size, or between two numbers
 RANGES = {
+    "fov": {"omega": ((0.2, 1.2), (-3.0, 3.0))},
+    "division": {"lambda": ((-0.4, 0.2), (-3.0, 3.0))},
+    "equisolid": {"k": (0.05, 0.5)},
+    "stereographic": {"k": (0.02, 0.3)},
+    "orthographic_fisheye": {"k": (0.05, 0.5)},
+    "thin_prism_fisheye": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
+    # steps from one node to the next
+    "tabulated": {"theta": ((0.2, 0.4), (0.2, 0.8)), "r": ((0.15, 0.4), (-0.1, 1.0))},
+    "f_theta": {"k": (0.1, 0.5)},
+    "f_theta_backward": {"k": (0.1, 0.5)},
+    "woodscape": {"k": (0.1, 0.5)},
+    "ucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5))},
+    "eucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5)), "beta": ((0.5, 1.5), (0.01, 20.0))},
+    "double_sphere": {"alpha": ((0.0, 1.0), (-0.5, 1.5)), "xi": ((-0.3, 0.6), (-0.9, 3.0))},
+    "mei": {"xi": ((0.0, 2.0), (-0.9, 4.0)), "k": (0.3, 1.0), "p": (2e-3, 0.05)},
     "brown_conrady": {"k": (0.3, 1.0), "p": (2e-3, 0.05), "s": (2e-3, 0.05), "tau": (0.05, 0.3)},
     "kannala_brandt": {"k": (0.05, 0.5)},
     "fisheye62": {"k": (0.05, 0.5), "p": (2e-3, 0.05)},
     "fisheye624": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
 }
+
+# Real calibrations of models that no reference file is of: intrinsics, distortion, picture size
+CALIBRATIONS = {
+    # KITTI-360, calibration/image_02.yaml
+    # WoodScape, as its polynomial in pixels: 339.749, -31.988, 48.275, -7.201, and an offset of (3.942, -3.093)
+    "woodscape": (
+        (339.749, 339.749, 643.442, 479.407),
+        (-31.988 / 339.749, 48.275 / 339.749, -7.201 / 339.749),
+        (966, 1280),
+    ),
+    "mei": (
+        (1336.3220825849971, 1335.7883350012958, 716.94323510126321, 705.76498308221585),
+        (2.2134047507854890, 1.6798235660113681e-2, 1.6548773243373522, 4.2223943394772046e-4, 4.2462134260997584e-4),
+        (1400, 1400),
+    ),
+}
+
+
+# Cameras with one continuous derivative on the axis, and no second one
+NOT_ANALYTIC = {"f_theta", "f_theta_backward", "woodscape"}
+
+
+def constants(camera):
+    """How many coefficients, the first ones, do not learn."""
+    return camera.distortion.shape[-1] // 2 if camera.key == "tabulated" else 0
+
+
+def axis_slope(key, k):
+    """d(r)/d(theta) on the axis."""
+    if key == "tabulated":
+        return k[len(k) // 2] / k[0]
+    slopes = {
+        "double_sphere": lambda xi, _: 1 / (1 + xi),
+        "mei": lambda xi, *_: 1 / (1 + xi),
+        "fov": lambda omega: 2 * math.tan(omega / 2) / omega if omega else 1.0,
+    }
+    return slopes[key](*k) if key in slopes else 1.0
 
 
 def tensor(values) -> torch.Tensor:
@@ -53,6 +106,10 @@ def golden_camera(case):
     """The camera of a file; a brown_conrady vector loses no coefficient, be it zero."""
     parameters = tensor(case["parameters"])
     size = tuple(case["image_size"])
+    if "colmap" in case:
+        key, *numbers = from_colmap(case["colmap"], case["parameters"])
+        assert key == case["family"]
+        return make(key, *(tensor(list(v)) for v in numbers), image_size=size)
     if case["family"] == "kannala_brandt_general":
         return ct.KannalaBrandt.from_general(parameters[:4], parameters[4:], image_size=size)
     return make(case["family"], parameters[:4], parameters[4:], image_size=size)
@@ -65,6 +122,9 @@ def real(key) -> dict:
         for name, case in GOLDEN.items()
         if name.startswith("mpmath") and case["family"] == key
     }
+    if key in CALIBRATIONS:
+        intrinsics, distortion, size = CALIBRATIONS[key]
+        return {"published": make(key, tensor(list(intrinsics)), tensor(list(distortion)), image_size=size)}
     default = make(key, torch.tensor([300.0, 310.0, 318.5, 242.25], dtype=torch.float64), image_size=(480, 640))
     return named or {"default": default}
 
@@ -74,6 +134,8 @@ def one(key):
     return list(real(key).values())[-1]
 
 
+# Every model with some of the others: all pairs would be too many
+PAIRS = [(key, KEYS[(i + step) % len(KEYS)]) for i, key in enumerate(KEYS) for step in (0, 1, 6)]
 REAL = [(key, name) for key in KEYS for name in real(key)]
 
 
@@ -81,15 +143,28 @@ def spread(key, dtype=torch.float64):
     """A camera with every coefficient away from zero, so that no term of the formula can be forgotten."""
     count = len(one(key).distortion_names)
     sign = torch.tensor([1.0, -1.0]).repeat(count)[:count]
-    widths = torch.tensor([_width(key, name, wild=False) for name in one(key).distortion_names])
-    intrinsics = torch.tensor([301.0, 310.5, 318.25, 243.5], dtype=dtype)
-    return make(key, intrinsics, (0.3 * sign * widths).to(dtype), image_size=(480, 640))
+    limits = torch.tensor([_limits(key, name, wild=False) for name in one(key).distortion_names]).view(-1, 2)
+    middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2
+    distortion = _summed(key, middle + 0.3 * sign * half)
+    slope = axis_slope(key, distortion.tolist())
+    intrinsics = torch.tensor([301.0 / slope, 310.5 / slope, 318.25, 243.5], dtype=dtype)
+    return make(key, intrinsics, distortion.to(dtype), image_size=(480, 640))
 
 
-def _width(key, name, wild):
+def _limits(key, name, wild):
     ranges = RANGES.get(key, {})
     letters = max((letters for letters in ranges if name.startswith(letters)), key=len, default=None)
-    return ranges[letters][wild] if letters else 0.0
+    limits = ranges[letters][wild] if letters else 0.0
+    return limits if isinstance(limits, tuple) else (-limits, limits)
+
+
+def _summed(key, numbers):
+    """The nodes of steps; a table begins to ascend."""
+    if key != "tabulated":
+        return numbers
+    angles, radii = numbers.chunk(2)
+    first = radii[:1].abs().clamp(min=0.05)
+    return torch.cat((angles.cumsum(0), torch.cat((first, radii[1:])).cumsum(0)))
 
 
 @st.composite
@@ -102,10 +177,11 @@ def drawn(draw, key, wild):
     model = ct.MODELS[key]
     counts = [n for n in range(1, 15) if RANGES.get(key) and model.names_of(n)]
     names = model.names_of(draw(st.sampled_from(counts))) if counts else ()
-    focal = number(150, 600)
-    intrinsics = [focal, focal * number(0.9, 1.1), 320 + number(-20, 20), 240 + number(-20, 20)]
-    widths = [_width(key, name, wild) for name in names]
-    distortion = [number(-width, width) for width in widths]
+    focal, aspect, across, down = number(150, 600), number(0.9, 1.1), number(-20, 20), number(-20, 20)
+    distortion = [number(*_limits(key, name, wild)) for name in names]
+    distortion = _summed(key, torch.tensor(distortion, dtype=torch.float64)).tolist()
+    focal /= axis_slope(key, distortion)
+    intrinsics = [focal, focal * aspect, 320 + across, 240 + down]
     intrinsics, distortion = (torch.tensor(v, dtype=torch.float64) for v in (intrinsics, distortion))
     return make(key, intrinsics, distortion, image_size=(480, 640))
 

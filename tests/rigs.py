@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import pytest
 import torch
 
 import camtorch as ct
@@ -19,20 +18,9 @@ def float64(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def needs(*keys):
-    for key in keys:
-        if key not in ct.MODELS:
-            pytest.skip(f"model {key} not in ct.MODELS")
-
-
 def load(name):
-    """A sample file, or a skip that names the model it waits for."""
-    try:
-        return ct.load(FILES / name)
-    except ct.CameraFileError as error:
-        if "needs the camera model" in str(error):
-            pytest.skip(f"model not in ct.MODELS: {error.args[2]}")
-        raise
+    """A sample file."""
+    return ct.load(FILES / name)
 
 
 def assert_same(a, b):

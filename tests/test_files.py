@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from rigs import MANIFEST, POINT, SAMPLES, SUFFIXES, assert_same, float64, load, needs
+from rigs import MANIFEST, POINT, SAMPLES, SUFFIXES, assert_same, float64, load
 
 import camtorch as ct
 
@@ -145,7 +145,6 @@ def test_each_model_of_colmap(entry, suffix, tmp_path):
         expected = ct.Equirectangular(float64([1024 / math.pi, 1024 / math.pi, 1023.5, 511.5]), image_size=(1024, 2048))
     else:
         key, focals, zeros = COLMAP[name]
-        needs(key)
         core = float64([values[0], values[focals - 1], values[focals] - 0.5, values[focals + 1] - 0.5])
         rest = (float64(values[focals + 2 :] + [0.0] * zeros),) if len(values) > focals + 2 else ()
         expected = ct.MODELS[key](core, *rest, image_size=(entry["height"], entry["width"]))

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import struct
 import time
 import tracemalloc
@@ -154,7 +155,7 @@ XML = "<opencv_storage>{}</opencv_storage>"
             "needs the camera model 'x'",
         ),
         ("a.json", '{"camtorch": 1, "cameras": {"a": 1, "a": 2}}', "the key 'a' stands there twice"),
-        ("a.json", '{"camera_angle_x": 5e-324, "w": 4, "h": 4}', "camera_angle_x: 4.94066e-324 is no angle"),
+        ("a.json", '{"camera_angle_x": 5e-324, "w": 4, "h": 4}', "camera_angle_x: 5e-324 is no angle"),
         ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
         ("a.json", '{"\\n\\u0000": {"K": 1}}', "no format that is known here"),
         ("a.xml", '<!DOCTYPE x [<!ENTITY a "b">]>' + XML.format("&a;"), "line 1: a document type"),
@@ -262,3 +263,39 @@ def test_memory(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 200 * path.stat().st_size
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("content", [
+    {"intrinsics": [[[1, 1, 1, 1]]] * 3000, "distortion": [[[0.0]] * 3000], "distortion_names": ["k1"]},
+    {"intrinsics": [[1, 1, 1, 1]] * 3, "distortion": [[0.0]] * 2, "distortion_names": ["k1"]},
+])  # fmt: skip
+def test_small_files_make_no_large_batches(content, tmp_path):
+    cameras = {"a": {"model": "kannala_brandt", **content}}
+    path = written(tmp_path / "own.json", json.dumps({"camtorch": 1, "cameras": cameras, "extrinsics": {}}))
+    with pytest.raises(ct.CameraFileError, match="batch dims that differ"):
+        ct.load(path)
+
+
+def test_many_directives_of_yaml(tmp_path):
+    tags = "".join(f"%TAG !{i:x}! b\n" for i in range(20_000))
+    with pytest.raises(ct.CameraFileError, match="too many YAML directives"):
+        ct.load(written(tmp_path / "a.yml", f"{tags}---\na: 1\n"))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.parametrize("suffix", ["txt", "bin"])
+def test_pipes_are_neither_waited_for_nor_replaced(suffix, tmp_path):
+    camera = ct.Pinhole([500.0, 500, 320, 240], image_size=(480, 640))
+    ct.save(camera, tmp_path / f"cameras.{suffix}", "colmap")
+    os.mkfifo(tmp_path / f"images.{suffix}")
+    with pytest.raises(ct.CameraFileError, match="no ordinary file"):
+        ct.load(tmp_path / f"cameras.{suffix}")
+    os.mkfifo(tmp_path / "pipe.yml")
+    with pytest.raises(OSError, match="no ordinary file"):
+        ct.save(camera, tmp_path / "pipe.yml", "opencv")
+
+
+def test_a_file_of_blanks_takes_no_memory(tmp_path):
+    for blank in ("\n", " ", "#\n"):
+        with pytest.raises(ct.CameraFileError):
+            ct.load(written(tmp_path / "a.cameramodel", blank * (1 << 20)))

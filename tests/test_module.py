@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from cameras import KEYS, fan, make, one, pixel_lattice, spread
+from cameras import KEYS, constants, fan, make, one, pixel_lattice, spread
 from torch import nn
 from torch.func import functional_call, jacfwd, jacrev, vmap
 
@@ -45,11 +45,12 @@ def parameters_of(module):
 
 # -- compile, export, transforms
 
+TRACED = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sphere", "division", "f_theta_backward"}
+
 
 def backend(key, method):
-    """Down to aten, but for unprojection through lenses that are not radial: that long trace is the same for all."""
-    lens = one(key).optics(one(key).distortion.unbind(-1))[1]
-    short = method == "project" or not lens.stages or lens.is_radial or key == "fisheye624"
+    """Down to aten for one model of each chart and lens: those long traces are the same for the others."""
+    short = key in TRACED or (key == "fisheye62" and method == "project")
     return "aot_eager" if short else "eager"
 
 
@@ -185,7 +186,7 @@ def test_state_dict_is_strict(key):
     state = camera.state_dict()
     expected = {"intrinsics", "distortion"} if camera.distortion_names else {"intrinsics"}
     assert set(state) == expected
-    other = make(key, 2 * camera.intrinsics.detach(), 0 * camera.distortion.detach())
+    other = make(key, 2 * camera.intrinsics.detach(), 0.5 * camera.distortion.detach())
     points = fan(60, 5, 7)
     other.project(points)
     other.load_state_dict(state, strict=True)
@@ -254,23 +255,25 @@ def test_gradients_reach_the_network_that_predicted_the_camera(key, method):
     seen = make(key, intrinsics, distortion)
     assert seen.batch_shape == (3,)
     assert list(seen.parameters()) == []
-    values = fan(40, 4, 5).float() if method == "project" else pixel_lattice(camera, 4, 5)
+    values = fan(100, 4, 5).float() if method == "project" else pixel_lattice(camera, 4, 5)
     result, valid = getattr(seen, method)(values.expand(3, *values.shape))
     assert valid.any()
     (result**2).sum().backward()
     assert network.weight.grad.isfinite().all()
-    assert (network.weight.grad.abs().amax(-1) > 0).all()
+    reached = network.weight.grad.abs().amax(-1) > 0
+    assert torch.cat((reached[:4], reached[4 + constants(camera) :])).all()
 
 
 @every_model
 def test_a_camera_is_found_from_its_own_pixels(key):
     """Gauss-Newton steps with autograd's Jacobians find the parameters that made the pixels."""
     truth = spread(key)
-    rays = fan(45, 8, 12)
+    rays = fan(100, 24, 12) if constants(truth) else fan(45, 8, 12)  # over all of a table
     pixels = truth.project(rays)[0].detach()
     fx, fy, cx, cy = truth.intrinsics.tolist()
     start = torch.tensor([1.02 * fx, 0.98 * fy, cx + 3, cy - 2], dtype=torch.float64)
-    camera = make(key, start, 0.9 * truth.distortion.detach())
+    share = torch.where(torch.arange(len(truth.distortion)) < constants(truth), 1.0, 0.9)
+    camera = make(key, start, share * truth.distortion.detach())
     sizes = [p.numel() for p in camera.parameters()]
 
     def residuals(vector):
@@ -279,7 +282,8 @@ def test_a_camera_is_found_from_its_own_pixels(key):
 
     vector = nn.utils.parameters_to_vector(camera.parameters()).detach()
     for _ in range(15):
-        vector = vector - torch.linalg.lstsq(jacrev(residuals)(vector), residuals(vector)).solution
+        # gelsd: a table has columns of zeros, and its heights trade with the focal length
+        vector = vector - torch.linalg.lstsq(jacrev(residuals)(vector), residuals(vector), driver="gelsd").solution
     assert residuals(vector).abs().max() < 1e-9
 
 
@@ -378,7 +382,7 @@ def test_repr(key):
     camera = spread(key)
     text = repr(camera)
     assert text.startswith(type(camera).__name__)
-    assert "fx=301" in text
+    assert f"fx={camera.intrinsics[0]:.6g}" in text
     assert "480, 640" in text
     for name, value in zip(camera.distortion_names, camera.distortion.tolist(), strict=True):
         assert re.search(rf"\b{name}={re.escape(f'{value:.6g}')}", text)

@@ -81,6 +81,70 @@ def test_json_flag_is_a_boolean_too(path):
         assert type(opencv.read(path)) is model
 
 
+@pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
+@pytest.mark.parametrize("xi", ["1.25", "[1.25]", "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1.25]}"])
+def test_omnidir(tmp_path, suffix, xi):
+    """What cv2.omnidir calibrates has an xi beside it, a number or a matrix."""
+    path = written(tmp_path / "omnidir.yml", f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\nxi: {xi}\n")
+    camera = ct.load(path).camera
+    assert type(camera) is ct.Mei
+    assert camera.distortion.tolist() == [1.25, 0.1, 0.01, 0.001, 0.0001]
+    ct.save(camera, tmp_path / f"again{suffix}", "opencv")
+    again = ct.load(tmp_path / f"again{suffix}").camera
+    assert type(again) is ct.Mei
+    assert torch.equal(again.distortion, camera.distortion)
+
+
+def test_an_omnidir_pair_as_opencv_writes_it(tmp_path):
+    text = "".join(
+        f"camera_matrix_{i}: {K}\ndistortion_coefficients_{i}: [0.1, 0.01, 0.001, {i}]\nxi_{i}: {i}.5\n" for i in (1, 2)
+    )
+    path = written(tmp_path / "pair.yml", text + "rvec: [0.1, 0.2, 0.3]\ntvec: [1, 2, 3]\n")
+    rig = ct.load(path)
+    assert [camera.distortion.tolist() for camera in rig.cameras.values()] == [
+        [1.5, 0.1, 0.01, 0.001, 1.0],
+        [2.5, 0.1, 0.01, 0.001, 2.0],
+    ]
+    assert rig.extrinsics["2"].rotation.tolist() == [0.1, 0.2, 0.3]
+    assert rig.extrinsics["2"].translation.tolist() == [1, 2, 3]
+    ct.save(rig, path)
+    for name, camera in ct.load(path).cameras.items():
+        assert torch.equal(camera.distortion, rig.cameras[name].distortion)
+
+
+@pytest.mark.parametrize("key", ["dist_coeff", "distCoeff", "dist_coef", "distortion_coefficient", "d", "distCoeffsMat",
+                                 "distortion_params", "distortion_parameters", "dist"])  # fmt: skip
+def test_distortion_by_many_names(path, key):
+    assert ct.load(written(path, f"K: {K}\n{key}: [[0.3, 0.1, 0, 0, 0]]")).camera.distortion.shape == (5,)
+
+
+@pytest.mark.parametrize("key", ["D1", "distCoeffs1", "camera_distortion", "distorsion", "coeffs", "d2", "xi_1"])
+def test_what_looks_like_distortion_is_not_passed_over(path, key):
+    with pytest.raises(CameraFileError, match=rf"camera.yml: {key}: looks like the distortion of a camera"):
+        ct.load(written(path, f"camera_matrix: {K}\n{key}: [0.3, 0.1, 0, 0, 0]"))
+
+
+def test_arrays_of_one_dimension(tmp_path):
+    """As OpenCV 5 writes them."""
+    yaml = f"%YAML:1.0\n---\nK: {K}\nD: !!opencv-nd-matrix\n   sizes: [ 5 ]\n   dt: d\n   data: [ 0.3, 0.1, 0, 0, 0 ]\n"
+    whole = {"K": K, "D": {"type_id": "opencv-nd-matrix", "sizes": [5], "dt": "d", "data": [0.3, 0.1, 0, 0, 0]}}
+    xml = (
+        "<?xml version='1.0'?><opencv_storage><K type_id='opencv-matrix'><rows>3</rows><cols>3</cols><dt>d</dt>"
+        f"<data>{' '.join(map(str, K))}</data></K><D type_id='opencv-nd-matrix'><sizes>5</sizes><dt>d</dt>"
+        "<data>0.3 0.1 0 0 0</data></D></opencv_storage>"
+    )
+    for suffix, text in ((".yml", yaml), (".json", json.dumps(whole)), (".xml", xml)):
+        camera = ct.load(written(tmp_path / f"camera{suffix}", text)).camera
+        assert camera.distortion.tolist() == [0.3, 0.1, 0, 0, 0]
+    with pytest.raises(CameraFileError, match=r"D.data: 5 numbers, where sizes say 6"):
+        ct.load(written(tmp_path / "camera.yml", yaml.replace("[ 5 ]", "[ 6 ]")))
+
+
+def test_many_cameras_in_the_order_of_their_numbers(path):
+    text = "".join(f"K{i}: {K}\n" for i in (10, 2, 1))
+    assert list(ct.load(written(path, text)).cameras) == ["1", "2", "10"]
+
+
 def test_model_argument_decides(path):
     written(path, f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\n")
     assert type(opencv.read(path, "kannala_brandt")) is ct.KannalaBrandt
@@ -136,7 +200,8 @@ def test_stereo_file_asks_for_a_name():
         (f"K: {K}\nimage_width: 640.5\nimage_height: 480", "image_width", "no number of pixels"),
         (f"K: {K}\nfisheye_model: [1]", "fisheye_model", "neither true nor false"),
         (f"K: {K}\nD: [0, 0, 0, 0]\ndistortion_model: equidistant", "distortion_model", "another model"),
-        (f"K: {K}\nxi: 1.2", "xi", "another model"),
+        (f"K: {K}\nxi: 1.2", "xi", "1 coefficients; Mei takes n = 5"),
+        (f"K: {K}\nxi: soon", "xi", "'soon' is no finite number"),
         ("<?xml version='1.0'?>", "line 1", "XML"),
         (b"\xff\xd8\xff\xe0", "byte 0", "not text"),
         ("a\0b: 1", "content", "not allowed"),

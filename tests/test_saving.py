@@ -115,6 +115,28 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory, core, distortion):
         assert_same(ct.Rig(again.cameras), ct.Rig({"cam0" if format == "kalibr" else "camera": one}))
 
 
+@pytest.mark.parametrize("name", ["\U0001f4f7 left", 'quote"', "line\nbreak"])
+def test_names_that_yaml_and_json_have_to_escape(name, tmp_path):
+    for path in (tmp_path / "camera_info.yaml", tmp_path / "own.json"):
+        ct.save(ct.Rig({name: camera()}), path)
+        assert list(ct.load(path).cameras) == [name]
+    with pytest.raises(ct.CameraFileError, match="is no text that a file can hold"):
+        ct.save(ct.Rig({"1": camera()}, {"\ud800": ct.Extrinsics([0.0] * 3, [0.0] * 3)}, images={"\ud800": "1"}),
+                tmp_path / "cameras.txt")  # fmt: skip
+
+
+def test_zeros_that_fill_a_message_of_ros(tmp_path):
+    text = "image_width: 640\nimage_height: 480\ndistortion_model: {}\nK: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nD: {}\n"
+    for name, numbers, key, count in (
+        ("equidistant", [0.1, 0, 0, 0, 0], "kannala_brandt", 4),
+        ("fisheye", [0.1, 0, 0, 0], "kannala_brandt", 4),
+        ("none", [0, 0, 0, 0, 0], "pinhole", 0),
+    ):
+        (tmp_path / "a.yaml").write_text(text.format(name, numbers))
+        found = ct.load(tmp_path / "a.yaml").camera
+        assert (found.key, found.distortion.shape[-1]) == (key, count)
+
+
 def test_numbers_are_numbers_to_pyyaml(tmp_path):
     yaml = pytest.importorskip("yaml")
     ct.save(camera(distortion=[1e-5, -1e22, 0, 1e-300]), tmp_path / "a.yaml", "kalibr")

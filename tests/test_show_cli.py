@@ -86,16 +86,20 @@ def test_show_draws_a_picture(folder, capsys):
         (["show", "camera.yml", "-o", "camera.yml"], "camera.yml: exists already; --force"),
         (["show", "camera.yml", "-o", "o.docx"], "written as .docx"),
         (["show", "camera.yml", "-o", "none/o.png"], "there is no folder none"),
-        (["show", "camera.yml", "--against", "camera.yml"], "--against needs -o OUT"),
+        (["show", "bare.yml", "--against", "camera.yml"], "bare.yml states no image size; --size says which"),
+        (["show", "camera.yml", "--size", "640x480"], "camera.yml: camera is for 96x64, not 640x480"),
         (["show", "bare.yml", "-o", "o.png"], "bare.yml states no image size"),
-        (["show", FILES / "opencv_stereo.yml", "-o", "o.png"], "--name which camera the picture is to show: 1, 2"),
+        (["show", FILES / "opencv_stereo.yml", "-o", "o.png"], "--name says which camera is meant: 1, 2"),
         (["show", "camera.yml", "--name", "left"], "no camera is called 'left'; there are camera"),
         (["convert", "camera.yml"], "required: OUT"),
         (["convert", "none.yml", "o.yml"], "none.yml: No such file"),
         (["convert", "camera.yml", "camera.yml", "--model", "fisheye624"], "camera.yml: exists already; --force"),
-        (["convert", "camera.yml", ".", "--force"], "is a folder"),
+        (["convert", "camera.yml", ".", "--format", "opencv", "--force"], ".: is a folder; opencv is one file"),
         (["convert", "camera.yml", "none/o.yml"], "none/o.yml: there is no folder none"),
-        (["convert", "camera.yml", "o.yml", "--model", "fisheye63"], "known are brown_conrady"),
+        (
+            ["convert", "camera.yml", "o.yml", "--model", "fisheye63"],
+            "did you mean 'fisheye62'? Known are",
+        ),
         (["convert", "camera.yml", "o.yml", "--model", "brown_conrady", "--count", "6"], "got count=6"),
         (["convert", "camera.yml", "o.yml", "--max-angle", "0"], "--max-angle must be above 0"),
         (["convert", "camera.yml", "o.yml", "--max-angle", "nan"], "--max-angle must be above 0"),
@@ -123,7 +127,7 @@ def test_convert_writes_the_new_camera(folder, capsys):
     command("convert", "camera.yml", "out.json", "--model", "fisheye624", "--format", "camtorch")
     assert capsys.readouterr().out == (
         "out.json: camera, kannala_brandt to fisheye624: exact, "
-        "up to 123.1 degrees from the axis, 100 % of the picture\n"
+        "up to 123.1 degrees from the axis, 100 % of what the picture has rays for\n"
     )
     camera = ct.load("out.json").camera
     assert (type(camera), camera.image_size) == (ct.Fisheye624, (64, 96))
@@ -148,6 +152,46 @@ def test_convert_keeps_poses(folder, capsys):
     assert [type(camera) for camera in after.cameras.values()] == [ct.Fisheye62] * 2
     for name, pose in before.extrinsics.items():
         assert torch.equal(after.extrinsics[name].translation, pose.translation)
+
+
+def test_convert_overwrites_no_images_unasked(folder, capsys):
+    rig = ct.load(FILES / "nerfstudio_transforms.json")
+    ct.save(rig, "rig.json", "camtorch")
+    Path("images.txt").write_text("# mine\n")
+    assert "images.txt: exists already; --force" in refused(capsys, "convert", "rig.json", "cameras.txt")
+    assert Path("images.txt").read_text() == "# mine\n"
+    assert not Path("cameras.txt").exists()
+    command("convert", "rig.json", "cameras.txt", "--force")
+    assert list(ct.load("cameras.txt").extrinsics) == list(rig.extrinsics)
+
+
+def test_show_compares_without_a_picture(folder, capsys):
+    command("convert", "camera.yml", "other.json", "--model", "fisheye624", "--format", "camtorch")
+    command("show", "camera.yml", "--against", "other.json")
+    assert "against other.json: the same to rounding, over " in capsys.readouterr().out
+    # of a rig the camera of that name, of a file of one camera that one
+    command("show", FILES / "kalibr_camchain.yaml", "--name", "cam1", "--against", FILES / "kalibr_camchain.yaml")
+    assert "the same to rounding" in capsys.readouterr().out
+    ct.save(ct.load(FILES / "kalibr_camchain.yaml").cameras["cam1"], "one.json")
+    command("show", FILES / "kalibr_camchain.yaml", "--name", "cam1", "--against", "one.json")
+    assert "the same to rounding" in capsys.readouterr().out
+
+
+def test_a_size_that_the_file_does_not_say(folder, capsys):
+    command(
+        "convert",
+        FILES / "opencv_stereo.yml",
+        "chain.yaml",
+        "--model",
+        "kannala_brandt",
+        "--format",
+        "kalibr",
+        "--size",
+        "1280x800",
+        "--count",
+        "4",
+    )
+    assert [camera.image_size for camera in ct.load("chain.yaml").cameras.values()] == [(800, 1280)] * 2
 
 
 # -- the numbers of a summary

@@ -55,10 +55,10 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     result = base.expand_as(step)
     left = torch.ones(step.shape[:-1], dtype=torch.bool, device=step.device)
     for halving in range(_HALVINGS):
-        candidate = base + step / 2**halving
+        candidate, defined = _defined(camera, base + step / 2**halving, base)
         numbers = (t.expand(*step.shape[:-1], -1) for t in (camera.intrinsics, candidate))
         lens = remade(camera, *numbers, camera.image_size)
-        invertible = (lens.unproject(lattice.expand(*lens.batch_shape, *lattice.shape))[1] | ~wanted).all(-1)
+        invertible = (lens.unproject(lattice.expand(*lens.batch_shape, *lattice.shape))[1] | ~wanted).all(-1) & defined
         result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
         left = left & ~invertible
         if not bool(left.any()):
@@ -108,7 +108,8 @@ def _measured(camera: Camera) -> Tensor:
     ends = []
     for sign in (-1, 1):
         change = sign * _STEP * torch.eye(count, dtype=torch.float64, device=rays.device)
-        distortion = camera.distortion.expand(*batch, count).unsqueeze(-2) + change
+        given = camera.distortion.expand(*batch, count).unsqueeze(-2)
+        distortion, _ = _defined(camera, given + change, given)
         intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, count, 4)
         ends.append(remade(camera, intrinsics, distortion, camera.image_size).project(rays))
     (before, valid), (after, also) = ends
@@ -117,6 +118,14 @@ def _measured(camera: Camera) -> Tensor:
     height, width = camera.image_size
     corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
     return torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
+
+
+def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients (*B, n), others where the model's formula does not exist for them, and bool (*B,): it does."""
+    sense = camera.defined(distortion.unbind(-1))
+    if sense is None:
+        return distortion, torch.ones_like(distortion[..., 0], dtype=torch.bool)
+    return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
 
 
 def _lattice(camera: Camera) -> Tensor:

@@ -62,7 +62,7 @@ def read(path, text: str | None = None) -> Rig:
     else:
         cameras = _from_text(path, read_text(path) if text is None else text)
     beside = _images_beside(path)
-    if not os.path.exists(beside):
+    if beside is None or not os.path.exists(beside):
         return Rig(cameras)
     extrinsics, images = {}, {}
     for image in colmap_images.read(beside):
@@ -74,9 +74,11 @@ def read(path, text: str | None = None) -> Rig:
     return Rig(cameras, extrinsics, images=images)
 
 
-def _images_beside(path) -> str:
+def _images_beside(path) -> str | None:
+    """The file of poses that belongs to a file of cameras, which COLMAP calls cameras.txt or cameras.bin."""
     folder, name = os.path.split(os.fspath(path))
-    return os.path.join(folder, "images" + (os.path.splitext(name)[1] or ".txt"))
+    stem, suffix = os.path.splitext(name)
+    return os.path.join(folder, f"images{suffix}") if stem == "cameras" else None
 
 
 def _from_text(path, text: str) -> dict[str, Camera]:
@@ -169,23 +171,36 @@ def write(rig: Rig, path) -> dict[str, bytes]:
     for name, camera in rig.cameras.items():
         height, width = lossy.size(name, camera)
         entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
-    binary = os.fspath(path).endswith(".bin")
-    files = {os.fspath(path): (_as_bytes if binary else _as_text)(entries)}
+    path = _file_of(path)
+    binary = path.endswith(".bin")
+    files = {path: (_as_bytes if binary else _as_text)(entries)}
     beside = _images_beside(path)
-    if not rig.extrinsics and os.path.exists(beside):
-        _check_images(lossy, {str(i) for i in ids}, beside)
     if rig.extrinsics:
+        if beside is None:
+            lossy.fail(
+                "extrinsics",
+                f"no place: COLMAP has them in images{os.path.splitext(path)[1]} beside cameras, so "
+                f"call the file cameras{os.path.splitext(path)[1]}, or name a folder",
+            )
         content = colmap_images.content(lossy, rig, identities, beside, binary)
         if content is not None:
             files[beside] = content
+            # COLMAP opens no folder without its points
+            points = os.path.join(os.path.dirname(path), "points3D" + os.path.splitext(path)[1])
+            if not os.path.exists(points):
+                files[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
+    elif beside is not None and os.path.exists(beside):
+        lossy.fail("extrinsics", f"none, while {beside} has poses of images, which these cameras would get")
     return files
 
 
-def _check_images(lossy: Lossy, ids: set[str], beside: str) -> None:
-    """The images that stay where they are must have their cameras."""
-    for image in colmap_images.read(beside):
-        if image.camera not in ids:
-            lossy.fail(f"camera {image.camera}", f"missing, while {beside} has images of it")
+def _file_of(path) -> str:
+    """The file of cameras: that of a folder is called cameras.txt, unless a cameras.bin is there."""
+    path = os.fspath(path)
+    if path.endswith((".txt", ".bin")) and not os.path.isdir(path):
+        return path
+    kind = "bin" if os.path.exists(os.path.join(path, "cameras.bin")) else "txt"
+    return os.path.join(path, f"cameras.{kind}")
 
 
 def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]]:

@@ -11,6 +11,7 @@ from typing import BinaryIO, NamedTuple
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.record import Record
+from camtorch.io.text import check_ordinary
 from camtorch.io.write import Lossy, number
 from camtorch.rig import Rig
 
@@ -37,6 +38,7 @@ def read(path) -> Iterator[Image]:
     Raises:
         CameraFileError: it is none.
     """
+    check_ordinary(path)
     with open(path, "rb") as file:
         images = (_from_bytes if os.fspath(path).endswith(".bin") else _from_text)(path, file)
         for i, image in enumerate(images):
@@ -132,6 +134,10 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
             return None
         if any(image.has_points for image in there):
             Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
+    folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
+    for name in ("rigs", "frames"):
+        if os.path.exists(os.path.join(folder, name + suffix)):
+            lossy.fail("extrinsics", f"would contradict {name}{suffix} beside them; write to another folder")
     return _as_bytes(entries) if binary else _as_text(entries)
 
 

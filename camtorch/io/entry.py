@@ -35,6 +35,11 @@ _SUFFIXES = {
     "mrcal": (".cameramodel",),
     "camtorch": (".json",),
 }
+_NAMES = {
+    r"transforms.*\.json": "nerfstudio",
+    r".*camchain.*\.ya?ml": "kalibr",
+    r".*camera_?info.*\.ya?ml": "ros",
+}
 _IN_A_FOLDER = ("cameras.bin", "cameras.txt", "transforms.json")
 
 
@@ -55,7 +60,7 @@ def load(path, format: str | None = None) -> Rig:
         CameraFileError: the file cannot be used; it says where and why. OSError: it cannot be opened.
         ValueError: an unknown format. ImportError: YAML without PyYAML.
     """
-    _known(format)
+    format = _known(format)
     if os.path.isdir(path):
         found = [os.path.join(path, name) for name in _IN_A_FOLDER if os.path.exists(os.path.join(path, name))]
         if not found:
@@ -91,41 +96,59 @@ def save(rig: Rig | Camera, path, format: str | None = None) -> None:
 
     Args:
         rig: a `Rig`, or one camera.
-        path: the file. With COLMAP, poses go to an images file beside it.
+        path: the file; with COLMAP it may be a folder. There poses go to an images file beside the cameras.
         format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch". If left out:
             the format that the rig was loaded from if its files end like this one, else what the name says
-            (`transforms.json`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`), else camtorch's own for `.json`.
+            (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
+            else camtorch's own for `.json`.
 
     Raises:
         CameraFileError: something that the format cannot hold; it says what would be lost.
         ValueError: an unknown format, or a suffix that does not say which. OSError: it cannot be written.
     """
+    for name, content in rendered(rig, path, format).items():
+        folder = os.path.dirname(name)
+        if folder == os.fspath(path):
+            os.makedirs(folder, exist_ok=True)
+        write_atomically(name, content)
+
+
+def rendered(rig: Rig | Camera, path, format: str | None = None) -> dict[str, bytes]:
+    """The files that `save` writes, by their paths. Raises what it raises."""
     if isinstance(rig, Camera):
         rig = Rig({"camera": rig})
     if not isinstance(rig, Rig):
         raise TypeError(f"save takes a Rig or a Camera; got {type(rig).__name__}")
     if not rig.cameras:
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
-    _known(format)
-    format = format or _format_of(rig, os.fspath(path))
-    files = colmap.write(rig, path) if format == "colmap" else {path: _BY_KEYS[format].render(rig, path).encode()}
-    for name, content in files.items():
-        write_atomically(name, content)
+    path = os.fspath(path)
+    format = _known(format) or _format_of(rig, path)
+    if format != "colmap" and os.path.isdir(path):
+        raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
+    try:
+        return colmap.write(rig, path) if format == "colmap" else {path: _BY_KEYS[format].render(rig, path).encode()}
+    except UnicodeEncodeError as error:
+        raise CameraFileError(path, "names", f"{error.object!r:.60} is no text that a file can hold") from None
 
 
-def _known(format: str | None) -> None:
-    if format is not None and format not in FORMATS:
+def _known(format: str | None) -> str | None:
+    name = None if format is None else str(format).lower()
+    if name is not None and name not in FORMATS:
         raise ValueError(f"unknown format {format!r}; known are {', '.join(sorted(FORMATS))}")
+    return name
 
 
 def _format_of(rig: Rig, path: str) -> str:
     name = os.path.basename(path).lower()
     suffix = os.path.splitext(name)[1]
     fitting = [format for format, suffixes in _SUFFIXES.items() if suffix in suffixes]
-    if rig.format in fitting:
+    if rig.format in fitting or (rig.format == "colmap" and os.path.isdir(path)):
         return rig.format
-    if re.fullmatch(r"transforms.*\.json", name):
-        return "nerfstudio"
+    if os.path.isdir(path):
+        raise ValueError(f"{path}: is a folder; name a file, or format='colmap'")
+    for pattern, format in _NAMES.items():
+        if re.fullmatch(pattern, name):
+            return format
     if suffix == ".json":
         return "camtorch"
     if len(fitting) == 1:

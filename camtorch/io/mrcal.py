@@ -15,8 +15,10 @@ from camtorch.rig import Rig
 _MODELS = {
     "LENSMODEL_PINHOLE": ("pinhole", 0),
     "LENSMODEL_LONLAT": ("equirectangular", 0),
+    "LENSMODEL_STEREOGRAPHIC": ("stereographic", 0),
     **{f"LENSMODEL_OPENCV{count}": ("brown_conrady", count) for count in (4, 5, 8, 12, 14)},
 }
+_START = 1 << 16
 _TOKEN = re.compile(
     r"""\s+|\#[^\n]*|(?P<mark>[][{}(),:])|b?(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|(?P<word>[^][\s{}(),:'"#]+)"""
 )
@@ -24,7 +26,9 @@ _TOKEN = re.compile(
 
 def matches_text(text: str) -> bool:
     """Whether this is the start of such a file: comments, a brace, a key in Python's quotes."""
-    return re.match(r"(?:\s|#[^\n]*\n)*\{(?:\s|#[^\n]*\n)*(?:'|\"(?:lens_?model|distortion_model)\")", text) is not None
+    # Python's regular expressions remember every repetition
+    start = re.sub(r"#[^\n]*", "", text[:_START]).split()[:2]
+    return re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)) is not None
 
 
 def parse_literal(path, text: str) -> dict[str, Any]:
@@ -92,6 +96,8 @@ def render(rig: Rig, path) -> str:
     height, width = lossy.size(name, camera)
     key = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
     intrinsics, distortion = lossy.numbers(name, camera)
+    if key == "stereographic":  # without the polynomial
+        distortion = lossy.at_most(name, camera, distortion, (0,))
     model = next(model for model, (k, count) in _MODELS.items() if k == key and count == len(distortion))
     rotation, translation = [0.0] * 3, [0.0] * 3
     if name in rig.extrinsics:

@@ -6,7 +6,7 @@ import math
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
-from camtorch.io import poses
+from camtorch.io import CameraFileError, poses
 from camtorch.io.record import Record, one_of
 from camtorch.io.write import Lossy, as_json
 from camtorch.rig import Rig
@@ -24,13 +24,27 @@ _MODELS = {
 }
 _RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
 _TANGENTIAL = ("p1", "p2")
-_CORE = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "distortion_params")
+_CORE = (
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "camera_angle_x",
+    "camera_angle_y",
+    "x_fov",
+    "y_fov",
+    "distortion_params",
+)
 _OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL)
 
 
 def matches(keys: dict) -> bool:
     """Whether these are the keys of such a file."""
-    return ("frames" in keys and "camtorch" not in keys) or "fl_x" in keys or "camera_angle_x" in keys
+    return (isinstance(keys.get("frames"), list) and "camtorch" not in keys) or any(
+        key in keys for key in ("fl_x", "camera_angle_x", "x_fov")
+    )
 
 
 def parse(record: Record) -> Rig:
@@ -60,7 +74,8 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
     merged = Record(record.path, values, record.place)
     if frame is not None:
         for key in _OF_A_CAMERA:
-            if key in frame and values.setdefault(key, frame.value[key]) != frame.value[key]:
+            same = key not in frame or values.setdefault(key, frame.value[key]) == frame.value[key]
+            if not same and not _equal(record[key], frame[key]):
                 record[key].fail("a frame says otherwise; Nerfstudio would take this one for all frames")
         merged.place = frame.place
     model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV"  # as instant-ngp has it
@@ -72,17 +87,34 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
         if size is None:
             merged["w"].fail("missing")
         return merged.camera(key, panorama(size), [], size)
-    if "fl_x" in merged:
-        fx = merged["fl_x"].number()
-    else:
-        angle = merged["camera_angle_x"].number()
-        if not 1e-6 < angle < math.pi:
-            merged["camera_angle_x"].fail(f"{angle:g} is no angle of a pinhole camera")
-        fx = merged["w"].side() / 2 / math.tan(angle / 2)
-    fy = merged["fl_y"].number() if "fl_y" in merged else fx
+    fx, fy = _focal(merged, "x", "w"), _focal(merged, "y", "h")
+    if fx is None and fy is None:
+        merged["fl_x"].fail("missing")
+    fx, fy = fx or fy, fy or fx
     centre = [merged[c].number() if c in merged else merged[side].side() / 2 for c, side in (("cx", "w"), ("cy", "h"))]
     key, distortion = _distortion(merged, key)
     return merged.camera(key, [fx, fy, centre[0] - 0.5, centre[1] - 0.5], distortion, size)
+
+
+def _equal(one: Record, other: Record) -> bool:
+    """Whether both are the same number, however written."""
+    try:
+        return one.number() == other.number()
+    except CameraFileError:
+        return False
+
+
+def _focal(record: Record, axis: str, side: str) -> float | None:
+    """The focal length along an axis: as such, or by the angle of the picture."""
+    if f"fl_{axis}" in record:
+        return record[f"fl_{axis}"].number()
+    for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180)):
+        if key in record:
+            angle = record[key].number() * unit
+            if not 1e-6 < angle < math.pi:
+                record[key].fail(f"{record[key].value} is no angle of a pinhole camera")
+            return record[side].side() / 2 / math.tan(angle / 2)
+    return None
 
 
 def _distortion(record: Record, key: str) -> tuple[str, list[float]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import re
 import warnings
@@ -13,19 +13,24 @@ import torch
 from camtorch.camera import MODELS, Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, poses
+from camtorch.io.filestorage import Value, as_json, as_xml, as_yaml
 from camtorch.io.record import Record
 from camtorch.io.text import read_mapping
-from camtorch.io.write import Lossy, number
+from camtorch.io.write import Lossy
 from camtorch.rig import Rig
 
 # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
 _NAMES = r"\d*|left|right"
 _MATRIX = re.compile(rf"(?:K|M|(?i:camera_?matrix|intrinsic_?matrix))_?({_NAMES})")
-_DISTORTION = re.compile(rf"(?:D|(?i:dist(?:ortion)?(?:_?coeff?s|_?coefficients)?))_?({_NAMES})")
+_DISTORTION = re.compile(
+    rf"(?:[Dd]|(?i:dist(?:ortion)?(?:_?coef(?:f|fs|s|ficients?)?(?:_?mat)?|_?param(?:s|eters)?)?))_?({_NAMES})"
+)
+_LIKE_DISTORTION = re.compile(r"(?i:d\d*|xi.*|.*coef.*|.*distor.*|dist(?!ance).*)")
+_XI = re.compile(rf"(?i:xi)_?({_NAMES})")
 _WIDTH = re.compile(r"(?i:(?:image_?)?width)")
 _HEIGHT = re.compile(r"(?i:(?:image_?)?height)")
 _FISHEYE = re.compile(r"(?i:(?:is_?)?fisheye(?:_?model)?)")
-_OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model|xi)")
+_OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model)")
 _FISHEYE_COUNT = 4  # of cv2.fisheye, and one of the counts of cv2.calibrateCamera
 _PAIRS = (["1", "2"], ["left", "right"])
 
@@ -37,7 +42,8 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`) and, where it has them,
             distortion coefficients (`distortion_coefficients`, `distCoeffs`, `D`), `image_width` and `image_height`.
         model: a key of `camtorch.MODELS`. If left out: without coefficients a pinhole, with a true `fisheye_model` a
-            Kannala-Brandt, else a Brown-Conrady camera, with a warning where 4 coefficients could be either.
+            Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning where 4 coefficients could be
+            of two models.
         name: which camera of a file with several: the end of its keys, "1" for `M1` and `D1`.
 
     Raises:
@@ -57,14 +63,16 @@ def matches(keys: dict) -> bool:
 def parse(record: Record) -> Rig:
     """The cameras of a file, called by the ends of their keys; `X2 = R X1 + T` of a pair."""
     file = _File(record)
-    names = sorted(file.by_name(_MATRIX))
+    names = sorted(file.by_name(_MATRIX), key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     if not names:
         file.camera(None, None)
     record.few(len(names))
     cameras = {name or "camera": file.camera(None, name) for name in names}
     extrinsics = {}
-    if names in _PAIRS and "R" in record and "T" in record:
-        extrinsics = dict(zip(names, (poses.pose(record, [0.0] * 3, [0.0] * 3), file.pose("R", "T")), strict=True))
+    if names in _PAIRS and (("R" in record and "T" in record) or ("rvec" in record and "tvec" in record)):
+        here = poses.pose(record, [0.0] * 3, [0.0] * 3)
+        there = file.pose("R", "T") if "R" in record else file.pose_by_vectors("rvec", "tvec")
+        extrinsics = dict(zip(names, (here, there), strict=True))
     return Rig(cameras, extrinsics)
 
 
@@ -74,6 +82,12 @@ class _File:
     def __init__(self, record: Record):
         self.record, self.path, self.keys = record, record.path, record.keys()
         self.found: dict[re.Pattern, Any] = {}
+        cameras = self.by_name(_MATRIX)
+        for key in self.keys:
+            if _LIKE_DISTORTION.fullmatch(key) and isinstance(record.value[key], (list, dict)):
+                known = _DISTORTION.fullmatch(key) or _XI.fullmatch(key)
+                if cameras and (not known or known[1] not in cameras):
+                    self.fail(key, "looks like the distortion of a camera; there is none of this name")
 
     def camera(self, model: str | None, name: str | None) -> Camera:
         key, distortion_key = self.keys_of_camera(name)
@@ -88,11 +102,16 @@ class _File:
         if below or bottom != [0, 0, 1]:
             self.fail(key, "is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
         distortion = self.numbers(distortion_key) if distortion_key else []
-        kind = MODELS[model or self.model(distortion)]
+        xi_key = self.by_name(_XI).get(_MATRIX.fullmatch(key)[1])
+        if xi_key:  # cv2.omnidir
+            xi = self.record[xi_key]
+            distortion = [*(self.numbers(xi_key) if isinstance(xi.value, (dict, list)) else [xi.number()]), *distortion]
+        kind = MODELS[model or ("mei" if xi_key else self.model(distortion))]
         arguments = [torch.tensor([fx, fy, cx, cy], dtype=torch.float64)]
         if distortion:
             if kind.names_of(len(distortion)) is None or not kind.distortion_names:
-                self.fail(distortion_key, f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
+                place = distortion_key or xi_key
+                self.fail(place, f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
             arguments.append(torch.tensor(distortion, dtype=torch.float64))
         try:
             return kind(*arguments, image_size=self.image_size())
@@ -145,7 +164,7 @@ class _File:
         if len(distortion) == _FISHEYE_COUNT and key is None:
             warnings.warn(
                 f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
-                "If they come from cv2.fisheye, the model is kannala_brandt",
+                "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt')",
                 stacklevel=4,
             )
         return "brown_conrady" if distortion else "pinhole"
@@ -159,6 +178,12 @@ class _File:
         record = self.record[rotation_key]
         pose = poses.pose(self.record[translation_key], poses.vector_of_matrix(record, rows), translation)
         return poses.keep(pose, "rows", poses.as_rows(rows, translation))
+
+    def pose_by_vectors(self, rotation_key: str, translation_key: str) -> Extrinsics:
+        rotation, translation = self.numbers(rotation_key), self.numbers(translation_key)
+        if (len(rotation), len(translation)) != (3, 3):
+            self.fail(f"{rotation_key}, {translation_key}", "are not three numbers each")
+        return poses.pose(self.record[translation_key], rotation, translation)
 
     def image_size(self) -> tuple[int, int] | None:
         keys = self.find(_HEIGHT), self.find(_WIDTH)
@@ -178,15 +203,23 @@ class _File:
         """An OpenCV matrix, a list, or a list of rows as one list."""
         record = self.record[key]
         if isinstance(record.value, dict):
-            rows, cols = (Record(self.path, record.value.get(s), f"{key}.{s}").number() for s in ("rows", "cols"))
+            if "sizes" in record:  # of any other number of dimensions
+                sizes = self.numbers_of_list(record["sizes"])
+            else:
+                sizes = [Record(self.path, record.value.get(s), f"{key}.{s}").number() for s in ("rows", "cols")]
             data = record.value.get("data")
-            if not isinstance(data, list) or len(data) != rows * cols:
+            if not isinstance(data, list) or len(data) != math.prod(sizes):
                 count = f"{len(data)} numbers" if isinstance(data, list) else "no list"
-                self.fail(f"{key}.data", f"{count}, where rows and cols say {rows:g} x {cols:g}")
+                says = "sizes say" if "sizes" in record else "rows and cols say"
+                self.fail(f"{key}.data", f"{count}, where {says} {' x '.join(f'{s:g}' for s in sizes)}")
             return record["data"].numbers()
         if not isinstance(record.value, list):
             self.fail(key, "is neither an OpenCV matrix nor a list of numbers")
         return [item.number() for row in record for item in (row if isinstance(row.value, list) else [row])]
+
+    def numbers_of_list(self, record: Record) -> list[float]:
+        """Those of a list, or of a single number, which XML cannot tell from it."""
+        return record.numbers() if isinstance(record.value, list) else [record.number()]
 
     def fail(self, place: str, reason: object) -> NoReturn:
         raise CameraFileError(self.path, place, reason) from None
@@ -206,16 +239,16 @@ def render(rig: Rig, path) -> str:
         ends = [names[0] if re.fullmatch(_NAMES, names[0]) else ""]
     elif not all(name and re.fullmatch(_NAMES, name) for name in names):
         ends = [str(i + 1) for i in range(len(names))]
-    values: dict[str, int | list[list[float]]] = {}
+    values: dict[str, Value] = {}
     for name, end in zip(names, ends, strict=True):
         _add_camera(lossy, values, name, rig.cameras[name], end)
     _add_pose(lossy, values, rig, sorted(zip(ends, names, strict=True)))
     suffix = os.path.splitext(str(path))[1].lower()
-    return {".json": _json, ".xml": _xml}.get(suffix, _yaml)(values)
+    return {".json": as_json, ".xml": as_xml}.get(suffix, as_yaml)(values)
 
 
 def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str) -> None:
-    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt"))
+    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt", "mei"))
     (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
     if camera.image_size is not None:
         values_of_size = {"image_width": camera.image_size[1], "image_height": camera.image_size[0]}
@@ -226,9 +259,11 @@ def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str)
         lossy.fail(name, "no image_size, unlike the cameras before it; OpenCV's file has one for all")
     if key == "kannala_brandt":
         distortion = lossy.at_most(name, camera, distortion, (_FISHEYE_COUNT,))
+    if key == "mei":
+        values[f"xi_{end}" if end else "xi"], *distortion = distortion
     fisheye = int(key == "kannala_brandt")
     # with one flag for all, several cameras must agree, be it on a flag that is not needed
-    says = fisheye or len(distortion) == _FISHEYE_COUNT or end
+    says = key != "mei" and (fisheye or len(distortion) == _FISHEYE_COUNT or end)
     if says and values.setdefault("fisheye_model", fisheye) != fisheye:
         lossy.fail(name, "a lens unlike that of the cameras before it; OpenCV's file has one fisheye_model for all")
     short = {"": ("camera_matrix", "distortion_coefficients")}
@@ -250,46 +285,3 @@ def _add_pose(lossy: Lossy, values: dict, rig: Rig, ends_and_names: list[tuple[s
         values["T"] = [row[3:] for row in rows[:3]]
     else:
         lossy.no_pose(rig)
-
-
-def _words(matrix: list[list[float]], separator: str) -> str:
-    return separator.join(number(value) for row in matrix for value in row)
-
-
-def _yaml(values: dict) -> str:
-    lines = ["%YAML:1.0", "---"]
-    for key, value in values.items():
-        if isinstance(value, int):
-            lines.append(f"{key}: {value}")
-        else:
-            lines += [f"{key}: !!opencv-matrix", f"   rows: {len(value)}", f"   cols: {len(value[0])}", "   dt: d"]
-            lines.append(f"   data: [ {_words(value, ', ')} ]")
-    return "\n".join(lines) + "\n"
-
-
-def _json(values: dict) -> str:
-    whole = {
-        key: value
-        if isinstance(value, int)
-        else {
-            "type_id": "opencv-matrix",
-            "rows": len(value),
-            "cols": len(value[0]),
-            "dt": "d",
-            "data": [v for row in value for v in row],
-        }
-        for key, value in values.items()
-    }
-    return json.dumps(whole, indent=4, allow_nan=False) + "\n"
-
-
-def _xml(values: dict) -> str:
-    lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
-    for key, value in values.items():
-        if isinstance(value, int):
-            lines.append(f"<{key}>{value}</{key}>")
-        else:
-            lines += [f'<{key} type_id="opencv-matrix">', f"  <rows>{len(value)}</rows>"]
-            lines += [f"  <cols>{len(value[0])}</cols>", "  <dt>d</dt>", "  <data>"]
-            lines.append(f"    {_words(value, ' ')}</data></{key}>")
-    return "\n".join([*lines, "</opencv_storage>"]) + "\n"

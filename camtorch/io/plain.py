@@ -35,8 +35,10 @@ def parse(record: Record) -> Rig:
             images[name] = entry["camera"].text()
         if images.get(name, name) not in cameras:
             entry.fail(f"of the camera {images.get(name, name)!r:.60}, which is not in the file")
+        vectors = _tensor(entry["rotation"], 3), _tensor(entry["translation"], 3)
+        _same_batch(entry, *vectors)
         try:
-            extrinsics[name] = Extrinsics(_tensor(entry["rotation"], 3), _tensor(entry["translation"], 3))
+            extrinsics[name] = Extrinsics(*vectors)
         except ValueError as error:
             entry.fail(error)
     return Rig(cameras, extrinsics, images=images)
@@ -55,10 +57,18 @@ def _camera(record: Record) -> Camera:
     if "image_size" in record:
         height, width = (side.side() for side in _two(record["image_size"]))
         size = (height, width)
+    _same_batch(record, *arguments)
     try:
         return kind(*arguments, image_size=size)
     except (ValueError, TypeError) as error:
         return record.fail(error)
+
+
+def _same_batch(record: Record, *tensors: Tensor) -> None:
+    """Refuse batch dims that would grow when they are broadcast: a small file is not to take much memory."""
+    shapes = {tuple(t.shape[:-1]) for t in tensors} - {()}
+    if len(shapes) > 1:
+        record.fail(f"batch dims that differ: {', '.join(map(str, sorted(shapes)))}")
 
 
 def _two(record: Record) -> Record:
@@ -91,18 +101,29 @@ def render(rig: Rig, path) -> str:
     lossy = Lossy(path, "camtorch")
     cameras, extrinsics = {}, {}
     for name, camera in rig.cameras.items():
-        entry = {"model": camera.key, "intrinsics": _values(lossy, name, camera.intrinsics)}
+        intrinsics, distortion = _rows(camera.intrinsics, camera.distortion)
+        entry = {"model": camera.key, "intrinsics": _values(lossy, name, intrinsics)}
         if camera.distortion.shape[-1]:
             entry["distortion_names"] = list(camera.distortion_names)
-            entry["distortion"] = _values(lossy, name, camera.distortion)
+            entry["distortion"] = _values(lossy, name, distortion)
         if camera.image_size is not None:
             entry["image_size"] = list(camera.image_size)
         cameras[name] = entry
     for name, pose in rig.extrinsics.items():
-        extrinsics[name] = {key: _values(lossy, name, getattr(pose, key)) for key in ("rotation", "translation")}
+        rotation, translation = _rows(pose.rotation, pose.translation)
+        extrinsics[name] = {
+            "rotation": _values(lossy, name, rotation),
+            "translation": _values(lossy, name, translation),
+        }
         if name in rig.images:
             extrinsics[name]["camera"] = rig.images[name]
     return as_json({"camtorch": _VERSION, "cameras": cameras, "extrinsics": extrinsics})
+
+
+def _rows(*tensors: Tensor) -> list[Tensor]:
+    """Tensors (*B, n) with equal batch dims, or with none."""
+    batch = torch.broadcast_shapes(*(t.shape[:-1] for t in tensors))
+    return [t if t.ndim == 1 else t.expand(*batch, -1) for t in tensors]
 
 
 def _values(lossy: Lossy, name: str, tensor: Tensor) -> Sequence:

@@ -154,5 +154,5 @@ class Record:
 def one_of(record: Record, names) -> str:
     """The text of a record, which must be one of the names."""
     if record.text() not in names:
-        record.fail(f"{record.text()!r:.60} is not known here; known are {', '.join(sorted(names))}")
+        record.fail(f"{record.text()!r:.60} is not known here; known are {', '.join(sorted(filter(None, names)))}")
     return record.text()

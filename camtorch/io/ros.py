@@ -10,6 +10,7 @@ _MODELS = {
     "plumb_bob": ("brown_conrady", (4, 5)),
     "rational_polynomial": ("brown_conrady", (8, 12, 14)),
     "equidistant": ("kannala_brandt", (4,)),
+    "fisheye": ("kannala_brandt", (4,)),
     "none": ("pinhole", ()),
     "": ("pinhole", ()),
 }
@@ -33,11 +34,13 @@ def parse(record: Record) -> Rig:
     key, counts = _MODELS[one_of(record["distortion_model"], _MODELS)]
     coefficients = _either(record, "distortion_coefficients", "D", "d")
     distortion = _numbers(coefficients)
+    while len(distortion) > max(counts, default=0) and not distortion[-1]:
+        distortion.pop()  # zeros to fill a message of fixed length
     if not distortion:
         key = "pinhole"
     elif len(distortion) not in counts:
         takes = " or ".join(map(str, counts)) or "none"
-        coefficients.fail(f"{len(distortion)} coefficients; {record['distortion_model'].value} takes {takes}")
+        coefficients.fail(f"{len(distortion)} coefficients; {record['distortion_model'].value!r} takes {takes}")
     camera = coefficients.camera(key, [fx, fy, cx, cy], distortion, (height, width))
     return Rig({name or "camera": camera})
 

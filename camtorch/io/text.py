@@ -13,6 +13,7 @@ LARGEST_FILE = 1 << 24
 _LARGEST_YAML = 1 << 22
 _LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
+_MOST_DIRECTIVES = 100  # libyaml compares each with all
 _MOST_JSON_VALUES = 1 << 21
 _MOST_VALUES = 1 << 17  # a second of work
 
@@ -23,13 +24,22 @@ def read_bytes(path) -> bytes:
     Raises:
         CameraFileError: no ordinary file, over 16 MiB. OSError: it cannot be opened.
     """
-    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
-        raise CameraFileError(path, "content", "no ordinary file")
+    check_ordinary(path)
     with open(path, "rb") as file:
         content = file.read(LARGEST_FILE + 1)
     if len(content) > LARGEST_FILE:
         raise CameraFileError(path, "size", f"more than {LARGEST_FILE >> 20} MiB")
     return content
+
+
+def check_ordinary(path) -> None:
+    """Refuse devices and pipes, which may have no end.
+
+    Raises:
+        CameraFileError: it is one.
+    """
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        raise CameraFileError(path, "content", "no ordinary file")
 
 
 def read_text(path) -> str:
@@ -98,6 +108,8 @@ def _from_yaml(path, text: str):
         raise CameraFileError(path, "size", f"more than {largest >> 10} KiB of YAML")
     # "%YAML:1.0", as OpenCV writes it, is not YAML
     text = re.sub(r"\A%YAML[^\n]*", "", text)
+    if len(re.findall(r"^%", text, re.MULTILINE)) > _MOST_DIRECTIVES:
+        raise CameraFileError(path, "content", "too many YAML directives")
     tree = Tree(path)
     try:
         # events, not yaml.load: no recursion, no tags, and none of YAML 1.1's ideas of what is a number
@@ -129,7 +141,7 @@ def _take(yaml, tree: Tree, event) -> None:
         _check_tag(tree, event, ("seq",))
         tree.open([], event.anchor)
     elif isinstance(event, yaml.MappingStartEvent):
-        _check_tag(tree, event, ("map", "opencv-matrix"))
+        _check_tag(tree, event, ("map", "opencv-matrix", "opencv-nd-matrix"))
         tree.open({}, event.anchor)
     elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
         tree.close()

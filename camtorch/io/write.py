@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -21,6 +22,8 @@ from camtorch.rig import Rig
 def write_atomically(path, content: bytes) -> None:
     """Write a file so that, whatever happens, the old or the new content stands there whole."""
     path = os.path.realpath(path)
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OSError(errno.EINVAL, "no ordinary file, which could be replaced", path)
     handle, temporary = tempfile.mkstemp(dir=os.path.dirname(path), prefix=f".{os.path.basename(path)[:100]}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -61,9 +64,10 @@ def listed(values: Sequence[float]) -> str:
 def quoted(text: str) -> str:
     """A text as YAML, in quotes unless it is a plain word."""
     plain = re.fullmatch(r"[A-Za-z_/][\w./-]*", text) and text.lower() not in _YAML_WORDS
-    return text if plain else json.dumps(text)
+    return text if plain else _SURROGATES.sub(lambda pair: json.loads(f'"{pair[0]}"'), json.dumps(text))
 
 
+_SURROGATES = re.compile(r"\\ud[89ab]..\\ud[c-f]..")  # which JSON writes, and YAML does not read
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 

@@ -31,6 +31,7 @@ class BrownConrady(Camera):
     default_count = 5
     counts = (4, 5, 8, 12, 14)
     special_cases = (("pinhole", ()),)
+    fit_counts = (5, 8)
     odd_in_x = frozenset({"p2", "s1", "s2", "tau_y"})
     odd_in_y = frozenset({"p1", "s3", "s4", "tau_x"})
 

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from camtorch.camera import Camera
 from camtorch.charts import Equidistant
 from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.models.odd_polynomial import OddPolynomial
 from camtorch.parameters import as_batch, as_real, is_concrete
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-class KannalaBrandt(Camera):
+class KannalaBrandt(OddPolynomial):
     """The radially symmetric fisheye: r = theta (1 + k1 theta^2 + k2 theta^4 + ...).
 
     theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real; (u, v) = f r (cos phi, sin phi) + c. A ray
@@ -27,16 +27,6 @@ class KannalaBrandt(Camera):
     """
 
     key = "kannala_brandt"
-    distortion_names = ("k1", "k2", "k3", "k4")
-    default_count = 4
-
-    @classmethod
-    def names_of(cls, count):
-        return tuple(f"k{i}" for i in range(1, count + 1)) or None
-
-    @classmethod
-    def counts_text(cls):
-        return "n >= 1 (k1 k2 ...)"
 
     @staticmethod
     def optics(k):

@@ -1,0 +1,92 @@
+"""How far apart two cameras show the same rays."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.camera import Camera
+from camtorch.summary import lattice
+
+_LONG = 400  # pixels of the lattice along the longer side
+_ROUNDING = 1e-9  # px, far above that of two equal cameras
+
+
+class Difference(NamedTuple):
+    """Two cameras on a lattice (rows, columns) of pixels of the first one's picture."""
+
+    apart: Tensor
+    """Pixels between the pixel and where the second camera shows its ray, float64."""
+    both: Tensor
+    """Bool: where both have the ray."""
+    rotation: Tensor
+    """(3, 3): by which the rays were turned."""
+
+    @property
+    def rms(self) -> float:
+        """The root of the mean square over what both have; NaN where that is nothing."""
+        return float(self.apart[self.both].square().mean().sqrt())
+
+    @property
+    def largest(self) -> float:
+        """The largest distance in pixels; NaN where both have nothing."""
+        return float(self.apart[self.both].max()) if bool(self.both.any()) else math.nan
+
+    @property
+    def part(self) -> float:
+        """The part of the picture that both have rays for."""
+        return float(self.both.double().mean())
+
+    def __str__(self) -> str:
+        if not self.part:
+            return "no ray in common"
+        if self.largest < _ROUNDING:
+            return "the same to rounding"
+        return f"rms {self.rms:.3g} px, at most {self.largest:.3g} px"
+
+
+@torch.no_grad()
+def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Difference:
+    """Compare two single cameras over the picture of the first.
+
+    Args:
+        a: the camera whose picture is looked at.
+        b: the other camera, of a picture of the same size, or of none stated.
+        remove_rotation: whether the rays are turned first, by the one rotation that brings those of the cameras
+            closest: two calibrations of one camera may differ by where they look.
+
+    Raises:
+        ValueError: a batch, no image size, or two different ones.
+    """
+    for camera in (a, b):
+        if camera.batch_shape:
+            raise ValueError(f"single cameras are compared; got batch dims {tuple(camera.batch_shape)}")
+    height, width = a._size("a difference")
+    if b.image_size not in (None, a.image_size):
+        raise ValueError(f"the cameras' pictures differ in size: {a.image_size} and {b.image_size}")
+    scale = _LONG / max(height, width)
+    pixels = lattice(a, max(2, round(height * scale)), max(2, round(width * scale))).double()
+    rays, seen = a.unproject(pixels)
+    turn = torch.eye(3, dtype=torch.float64, device=rays.device)
+    if remove_rotation:
+        turn = _rotation(rays, b.unproject(pixels), seen)
+    others, shown = b.project(rays.double() @ turn.mT)
+    return Difference(torch.linalg.vector_norm(others.double() - pixels, dim=-1), seen & shown, turn)
+
+
+def _rotation(rays: Tensor, others: tuple[Tensor, Tensor], seen: Tensor) -> Tensor:
+    """The rotation R of least squares of `R ray - other`, by Kabsch's method."""
+    use = seen & others[1]
+    u, _, vh = torch.linalg.svd(others[0][use].double().mT @ rays[use].double())
+    sign = torch.ones(3, dtype=torch.float64, device=u.device)
+    sign[2] = torch.linalg.det(u @ vh)
+    return u @ torch.diag(sign) @ vh
+
+
+def angle(rotation: Tensor) -> float:
+    """Radians by which a matrix (3, 3) turns."""
+    sine = torch.linalg.matrix_norm(rotation - rotation.mT) / math.sqrt(8)
+    return math.atan2(float(sine), (float(rotation.trace()) - 1) / 2)

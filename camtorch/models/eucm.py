@@ -1,0 +1,38 @@
+"""The extended unified camera."""
+
+from camtorch.camera import Camera
+from camtorch.lens import Lens
+from camtorch.unified import Unified
+
+
+class EUCM(Camera):
+    """The extended unified camera model.
+
+        (a, b) = (x, y) / (alpha d + (1 - alpha) z),  d = sqrt(beta (x^2 + y^2) + z^2),  (u, v) = f (a, b) + c
+
+    A ray is valid before the pole or the fold of r: for z > -w d, see `UCM`, which this is for beta = 1.
+    Needs beta > 0.
+
+    Distortion: alpha beta; 0, 1 if left out, a pinhole camera. The same as Basalt `eucm`, COLMAP EUCM and Kalibr
+    `eucm`. Source: Khomutenko, Garcia and Martinet, "An enhanced unified camera model", RA-L 2016. See `Camera`
+    for shapes, conventions and errors.
+    """
+
+    key = "eucm"
+    distortion_names = ("alpha", "beta")
+    default_count = 2
+    special_cases = (("ucm", ("alpha",)),)
+    fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"alpha": 0.7})
+    defined_text = "beta > 0"
+
+    @classmethod
+    def ideal(cls, count):
+        return 0.0, 1.0
+
+    @staticmethod
+    def defined(k):
+        return k[1]
+
+    @staticmethod
+    def optics(k):
+        return Unified(alpha=k[0], beta=k[1]), Lens()

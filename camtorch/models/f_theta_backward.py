@@ -1,0 +1,36 @@
+"""The f-theta fisheye camera that is given from the pixel to the angle."""
+
+from __future__ import annotations
+
+from camtorch import opaque
+from camtorch.inverted import Inverted, flat
+from camtorch.lens import Lens
+from camtorch.models.f_theta import FreePolynomial
+from camtorch.radial import RadiusPolynomial
+
+_ANGLES = opaque.register_optics("f_theta_backward", flat(RadiusPolynomial))
+
+
+class FThetaBackward(FreePolynomial):
+    """The radially symmetric fisheye with a free polynomial of the radius: theta = r (1 + k2 r + k3 r^2 + ...).
+
+    r is the distance of the pixel from the axis in focal lengths, theta = atan2(hypot(x, y), z). The other direction of
+    `FTheta`: there the polynomial gives r, and its inverse is found. A ray is valid before theta ceases to ascend, and
+    up to a radius of 19 focal lengths.
+
+    Distortion: k2 k3 ... by the power of r, any number of them, at least one; 3 if left out. A polynomial of pixels
+    comes in through `from_polynomial`. The same as NVIDIA DriveWorks `ftheta` where its polynomial gives angles of
+    pixels (`bw-poly`). On the axis see `FTheta`. See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "f_theta_backward"
+
+    @staticmethod
+    def optics(k):
+        return Inverted(_ANGLES, k), Lens()
+
+    @classmethod
+    def _scaled(cls, coefficients):
+        focal = 1 / coefficients[..., :1]
+        powers = range(2, coefficients.shape[-1] + 1)
+        return focal, coefficients[..., 1:] * focal ** coefficients.new_tensor(list(powers))

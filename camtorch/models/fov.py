@@ -1,0 +1,36 @@
+"""The field-of-view camera."""
+
+import math
+
+from camtorch.camera import Camera
+from camtorch.fisheyes import Fov
+from camtorch.lens import Lens
+
+
+class FOV(Camera):
+    """The field-of-view camera, "ATAN": r = atan(2 tan(omega / 2) rho / z) / omega.
+
+    rho = hypot(x, y), and the arc tangent is that of both arguments, so that angles past 90 degrees are real;
+    (u, v) = f r (cos phi, sin phi) + c. Every ray but the exact backward one is valid; for omega = 0 it is the pinhole
+    camera. On the axis the slope is 2 f tan(omega / 2) / omega.
+
+    Distortion: omega, in radians, between -pi and pi; its sign does not matter. The same as Basalt `fov` and COLMAP
+    FOV, which are inexact near the axis, and return wrong rays past 90 degrees. Source: Devernay and Faugeras,
+    "Straight lines have to be straight", MVA 2001, equation (13). See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "fov"
+    distortion_names = ("omega",)
+    default_count = 1
+    special_cases = (("pinhole", ()),)
+    # even in omega: zero is no start
+    fit_starts = ({"omega": 0.3}, {"omega": 0.9})
+    defined_text = "-pi < omega < pi"
+
+    @staticmethod
+    def defined(k):
+        return math.pi - k[0].abs()
+
+    @staticmethod
+    def optics(k):
+        return Fov(k[0]), Lens()

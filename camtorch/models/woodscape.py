@@ -1,0 +1,47 @@
+"""The camera of the WoodScape data set."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from camtorch.models.f_theta import FTheta
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class WoodScape(FTheta):
+    """WoodScape's fisheye: `FTheta` of fourth order, r = theta (1 + k2 theta + k3 theta^2 + k4 theta^3).
+
+    The files give rho = k1 theta + k2 theta^2 + k3 theta^3 + k4 theta^4 in pixels: see `from_woodscape`.
+
+    Distortion: k2 k3 k4, each that of the file divided by its k1. Source: Yogamani et al., "WoodScape: a multi-task,
+    multi-camera fisheye dataset for autonomous driving", ICCV 2019, and its `projection.py`. See `Camera` for shapes,
+    conventions and errors.
+    """
+
+    key = "woodscape"
+    special_cases = ()
+    fit_counts = ()
+
+    @classmethod
+    def names_of(cls, count):
+        return cls.distortion_names if count == 3 else None
+
+    @classmethod
+    def counts_text(cls):
+        return "n = 3 (k2 k3 k4)"
+
+    @classmethod
+    def from_woodscape(cls, coefficients, offset=(0.0, 0.0), *, image_size, aspect_ratio: float = 1.0) -> Self:
+        """From the numbers of a calibration file.
+
+        Args:
+            coefficients: k1, k2, k3, k4 in pixels.
+            offset: cx_offset, cy_offset: of the axis from the middle of the picture, in pixels.
+            image_size: (height, width) in pixels.
+            aspect_ratio: the file's, by which it scales v.
+        """
+        height, width = image_size
+        centre = [offset[0] + (width - 1) / 2, offset[1] + (height - 1) / 2]
+        return cls.from_polynomial(centre, coefficients, aspect_ratio=aspect_ratio, image_size=image_size)

@@ -1,0 +1,161 @@
+"""Radial factors of lenses whose radius is no odd function of the angle, and so not analytic at the centre."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from camtorch.analytic import root
+from camtorch.lens import Polynomial
+
+
+class RadiusPolynomial:
+    """The radial factor R(t) = 1 + c0 s + c1 s^2 + ... of s = radius = sqrt(t).
+
+    With odd powers of s the point m R(|m|^2) has one continuous derivative at the centre, and no second one: it depends
+    on the direction from which the centre is approached. The one given there is zero, their mean.
+    """
+
+    def __init__(self, coefficients: Sequence[Tensor]):
+        self.of_radius = Polynomial(coefficients)
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        return self.of_radius.parameters
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return self.derivatives(t, 0)[0]
+
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
+        radius = root(t)
+        factor, *by_radius = self.of_radius.derivatives(radius, order)
+        if not order:
+            return (factor,)
+        slope = by_radius[0] / (2 * radius)
+        if order == 1:
+            return factor, slope
+        return factor, slope, (by_radius[1] - 2 * slope) / (4 * radius * radius)
+
+    def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+        """The sums over the points of dR/dc weight, for each coefficient c."""
+        return self.of_radius.pull(root(t), weight)
+
+
+class RadiusTable:
+    """The radial factor R(t) = r(s) / s of s = radius = sqrt(t), r a monotone cubic spline through (0, 0) and a table.
+
+    The spline has two continuous derivatives, but for nodes at which Hyman's filter keeps it monotone (Hyman, "Accurate
+    monotonicity preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983). Behind its last node r turns back,
+    so that the lens folds there.
+    """
+
+    def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
+        """nodes: ascending radii. values: r at the nodes, as many, two at least."""
+        zero = torch.zeros_like(values[0])
+        self.nodes, self.end = (zero, *nodes[:-1]), nodes[-1]
+        nodes, values = (torch.stack(torch.broadcast_tensors(zero, *w), -1) for w in (nodes, values))
+        steps = nodes.diff(dim=-1)
+        secants = values.diff(dim=-1) / steps
+        slopes = _slopes(steps, secants)
+        before, after = slopes[..., :-1], slopes[..., 1:]
+        squares = (3 * secants - 2 * before - after) / steps
+        # of the first piece it is zero, unless the filter was at work; not rounding, which the axis divides by zero
+        first = (squares * steps).abs() < 64 * torch.finfo(steps.dtype).eps * secants.abs()
+        start = nodes[..., :-1]
+        squares = torch.where(first & (start == 0), 0.0, squares)
+        cubes = (before + after - 2 * secants) / (steps * steps)
+        # by powers of the radius itself: on the first piece the factor is a polynomial of t
+        cubics = (
+            values[..., :-1] - start * (before - start * (squares - start * cubes)),
+            before - start * (2 * squares - 3 * start * cubes),
+            squares - 3 * start * cubes,
+            cubes,
+        )
+        self.cubics = tuple(power.unbind(-1) for power in cubics)
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        """The four coefficients of every piece, by powers."""
+        return tuple(c for power in self.cubics for c in power)
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return self.derivatives(t, 0)[0]
+
+    def _at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The radius, whether it lies behind the end, where it is mirrored to, its piece."""
+        radius = root(t)
+        behind = radius > self.end
+        place = torch.where(behind, (2 * self.end - radius).clamp(min=0), radius)
+        return radius, behind, place, _piece(self.nodes[1:], place)
+
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
+        radius, behind, place, piece = self._at(t)
+        zeroth, first, second, third = (_pick(power, piece) for power in self.cubics)
+        # before the end neither division nor root has a part in the derivatives of the outer terms
+        share, square = torch.where(behind, place / radius, 1.0), torch.where(behind, place * place, t)
+        factor = zeroth / radius + share * (first + place * second + square * third)
+        if not order:
+            return (factor,)
+        sense = torch.where(behind, -1.0, 1.0)
+        by_radius = (sense * (first + 2 * place * second + 3 * square * third) - factor) / radius
+        slope = by_radius / (2 * radius)
+        if order == 1:
+            return factor, slope
+        twice = (2 * second + 6 * place * third - 2 * by_radius) / radius
+        return factor, slope, (twice - 2 * slope) / (4 * radius * radius)
+
+    def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+        """The sums over the points of dR/dc weight, for each coefficient c."""
+        radius, _, place, piece = self._at(t)
+        weight, sums = weight / radius, []
+        for _ in self.cubics:
+            table = weight.new_zeros(*weight.shape[:-1], len(self.nodes)).scatter_add(-1, piece, weight)
+            sums += table.split(1, -1)
+            weight = weight * place
+        return sums
+
+
+def _piece(nodes: Sequence[Tensor], place: Tensor) -> Tensor:
+    """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
+    table = torch.stack(nodes, -1).contiguous()
+    if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own
+        return torch.searchsorted(table, place.unsqueeze(-1).contiguous(), right=True).squeeze(-1)
+    table = table.squeeze(-2).expand(*place.shape[:-1], -1)
+    return torch.searchsorted(table.contiguous(), place.contiguous(), right=True)
+
+
+def _pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
+    """From each plane's own columns the one of that index."""
+    table = torch.stack(torch.broadcast_tensors(*columns), -1)
+    shape = torch.broadcast_shapes(table.shape[:-1], index.shape)
+    return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
+
+
+def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
+    """(*B, N) of the pieces -> (*B, N + 1): the slopes of the cubic spline at the nodes, made to ascend where it does.
+
+    The equations of a spline with two continuous derivatives; at the origin its second one is zero, as its mirror
+    image wants it, and the last two pieces are one polynomial. Then Hyman's filter.
+    """
+    before, after = steps[..., :-1], steps[..., 1:]
+    both = before[..., -1:] + after[..., -1:]
+    one, zero = torch.ones_like(both), torch.zeros_like(both)
+    main = torch.cat((2 * one, 2 * (before + after), before[..., -1:]), -1)
+    above, below = torch.cat((one, before), -1), torch.cat((after, both), -1)
+    matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
+    last, last_but_one = after[..., -1:], before[..., -1:]
+    end = (last * last * secants[..., -2:-1] + (2 * both + last) * last_but_one * secants[..., -1:]) / both
+    middle = 3 * (after * secants[..., :-1] + before * secants[..., 1:])
+    right = torch.cat((3 * secants[..., :1], middle, end), -1)
+    slopes = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
+    # between pieces of different sense there is no slope
+    turns = torch.cat((zero > 1, secants[..., :-1] * secants[..., 1:] <= 0, zero > 1), -1)
+    neighbours = torch.stack((torch.cat((secants[..., :1], secants), -1), torch.cat((secants, secants[..., -1:]), -1)))
+    sense, least = neighbours[0].sign(), neighbours.abs().amin(0)
+    # from 0 to 3 a piece is monotone; a little less, and it is flat nowhere
+    ascending = torch.minimum(torch.maximum(slopes * sense, 0.25 * least), 2.5 * least) * sense
+    return torch.where(turns, 0.0, ascending)

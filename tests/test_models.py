@@ -1,0 +1,271 @@
+"""What models are of each other, the constructors of some, and coefficients for which a formula does not exist."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from cameras import fan, one, pixel_lattice, spread
+
+import camtorch as ct
+
+INTRINSICS = torch.tensor([310.0, 315.0, 318.5, 242.25], dtype=torch.float64)
+
+
+def camera(model, *coefficients, scale=1.0):
+    intrinsics = INTRINSICS * torch.tensor([scale, scale, 1, 1])
+    return model(intrinsics, *([torch.tensor(coefficients, dtype=torch.float64)] if coefficients else []))
+
+
+def radius(model, *coefficients):
+    """r of theta at half of the angles of `fan`, and theta."""
+    theta = torch.linspace(0.01, 1.5, 40, dtype=torch.float64)
+    rays = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1)
+    pixels, valid = camera(model, *coefficients).project(rays)
+    assert valid.all()
+    return (pixels[:, 0] - INTRINSICS[2]) / INTRINSICS[0], theta
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (camera(ct.UCM, 0.6), camera(ct.EUCM, 0.6, 1.0)),
+        (camera(ct.UCM, 0.6), camera(ct.DoubleSphere, 0.0, 0.6)),
+        (camera(ct.UCM, 0.6), camera(ct.Mei, 1.5, 0.0, 0.0, 0.0, 0.0, scale=2.5)),
+        (camera(ct.DoubleSphere, 1.5, 0.0), camera(ct.Mei, 1.5, 0.0, 0.0, 0.0, 0.0)),
+        (camera(ct.Mei, 0.0, -0.1, 0.02, 1e-3, 2e-3), camera(ct.BrownConrady, -0.1, 0.02, 1e-3, 2e-3)),
+        (camera(ct.UCM, 0.5), camera(ct.Stereographic, 0.0)),
+        (camera(ct.UCM, 1.0), camera(ct.OrthographicFisheye, 0.0)),
+        (camera(ct.UCM, 0.0), camera(ct.Pinhole)),
+        (camera(ct.FOV, 0.0), camera(ct.Pinhole)),
+        (camera(ct.Division, 0.0), camera(ct.Pinhole)),
+        (camera(ct.Division, -0.25), camera(ct.Stereographic, 0.0)),
+        (camera(ct.FTheta, 0.0, 0.02, 0.0, -0.003), camera(ct.KannalaBrandt, 0.02, -0.003)),
+        (camera(ct.FThetaBackward, 0.0, 0.0), camera(ct.KannalaBrandt, 0.0)),
+        (camera(ct.FTheta, 0.1, 0.02, -0.003), camera(ct.WoodScape, 0.1, 0.02, -0.003)),
+        (camera(ct.ThinPrismFisheye, 0.02, 0.01, 0, 0, 0, 0, 0, 0), camera(ct.KannalaBrandt, 0.02, 0.01)),
+    ],
+    ids=lambda c: type(c).__name__,
+)
+def test_the_same_camera(first, second):
+    rays = fan(170)
+    (pixels, valid), (others, other_valid) = (c.project(rays) for c in (first, second))
+    assert torch.equal(valid, other_valid)
+    assert valid.sum() > 100
+    torch.testing.assert_close(pixels, others, rtol=1e-11, atol=1e-10)
+    pixels = pixels[valid & (pixels.norm(dim=-1) < 3000)].detach()
+    (rays, valid), (others, other_valid) = (c.unproject(pixels) for c in (first, second))
+    assert torch.equal(valid, other_valid)
+    torch.testing.assert_close(rays, others, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "formula"),
+    [
+        (ct.Equisolid, [0.0], lambda t: 2 * (t / 2).sin()),
+        (ct.Equisolid, [0.03], lambda t: 2 * (t / 2).sin() * (1 + 0.03 * (2 * (t / 2).sin()) ** 2)),
+        (ct.Stereographic, [0.03], lambda t: 2 * (t / 2).tan() * (1 + 0.03 * (2 * (t / 2).tan()) ** 2)),
+        (ct.OrthographicFisheye, [0.03], lambda t: t.sin() * (1 + 0.03 * t.sin() ** 2)),
+        (ct.FOV, [0.9], lambda t: (2 * math.tan(0.45) * t.tan()).atan() / 0.9),
+        (ct.FTheta, [-0.09, 0.14, -0.02], lambda t: t - 0.09 * t**2 + 0.14 * t**3 - 0.02 * t**4),
+    ],
+)
+def test_radius(model, coefficients, formula):
+    r, theta = radius(model, *coefficients)
+    torch.testing.assert_close(r, formula(theta), rtol=1e-13, atol=1e-14)
+
+
+def test_division_sees_along_its_polynomial():
+    pixels = pixel_lattice(spread("division"))
+    rays, valid = camera(ct.Division, -0.3).unproject(pixels)
+    assert valid.all()
+    a, b = ((pixels - INTRINSICS[2:]) / INTRINSICS[:2]).unbind(-1)
+    expected = torch.stack((a, b, 1 - 0.3 * (a * a + b * b)), -1)
+    torch.testing.assert_close(rays, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-15)
+
+    more = camera(ct.Division, -0.3, 0.05, -0.02)
+    r2 = a * a + b * b
+    expected = torch.stack((a, b, 1 - 0.3 * r2 + 0.05 * r2**2 - 0.02 * r2**3), -1)
+    rays, valid = more.unproject(pixels)
+    assert valid.all()
+    torch.testing.assert_close(rays, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-15)
+
+
+def test_f_theta_from_the_polynomial_of_angles():
+    """Of pixels, as DriveWorks has it; and its inverse by bisection."""
+    bw = torch.tensor([3.3e-3, 2.0e-8, -1.5e-10, 1.0e-13], dtype=torch.float64)
+    made = ct.FThetaBackward.from_polynomial(INTRINSICS[2:], bw)
+    distance = torch.tensor([1e-3, 10, 200, 500], dtype=torch.float64)
+    theta = sum(c * distance ** (i + 1) for i, c in enumerate(bw))
+    rays, valid = made.unproject(INTRINSICS[2:] + torch.stack((distance, 0 * distance), -1))
+    assert valid.all()
+    # a rounding of the pixel, in radians
+    torch.testing.assert_close(torch.atan2(rays[:, 0], rays[:, 2]), theta, rtol=1e-13, atol=500 * 2**-52 * 3.3e-3)
+    pixels, valid = made.project(torch.stack((theta.sin(), 0 * theta, theta.cos()), -1))
+    assert valid.all()
+    torch.testing.assert_close(pixels[:, 0] - INTRINSICS[2], distance, rtol=1e-12, atol=1e-12)
+
+
+def test_the_inverse_of_an_angle_is_valid_before_it_turns_back():
+    """Theta = r (1 - 0.1 r^2) ascends up to r^2 = 1 / 0.3, where it is 2 r / 3."""
+    made = camera(ct.FThetaBackward, 0.0, -0.1)
+    end = (1 / 0.3) ** 0.5
+    r = torch.tensor([end - 1e-6, end + 1e-6], dtype=torch.float64)
+    assert made.unproject(INTRINSICS[2:] + INTRINSICS[:1] * torch.stack((r, 0 * r), -1))[1].tolist() == [True, False]
+    theta = torch.tensor([2 / 3 * end - 1e-12, 2 / 3 * end + 1e-12], dtype=torch.float64)
+    pixels, valid = made.project(torch.stack((theta.sin(), 0 * theta, theta.cos()), -1))
+    assert valid.tolist() == [True, False]
+    assert pixels[0, 0].item() == pytest.approx((INTRINSICS[2] + INTRINSICS[0] * end).item(), abs=1e-2)
+
+
+def test_woodscape_from_its_numbers():
+    k = [339.749, -31.988, 48.275, -7.201]
+    made = ct.WoodScape.from_woodscape(torch.tensor(k).double(), (3.942, -3.093), image_size=(966, 1280))
+    published = one("woodscape")
+    torch.testing.assert_close(made.intrinsics, published.intrinsics)
+    torch.testing.assert_close(made.distortion, published.distortion)
+    theta = torch.tensor([0.2, 0.9, 1.6], dtype=torch.float64)
+    pixels, valid = made.project(torch.stack((0 * theta, theta.sin(), theta.cos()), -1))
+    assert valid.all()
+    expected = sum(c * theta ** (i + 1) for i, c in enumerate(k))
+    torch.testing.assert_close(pixels[:, 1], 479.407 + expected)
+
+
+@pytest.mark.parametrize(
+    ("centre", "coefficients", "text"),
+    [([1.0], [1.0, 2], "centre"), ([1.0, 2], [1.0], "n >= 2"), ([1.0, 2], [-1.0, 2], "must be positive")],
+)
+def test_bad_polynomials_are_refused(centre, coefficients, text):
+    with pytest.raises(ValueError, match=text):
+        ct.FTheta.from_polynomial(centre, coefficients)
+
+
+BREAKS = [
+    (ct.EUCM, (0.5, 0.0), "beta > 0"),
+    (ct.DoubleSphere, (-1.0, 0.5), "xi > -1"),
+    (ct.Mei, (-1.5, 0.0, 0.0, 0.0, 0.0), "xi > -1"),
+    (ct.FOV, (math.pi,), "omega < pi"),
+]
+
+
+@pytest.mark.parametrize(("model", "coefficients", "text"), BREAKS)
+def test_coefficients_without_a_formula(model, coefficients, text):
+    """Refused at the door; where learning ended there, all is invalid, and finite."""
+    with pytest.raises(ValueError, match=text):
+        camera(model, *coefficients)
+    learnt = model(INTRINSICS)
+    with torch.no_grad():
+        learnt.distortion.copy_(torch.tensor(coefficients))
+    for method, values in (("project", fan(60)), ("unproject", pixel_lattice(spread("pinhole")))):
+        result, valid = getattr(learnt, method)(values)
+        assert not valid.any()
+        gradients = torch.autograd.grad(result.sum(), list(learnt.parameters()))
+        assert all((g == 0).all() for g in gradients)
+
+
+@pytest.mark.parametrize(("xi", "alpha"), [(1.0, 0.5), (1.01, 0.6), (1.1, 0.55), (1.5, 0.5), (0.999, 0.6), (2.0, 0.6)])
+def test_a_double_sphere_from_outside_of_the_sphere(xi, alpha):
+    """Far out the line of a pixel meets the sphere only behind the shifted centre."""
+    made = camera(ct.DoubleSphere, xi, alpha)
+    steps = torch.linspace(-5000, 5000, 501, dtype=torch.float64)
+    pixels = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
+    rays, valid = made.unproject(pixels)
+    again, reachable = made.project(rays)
+    assert reachable[valid].all()
+    assert 100 < valid.sum() < valid.numel()
+    torch.testing.assert_close(again[valid], pixels[valid], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_powers_that_overflow_are_not_valid(dtype):
+    for made in (
+        ct.Stereographic(INTRINSICS.to(dtype), torch.full((20,), 0.01, dtype=dtype)),
+        ct.KannalaBrandt(INTRINSICS.to(dtype), torch.full((40,), 0.01, dtype=dtype)),
+        ct.FTheta(INTRINSICS.to(dtype), torch.full((100,), 0.01, dtype=dtype)),
+    ):
+        theta = math.pi - torch.logspace(-9, 0, 200, dtype=torch.float64)
+        points = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1).to(dtype).requires_grad_()
+        pixels, _ = made.project(points)
+        assert pixels.isfinite().all()
+        gradients = torch.autograd.grad(pixels.sum(), (points, *made.parameters()))
+        assert all(g.isfinite().all() for g in gradients), type(made)
+
+
+def test_a_camera_made_without_coefficients_is_an_ideal_one():
+    torch.testing.assert_close(ct.EUCM(INTRINSICS).project(fan(80))[0], ct.Pinhole(INTRINSICS).project(fan(80))[0])
+
+
+def spline(nodes, values):
+    """The cubics (pieces, 4) through (0, 0) and a table: all conditions of an odd spline, not-a-knot at the end."""
+    nodes, values = np.concatenate(([0], nodes)), np.concatenate(([0], values))
+    pieces = len(nodes) - 1
+    rows, right = [], []
+
+    def row(*terms, equals=0.0):
+        made = np.zeros((pieces, 4))
+        for piece, powers, sign in terms:
+            made[piece] += sign * np.array(powers)
+        rows.append(made.ravel())
+        right.append(equals)
+
+    for i, h in enumerate(np.diff(nodes)):
+        row((i, (1, 0, 0, 0), 1), equals=values[i])
+        row((i, (1, h, h**2, h**3), 1), equals=values[i + 1])
+        if i < pieces - 1:
+            row((i, (0, 1, 2 * h, 3 * h**2), 1), (i + 1, (0, 1, 0, 0), -1))
+            row((i, (0, 0, 2, 6 * h), 1), (i + 1, (0, 0, 2, 0), -1))
+    row((0, (0, 0, 1, 0), 1))
+    row((pieces - 2, (0, 0, 0, 1), 1), (pieces - 1, (0, 0, 0, 1), -1))
+    return np.linalg.solve(np.stack(rows), right).reshape(pieces, 4)
+
+
+def test_a_table_of_millimetres():
+    degrees = torch.arange(0, 100, 10, dtype=torch.float64)
+    heights = torch.tensor([0, 0.52, 1.03, 1.55, 2.08, 2.6, 3.1, 3.57, 3.97, 4.26], dtype=torch.float64)
+    made = ct.Tabulated.from_table(INTRINSICS[2:], degrees.deg2rad(), heights, pixels_per_unit=1 / 0.003)
+    theta = torch.tensor([10.0, 40, 80, 3, 15, 47, 89], dtype=torch.float64)
+    sight = theta.deg2rad()
+    pixels, valid = made.project(torch.stack((0 * sight, sight.sin(), sight.cos()), -1))
+    assert valid.all()
+    r = (pixels[:, 1] - INTRINSICS[3]) * 0.003
+    torch.testing.assert_close(r[:3], heights[[1, 4, 8]])
+    cubics = spline(degrees[1:].numpy(), heights[1:].numpy())
+    expected = [np.polyval(cubics[int(t // 10)][::-1], t % 10) for t in theta.tolist()]
+    torch.testing.assert_close(r, torch.tensor(expected), rtol=1e-12, atol=0)
+    beyond = torch.tensor([1.58, 2.0], dtype=torch.float64)
+    assert not made.project(torch.stack((0 * beyond, beyond.sin(), beyond.cos()), -1))[1].any()
+
+
+def test_a_table_stays_monotone():
+    """A spline through a step would swing; and a table that turns back is valid up to there."""
+    angles = torch.linspace(0.2, 1.4, 7, dtype=torch.float64)
+    step = torch.tensor([0.2, 0.21, 0.22, 0.6, 0.98, 0.99, 1.0], dtype=torch.float64)
+    theta = torch.linspace(0.001, 1.399, 500, dtype=torch.float64)
+    rays = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1)
+    pixels, valid = ct.Tabulated.from_table([0.0, 0], angles, step).project(rays)
+    assert valid.all()
+    assert (pixels[:, 0].diff() > 0).all()
+    back = torch.tensor([0.2, 0.4, 0.6, 0.8, 0.7, 0.6, 0.5], dtype=torch.float64)
+    valid = ct.Tabulated.from_table([0.0, 0], angles, back).project(rays)[1]
+    assert torch.equal(valid, theta < 0.8)
+
+
+def test_the_angles_of_a_table_do_not_learn():
+    made = spread("tabulated")
+    made.project(fan(60))[0].sum().backward()
+    angles, radii = made.distortion.grad.chunk(2)
+    assert (angles == 0).all()
+    assert (radii != 0).any()
+
+
+@pytest.mark.parametrize(
+    ("angles", "radii", "text"),
+    [([0.1], [1.0], "two nodes"), ([0, 0.1, 0.2], [0.1, 1, 2], "two nodes"), ([0.1, 0.2], [1.0], "shapes")],
+)
+def test_bad_tables_are_refused(angles, radii, text):
+    with pytest.raises(ValueError, match=text):
+        ct.Tabulated.from_table([1.0, 2.0], angles, radii)
+    with pytest.raises(ValueError, match=r"radians, up to pi; got up to 90.0. Degrees"):
+        ct.Tabulated.from_table([1.0, 2.0], [10.0, 90.0], [1.0, 2.0])
+    with pytest.raises(ValueError, match="ascend"):
+        camera(ct.Tabulated, 0.3, 0.2, 1.0, 2.0)
