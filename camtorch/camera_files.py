@@ -42,19 +42,13 @@ def read_rig(path: Path, name: str | None = None, model: str | None = None, size
     return rig
 
 
-def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
-    """The camera to compare with: the only one of its file, or the one of that name."""
-    only = len(read_rig(path, None, model).cameras) == 1
-    return read_camera(path, None if only else name, model)
-
-
-def read_camera(path: Path, name: str | None = None, model: str | None = None) -> Camera:
-    """The one camera of a file, or the one of that name; see `read_rig`.
+def read_other(path: Path, name: str | None = None) -> Camera:
+    """The camera to compare with: the only one of its file, or the one of that name.
 
     Raises:
-        ValueError: there are several.
+        ValueError: there are several, and none of that name.
     """
-    rig = read_rig(path, name, model)
-    if len(rig.cameras) > 1:
+    rig = read_rig(path)
+    if len(rig.cameras) > 1 and name is None:
         raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
-    return rig.camera
+    return rig.camera if len(rig.cameras) == 1 else rig.camera_of(name)

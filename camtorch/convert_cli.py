@@ -99,7 +99,7 @@ def _show(arguments: argparse.Namespace) -> None:
     if single and camera.image_size is None:
         raise ValueError(f"{arguments.input} states no image size; --size says which")
     if arguments.against is not None:
-        other = read_other(arguments.against, arguments.name, arguments.from_model)
+        other = read_other(arguments.against, arguments.name)
     for name, camera in cameras.items():
         print(f"{arguments.input}: {name}", *summarise(camera).lines(), sep="\n")
     if other is not None:

@@ -139,8 +139,10 @@ class Inverted(Chart):
         t = torch.addcmul(a * a, b, b)
         inside = self._domain.inner2 * (1 - 64 * torch.finfo(a.dtype).eps) - t
         t = torch.minimum(t, self._domain.inner2)
-        factor = self._domain.lens.radial(t)
-        return torch.minimum(inside, math.pi**2 - t * factor * factor)
+        theta2 = t * self._domain.lens.radial(t) ** 2
+        # where theta ceases to ascend its rounding is that of many radii; further from there than `margin` is
+        before = self._domain.inverse.most2 * (1 - 128 * torch.finfo(a.dtype).eps)
+        return torch.minimum(inside, before.clamp(max=math.pi**2) - theta2)
 
     def to_ray(self, a, b, order=2):
         return Equidistant().to_ray(*self._planar.at(a, b, order=0).value, order)

@@ -191,7 +191,7 @@ def test_a_folder_of_colmap(suffix, tmp_path):
     if suffix == "bin":
         folder.mkdir()
         ct.save(rig, folder / "cameras.bin")
-    ct.save(rig, folder, "colmap")
+    ct.save(rig, f"{folder}/", "colmap")
     assert sorted(path.name for path in folder.iterdir()) == [
         f"{n}.{suffix}" for n in ("cameras", "images", "points3D")
     ]

@@ -124,6 +124,27 @@ def test_what_looks_like_distortion_is_not_passed_over(path, key):
         ct.load(written(path, f"camera_matrix: {K}\n{key}: [0.3, 0.1, 0, 0, 0]"))
 
 
+def test_what_opencvs_own_programs_write_besides(path):
+    """interactive-calibration, and others: statistics are no distortion."""
+    text = f"""cameraResolution: [640, 480]
+cameraMatrix: {K}
+cameraMatrix_std_dev: [1, 1, 1, 1]
+dist_coeffs: [0.3, 0.1, 0, 0, 0]
+dist_coeffs_std_dev: [1, 1, 1, 1, 1]
+undistorted_image_size: [640, 480]
+correlation_coefficients: [1, 2]
+avg_reprojection_error: 0.2
+"""
+    camera = ct.load(written(path, text)).camera
+    assert camera.distortion.tolist() == [0.3, 0.1, 0, 0, 0]
+    assert camera.image_size == (480, 640)
+    without = f"K: {K}\nundistorted_points: [1]\ndist_std_dev: [1]\ndistortion_names: [k1]\n"
+    assert type(ct.load(written(path, without)).camera) is ct.Pinhole
+    for orphan in ("xi_1", "xi_left"):
+        with pytest.raises(CameraFileError, match=f"{orphan}: looks like"):
+            ct.load(written(path, f"K: {K}\nD: [0, 0, 0, 0]\n{orphan}: 1.2"))
+
+
 def test_arrays_of_one_dimension(tmp_path):
     """As OpenCV 5 writes them."""
     yaml = f"%YAML:1.0\n---\nK: {K}\nD: !!opencv-nd-matrix\n   sizes: [ 5 ]\n   dt: d\n   data: [ 0.3, 0.1, 0, 0, 0 ]\n"

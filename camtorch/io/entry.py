@@ -108,7 +108,7 @@ def save(rig: Rig | Camera, path, format: str | None = None) -> None:
     """
     for name, content in rendered(rig, path, format).items():
         folder = os.path.dirname(name)
-        if folder == os.fspath(path):
+        if os.path.normpath(folder or ".") == os.path.normpath(path):
             os.makedirs(folder, exist_ok=True)
         write_atomically(name, content)
 

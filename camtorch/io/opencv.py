@@ -25,10 +25,12 @@ _MATRIX = re.compile(rf"(?:K|M|(?i:camera_?matrix|intrinsic_?matrix))_?({_NAMES}
 _DISTORTION = re.compile(
     rf"(?:[Dd]|(?i:dist(?:ortion)?(?:_?coef(?:f|fs|s|ficients?)?(?:_?mat)?|_?param(?:s|eters)?)?))_?({_NAMES})"
 )
-_LIKE_DISTORTION = re.compile(r"(?i:d\d*|xi.*|.*coef.*|.*distor.*|dist(?!ance).*)")
+_LIKE_DISTORTION = re.compile(r"(?i:d\d*|.*coef.*|.*distor.*|dist(?!ance).*)")
+_NO_DISTORTION = re.compile(r"(?i:.*(?:std|err|undist|names|flags|model).*)")
 _XI = re.compile(rf"(?i:xi)_?({_NAMES})")
 _WIDTH = re.compile(r"(?i:(?:image_?)?width)")
 _HEIGHT = re.compile(r"(?i:(?:image_?)?height)")
+_SIZE = re.compile(r"(?i:camera_?resolution|im(?:age|g)_?size)")  # width and height
 _FISHEYE = re.compile(r"(?i:(?:is_?)?fisheye(?:_?model)?)")
 _OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model)")
 _FISHEYE_COUNT = 4  # of cv2.fisheye, and one of the counts of cv2.calibrateCamera
@@ -82,12 +84,18 @@ class _File:
     def __init__(self, record: Record):
         self.record, self.path, self.keys = record, record.path, record.keys()
         self.found: dict[re.Pattern, Any] = {}
-        cameras = self.by_name(_MATRIX)
-        for key in self.keys:
-            if _LIKE_DISTORTION.fullmatch(key) and isinstance(record.value[key], (list, dict)):
-                known = _DISTORTION.fullmatch(key) or _XI.fullmatch(key)
-                if cameras and (not known or known[1] not in cameras):
-                    self.fail(key, "looks like the distortion of a camera; there is none of this name")
+        self.check_that_none_is_left_over()
+
+    def check_that_none_is_left_over(self) -> None:
+        """Refuse what may be the distortion of a camera that has none: without it all would be wrong in silence."""
+        cameras, lenses, xis = (self.by_name(pattern) for pattern in (_MATRIX, _DISTORTION, _XI))
+        known = [*lenses.values(), *xis.values()]
+        orphans = [key for name, key in (lenses | xis).items() if name not in cameras]
+        if not cameras.keys() <= lenses.keys():
+            like = [k for k in self.keys if _LIKE_DISTORTION.fullmatch(k) and not _NO_DISTORTION.fullmatch(k)]
+            orphans += [k for k in like if k not in known and isinstance(self.record.value[k], (list, dict))]
+        if cameras and orphans:
+            self.fail(orphans[0], "looks like the distortion of a camera; there is none of this name")
 
     def camera(self, model: str | None, name: str | None) -> Camera:
         key, distortion_key = self.keys_of_camera(name)
@@ -188,7 +196,8 @@ class _File:
     def image_size(self) -> tuple[int, int] | None:
         keys = self.find(_HEIGHT), self.find(_WIDTH)
         if keys == (None, None):
-            return None
+            size = self.find(_SIZE)
+            return None if size is None else self.record[size].size()
         if None in keys:
             self.fail("image_height" if keys[0] is None else "image_width", "missing, while the other side is given")
         height, width = (self.record[key].side() for key in keys)
