@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch.analytic import angle_per_radius, cos_root, sinc_root, tanc_root
-from camtorch.charts import Chart, Perspective, even_steps_and_ratios, floor_of, unit
+from camtorch.charts import Chart, Equidistant, Perspective, even_steps_and_ratios, floor_of, unit
 
 
 def _length(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -26,9 +26,7 @@ class Equisolid(Chart):
     """2 sin(theta / 2) (cos phi, sin phi): every ray but the exact backward one."""
 
     def margin(self, x, y, z):
-        # closer to the backward direction the derivative 2 / rho leaves the floating-point range
-        floor = floor_of(z.dtype) / torch.finfo(z.dtype).eps
-        return torch.maximum(z, torch.addcmul(x * x - floor, y, y))
+        return Equidistant().margin(x, y, z)
 
     def covers_all(self, nearest, extent, dtype):
         return True
