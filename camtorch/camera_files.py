@@ -42,6 +42,15 @@ def read_rig(path: Path, name: str | None = None, model: str | None = None, size
     return rig
 
 
+def read_camera(path: Path, name: str | None = None, model: str | None = None) -> Camera:
+    """The one camera of a file, or the one of that name; see `read_rig`.
+
+    Raises:
+        ValueError: there are several.
+    """
+    return _only(path, read_rig(path, name, model))
+
+
 def read_other(path: Path, name: str | None = None) -> Camera:
     """The camera to compare with: the only one of its file, or the one of that name.
 
@@ -49,6 +58,10 @@ def read_other(path: Path, name: str | None = None) -> Camera:
         ValueError: there are several, and none of that name.
     """
     rig = read_rig(path)
-    if len(rig.cameras) > 1 and name is None:
+    return _only(path, rig) if name is None or len(rig.cameras) == 1 else rig.camera_of(name)
+
+
+def _only(path: Path, rig: Rig) -> Camera:
+    if len(rig.cameras) > 1:
         raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
-    return rig.camera if len(rig.cameras) == 1 else rig.camera_of(name)
+    return rig.camera
