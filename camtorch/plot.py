@@ -23,6 +23,7 @@ _INK, _GREY, _PALE = "#2b2a2e", "#8a8378", "#efe9dd"
 _COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
 _AZIMUTHS, _ANGLES = 32, 721
 _NOTHING = 1e-6  # px: what is less is rounding, and shown as none
+_FAINT = 1e-3  # px: no colours are spent on what is less, where there is more
 
 
 @torch.no_grad()
@@ -243,7 +244,7 @@ def _without_palest(name: str):
 def _limit(mappable, values: Tensor) -> str:
     """Give what is coloured its range, without the few largest values if they are far from the others."""
     most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)
-    cut = most > 4 * many > 0
+    cut = most > 4 * many > _FAINT
     if most < _NOTHING:
         mappable.set_clim(0, _NOTHING)
         return "neither"
