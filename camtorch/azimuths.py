@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.lens import Planar
+from camtorch.optics.lens import Planar
 
 if TYPE_CHECKING:
-    from camtorch.charts import Chart
-    from camtorch.lens import Lens, Polynomial, Rational
+    from camtorch.optics.charts import Chart
+    from camtorch.optics.lens import Lens, Polynomial, Rational
 
 AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # on one azimuth, which stands for all where the lens is radial

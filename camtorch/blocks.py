@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch import mapping
-from camtorch.charts import Chart
+from camtorch.optics.charts import Chart
 from camtorch.domain import Domain
-from camtorch.lens import Lens
+from camtorch.optics.lens import Lens
 from camtorch.parameters import columns
 from camtorch.solve import invert, newton_step, search
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from camtorch import mapping, opaque
 from camtorch.blocks import Cameras, Project, Unproject
-from camtorch.charts import Chart
+from camtorch.optics.charts import Chart
 from camtorch.convertible import Convertible
 from camtorch.domain import Domain
-from camtorch.lens import Lens
+from camtorch.optics.lens import Lens
 from camtorch.opaque import finish, positive, tables, to_planes, without_keeping
 from camtorch.parameters import (
     Memo,

@@ -13,8 +13,8 @@ from camtorch.azimuths import AZIMUTHS, Azimuths, azimuth, first_loss, radial_se
 from camtorch.parameters import columns, may_look
 
 if TYPE_CHECKING:
-    from camtorch.charts import Chart
-    from camtorch.lens import Lens, Polynomial, Rational
+    from camtorch.optics.charts import Chart
+    from camtorch.optics.lens import Lens, Polynomial, Rational
 
 Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
 

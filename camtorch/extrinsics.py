@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from camtorch.analytic import cosc_root, sinc_root
+from camtorch.optics.special import cosc_root, sinc_root
 from camtorch.parameters import GeometryModule, as_batch, as_real, as_rows, columns, in_graph, is_concrete
 
 

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.charts import floor_of
+from camtorch.optics.charts import floor_of
 from camtorch.parameters import may_look
 from camtorch.solve import Found, attach
 
 if TYPE_CHECKING:
-    from camtorch.charts import Chart
+    from camtorch.optics.charts import Chart
     from camtorch.domain import Domain
-    from camtorch.lens import Lens
+    from camtorch.optics.lens import Lens
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from camtorch.azimuths import azimuth
-from camtorch.charts import floor_of
+from camtorch.optics.charts import floor_of
 from camtorch.domain import regular
 from camtorch.parameters import may_look
 
 if TYPE_CHECKING:
     from camtorch.domain import Domain
-    from camtorch.lens import Lens
-    from camtorch.local import Jacobian
+    from camtorch.optics.lens import Lens
+    from camtorch.optics.local import Jacobian
 
 Planes2 = tuple[Tensor, Tensor]
 

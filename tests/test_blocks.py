@@ -10,7 +10,7 @@ from torch.autograd import gradcheck
 
 import camtorch as ct
 from camtorch import blocks, opaque, positions, sampling
-from camtorch.charts import Perspective
+from camtorch.optics.charts import Perspective
 from camtorch.solve import invert
 
 every_model = pytest.mark.parametrize("key", KEYS)

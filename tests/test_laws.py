@@ -25,9 +25,9 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.func import jacfwd, jacrev, jvp, vmap
 
 import camtorch as ct
-from camtorch.charts import CylinderChart, Perspective, SphereChart
-from camtorch.inverted import Inverted
-from camtorch.lens import Lens
+from camtorch.optics.charts import CylinderChart, Perspective, SphereChart
+from camtorch.optics.backprojection import Inverted
+from camtorch.optics.lens import Lens
 
 EPS = torch.finfo(torch.float64).eps
 every_model = pytest.mark.parametrize("key", KEYS)

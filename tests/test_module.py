@@ -410,8 +410,8 @@ def test_the_models_that_must_be_there():
 
 def test_a_model_is_one_class():
     """Defining a class with a key is all that a new model needs."""
-    from camtorch.charts import Equidistant
-    from camtorch.lens import Lens
+    from camtorch.optics.charts import Equidistant
+    from camtorch.optics.lens import Lens
 
     try:
 

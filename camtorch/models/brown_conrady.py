@@ -5,8 +5,8 @@ import math
 import torch
 
 from camtorch.camera import Camera
-from camtorch.charts import Perspective
-from camtorch.lens import Lens, Planar, Polynomial, Rational, Tilt
+from camtorch.optics.charts import Perspective
+from camtorch.optics.lens import Lens, Planar, Polynomial, Rational, Tilt
 
 
 class BrownConrady(Camera):

@@ -1,8 +1,8 @@
 """The cylindrical panorama."""
 
 from camtorch.camera import Camera
-from camtorch.charts import CylinderChart
-from camtorch.lens import Lens
+from camtorch.optics.charts import CylinderChart
+from camtorch.optics.lens import Lens
 
 
 class Cylindrical(Camera):

@@ -2,9 +2,9 @@
 
 from camtorch import opaque
 from camtorch.camera import Camera
-from camtorch.fisheyes import OneDivision
-from camtorch.inverted import AnglePerRadius, Inverted, flat
-from camtorch.lens import Lens
+from camtorch.optics.fisheyes import OneDivision
+from camtorch.optics.backprojection import AnglePerRadius, Inverted, flat
+from camtorch.optics.lens import Lens
 
 _ANGLES = opaque.register_optics("division", flat(AnglePerRadius))
 

@@ -1,8 +1,8 @@
 """The double sphere camera."""
 
 from camtorch.camera import Camera
-from camtorch.lens import Lens
-from camtorch.unified import Unified
+from camtorch.optics.lens import Lens
+from camtorch.optics.unified import Unified
 
 
 class DoubleSphere(Camera):

@@ -1,8 +1,8 @@
 """The equirectangular panorama."""
 
 from camtorch.camera import Camera
-from camtorch.charts import SphereChart
-from camtorch.lens import Lens
+from camtorch.optics.charts import SphereChart
+from camtorch.optics.lens import Lens
 
 
 class Equirectangular(Camera):

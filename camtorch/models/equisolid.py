@@ -1,7 +1,7 @@
 """The equisolid fisheye."""
 
-from camtorch.fisheyes import Equisolid as EquisolidChart
-from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.optics.fisheyes import Equisolid as EquisolidChart
+from camtorch.optics.lens import Lens, Planar, Polynomial
 from camtorch.models.odd_polynomial import OddPolynomial
 
 

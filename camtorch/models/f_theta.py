@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from camtorch.camera import Camera
-from camtorch.charts import Equidistant
-from camtorch.lens import Lens, Planar
+from camtorch.optics.charts import Equidistant
+from camtorch.optics.lens import Lens, Planar
 from camtorch.parameters import as_batch, as_real, is_concrete
-from camtorch.radial import RadiusPolynomial
+from camtorch.optics.radial import RadiusPolynomial
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from camtorch import opaque
-from camtorch.inverted import Inverted, flat
-from camtorch.lens import Lens
+from camtorch.optics.backprojection import Inverted, flat
+from camtorch.optics.lens import Lens
 from camtorch.models.f_theta import FreePolynomial
-from camtorch.radial import RadiusPolynomial
+from camtorch.optics.radial import RadiusPolynomial
 
 _ANGLES = opaque.register_optics("f_theta_backward", flat(RadiusPolynomial))
 

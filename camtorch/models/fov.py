@@ -3,8 +3,8 @@
 import math
 
 from camtorch.camera import Camera
-from camtorch.fisheyes import Fov
-from camtorch.lens import Lens
+from camtorch.optics.fisheyes import Fov
+from camtorch.optics.lens import Lens
 
 
 class FOV(Camera):

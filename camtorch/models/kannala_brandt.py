@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from camtorch.charts import Equidistant
-from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.optics.charts import Equidistant
+from camtorch.optics.lens import Lens, Planar, Polynomial
 from camtorch.models.odd_polynomial import OddPolynomial
 from camtorch.parameters import as_batch, as_real, is_concrete
 

@@ -1,8 +1,8 @@
 """The unified camera with a radial-tangential lens."""
 
 from camtorch.camera import Camera
-from camtorch.lens import Lens, Planar, Polynomial
-from camtorch.unified import Unified
+from camtorch.optics.lens import Lens, Planar, Polynomial
+from camtorch.optics.unified import Unified
 
 
 class Mei(Camera):

@@ -1,8 +1,8 @@
 """The pinhole camera."""
 
 from camtorch.camera import Camera
-from camtorch.charts import Perspective
-from camtorch.lens import Lens
+from camtorch.optics.charts import Perspective
+from camtorch.optics.lens import Lens
 
 
 class Pinhole(Camera):

@@ -1,8 +1,8 @@
 """The stereographic fisheye."""
 
-from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.optics.lens import Lens, Planar, Polynomial
 from camtorch.models.odd_polynomial import OddPolynomial
-from camtorch.unified import Unified
+from camtorch.optics.unified import Unified
 
 
 class Stereographic(OddPolynomial):

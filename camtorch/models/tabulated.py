@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from camtorch.camera import Camera
-from camtorch.charts import EquidistantUpTo
-from camtorch.lens import Lens, Planar
+from camtorch.optics.charts import EquidistantUpTo
+from camtorch.optics.lens import Lens, Planar
 from camtorch.parameters import as_real
-from camtorch.radial import RadiusTable
+from camtorch.optics.radial import RadiusTable
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -3,8 +3,8 @@
 import torch
 
 from camtorch.camera import Camera
-from camtorch.charts import Equidistant
-from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.optics.charts import Equidistant
+from camtorch.optics.lens import Lens, Planar, Polynomial
 
 
 class ThinPrismFisheye(Camera):

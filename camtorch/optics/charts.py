@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from camtorch.analytic import angle_per_radius, cos_root, sinc_root
+from camtorch.optics.special import angle_per_radius, cos_root, sinc_root
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]

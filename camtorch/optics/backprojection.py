@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from camtorch import opaque
-from camtorch.analytic import angle_per_radius
-from camtorch.charts import Chart, Equidistant, Perspective, even_steps_and_ratios
+from camtorch.optics.special import angle_per_radius
+from camtorch.optics.charts import Chart, Equidistant, Perspective, even_steps_and_ratios
 from camtorch.domain import Domain, Optics
-from camtorch.lens import Lens, Planar, Polynomial
+from camtorch.optics.lens import Lens, Planar, Polynomial
 from camtorch.parameters import has_tangent, may_look
 
 FURTHEST = math.tan(math.radians(87))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch.local import LensAt, PlanarAt, Planes2, TiltAt, total
+from camtorch.optics.local import LensAt, PlanarAt, Planes2, TiltAt, total
 
 
 class Polynomial:

@@ -8,8 +8,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from camtorch.charts import Chart, Perspective, even_steps_and_ratios, unit
-from camtorch.local import total
+from camtorch.optics.charts import Chart, Perspective, even_steps_and_ratios, unit
+from camtorch.optics.local import total
 from camtorch.parameters import may_look
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from camtorch.lens import Planar, Tilt
+    from camtorch.optics.lens import Planar, Tilt
 
 Planes2 = tuple[Tensor, Tensor]
 Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db

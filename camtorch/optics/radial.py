@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch.analytic import root
-from camtorch.lens import Polynomial
+from camtorch.optics.special import root
+from camtorch.optics.lens import Polynomial
 
 
 class RadiusPolynomial:
