@@ -8,13 +8,15 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from camtorch import mapping, opaque
-from camtorch.blocks import Cameras, Project, Unproject
+from camtorch.projection import formulas
+
+from camtorch.projection import ops
+from camtorch.projection.autograd import Cameras, Project, Unproject
 from camtorch.optics.charts import Chart
 from camtorch.convertible import Convertible
-from camtorch.domain import Domain
+from camtorch.projection.domain import Domain
 from camtorch.optics.lens import Lens
-from camtorch.opaque import finish, positive, tables, to_planes, without_keeping
+from camtorch.projection.ops import finish, positive, tables, to_planes, without_keeping
 from camtorch.parameters import (
     Memo,
     as_batch,
@@ -28,7 +30,7 @@ from camtorch.parameters import (
     may_look,
 )
 from camtorch.picture import Picture
-from camtorch.solve import invert
+from camtorch.projection.solve import invert
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
@@ -69,7 +71,7 @@ class Camera(Convertible, Picture):
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
-        cls._model = opaque.register(cls)
+        cls._model = ops.register(cls)
         if "key" in cls.__dict__:
             MODELS[cls.key] = cls
 
@@ -154,12 +156,12 @@ class Camera(Convertible, Picture):
         intrinsics, distortion, domain, usable = self._traced(points, intrinsics, distortion)
 
         def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-            ray = mapping.to_ray(domain.chart, x, y, z)
-            a, b, mask = mapping.see(ray, *self.optics(columns(distortion)), domain, order)
-            mask = mapping.both(mask, usable)
+            ray = formulas.to_ray(domain.chart, x, y, z)
+            a, b, mask = formulas.see(ray, *self.optics(columns(distortion)), domain, order)
+            mask = formulas.both(mask, usable)
             focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
             pixels = focal_x * a + centre_x, focal_y * b + centre_y
-            pixels = torch.stack([mapping.replace(mask, w, mapping.INVALID_PIXEL) for w in pixels])
+            pixels = torch.stack([formulas.replace(mask, w, formulas.INVALID_PIXEL) for w in pixels])
             return pixels, torch.ones_like(pixels[0]) if mask is None else mask.expand_as(pixels[0])
 
         pixels, mask = without_keeping(evaluate, *to_planes(points), intrinsics, distortion)
@@ -181,22 +183,22 @@ class Camera(Convertible, Picture):
     def _unproject_by_formulas(self, pixels: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
         intrinsics, distortion, domain, usable = self._traced(pixels, intrinsics, distortion)
         u, v = to_planes(pixels)
-        p, q, mask = mapping.to_target(u.detach(), v.detach(), columns(intrinsics.detach()))
-        mask = mapping.both(mask, usable)
-        p, q = mapping.replace(mask, p, 0.0), mapping.replace(mask, q, 0.0)
+        p, q, mask = formulas.to_target(u.detach(), v.detach(), columns(intrinsics.detach()))
+        mask = formulas.both(mask, usable)
+        p, q = formulas.replace(mask, p, 0.0), formulas.replace(mask, q, 0.0)
         if domain.lens.stages:
             found = finish(self._model, domain.k, p, q, invert(domain, p, q))
-            solved = mapping.to_mask(found.solved)
-            solution = mapping.clean(solved, found)
+            solved = formulas.to_mask(found.solved)
+            solution = formulas.clean(solved, found)
         else:
-            solved = mapping.to_mask(domain.chart.on_plane(p, q))
-            solution = mapping.replace(solved, p, 0.0), mapping.replace(solved, q, 0.0)
-        mask = mapping.both(mask, solved)
+            solved = formulas.to_mask(domain.chart.on_plane(p, q))
+            solution = formulas.replace(solved, p, 0.0), formulas.replace(solved, q, 0.0)
+        mask = formulas.both(mask, solved)
 
         def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
-            target = mapping.to_target(u, v, columns(intrinsics))
+            target = formulas.to_target(u, v, columns(intrinsics))
             optics = self.optics(columns(distortion))
-            return torch.stack(mapping.rays_of(solution, target[:2], mask, *optics, order))
+            return torch.stack(formulas.rays_of(solution, target[:2], mask, *optics, order))
 
         if torch.compiler.is_compiling() and not any(t.requires_grad for t in (pixels, intrinsics, distortion)):
             order = 0
@@ -226,7 +228,7 @@ class Camera(Convertible, Picture):
                 ideal = (intrinsics, 1.0), (distortion, self._ideal(distortion))
                 values = [torch.where(usable, t.detach(), w).clone() for t, w in ideal]
                 mask = None if may_look(usable) and bool(usable.all()) else usable.to(intrinsics.dtype)
-                return Cameras(values[0], opaque.domain_of(self._model, values[1], self.optics), mask)
+                return Cameras(values[0], ops.domain_of(self._model, values[1], self.optics), mask)
 
         return self._memo((intrinsics, distortion), (intrinsics.dtype, intrinsics.device), look)
 

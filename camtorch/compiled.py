@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.opaque import CLASSES
+from camtorch.projection.ops import CLASSES
 
 if TYPE_CHECKING:
     from camtorch.warp import Warp

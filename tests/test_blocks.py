@@ -9,9 +9,11 @@ from cameras import KEYS, fan, make, one, pixel_lattice, spread
 from torch.autograd import gradcheck
 
 import camtorch as ct
-from camtorch import blocks, opaque, positions, sampling
+from camtorch import positions, sampling
+from camtorch.projection import autograd
+from camtorch.projection import ops
 from camtorch.optics.charts import Perspective
-from camtorch.solve import invert
+from camtorch.projection.solve import invert
 
 every_model = pytest.mark.parametrize("key", KEYS)
 
@@ -51,7 +53,7 @@ def test_blocks_change_nothing(key, method, cameras, block, monkeypatch):
         values = torch.cat((pixel_lattice(camera, 9, 11), torch.tensor([[math.nan, 1], [1e9, 3]]).double()))
         values = values.expand(cameras, -1, -1)
     whole = everything(camera, method, values)
-    monkeypatch.setattr(blocks, "_BLOCK", block)
+    monkeypatch.setattr(autograd, "_BLOCK", block)
     for result, expected in zip(everything(camera, method, values), whole, strict=True):
         torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
 
@@ -100,13 +102,13 @@ def test_search_alone_agrees_with_newton(key, monkeypatch):
     camera = one(key)
     pixels = pixel_lattice(camera)
     expected = everything(camera, "unproject", pixels)
-    monkeypatch.setattr(blocks, "invert", nothing_solved)
+    monkeypatch.setattr(autograd, "invert", nothing_solved)
     for result, reference in zip(everything(camera, "unproject", pixels), expected, strict=True):
         torch.testing.assert_close(result, reference, rtol=1e-9, atol=1e-11)
 
 
 def test_gradcheck_over_several_blocks(monkeypatch):
-    monkeypatch.setattr(blocks, "_BLOCK", 4)
+    monkeypatch.setattr(autograd, "_BLOCK", 4)
     camera = spread("fisheye624")
     leaves = [t.detach().clone().requires_grad_() for t in (camera.intrinsics, camera.distortion)]
     points = (fan(60, 3, 3) * 1.7).requires_grad_()
@@ -129,7 +131,7 @@ def test_two_classes_of_one_name_keep_their_own_lens():
         compiled = torch.compile(camera.unproject, backend="eager", fullgraph=True)
         pixels = camera.project(points)[0].detach()
         torch.testing.assert_close(compiled(pixels)[0], camera.unproject(pixels)[0])
-    assert opaque.MODELS[first._model] is not opaque.MODELS[second._model]
+    assert ops.MODELS[first._model] is not ops.MODELS[second._model]
 
 
 # -- pictures

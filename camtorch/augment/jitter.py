@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.augment.cameras import frozen, remade
 from camtorch.camera import Camera
-from camtorch.opaque import CLASSES
+from camtorch.projection.ops import CLASSES
 from camtorch.parameters import same
 
 DRAWN = 16

@@ -1,12 +1,12 @@
 """The division camera."""
 
-from camtorch import opaque
+from camtorch.projection import ops
 from camtorch.camera import Camera
 from camtorch.optics.fisheyes import OneDivision
 from camtorch.optics.backprojection import AnglePerRadius, Inverted, flat
 from camtorch.optics.lens import Lens
 
-_ANGLES = opaque.register_optics("division", flat(AnglePerRadius))
+_ANGLES = ops.register_optics("division", flat(AnglePerRadius))
 
 
 class Division(Camera):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from camtorch import opaque
+from camtorch.projection import ops
 from camtorch.optics.backprojection import Inverted, flat
 from camtorch.optics.lens import Lens
 from camtorch.models.f_theta import FreePolynomial
 from camtorch.optics.radial import RadiusPolynomial
 
-_ANGLES = opaque.register_optics("f_theta_backward", flat(RadiusPolynomial))
+_ANGLES = ops.register_optics("f_theta_backward", flat(RadiusPolynomial))
 
 
 class FThetaBackward(FreePolynomial):

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch import opaque
+from camtorch.projection import ops
 from camtorch.optics.special import angle_per_radius
 from camtorch.optics.charts import Chart, Equidistant, Perspective, even_steps_and_ratios
-from camtorch.domain import Domain, Optics
+from camtorch.projection.domain import Domain, Optics
 from camtorch.optics.lens import Lens, Planar, Polynomial
 from camtorch.parameters import has_tangent, may_look
 
@@ -72,13 +72,13 @@ class Inverted(Chart):
     """
 
     def __init__(self, name: str, parameters: Sequence[Tensor]):
-        """name: under which `opaque.register_optics` knows what `flat` makes of the factor."""
+        """name: under which `ops.register_optics` knows what `flat` makes of the factor."""
         self.name, self.parameters = name, tuple(parameters)
         self._known: Domain | None = None
 
     @property
     def _planar(self) -> Planar:
-        return opaque.MODELS[self.name](self.parameters)[1].stages[0]
+        return ops.MODELS[self.name](self.parameters)[1].stages[0]
 
     @property
     def _domain(self) -> Domain:
@@ -91,7 +91,7 @@ class Inverted(Chart):
 
     def _tabulated(self) -> Domain:
         k = torch.stack([w.detach() for w in self.parameters], -1).reshape(-1, len(self.parameters))
-        return Domain(opaque.MODELS[self.name], k).with_tables(*opaque.tables(self.name, k))
+        return Domain(ops.MODELS[self.name], k).with_tables(*ops.tables(self.name, k))
 
     def margin(self, x, y, z):
         theta2 = torch.addcmul(x * x, y, y) * Equidistant().scale(x, y, z, 1) ** 2
@@ -107,7 +107,7 @@ class Inverted(Chart):
         angle = Equidistant().scale(x, y, z, order)
         theta2 = torch.minimum(torch.addcmul(x * x, y, y) * angle * angle, self._domain.inverse.most2)
         rows = theta2.detach().reshape(len(self._domain.k), -1)
-        found = opaque.radial_scale(self.name, self._domain.k, rows).view_as(theta2)
+        found = ops.radial_scale(self.name, self._domain.k, rows).view_as(theta2)
         if torch.is_grad_enabled() or not may_look(x) or any(map(has_tangent, (x, y, z, *self.parameters))):
             found = self._attached(found, theta2, order)
         return angle * found

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.azimuths import azimuth
+from camtorch.projection.fold import azimuth
 from camtorch.optics.charts import floor_of
-from camtorch.domain import regular
+from camtorch.projection.domain import regular
 from camtorch.parameters import may_look
 
 if TYPE_CHECKING:
-    from camtorch.domain import Domain
+    from camtorch.projection.domain import Domain
     from camtorch.optics.lens import Lens
     from camtorch.optics.local import Jacobian
 

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from camtorch.optics.charts import floor_of
 from camtorch.parameters import may_look
-from camtorch.solve import Found, attach
+from camtorch.projection.solve import Found, attach
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
-    from camtorch.domain import Domain
+    from camtorch.projection.domain import Domain
     from camtorch.optics.lens import Lens
 
 Planes2 = tuple[Tensor, Tensor]

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from camtorch import mapping
+from camtorch.projection import formulas
 from camtorch.optics.charts import Chart
-from camtorch.domain import Domain
+from camtorch.projection.domain import Domain
 from camtorch.optics.lens import Lens
 from camtorch.parameters import columns
-from camtorch.solve import invert, newton_step, search
+from camtorch.projection.solve import invert, newton_step, search
 
 _BLOCK = 1 << 17  # points
 
@@ -83,14 +83,14 @@ class Project(Function):
         ctx.plain = []
         for block in _blocks(cameras, points):
             here, chart = block.here, block.domain.chart
-            ray = mapping.to_ray(chart, *_planes(points[here]))
+            ray = formulas.to_ray(chart, *_planes(points[here]))
             scale = chart.scale(ray.x, ray.y, ray.z, 1)
-            a, b, mask = mapping.see(ray, chart, block.domain.lens, block.domain, 1, scale)
-            mask = mapping.both(ray.mask, mask, block.usable)
+            a, b, mask = formulas.see(ray, chart, block.domain.lens, block.domain, 1, scale)
+            mask = formulas.both(ray.mask, mask, block.usable)
             for plane, m, focal, centre in zip(pixels, (a, b), block.intrinsics[:2], block.intrinsics[2:], strict=True):
                 torch.add(focal * m, centre, out=plane[here])
                 if mask is not None:
-                    plane[here] = mapping.replace(mask, plane[here], mapping.INVALID_PIXEL)
+                    plane[here] = formulas.replace(mask, plane[here], formulas.INVALID_PIXEL)
             if mask is not None:
                 valid[here] = mask > 0
             if scales.numel():
@@ -119,12 +119,12 @@ class Project(Function):
             shrink = mask = None
             gu, gv = by_pixels[0][here], by_pixels[1][here]
             if not plain:
-                x, y, z, shrink, _ = mapping.to_ray(chart, x, y, z)
+                x, y, z, shrink, _ = formulas.to_ray(chart, x, y, z)
                 mask = valid[here].to(x.dtype)
-                x, y, z = (mapping.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+                x, y, z = (formulas.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
                 # what comes back of an invalid point need not be finite
                 gu, gv = (torch.where(valid[here], g, 0.0) for g in (gu, gv))
-            scale = mapping.replace(mask, scales[here], 1.0) if scales.numel() else None
+            scale = formulas.replace(mask, scales[here], 1.0) if scales.numel() else None
             at = block.domain.lens.at(*chart.to_plane(x, y, z, 1, scale))
             sums.add_intrinsics(block, gu, gv, *at.value)
             wanted = sums.wants_distortion
@@ -204,14 +204,14 @@ class Unproject(Function):
 def _unproject_block(block: _Block, pixels: Tensor, rays: Tensor, solution: Tensor | None, valid: Tensor):
     """Write rays, solutions and validity; returns the places and targets of the points that are left open, if any."""
     chart = block.domain.chart
-    p, q, known = mapping.to_target(*_planes(pixels[block.here]), block.intrinsics)
-    known = mapping.both(known, block.usable)
-    p, q = mapping.replace(known, p, 0.0), mapping.replace(known, q, 0.0)
+    p, q, known = formulas.to_target(*_planes(pixels[block.here]), block.intrinsics)
+    known = formulas.both(known, block.usable)
+    p, q = formulas.replace(known, p, 0.0), formulas.replace(known, q, 0.0)
     left = None
     if block.domain.lens.stages:
         found = invert(block.domain, p, q)
-        solved = mapping.to_mask(found.solved)
-        a, b = mapping.clean(solved, found)
+        solved = formulas.to_mask(found.solved)
+        a, b = formulas.clean(solved, found)
         if solved is not None:
             camera, point = ((found.possible > 0) & ~(solved > 0)).nonzero(as_tuple=True)
             if len(camera):
@@ -222,11 +222,11 @@ def _unproject_block(block: _Block, pixels: Tensor, rays: Tensor, solution: Tens
                     q[camera, point],
                 )
     else:
-        solved = mapping.to_mask(chart.on_plane(p, q))
-        a, b = mapping.replace(solved, p, 0.0), mapping.replace(solved, q, 0.0)
-    mask = mapping.both(known, solved)
+        solved = formulas.to_mask(chart.on_plane(p, q))
+        a, b = formulas.replace(solved, p, 0.0), formulas.replace(solved, q, 0.0)
+    mask = formulas.both(known, solved)
     x, y, z = chart.to_ray(a, b, 1)
-    _write(rays, block.here, (mapping.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0))))
+    _write(rays, block.here, (formulas.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0))))
     _write(solution, block.here, (a, b))
     if mask is not None:
         valid[block.here] = mask > 0

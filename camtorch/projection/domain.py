@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.azimuths import AZIMUTHS, Azimuths, azimuth, first_loss, radial_sense
+from camtorch.projection.fold import AZIMUTHS, Azimuths, azimuth, first_loss, radial_sense
 from camtorch.parameters import columns, may_look
 
 if TYPE_CHECKING:
