@@ -2,7 +2,7 @@
 
 from camtorch import augment, io
 from camtorch.camera import MODELS, Camera
-from camtorch.conversion import Conversion
+from camtorch.convert.conversion import Conversion
 from camtorch.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save

@@ -9,7 +9,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
-    from camtorch.conversion import Conversion
+    from camtorch.convert.conversion import Conversion
 
 
 class Convertible:
@@ -87,7 +87,7 @@ class Convertible:
             TypeError: no camera model. ValueError: an unknown key, a count that the model does not take, a
                 `max_angle` that is not positive or beyond pi, a `tolerance` that is not positive.
         """
-        from camtorch.conversion import convert
+        from camtorch.convert.conversion import convert
 
         return convert(
             self, model, count=count, image_size=image_size, max_angle=max_angle, tolerance=tolerance, **options

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.fit import Sights
+from camtorch.convert.least_squares import Sights
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from camtorch import survey
-from camtorch.fit import even_out, fit, see
+from camtorch.convert import views
+from camtorch.convert.least_squares import even_out, fit, see
 from camtorch.parameters import as_image_size, as_whole
-from camtorch.related import carried, default_count
+from camtorch.convert.relations import carried, default_count
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -194,10 +194,10 @@ def _as_far(angle: Tensor, before: Tensor) -> Tensor:
 def _converted(task: _Task, count: int) -> _Result:
     source, model, made = task.source, task.model, task.made
     names = model.names_of(count)
-    slopes = survey.slopes_at_axis(source)
-    view = survey.view(source, task.image_size, _FIT_SIDE, task.limit)
-    fine = survey.view(source, task.image_size, _CHECK_SIDE, task.limit)
-    starts = model.fit_start(names, *survey.radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
+    slopes = views.slopes_at_axis(source)
+    view = views.view(source, task.image_size, _FIT_SIDE, task.limit)
+    fine = views.view(source, task.image_size, _CHECK_SIDE, task.limit)
+    starts = model.fit_start(names, *views.radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
@@ -213,7 +213,7 @@ def _converted(task: _Task, count: int) -> _Result:
     # no camera of the model has a largest error below the least root of the mean square
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
-        sights = survey.rings(task.of(rows).source, task.image_size, _FIT_SIDE, task.limit).sights
+        sights = views.rings(task.of(rows).source, task.image_size, _FIT_SIDE, task.limit).sights
         evened = _measured(task.of(rows), even_out(made(parameters), sights, parameters[rows]), exact[rows])
         (better,) = (
             (evened.max_error < result.max_error[rows]) & _as_far(evened.max_angle, result.max_angle[rows])
@@ -223,16 +223,16 @@ def _converted(task: _Task, count: int) -> _Result:
 
 
 def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
-    check = survey.view(task.source, task.image_size, _CHECK_SIDE, task.limit)
-    whole = check if task.limit == math.pi else survey.view(task.source, task.image_size, _CHECK_SIDE, math.pi)
+    check = views.view(task.source, task.image_size, _CHECK_SIDE, task.limit)
+    whole = check if task.limit == math.pi else views.view(task.source, task.image_size, _CHECK_SIDE, math.pi)
     numbers = _numbers(task.made(parameters), parameters[:, 4:], exact, check, whole)
     return _Result(parameters, *numbers, exact)
 
 
-def _numbers(target: Camera, k: Tensor, exact: Tensor, check: survey.View, whole: survey.View) -> tuple[Tensor, ...]:
+def _numbers(target: Camera, k: Tensor, exact: Tensor, check: views.View, whole: views.View) -> tuple[Tensor, ...]:
     """rms, max_error, max_angle and valid_fraction, (C,) each."""
 
-    def compared(view: survey.View) -> tuple[Tensor, Tensor]:
+    def compared(view: views.View) -> tuple[Tensor, Tensor]:
         pixels, valid = target.project(view.rays)
         # what was out of the reach of the fit is no part of its result
         reached = see(target, k, view.rays).covered | exact[:, None]
