@@ -86,8 +86,8 @@ def _convert(arguments: argparse.Namespace) -> None:
 def _show(arguments: argparse.Namespace) -> None:
     from camtorch import image_files
     from camtorch.camera_files import read_other, read_rig
-    from camtorch.difference import difference
-    from camtorch.summary import summarise
+    from camtorch.analysis.difference import difference
+    from camtorch.analysis.summary import summarise
 
     if arguments.output is not None:
         image_files.check_target(arguments.output, force=arguments.force)

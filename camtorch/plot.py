@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-import camtorch.difference
-from camtorch.summary import fan, ideal, lattice
+import camtorch.analysis.difference
+from camtorch.analysis.summary import fan, ideal, lattice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -161,7 +161,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     ax.figure.colorbar(image, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
     turned = ""
     if remove_rotation:
-        turned = f", turned by {math.degrees(camtorch.difference.angle(compared.rotation)):.3g} degrees"
+        turned = f", turned by {math.degrees(camtorch.analysis.difference.angle(compared.rotation)):.3g} degrees"
     ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
     return ax
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 import camtorch as ct
 from camtorch.cli import main
-from camtorch.summary import summarise
+from camtorch.analysis.summary import summarise
 
 FILES = Path(__file__).parent / "files"
 FISHEYE = (

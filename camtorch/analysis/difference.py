@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.summary import lattice
+from camtorch.analysis.summary import lattice
 
 _LONG = 400  # pixels of the lattice along the longer side
 _ROUNDING = 1e-9  # px, far above that of two equal cameras

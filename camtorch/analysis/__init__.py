@@ -1,0 +1,1 @@
+"""Numbers about a camera, and about the difference of two."""
