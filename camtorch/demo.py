@@ -13,7 +13,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.dewarp import Dewarp
+from camtorch.warp.dewarp import Dewarp
 from camtorch.models import BrownConrady, Fisheye62, Fisheye624, KannalaBrandt, Pinhole
 from camtorch.scenes import room
 

@@ -9,7 +9,8 @@ from cameras import KEYS, fan, make, one, pixel_lattice, spread
 from torch.autograd import gradcheck
 
 import camtorch as ct
-from camtorch import positions, sampling
+from camtorch.warp import grid
+from camtorch.warp import sampling
 from camtorch.projection import autograd
 from camtorch.projection import ops
 from camtorch.optics.charts import Perspective
@@ -162,7 +163,7 @@ def test_strips_of_a_map_change_nothing(cameras, monkeypatch):
     for one_camera in (source, target):
         one_camera.requires_grad_(False)
     whole = ct.Warp(source, target)
-    monkeypatch.setattr(positions, "_STRIP", 7 * 63)
+    monkeypatch.setattr(grid, "_STRIP", 7 * 63)
     strips = ct.Warp(source, target)
     assert torch.equal(strips.grid(), whole.grid())
     assert torch.equal(strips.valid_mask(), whole.valid_mask())

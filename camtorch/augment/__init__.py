@@ -10,7 +10,7 @@ from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.fields import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random import RandomCamera, RandomLens, RandomMount, mount_rotation
-from camtorch.outlines import outlines
+from camtorch.warp.polygons import outlines
 
 __all__ = [
     "PRESETS",

@@ -13,7 +13,7 @@ from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
 from camtorch.augment.ranges import Range, draw
 from camtorch.camera import Camera
 from camtorch.parameters import as_whole, may_look
-from camtorch.sampling import as_options
+from camtorch.warp.sampling import as_options
 
 
 class Augmentation(Mover):

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from camtorch.augment.cameras import expanded, joined, kind, remade, rows_of, singles
 from camtorch.camera import Camera
-from camtorch.outlines import EDGE_SAMPLES, along_edges, corners_of
-from camtorch.sampling import narrow, widen
-from camtorch.warp import Warp
+from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
+from camtorch.warp.sampling import narrow, widen
+from camtorch.warp.warp import Warp
 
 
 def _same(value: Tensor) -> Tensor:

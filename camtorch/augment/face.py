@@ -14,8 +14,8 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotation_matrix
 from camtorch.models import Pinhole
 from camtorch.parameters import as_image_size, is_concrete
-from camtorch.sampling import as_options
-from camtorch.warp import Warp
+from camtorch.warp.sampling import as_options
+from camtorch.warp.warp import Warp
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
 

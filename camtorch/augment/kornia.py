@@ -22,7 +22,7 @@ from camtorch.augment.change import Change
 from camtorch.augment.ranges import draw
 from camtorch.camera import Camera
 from camtorch.parameters import Memo
-from camtorch.sampling import narrow, widen
+from camtorch.warp.sampling import narrow, widen
 
 __all__ = ["CameraAugmentation", "RandomCamera", "RandomLens", "RandomMount", "with_cameras"]
 

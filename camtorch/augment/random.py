@@ -15,7 +15,7 @@ from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import as_range
 from camtorch.camera import MODELS, Camera
 from camtorch.parameters import as_image_size, is_concrete
-from camtorch.warp import Warp
+from camtorch.warp.warp import Warp
 
 
 class RandomCamera(Augmentation):

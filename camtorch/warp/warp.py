@@ -8,10 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from camtorch import compiled, minify
+from camtorch.warp import compiled
+
+from camtorch.warp import minify
 from camtorch.camera import Camera
 from camtorch.extrinsics import as_rotation, turn
-from camtorch.outlines import EDGE_SAMPLES, along_edges, corners_of
+from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
 from camtorch.parameters import (
     GeometryModule,
     Memo,
@@ -20,8 +22,8 @@ from camtorch.parameters import (
     is_concrete,
     may_look,
 )
-from camtorch.positions import OUTSIDE, in_strips, on_lattice
-from camtorch.sampling import MODES, PADDINGS, as_fill, as_options, coverage, narrow, one_of, sample, widen
+from camtorch.warp.grid import OUTSIDE, in_strips, on_lattice
+from camtorch.warp.sampling import MODES, PADDINGS, as_fill, as_options, coverage, narrow, one_of, sample, widen
 
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 

@@ -11,7 +11,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import as_rotation, turn
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
 from camtorch.parameters import as_image_size
-from camtorch.warp import Warp
+from camtorch.warp.warp import Warp
 
 _WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold
 # projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for

@@ -12,7 +12,7 @@ from torch import Tensor
 from camtorch.projection.ops import CLASSES
 
 if TYPE_CHECKING:
-    from camtorch.warp import Warp
+    from camtorch.warp.warp import Warp
 
 
 def positions(warp: Warp) -> tuple[Tensor, Tensor]:
@@ -36,7 +36,7 @@ def _positions(
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
     """The map of a compiled warp with a tolerance: its planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
-    from camtorch.warp import Warp
+    from camtorch.warp.warp import Warp
 
     cameras = []
     for model, intrinsics, distortion, size in (
