@@ -2,7 +2,7 @@
 
 from camtorch.optics.fisheyes import Equisolid as EquisolidChart
 from camtorch.optics.lens import Lens, Planar, Polynomial
-from camtorch.models.odd_polynomial import OddPolynomial
+from camtorch.models._polynomial import OddPolynomial
 
 
 class Equisolid(OddPolynomial):

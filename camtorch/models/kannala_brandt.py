@@ -8,7 +8,7 @@ import torch
 
 from camtorch.optics.charts import Equidistant
 from camtorch.optics.lens import Lens, Planar, Polynomial
-from camtorch.models.odd_polynomial import OddPolynomial
+from camtorch.models._polynomial import OddPolynomial
 from camtorch.parameters import as_batch, as_real, is_concrete
 
 if TYPE_CHECKING:
