@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.augment.cameras import alone, collate, kind, rows_of
 from camtorch.augment.change import Change, Part
-from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
+from camtorch.augment.sample import Mover, Sample, without_graph_in_workers
 from camtorch.augment.ranges import Range, draw
 from camtorch.camera import Camera
 from camtorch.parameters import as_whole, may_look

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.augment.cameras import alone, remade
 from camtorch.augment.change import Change, Part
-from camtorch.augment.mover import Mover, Sample, without_graph_in_workers
+from camtorch.augment.sample import Mover, Sample, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.extrinsics import check_rotation, rotation_matrix
 from camtorch.models import Pinhole

@@ -19,7 +19,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import singles
 from camtorch.augment.change import Change
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.mover import Sample
+from camtorch.augment.sample import Sample
 from camtorch.camera import Camera
 
 _OWNER = "numpy.Transform"
