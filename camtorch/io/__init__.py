@@ -18,6 +18,6 @@ class CameraFileError(ValueError):
 
 
 from camtorch.io import opencv  # noqa: E402 (it raises the error above)
-from camtorch.io.entry import FORMATS, load, save  # noqa: E402
+from camtorch.io.formats import FORMATS, load, save  # noqa: E402
 
 __all__ = ["FORMATS", "CameraFileError", "load", "opencv", "save"]

@@ -6,7 +6,7 @@ import math
 
 from camtorch.io import poses
 from camtorch.io.record import Record, one_of
-from camtorch.io.write import Lossy, as_json
+from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
 
 # Projection.Name -> key, how many focal lengths, how many coefficients

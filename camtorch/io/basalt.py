@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from camtorch.io import poses
 from camtorch.io.record import Record, one_of
-from camtorch.io.write import Lossy, as_json
+from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
 
 _CORE = ("fx", "fy", "cx", "cy")

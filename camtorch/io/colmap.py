@@ -15,8 +15,8 @@ from camtorch.camera import Camera
 from camtorch.io import colmap_images
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.record import Record
-from camtorch.io.text import read_bytes, read_text
-from camtorch.io.write import Lossy, number
+from camtorch.io.parsing import read_bytes, read_text
+from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 
 # model -> id, key, how many focal lengths, how many coefficients; where a smaller model comes first

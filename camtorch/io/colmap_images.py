@@ -11,8 +11,8 @@ from typing import BinaryIO, NamedTuple
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.record import Record
-from camtorch.io.text import check_ordinary
-from camtorch.io.write import Lossy, number
+from camtorch.io.parsing import check_ordinary
+from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 
 _HEAD = struct.Struct("<I7dI")

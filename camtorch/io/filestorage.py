@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from camtorch.io.write import number
+from camtorch.io.writing import number
 
 Value = float | list[list[float]]
 """A number, or the rows of a matrix."""

@@ -9,7 +9,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.record import Record
-from camtorch.io.write import Lossy, listed
+from camtorch.io.writing import Lossy, listed
 from camtorch.rig import Rig
 
 # camera_model, distortion_model -> key, how many of its coefficients stand before the intrinsics, how many after

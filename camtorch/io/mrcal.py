@@ -7,8 +7,8 @@ from typing import Any
 
 from camtorch.io import poses
 from camtorch.io.record import Record, one_of
-from camtorch.io.text import Tree
-from camtorch.io.write import Lossy, number
+from camtorch.io.parsing import Tree
+from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 
 # lens model -> key, number of coefficients

@@ -8,7 +8,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, poses
 from camtorch.io.record import Record, one_of
-from camtorch.io.write import Lossy, as_json
+from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
 
 # camera_model -> key

@@ -15,8 +15,8 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, poses
 from camtorch.io.filestorage import Value, as_json, as_xml, as_yaml
 from camtorch.io.record import Record
-from camtorch.io.text import read_mapping
-from camtorch.io.write import Lossy
+from camtorch.io.parsing import read_mapping
+from camtorch.io.writing import Lossy
 from camtorch.rig import Rig
 
 # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left

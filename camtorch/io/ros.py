@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from camtorch.io.record import Record, one_of
-from camtorch.io.write import Lossy, listed, quoted
+from camtorch.io.writing import Lossy, listed, quoted
 from camtorch.rig import Rig
 
 _MODELS = {

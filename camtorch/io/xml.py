@@ -14,7 +14,7 @@ _MOST_VALUES = 1 << 18
 
 
 def parse_storage(path, text: str) -> dict[str, Any]:
-    """The keys of an XML text, as `camtorch.io.text.parse_mapping`.
+    """The keys of an XML text, as `camtorch.io.parsing.parse_mapping`.
 
     Raises:
         CameraFileError: no XML, a document type or an entity declared, a key twice, nested too deeply.

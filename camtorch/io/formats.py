@@ -8,8 +8,8 @@ import re
 from camtorch.camera import Camera
 from camtorch.io import CameraFileError, aria, basalt, colmap, kalibr, mrcal, nerfstudio, opencv, plain, ros
 from camtorch.io.record import Record
-from camtorch.io.text import parse_mapping, read_text
-from camtorch.io.write import write_atomically
+from camtorch.io.parsing import parse_mapping, read_text
+from camtorch.io.writing import write_atomically
 from camtorch.rig import Rig
 
 # what has keys and values, in the order in which their keys are tried

@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.record import Record
-from camtorch.io.write import Lossy, as_json
+from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
 
 _VERSION = 1
