@@ -2,6 +2,6 @@
 
 import sys
 
-from camtorch.cli import main
+from camtorch.cli.main import main
 
 sys.exit(main())

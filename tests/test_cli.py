@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 import camtorch as ct
-from camtorch.cli import main
+from camtorch.cli.main import main
 
 FILES = Path(__file__).parent / "files"
 FISHEYE = "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"

@@ -3,7 +3,9 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch import Pinhole, cli, demo
+from camtorch import Pinhole, demo
+
+from camtorch.cli import main
 from camtorch.scenes import room
 
 
@@ -53,7 +55,7 @@ def test_all_lenses_one_picture(tmp_path, monkeypatch, capsys):
     threads = torch.get_num_threads()
     whole = demo.run
     monkeypatch.setattr(demo, "run", lambda report: whole(report, height=200, samples=2))
-    assert cli.main(["demo", "-o", str(tmp_path / "demo.png")]) == 0
+    assert main.main(["demo", "-o", str(tmp_path / "demo.png")]) == 0
     table = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in table[1:6]] == [lens.title for lens in demo.lenses()]
     assert len(table) == 7

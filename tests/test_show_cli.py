@@ -10,7 +10,7 @@ from cameras import KEYS, one
 from PIL import Image
 
 import camtorch as ct
-from camtorch.cli import main
+from camtorch.cli.main import main
 from camtorch.analysis.summary import summarise
 
 FILES = Path(__file__).parent / "files"

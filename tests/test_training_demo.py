@@ -3,7 +3,9 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch import cli, lessons, training_demo
+from camtorch import lessons, training_demo
+
+from camtorch.cli import main
 from camtorch.lessons import PLANNED, TEACHERS, Pictures
 from camtorch.scenes import cabin
 
@@ -73,7 +75,7 @@ def test_a_small_run_by_the_command_line(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(training_demo, "run", small)
     for _ in range(2):
-        assert cli.main(["demo", "training", "-o", str(tmp_path / "training.png"), "--force"]) == 0
+        assert main.main(["demo", "training", "-o", str(tmp_path / "training.png"), "--force"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert all(any(line.startswith(title) for line in lines) for title in TEACHERS.values())
     assert [result.teacher for result in kept[0]] == list(TEACHERS)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy
 
-from camtorch.picture_size import picture_size
+from camtorch.cli.options import picture_size
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -46,7 +46,7 @@ def add(commands) -> None:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
-    from camtorch.camera_files import read_rig
+    from camtorch.cli.cameras import read_rig
     from camtorch.io import entry
     from camtorch.rig import Rig
 
@@ -84,13 +84,13 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 
 def _show(arguments: argparse.Namespace) -> None:
-    from camtorch import image_files
-    from camtorch.camera_files import read_other, read_rig
+    from camtorch.cli import images
+    from camtorch.cli.cameras import read_other, read_rig
     from camtorch.analysis.difference import difference
     from camtorch.analysis.summary import summarise
 
     if arguments.output is not None:
-        image_files.check_target(arguments.output, force=arguments.force)
+        images.check_target(arguments.output, force=arguments.force)
     cameras = read_rig(arguments.input, arguments.name, arguments.from_model, arguments.size).cameras
     single = arguments.output is not None or arguments.against is not None
     if single and len(cameras) > 1:
@@ -115,11 +115,13 @@ def _show(arguments: argparse.Namespace) -> None:
 def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
     from PIL import Image
 
-    from camtorch import image_files, plot
+    from camtorch import plot
+
+    from camtorch.cli import images
 
     figure = plot.portrait(camera, other, title=title)
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # after `portrait` said what to install
 
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    image_files.write(path, Image.fromarray(numpy.array(canvas.buffer_rgba())[..., :3]))
+    images.write(path, Image.fromarray(numpy.array(canvas.buffer_rgba())[..., :3]))

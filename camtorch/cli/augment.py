@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.augment import PRESETS, RandomCamera
 from camtorch.camera import Camera
-from camtorch.labels import Labels
+from camtorch.cli.labels import Labels
 from camtorch.models import Pinhole
 from camtorch.scenes import cabin
 

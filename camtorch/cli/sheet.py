@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from camtorch.views import View
+from camtorch.cli.augment import View
 
 TILE = (315, 420)
 """(height, width) within which the new pictures are shown."""

@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from camtorch import __version__, convert_cli
-from camtorch.picture_size import picture_size
+from camtorch import __version__
+
+from camtorch.cli import convert
+from camtorch.cli.options import picture_size
 
 _STRIP_PIXELS = 1 << 21
 _MOST_TILES = 100
@@ -90,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     for name in ("yaw", "pitch", "roll", "zoom", "fov"):
         augment.add_argument(f"--{name}", type=_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
 
-    convert_cli.add(commands)
+    convert.add(commands)
 
     demo = commands.add_parser("demo", help="render, and measure what camtorch makes of it", allow_abbrev=False)
     demo.set_defaults(run=_demo)
@@ -136,10 +138,10 @@ def _range(text: str) -> float | tuple[float, float]:
 
 def _photograph(arguments: argparse.Namespace):
     """The picture, its Exif orientation, and its camera."""
-    from camtorch import image_files
-    from camtorch.camera_files import read_camera
+    from camtorch.cli import images
+    from camtorch.cli.cameras import read_camera
 
-    picture, orientation = image_files.read(arguments.image)
+    picture, orientation = images.read(arguments.image)
     camera = read_camera(arguments.camera, arguments.name, arguments.model)
     size = tuple(picture.shape[-2:])
     if camera.image_size is None:
@@ -155,14 +157,16 @@ def _photograph(arguments: argparse.Namespace):
 def _dewarp(arguments: argparse.Namespace) -> None:
     import torch
 
-    from camtorch import Dewarp, image_files
+    from camtorch import Dewarp
+
+    from camtorch.cli import images
 
     fov = arguments.fov
     if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
         wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
         allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
         raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
-    image_files.check_target(arguments.output, force=arguments.force)
+    images.check_target(arguments.output, force=arguments.force)
     picture, orientation, camera = _photograph(arguments)
     size = camera.image_size
     with torch.no_grad():
@@ -170,7 +174,7 @@ def _dewarp(arguments: argparse.Namespace) -> None:
         result, filled = _in_strips(warp, picture)
         lattice = (camera.resize(64, 64).pixel_grid() + 0.5) * torch.tensor([size[1] / 64, size[0] / 64]) - 0.5
         shown = float(warp.transform_points(lattice)[1].double().mean())
-    image_files.write(arguments.output, image_files.from_tensor(result), orientation=orientation)
+    images.write(arguments.output, images.from_tensor(result), orientation=orientation)
     height, width = result.shape[-2:]
     fx, fy, cx, cy = warp.target.intrinsics.tolist()
     print(
@@ -221,13 +225,16 @@ def _degrees(target) -> float:
 
 
 def _augment(arguments: argparse.Namespace) -> None:
-    from camtorch import image_files, labels, sheet, views
-    from camtorch.camera_files import read_camera
+    from camtorch.cli import images
+    from camtorch.cli import labels
+    from camtorch.cli import sheet
+    from camtorch.cli import augment
+    from camtorch.cli.cameras import read_camera
 
     if arguments.list:
-        print("\n".join(views.presets()))
+        print("\n".join(augment.presets()))
         return
-    lens = views.lens(arguments.preset)
+    lens = augment.lens(arguments.preset)
     if not 1 <= arguments.n <= _MOST_TILES:
         raise ValueError(f"-n must be 1 to {_MOST_TILES}; got {arguments.n}")
     if not 0 <= arguments.seed < 1 << 63:
@@ -239,40 +246,41 @@ def _augment(arguments: argparse.Namespace) -> None:
             raise ValueError(f"--{idle[0]} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
     if arguments.image is not None and arguments.camera is None:
         raise ValueError(f"{arguments.image}: which camera took it? --camera FILE, its OpenCV calibration, says so")
-    image_files.check_target(arguments.output, force=arguments.force)
+    images.check_target(arguments.output, force=arguments.force)
     if arguments.image is not None:
         picture, orientation, camera = _photograph(arguments)
         if orientation not in (None, 1):
             _note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
         known = None if arguments.labels is None else labels.read(arguments.labels, camera)
-        before = views.photograph(picture, camera, known, arguments.image.name)
+        before = augment.photograph(picture, camera, known, arguments.image.name)
     elif arguments.camera is not None:
         camera = read_camera(arguments.camera, arguments.name, arguments.model)
         if camera.image_size is None:
             raise ValueError(f"{arguments.camera} states no image size, which a rendered picture needs")
-        before = views.scene(camera)
+        before = augment.scene(camera)
     else:
-        before = views.scene()
+        before = augment.scene()
     ranges = {name: getattr(arguments, name) for name in ("yaw", "pitch", "roll", "zoom", "fov")}
     ranges = {name: value for name, value in ranges.items() if value is not None}
     shown = [before]
-    for view in views.augmented(before, lens, arguments.n, arguments.seed, arguments.size, **ranges):
+    for view in augment.augmented(before, lens, arguments.n, arguments.seed, arguments.size, **ranges):
         print(view.note, flush=True)
         shown.append(view)
     title = f"One picture, {sheet.counted(arguments.n, 'other camera')}"
-    image_files.write(arguments.output, sheet.picture(shown, title, views.origin(lens, before)))
+    images.write(arguments.output, sheet.picture(shown, title, augment.origin(lens, before)))
     print(f"{arguments.output}: the picture before, and as each of them sees it, with what became of the labels")
 
 
 def _demo(arguments: argparse.Namespace) -> None:
-    from camtorch import demo, image_files, training_demo
+    from camtorch import demo, training_demo
+    from camtorch.cli import images
 
     shown, caption = demo, "the sources, what became of them, and what separates that from the truth"
     if arguments.subject == "training":
         shown, caption = training_demo, "what each network learned from, and what it finds behind the fisheye"
-    image_files.check_target(arguments.output, force=arguments.force)
+    images.check_target(arguments.output, force=arguments.force)
     results = shown.run(lambda line: print(line, flush=True))
-    image_files.write(arguments.output, shown.picture(results))
+    images.write(arguments.output, shown.picture(results))
     print(f"{arguments.output}: {caption}")
 
 
