@@ -3,7 +3,7 @@ import torch
 
 import camtorch as ct
 from camtorch.scenes import driver
-from camtorch.scenes.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
+from camtorch.demo.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
 
 
 def pinhole(focal: float, height: int, width: int, centre=None) -> ct.Pinhole:

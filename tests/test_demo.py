@@ -3,7 +3,9 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch import Pinhole, demo
+from camtorch import Pinhole
+
+from camtorch.demo import dewarping
 
 from camtorch.cli import main
 from camtorch.scenes import room
@@ -11,8 +13,8 @@ from camtorch.scenes import room
 
 @pytest.fixture(scope="module")
 def studies():
-    chosen = [lens for lens in demo.lenses(480) if lens.title in ("Brown-Conrady", "Fisheye624")]
-    return [demo.study(lens) for lens in chosen]
+    chosen = [lens for lens in dewarping.lenses(480) if lens.title in ("Brown-Conrady", "Fisheye624")]
+    return [dewarping.study(lens) for lens in chosen]
 
 
 def test_dewarped_is_what_the_target_would_have_seen(studies):
@@ -38,26 +40,26 @@ def test_keypoints_move_with_the_picture(studies):
 
 def test_a_wrong_camera_would_be_noticed():
     # the measurements must be able to fail: the same picture, dewarped with another k1
-    lens = next(lens for lens in demo.lenses(320) if lens.title == "Brown-Conrady")
+    lens = next(lens for lens in dewarping.lenses(320) if lens.title == "Brown-Conrady")
     source = room.render(lens.camera, samples=2)
     wrong = lens.camera.resize(*lens.camera.image_size)
     with torch.no_grad():
         wrong.distortion[:1] *= 0.7
     bends = []
     for camera in (lens.camera, wrong):
-        warp = demo.Dewarp(camera, fov=1.5, image_size=lens.size)
+        warp = dewarping.Dewarp(camera, fov=1.5, image_size=lens.size)
         view = (warp(source[None])[0], warp.target, torch.eye(3, dtype=torch.float64))
-        bends.append(demo._bend(demo._edges(room.lines(), view)[0]))
+        bends.append(dewarping._bend(dewarping._edges(room.lines(), view)[0]))
     assert bends[1] > 3 * bends[0]
 
 
 def test_all_lenses_one_picture(tmp_path, monkeypatch, capsys):
     threads = torch.get_num_threads()
-    whole = demo.run
-    monkeypatch.setattr(demo, "run", lambda report: whole(report, height=200, samples=2))
+    whole = dewarping.run
+    monkeypatch.setattr(dewarping, "run", lambda report: whole(report, height=200, samples=2))
     assert main.main(["demo", "-o", str(tmp_path / "demo.png")]) == 0
     table = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in table[1:6]] == [lens.title for lens in demo.lenses()]
+    assert [line.split("  ")[0] for line in table[1:6]] == [lens.title for lens in dewarping.lenses()]
     assert len(table) == 7
     assert "demo.png" in table[6]
     with Image.open(tmp_path / "demo.png") as image:
@@ -91,7 +93,7 @@ def test_rays_of_any_shape_and_dtype():
 
 def test_no_rays_no_light():
     # a fold of this lens lies inside the picture
-    camera = demo.BrownConrady([100.0, 100, 79.5, 59.5], [-0.6, 0.0, 0.0, 0.0], image_size=(120, 160))
+    camera = dewarping.BrownConrady([100.0, 100, 79.5, 59.5], [-0.6, 0.0, 0.0, 0.0], image_size=(120, 160))
     picture = room.render(camera, samples=1)
     _, valid = camera.rays()
     assert not valid.all()

@@ -3,22 +3,24 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch import lessons, training_demo
+from camtorch.demo import training_data
+
+from camtorch.demo import training
 
 from camtorch.cli import main
-from camtorch.lessons import PLANNED, TEACHERS, Pictures
+from camtorch.demo.training_data import PLANNED, TEACHERS, Pictures
 from camtorch.scenes import cabin
 
 
 @pytest.fixture(scope="module")
 def seen() -> Pictures:
     drivers = cabin.random_drivers(12, torch.Generator().manual_seed(0))
-    return lessons.photograph(lessons.cameras()[0], drivers)
+    return training_data.photograph(training_data.cameras()[0], drivers)
 
 
 def lesson(name: str, seen: Pictures, seed: int = 1) -> Pictures:
     torch.manual_seed(seed)
-    return lessons.teacher(name, *lessons.cameras())(seen, torch.Generator().manual_seed(seed))
+    return training_data.teacher(name, *training_data.cameras())(seen, torch.Generator().manual_seed(seed))
 
 
 def test_labels_of_lessons_are_where_their_cameras_see_them(seen):
@@ -30,9 +32,9 @@ def test_labels_of_lessons_are_where_their_cameras_see_them(seen):
 
 
 def test_the_planned_mount_puts_drivers_into_the_middle_of_the_fisheye():
-    like = lessons.cameras()[1]
+    like = training_data.cameras()[1]
     drivers = cabin.random_drivers(3, spread=0)
-    pictures = lessons.photograph(like, drivers, PLANNED)
+    pictures = training_data.photograph(like, drivers, PLANNED)
     middle = pictures.keypoints.mean((0, 1))
     assert (middle - torch.tensor([47.5, 39.5])).abs().max() < 4
     assert bool(pictures.seen.all())
@@ -58,8 +60,8 @@ def test_both_augmentations_turn_and_scale_alike(seen):
 
 def test_learning_lowers_the_loss(seen):
     torch.manual_seed(0)
-    network = training_demo.Network(seen.camera.image_size)
-    losses = training_demo.learn(network, seen, lambda p, generator: p, 30, 12)
+    network = training.Network(seen.camera.image_size)
+    losses = training.learn(network, seen, lambda p, generator: p, 30, 12)
     assert len(losses) == 30
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
 
@@ -67,13 +69,13 @@ def test_learning_lowers_the_loss(seen):
 def test_a_small_run_by_the_command_line(tmp_path, monkeypatch, capsys):
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     kept = []
-    whole = training_demo.run
+    whole = training.run
 
     def small(report):
         kept.append(whole(report, pictures=8, tests=6, steps=3, seed=2))
         return kept[-1]
 
-    monkeypatch.setattr(training_demo, "run", small)
+    monkeypatch.setattr(training, "run", small)
     for _ in range(2):
         assert main.main(["demo", "training", "-o", str(tmp_path / "training.png"), "--force"]) == 0
     lines = capsys.readouterr().out.splitlines()

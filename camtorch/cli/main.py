@@ -95,8 +95,8 @@ def _parser() -> argparse.ArgumentParser:
     convert.add(commands)
 
     demo = commands.add_parser("demo", help="render, and measure what camtorch makes of it", allow_abbrev=False)
-    demo.set_defaults(run=_demo)
-    demo.add_argument(
+    dewarping.set_defaults(run=_demo)
+    dewarping.add_argument(
         "subject",
         nargs="?",
         choices=("room", "training"),
@@ -272,7 +272,8 @@ def _augment(arguments: argparse.Namespace) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> None:
-    from camtorch import demo, training_demo
+    from camtorch.demo import dewarping
+    from camtorch.demo import training
     from camtorch.cli import images
 
     shown, caption = demo, "the sources, what became of them, and what separates that from the truth"

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from camtorch.camera import Camera
 from camtorch.scenes import driver, landmarks
-from camtorch.scenes.driver import FRIENDLY, LOOKS
-from camtorch.scenes.landmarks import LANDMARKS
-from camtorch.scenes.sight import BACKGROUND, CLASSES, Scene, see
+from camtorch.demo.driver import FRIENDLY, LOOKS
+from camtorch.demo.landmarks import LANDMARKS
+from camtorch.demo.sight import BACKGROUND, CLASSES, Scene, see
 
 __all__ = ["CLASSES", "LANDMARKS", "LOOKS", "Drivers", "random_drivers", "render", "render_classes"]
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from camtorch.scenes import driver
-from camtorch.scenes.driver import Shape
+from camtorch.demo.driver import Shape
 
 LANDMARKS = (
     *("right_eye_outer", "right_eye_inner", "left_eye_inner", "left_eye_outer", "right_iris", "left_iris"),

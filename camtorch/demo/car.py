@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch.scenes.driver import Planes
-from camtorch.scenes.paint import blend
-from camtorch.scenes.walls import colour, soft
+from camtorch.demo.driver import Planes
+from camtorch.demo.paint import blend
+from camtorch.demo.walls import colour, soft
 
 # a point on each wall and where it faces; all the car is on that side of it
 WALLS = (

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from camtorch.scenes import driver, paint
-from camtorch.scenes.car import BOXES, MOVING, WALLS, corners, cushion, seat_paint, slabs, wall_paint
-from camtorch.scenes.driver import LOOKS, Neck, Planes, Shape
+from camtorch.demo.car import BOXES, MOVING, WALLS, corners, cushion, seat_paint, slabs, wall_paint
+from camtorch.demo.driver import LOOKS, Neck, Planes, Shape
 
 CLASSES = ("background", "skin", "hair", "eye", "clothes", "seat", "window", "cabin")
 BACKGROUND, SKIN, HAIR, EYE, CLOTHES, SEAT, WINDOW, CABIN = range(8)

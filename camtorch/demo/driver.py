@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.scenes.walls import soft
+from camtorch.demo.walls import soft
 
 Planes = tuple[Tensor, Tensor, Tensor]
 

@@ -1,0 +1,1 @@
+"""Rendered rooms and drivers with exact truth, for the demos. Not part of the wheel."""
