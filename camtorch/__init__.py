@@ -3,7 +3,6 @@
 from camtorch import augment, io
 from camtorch.camera import MODELS, Camera
 from camtorch.convert.conversion import Conversion
-from camtorch.warp.dewarp import Dewarp
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save
 from camtorch.models import (
@@ -31,6 +30,7 @@ from camtorch.models import (
     WoodScape,
 )
 from camtorch.rig import Rig
+from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
 __version__ = "0.1.0"

@@ -2,41 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from camtorch.projection import formulas
-
-from camtorch.projection import ops
-from camtorch.projection.autograd import Cameras, Project, Unproject
+from camtorch._arguments import as_batch, as_image_size, as_real, as_rows, as_values, as_whole, columns
+from camtorch._module import GeometryModule, Memo
+from camtorch._tracing import has_tangent, in_transform, is_concrete, may_look
+from camtorch.convert.conversion import Conversion, convert
 from camtorch.optics.charts import Chart
-from camtorch.convertible import Convertible
-from camtorch.projection.domain import Domain
 from camtorch.optics.lens import Lens
+from camtorch.projection import formulas, ops
+from camtorch.projection.autograd import Cameras, Project, Unproject
+from camtorch.projection.domain import Domain
 from camtorch.projection.ops import finish, positive, tables, to_planes, without_keeping
-from camtorch.parameters import (
-    Memo,
-    as_batch,
-    as_image_size,
-    as_real,
-    as_rows,
-    columns,
-    has_tangent,
-    in_transform,
-    is_concrete,
-    may_look,
-)
-from camtorch.picture import Picture
 from camtorch.projection.solve import invert
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
 
-class Camera(Convertible, Picture):
+class Camera(GeometryModule):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
     A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
@@ -68,6 +59,26 @@ class Camera(Convertible, Picture):
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
     """In words, what `defined` asks for."""
+    intrinsics: Tensor
+    distortion: Tensor
+    distortion_names: tuple[str, ...] = ()
+    image_size: tuple[int, int] | None
+    odd_in_x: ClassVar[frozenset[str]] = frozenset()
+    """The coefficients that change sign when the scene is mirrored left to right."""
+    odd_in_y: ClassVar[frozenset[str]] = frozenset()
+    """Likewise top to bottom."""
+    special_cases: ClassVar[tuple[tuple[str, tuple[str, ...]], ...]] = ()
+    """The models that this one generalises: the key of each, and the names here of its coefficients in its order.
+
+    A special case is this model, at the same intrinsics, with all other coefficients as in `Camera.ideal`.
+    """
+    fit_bounds: ClassVar[Mapping[str, tuple[float, float] | None]] = {}
+    """The least and the greatest value of coefficients that a fit tries, where there are such; None: as it starts."""
+    fit_starts: ClassVar[tuple[Mapping[str, float], ...]] = ({},)
+    """Alternatives to start a fit from: the values of some coefficients, while the others are as in `Camera.ideal`."""
+    fit_counts: ClassVar[tuple[int, ...]] = ()
+    """Ascending numbers of coefficients of which a fit takes the least one that is good enough; none: the default
+    one. Where there are several, further coefficients that are zero change nothing."""
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
@@ -105,6 +116,44 @@ class Camera(Convertible, Picture):
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, len(names)))
 
+    @classmethod
+    def from_matrix(cls, K, distortion=None, *, image_size=None, ignore_skew: bool = False) -> Self:  # noqa: N803
+        """A camera from its (*B, 3, 3) matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+
+        Raises:
+            ValueError: not such a matrix, or a skew (its K[0, 1]) that is not zero and not to be ignored.
+        """
+        K = as_real(K, "K", cls.__name__)  # noqa: N806
+        if K.shape[-2:] != (3, 3):
+            raise ValueError(f"{cls.__name__}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
+        if is_concrete(K):
+            bottom = K[..., 2, :].detach()
+            if bool((bottom != bottom.new_tensor([0, 0, 1])).any()) or bool((K[..., 1, 0] != 0).any()):
+                raise ValueError(f"{cls.__name__}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
+            skew = K[..., 0, 1].detach()
+            if not ignore_skew and bool((skew != 0).any()):
+                raise ValueError(
+                    f"{cls.__name__}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
+                    "ignore_skew=True drops it"
+                )
+        intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
+        if distortion is None:
+            return cls(intrinsics, image_size=image_size)
+        return cls(intrinsics, distortion, image_size=image_size)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """*B, the batch dims of the parameters."""
+        shapes = self.intrinsics.shape[:-1], self.distortion.shape[:-1]
+        return shapes[0] if shapes[0] == shapes[1] else torch.broadcast_shapes(*shapes)
+
+    @property
+    def K(self) -> Tensor:  # noqa: N802 (the field's name for it)
+        """The (*B, 3, 3) camera matrix."""
+        fx, fy, cx, cy = self.intrinsics.expand(*self.batch_shape, 4).unbind(-1)
+        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+        return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+
     # -- what a model states
 
     @staticmethod
@@ -131,6 +180,24 @@ class Camera(Convertible, Picture):
     def counts_text(cls) -> str:
         """How many coefficients the model takes, in words."""
         return f"n = {len(cls.distortion_names)} ({' '.join(cls.distortion_names) or 'none'})"
+
+    @classmethod
+    def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
+        """Coefficients to start a fit from, float64; by default those of `fit_starts`.
+
+        Args:
+            names: of the n coefficients.
+            angles: (C, K) radians from the axis, evenly from above 0 to the last one that is to be fitted.
+            radii: (C, K) the distance from the principal point at which the camera to be fitted sees them, in units of
+                its focal length at the axis and averaged over the azimuths; ascending. Where it sees nothing the
+                line goes on straight.
+
+        Returns:
+            (S, C, n): S alternatives, of which the one that ends best is kept.
+        """
+        ideal = dict(zip(names, cls.ideal(len(names)), strict=True))
+        starts = [[(ideal | values)[name] for name in names] for values in cls.fit_starts]
+        return radii.new_tensor(starts).view(len(starts), 1, len(names)).expand(-1, len(radii), -1)
 
     # -- both directions
 
@@ -268,12 +335,124 @@ class Camera(Convertible, Picture):
     def _tensors(self) -> tuple[Tensor, Tensor]:
         return self.intrinsics, self.distortion
 
-    # -- the picture
+    # -- the image
+
+    def contains(self, pixels: Tensor) -> Tensor:
+        """Bool (...): whether pixels (..., 2) lie on the picture, its outer pixel edges included."""
+        height, width = self._size("contains")
+        pixels = as_values(pixels, "pixels", type(self).__name__)
+        if pixels.ndim == 0 or pixels.shape[-1] != 2:
+            raise ValueError(f"{type(self).__name__}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
+        u, v = pixels.unbind(-1)
+        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+
+    def pixel_grid(self) -> Tensor:
+        """(H, W, 2): the centre of every pixel."""
+        height, width = self._size("pixel_grid")
+        like = {"dtype": torch.promote_types(self.intrinsics.dtype, torch.float32), "device": self.intrinsics.device}
+        v, u = torch.meshgrid(torch.arange(height, **like), torch.arange(width, **like), indexing="ij")
+        return torch.stack((u, v), -1)
+
+    def _size(self, what: str) -> tuple[int, int]:
+        if self.image_size is None:
+            raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
+        return self.image_size
 
     def rays(self) -> tuple[Tensor, Tensor]:
         """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W)."""
         grid = self.pixel_grid()
         return self.unproject(grid.expand(*self.batch_shape, *grid.shape))
+
+    # -- the camera of an edited image. It has no Parameters of its own while the original learns: its intrinsics are
+    # made from the original's, and that is where gradients go. From a frozen camera, or under no_grad, it is a copy.
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Self:
+        """The camera of the part of the picture whose top-left pixel is (left, top); it may reach outside."""
+        top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
+        return self._edited(shift=(-left, -top), size=(height, width))
+
+    def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
+        """The camera of the picture with that many more pixels on each side."""
+        height, width = self._size("pad")
+        sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
+        left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
+        return self._edited(shift=(left, top), size=(height + top + bottom, width + left + right))
+
+    def resize(self, height: int, width: int) -> Self:
+        """The camera of the picture scaled to that size; pixel edges scale, as with align_corners=False."""
+        old_height, old_width = self._size("resize")
+        as_image_size((height, width), f"{type(self).__name__}.resize")
+        return self._edited(scale=(width / old_width, height / old_height), size=(height, width))
+
+    def hflip(self) -> Self:
+        """The camera that sees the scene mirrored left to right: its picture is this one's, flipped."""
+        return self._edited(mirror="x", size=self._size("hflip"))
+
+    def vflip(self) -> Self:
+        """The camera that sees the scene mirrored top to bottom: its picture is this one's, flipped."""
+        return self._edited(mirror="y", size=self._size("vflip"))
+
+    def _edited(self, *, size, shift=(0, 0), scale=(1.0, 1.0), mirror: str = "") -> Self:
+        fx, fy, cx, cy = self.intrinsics.unbind(-1)
+        cx, cy = (cx + 0.5) * scale[0] - 0.5 + shift[0], (cy + 0.5) * scale[1] - 0.5 + shift[1]
+        odd: frozenset[str] = frozenset()
+        if mirror == "x":
+            cx, odd = size[1] - 1 - cx, self.odd_in_x
+        elif mirror == "y":
+            cy, odd = size[0] - 1 - cy, self.odd_in_y
+        intrinsics = torch.stack((fx * scale[0], fy * scale[1], cx, cy), -1)
+        arguments = [intrinsics]
+        if self.distortion.shape[-1]:
+            sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
+            arguments.append(self.distortion * sign)
+        edited = type(self)(*arguments, image_size=size)
+        for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
+            if isinstance(its, nn.Parameter) and not mine.requires_grad:
+                its.requires_grad = False
+        return edited
+
+    # -- another model
+
+    def convert(
+        self,
+        model: type[Camera] | str,
+        *,
+        count: int | None = None,
+        image_size: tuple[int, int] | None = None,
+        max_angle: float | None = None,
+        tolerance: float = 0.1,
+        **options,
+    ) -> Conversion:
+        """The camera of another model, or number of coefficients, that comes closest to this one.
+
+        Where the models are related and the numbers allow, it is this camera exactly: its coefficients are taken over
+        bit by bit. Otherwise the squared pixel errors are least over the rays of this camera's picture (without a size:
+        over all its rays) that are within `max_angle` and that the new model can express; where the largest error then
+        is above the tolerance, and their root mean square below, it is brought down at the expense of smaller ones. The
+        result says how good that is; a bad conversion raises no error. Rows of a batch are converted independently.
+
+        Args:
+            model: a class of cameras, or its key in `ct.MODELS`.
+            count: of coefficients, for models that leave a choice. By default the least number that holds what a
+                related camera has, the model's own at least; where that does not keep the tolerance, those of
+                `fit_counts` are tried, and taken if they keep it or halve the largest error. Rows of a batch that need
+                less have zeros.
+            image_size: (height, width) of the picture, for a camera that does not say or to look at another part.
+            max_angle: radians from the optical axis up to which rays matter; by default all do.
+            tolerance: the largest error in pixels that is good enough.
+            options: passed on to the model.
+
+        Returns:
+            A `Conversion`: camera (float64, with parameters of its own, frozen if this camera is), rms and max_error in
+            pixels, max_angle in radians, valid_fraction of the picture.
+
+        Raises:
+            TypeError: no camera model. ValueError: an unknown key, a count that the model does not take, a
+                `max_angle` that is not positive or beyond pi, a `tolerance` that is not positive.
+        """
+        return convert(
+            self, model, count=count, image_size=image_size, max_angle=max_angle, tolerance=tolerance, **options
+        )
 
     def extra_repr(self) -> str:
         """Batch, size and, for a single camera, its numbers."""

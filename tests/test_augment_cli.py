@@ -8,9 +8,8 @@ import torch
 from PIL import Image
 
 import camtorch as ct
-from camtorch.cli import labels
-from camtorch.cli import sheet
-from camtorch.cli import augment
+from camtorch.cli import augment as views
+from camtorch.cli import labels, sheet
 from camtorch.cli.main import main
 
 CAMERA = (
@@ -29,8 +28,8 @@ LABELS = {
 def folder(tmp_path, monkeypatch):
     """The current folder, with a picture, its camera and labels; all pictures are small."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(augment, "SCENE_SIZE", (48, 64))
-    monkeypatch.setattr(augment, "NEW_SIZE", (96, 128))
+    monkeypatch.setattr(views, "SCENE_SIZE", (48, 64))
+    monkeypatch.setattr(views, "NEW_SIZE", (96, 128))
     Path("camera.yml").write_text(CAMERA)
     Path("labels.json").write_text(json.dumps(LABELS))
     grey = np.full((64, 96, 3), 128, np.uint8)
@@ -58,7 +57,7 @@ def camera():
 
 def photograph(known=None, picture=None):
     picture = torch.full((3, 64, 96), 128, dtype=torch.uint8) if picture is None else picture
-    return augment.photograph(picture, camera(), known, "in.png")
+    return views.photograph(picture, camera(), known, "in.png")
 
 
 def near(picture, x, y, colour):
@@ -141,7 +140,7 @@ def test_labels_move_with_the_picture(folder, preset):
     known = labels.read("labels.json", camera())
     known.keypoints = torch.tensor([start, end], dtype=torch.float64)
     before = photograph(known, spot.byte().expand(3, -1, -1).contiguous())
-    for view in augment.augmented(before, augment.lens(preset), 3, 0):
+    for view in views.augmented(before, views.lens(preset), 3, 0):
         ((start, end),) = sheet._arrows(view)
         torch.testing.assert_close(view.labels.keypoints.tolist(), [start, end], rtol=0, atol=1e-2)
         weight = (view.picture[0].double() - 128).clamp(min=0) * (view.picture[0] == view.picture[2])

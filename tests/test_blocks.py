@@ -9,12 +9,10 @@ from cameras import KEYS, fan, make, one, pixel_lattice, spread
 from torch.autograd import gradcheck
 
 import camtorch as ct
-from camtorch.warp import grid
-from camtorch.warp import sampling
-from camtorch.projection import autograd
-from camtorch.projection import ops
 from camtorch.optics.charts import Perspective
+from camtorch.projection import autograd, ops
 from camtorch.projection.solve import invert
+from camtorch.warp import grid, sampling
 
 every_model = pytest.mark.parametrize("key", KEYS)
 

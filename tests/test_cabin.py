@@ -2,7 +2,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.scenes import driver
+from camtorch.demo import driver
 from camtorch.demo.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
 
 

@@ -4,11 +4,8 @@ import torch
 from PIL import Image
 
 from camtorch import Pinhole
-
-from camtorch.demo import dewarping
-
-from camtorch.cli import main
-from camtorch.scenes import room
+from camtorch.cli.main import main
+from camtorch.demo import dewarping, room
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +54,7 @@ def test_all_lenses_one_picture(tmp_path, monkeypatch, capsys):
     threads = torch.get_num_threads()
     whole = dewarping.run
     monkeypatch.setattr(dewarping, "run", lambda report: whole(report, height=200, samples=2))
-    assert main.main(["demo", "-o", str(tmp_path / "demo.png")]) == 0
+    assert main(["demo", "-o", str(tmp_path / "demo.png")]) == 0
     table = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in table[1:6]] == [lens.title for lens in dewarping.lenses()]
     assert len(table) == 7

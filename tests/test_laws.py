@@ -25,8 +25,8 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.func import jacfwd, jacrev, jvp, vmap
 
 import camtorch as ct
-from camtorch.optics.charts import CylinderChart, Perspective, SphereChart
 from camtorch.optics.backprojection import Inverted
+from camtorch.optics.charts import CylinderChart, Perspective, SphereChart
 from camtorch.optics.lens import Lens
 
 EPS = torch.finfo(torch.float64).eps

@@ -10,8 +10,8 @@ from cameras import KEYS, one
 from PIL import Image
 
 import camtorch as ct
-from camtorch.cli.main import main
 from camtorch.analysis.summary import summarise
+from camtorch.cli.main import main
 
 FILES = Path(__file__).parent / "files"
 FISHEYE = (

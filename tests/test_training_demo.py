@@ -3,13 +3,9 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch.demo import training_data
-
-from camtorch.demo import training
-
 from camtorch.cli import main
+from camtorch.demo import cabin, training, training_data
 from camtorch.demo.training_data import PLANNED, TEACHERS, Pictures
-from camtorch.scenes import cabin
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +73,7 @@ def test_a_small_run_by_the_command_line(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(training, "run", small)
     for _ in range(2):
-        assert main.main(["demo", "training", "-o", str(tmp_path / "training.png"), "--force"]) == 0
+        assert main(["demo", "training", "-o", str(tmp_path / "training.png"), "--force"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert all(any(line.startswith(title) for line in lines) for title in TEACHERS.values())
     assert [result.teacher for result in kept[0]] == list(TEACHERS)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
 from camtorch.analysis.summary import lattice
+from camtorch.camera import Camera
 
 _LONG = 400  # pixels of the lattice along the longer side
 _ROUNDING = 1e-9  # px, far above that of two equal cameras

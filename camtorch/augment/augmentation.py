@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from camtorch._arguments import as_whole
+from camtorch._tracing import may_look
 from camtorch.augment.cameras import alone, collate, kind, rows_of
 from camtorch.augment.change import Change, Part
-from camtorch.augment.sample import Mover, Sample, without_graph_in_workers
 from camtorch.augment.ranges import Range, draw
+from camtorch.augment.sample import Mover, Sample, without_graph_in_workers
 from camtorch.camera import Camera
-from camtorch.parameters import as_whole, may_look
 from camtorch.warp.sampling import as_options
 
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from camtorch._tracing import in_graph
 from camtorch.camera import Camera
-from camtorch.parameters import in_graph
 
 
 def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:

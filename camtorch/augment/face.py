@@ -7,13 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from camtorch._arguments import as_image_size
+from camtorch._tracing import is_concrete
 from camtorch.augment.cameras import alone, remade
 from camtorch.augment.change import Change, Part
 from camtorch.augment.sample import Mover, Sample, without_graph_in_workers
 from camtorch.camera import Camera
-from camtorch.extrinsics import check_rotation, rotation_matrix
 from camtorch.models import Pinhole
-from camtorch.parameters import as_image_size, is_concrete
+from camtorch.rotations import check_rotation, rotation_matrix
 from camtorch.warp.sampling import as_options
 from camtorch.warp.warp import Warp
 

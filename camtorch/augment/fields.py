@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch.augment.change import Change
 from camtorch.camera import Camera
-from camtorch.extrinsics import rotation_matrix, rotation_vector
+from camtorch.rotations import rotation_matrix, rotation_vector
 
 KEEP = "keep"
 PICTURES = ("image", "mask", "depth", "distance")

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from camtorch._module import same
 from camtorch.augment.cameras import frozen, remade
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
-from camtorch.parameters import same
 
 DRAWN = 16
 """How many coefficients have a draw of their own; more take turns."""

@@ -15,13 +15,13 @@ from kornia.augmentation.utils import _transform_output_shape
 from kornia.constants import Resample, SamplePadding
 from torch import Tensor
 
+from camtorch._module import Memo
 from camtorch.augment import random
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import collate, remade
 from camtorch.augment.change import Change
 from camtorch.augment.ranges import draw
 from camtorch.camera import Camera
-from camtorch.parameters import Memo
 from camtorch.warp.sampling import narrow, widen
 
 __all__ = ["CameraAugmentation", "RandomCamera", "RandomLens", "RandomMount", "with_cameras"]

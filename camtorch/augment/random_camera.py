@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from camtorch._arguments import as_image_size
+from camtorch._tracing import is_concrete
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import frozen, remade
 from camtorch.augment.change import Part
@@ -14,7 +16,6 @@ from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import as_range
 from camtorch.camera import MODELS, Camera
-from camtorch.parameters import as_image_size, is_concrete
 from camtorch.warp.warp import Warp
 
 

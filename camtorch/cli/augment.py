@@ -14,8 +14,8 @@ from torch import Tensor
 from camtorch.augment import PRESETS, RandomCamera
 from camtorch.camera import Camera
 from camtorch.cli.labels import Labels
+from camtorch.demo import cabin
 from camtorch.models import Pinhole
-from camtorch.scenes import cabin
 
 SCENE_SIZE = (480, 640)
 """(height, width) of the rendered picture; of a given camera the width is this at most."""

@@ -84,10 +84,10 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 
 def _show(arguments: argparse.Namespace) -> None:
-    from camtorch.cli import images
-    from camtorch.cli.cameras import read_other, read_rig
     from camtorch.analysis.difference import difference
     from camtorch.analysis.summary import summarise
+    from camtorch.cli import images
+    from camtorch.cli.cameras import read_other, read_rig
 
     if arguments.output is not None:
         images.check_target(arguments.output, force=arguments.force)
@@ -116,7 +116,6 @@ def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
     from PIL import Image
 
     from camtorch import plot
-
     from camtorch.cli import images
 
     figure = plot.portrait(camera, other, title=title)

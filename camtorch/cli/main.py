@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import NoReturn
 
 from camtorch import __version__
-
 from camtorch.cli import convert
 from camtorch.cli.options import picture_size
 
@@ -95,8 +94,8 @@ def _parser() -> argparse.ArgumentParser:
     convert.add(commands)
 
     demo = commands.add_parser("demo", help="render, and measure what camtorch makes of it", allow_abbrev=False)
-    dewarping.set_defaults(run=_demo)
-    dewarping.add_argument(
+    demo.set_defaults(run=_demo)
+    demo.add_argument(
         "subject",
         nargs="?",
         choices=("room", "training"),
@@ -158,7 +157,6 @@ def _dewarp(arguments: argparse.Namespace) -> None:
     import torch
 
     from camtorch import Dewarp
-
     from camtorch.cli import images
 
     fov = arguments.fov
@@ -225,10 +223,7 @@ def _degrees(target) -> float:
 
 
 def _augment(arguments: argparse.Namespace) -> None:
-    from camtorch.cli import images
-    from camtorch.cli import labels
-    from camtorch.cli import sheet
-    from camtorch.cli import augment
+    from camtorch.cli import augment, images, labels, sheet
     from camtorch.cli.cameras import read_camera
 
     if arguments.list:
@@ -272,13 +267,12 @@ def _augment(arguments: argparse.Namespace) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> None:
-    from camtorch.demo import dewarping
-    from camtorch.demo import training
     from camtorch.cli import images
+    from camtorch.demo import dewarping, training
 
-    shown, caption = demo, "the sources, what became of them, and what separates that from the truth"
+    shown, caption = dewarping, "the sources, what became of them, and what separates that from the truth"
     if arguments.subject == "training":
-        shown, caption = training_demo, "what each network learned from, and what it finds behind the fisheye"
+        shown, caption = training, "what each network learned from, and what it finds behind the fisheye"
     images.check_target(arguments.output, force=arguments.force)
     results = shown.run(lambda line: print(line, flush=True))
     images.write(arguments.output, shown.picture(results))

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from camtorch._arguments import as_image_size, as_whole
 from camtorch.convert import views
 from camtorch.convert.least_squares import even_out, fit, see
-from camtorch.parameters import as_image_size, as_whole
 from camtorch.convert.relations import carried, default_count
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from camtorch.parameters import columns
+from camtorch._arguments import columns
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.scenes import driver, landmarks
+from camtorch.demo import driver, landmarks
 from camtorch.demo.driver import FRIENDLY, LOOKS
 from camtorch.demo.landmarks import LANDMARKS
 from camtorch.demo.sight import BACKGROUND, CLASSES, Scene, see

@@ -13,9 +13,9 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.warp.dewarp import Dewarp
+from camtorch.demo import room
 from camtorch.models import BrownConrady, Fisheye62, Fisheye624, KannalaBrandt, Pinhole
-from camtorch.scenes import room
+from camtorch.warp.dewarp import Dewarp
 
 
 @dataclass

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch.scenes import driver
+from camtorch.demo import driver
 from camtorch.demo.driver import Shape
 
 LANDMARKS = (

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.scenes import walls
+from camtorch.demo import walls
 
 Planes = tuple[Tensor, Tensor, Tensor]
 _CHUNK = 1 << 17

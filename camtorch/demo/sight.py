@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch.scenes import driver, paint
+from camtorch.demo import driver, paint
 from camtorch.demo.car import BOXES, MOVING, WALLS, corners, cushion, seat_paint, slabs, wall_paint
 from camtorch.demo.driver import LOOKS, Neck, Planes, Shape
 

@@ -18,8 +18,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor, nn
 
+from camtorch.demo import cabin
 from camtorch.demo.training_data import MOUNT, NAMES, TEACHERS, Augment, Pictures, cameras, photograph, teacher
-from camtorch.scenes import cabin
 
 _METRE = 40.0  # what a metre of error costs in the loss, where a pixel costs 1
 

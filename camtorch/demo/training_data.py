@@ -12,8 +12,8 @@ from torch import Tensor
 
 from camtorch.augment import RandomCamera, mount_rotation
 from camtorch.camera import Camera
+from camtorch.demo import cabin
 from camtorch.models import KannalaBrandt, Pinhole
-from camtorch.scenes import cabin
 
 NAMES = (
     *("right_eye_outer", "right_eye_inner", "left_eye_inner", "left_eye_outer"),

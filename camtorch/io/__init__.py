@@ -1,23 +1,7 @@
 """Calibration files, one file per format."""
 
-
-class CameraFileError(ValueError):
-    """A calibration file that cannot be used.
-
-    Args:
-        path: the file.
-        place: the line or the key where reading stopped.
-        reason: what is wrong there, and where possible what to do.
-    """
-
-    def __init__(self, path, place: str, reason: object):
-        super().__init__(str(path), place, str(reason))
-
-    def __str__(self) -> str:
-        return "{}: {}: {}".format(*self.args)
-
-
-from camtorch.io import opencv  # noqa: E402 (it raises the error above)
-from camtorch.io.formats import FORMATS, load, save  # noqa: E402
+from camtorch.io import opencv
+from camtorch.io._errors import CameraFileError
+from camtorch.io.formats import FORMATS, load, save
 
 __all__ = ["FORMATS", "CameraFileError", "load", "opencv", "save"]

@@ -14,8 +14,8 @@ import struct
 from camtorch.camera import Camera
 from camtorch.io import colmap_images
 from camtorch.io.nerfstudio import panorama
-from camtorch.io.record import Record
 from camtorch.io.parsing import read_bytes, read_text
+from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 

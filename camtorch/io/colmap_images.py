@@ -10,8 +10,8 @@ from typing import BinaryIO, NamedTuple
 
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
-from camtorch.io.record import Record
 from camtorch.io.parsing import check_ordinary
+from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 

@@ -6,15 +6,16 @@ import os
 import re
 
 from camtorch.camera import Camera
-from camtorch.io import CameraFileError, aria, basalt, colmap, kalibr, mrcal, nerfstudio, opencv, plain, ros
-from camtorch.io.record import Record
+from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, opencv, ros
+from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, read_text
+from camtorch.io.record import Record
 from camtorch.io.writing import write_atomically
 from camtorch.rig import Rig
 
 # what has keys and values, in the order in which their keys are tried
 _BY_KEYS = {
-    "camtorch": plain,
+    "camtorch": camtorch_json,
     "aria": aria,
     "basalt": basalt,
     "mrcal": mrcal,

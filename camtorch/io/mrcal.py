@@ -6,8 +6,8 @@ import re
 from typing import Any
 
 from camtorch.io import poses
-from camtorch.io.record import Record, one_of
 from camtorch.io.parsing import Tree
+from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 

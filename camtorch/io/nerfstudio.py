@@ -6,7 +6,8 @@ import math
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
-from camtorch.io import CameraFileError, poses
+from camtorch.io import poses
+from camtorch.io._errors import CameraFileError
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig

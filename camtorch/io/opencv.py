@@ -12,10 +12,11 @@ import torch
 
 from camtorch.camera import MODELS, Camera
 from camtorch.extrinsics import Extrinsics
-from camtorch.io import CameraFileError, poses
+from camtorch.io import poses
+from camtorch.io._errors import CameraFileError
 from camtorch.io.filestorage import Value, as_json, as_xml, as_yaml
-from camtorch.io.record import Record
 from camtorch.io.parsing import read_mapping
+from camtorch.io.record import Record
 from camtorch.io.writing import Lossy
 from camtorch.rig import Rig
 

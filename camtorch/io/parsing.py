@@ -7,7 +7,7 @@ import os
 import re
 from typing import Any, NoReturn
 
-from camtorch.io import CameraFileError
+from camtorch.io._errors import CameraFileError
 
 LARGEST_FILE = 1 << 24
 _LARGEST_YAML = 1 << 22

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import torch
 
 from camtorch.camera import MODELS, Camera
-from camtorch.io import CameraFileError
+from camtorch.io._errors import CameraFileError
 
 LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
-from camtorch.io import CameraFileError
+from camtorch.io._errors import CameraFileError
 from camtorch.rig import Rig
 
 

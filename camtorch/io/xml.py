@@ -6,7 +6,7 @@ import re
 from typing import Any
 from xml.parsers import expat
 
-from camtorch.io import CameraFileError
+from camtorch.io._errors import CameraFileError
 
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
 _DEEPEST = 100

@@ -1,10 +1,10 @@
 """The division camera."""
 
-from camtorch.projection import ops
 from camtorch.camera import Camera
-from camtorch.optics.fisheyes import OneDivision
 from camtorch.optics.backprojection import AnglePerRadius, Inverted, flat
+from camtorch.optics.fisheyes import OneDivision
 from camtorch.optics.lens import Lens
+from camtorch.projection import ops
 
 _ANGLES = ops.register_optics("division", flat(AnglePerRadius))
 

@@ -1,8 +1,8 @@
 """The equisolid fisheye."""
 
+from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics.fisheyes import Equisolid as EquisolidChart
 from camtorch.optics.lens import Lens, Planar, Polynomial
-from camtorch.models._polynomial import OddPolynomial
 
 
 class Equisolid(OddPolynomial):

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from camtorch._arguments import as_batch, as_real
+from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.optics.charts import Equidistant
 from camtorch.optics.lens import Lens, Planar
-from camtorch.parameters import as_batch, as_real, is_concrete
 from camtorch.optics.radial import RadiusPolynomial
 
 if TYPE_CHECKING:

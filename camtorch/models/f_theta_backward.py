@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from camtorch.projection import ops
+from camtorch.models.f_theta import FreePolynomial
 from camtorch.optics.backprojection import Inverted, flat
 from camtorch.optics.lens import Lens
-from camtorch.models.f_theta import FreePolynomial
 from camtorch.optics.radial import RadiusPolynomial
+from camtorch.projection import ops
 
 _ANGLES = ops.register_optics("f_theta_backward", flat(RadiusPolynomial))
 

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from camtorch._arguments import as_batch, as_real
+from camtorch._tracing import is_concrete
+from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics.charts import Equidistant
 from camtorch.optics.lens import Lens, Planar, Polynomial
-from camtorch.models._polynomial import OddPolynomial
-from camtorch.parameters import as_batch, as_real, is_concrete
 
 if TYPE_CHECKING:
     from typing_extensions import Self

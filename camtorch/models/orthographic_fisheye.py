@@ -1,7 +1,7 @@
 """The orthographic fisheye."""
 
-from camtorch.optics.lens import Lens, Planar, Polynomial
 from camtorch.models._polynomial import OddPolynomial
+from camtorch.optics.lens import Lens, Planar, Polynomial
 from camtorch.optics.unified import Unified
 
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from camtorch._arguments import as_real
 from camtorch.camera import Camera
 from camtorch.optics.charts import EquidistantUpTo
 from camtorch.optics.lens import Lens, Planar
-from camtorch.parameters import as_real
 from camtorch.optics.radial import RadiusTable
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch.projection import ops
-from camtorch.optics.special import angle_per_radius
+from camtorch._tracing import has_tangent, may_look
 from camtorch.optics.charts import Chart, Equidistant, Perspective, even_steps_and_ratios
-from camtorch.projection.domain import Domain, Optics
 from camtorch.optics.lens import Lens, Planar, Polynomial
-from camtorch.parameters import has_tangent, may_look
+from camtorch.optics.special import angle_per_radius
+from camtorch.projection import ops
+from camtorch.projection.domain import Domain, Optics
 
 FURTHEST = math.tan(math.radians(87))
 """The radius, in focal lengths, up to which pixels have rays."""

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from camtorch.optics.special import angle_per_radius, cos_root, sinc_root, tanc_root
 from camtorch.optics.charts import Chart, Equidistant, Perspective, even_steps_and_ratios, floor_of, unit
+from camtorch.optics.special import angle_per_radius, cos_root, sinc_root, tanc_root
 
 
 def _length(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch.optics.special import root
 from camtorch.optics.lens import Polynomial
+from camtorch.optics.special import root
 
 
 class RadiusPolynomial:

@@ -8,9 +8,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from camtorch._tracing import may_look
 from camtorch.optics.charts import Chart, Perspective, even_steps_and_ratios, unit
 from camtorch.optics.local import total
-from camtorch.parameters import may_look
 
 
 class Unified(Chart):

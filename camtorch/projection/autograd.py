@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from camtorch.projection import formulas
+from camtorch._arguments import columns
 from camtorch.optics.charts import Chart
-from camtorch.projection.domain import Domain
 from camtorch.optics.lens import Lens
-from camtorch.parameters import columns
+from camtorch.projection import formulas
+from camtorch.projection.domain import Domain
 from camtorch.projection.solve import invert, newton_step, search
 
 _BLOCK = 1 << 17  # points

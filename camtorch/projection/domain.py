@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from camtorch._arguments import columns
+from camtorch._tracing import may_look
 from camtorch.projection.fold import AZIMUTHS, Azimuths, azimuth, first_loss, radial_sense
-from camtorch.parameters import columns, may_look
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart

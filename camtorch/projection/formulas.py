@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch._tracing import may_look
 from camtorch.optics.charts import floor_of
-from camtorch.parameters import may_look
 from camtorch.projection.solve import Found, attach
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
-    from camtorch.projection.domain import Domain
     from camtorch.optics.lens import Lens
+    from camtorch.projection.domain import Domain
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]

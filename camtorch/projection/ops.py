@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from camtorch.projection.fold import AZIMUTHS
+from camtorch._arguments import columns
+from camtorch._module import same
 from camtorch.projection.domain import Domain, Optics, table_width
-from camtorch.parameters import columns, same
+from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import Found, radial_scale_at_last, search
 
 Result = TypeVar("Result")

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.projection.fold import azimuth
+from camtorch._tracing import may_look
 from camtorch.optics.charts import floor_of
 from camtorch.projection.domain import regular
-from camtorch.parameters import may_look
+from camtorch.projection.fold import azimuth
 
 if TYPE_CHECKING:
-    from camtorch.projection.domain import Domain
     from camtorch.optics.lens import Lens
     from camtorch.optics.local import Jacobian
+    from camtorch.projection.domain import Domain
 
 Planes2 = tuple[Tensor, Tensor]
 

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor, nn
 
+from camtorch._arguments import as_image_size
 from camtorch.camera import Camera
-from camtorch.extrinsics import as_rotation, turn
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
-from camtorch.parameters import as_image_size
+from camtorch.rotations import as_rotation, turn
 from camtorch.warp.warp import Warp
 
 _WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.parameters import may_look
+from camtorch._tracing import may_look
 from camtorch.warp.sampling import sample
 
 _TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth

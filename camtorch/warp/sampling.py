@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.parameters import in_graph, in_transform, is_concrete
+from camtorch._tracing import in_graph, in_transform, is_concrete
 
 # Between two pixel centres the interpolation is a polynomial; as many nodes determine it
 _NODES = {"nearest": (), "bilinear": (0.0, 1.0), "bicubic": (0.0, 1 / 3, 2 / 3, 1.0)}

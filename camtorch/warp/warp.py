@@ -8,21 +8,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from camtorch.warp import compiled
-
-from camtorch.warp import minify
+from camtorch._arguments import as_values
+from camtorch._module import GeometryModule, Memo
+from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
-from camtorch.extrinsics import as_rotation, turn
-from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
-from camtorch.parameters import (
-    GeometryModule,
-    Memo,
-    as_values,
-    in_transform,
-    is_concrete,
-    may_look,
-)
+from camtorch.rotations import as_rotation, turn
+from camtorch.warp import compiled, minify
 from camtorch.warp.grid import OUTSIDE, in_strips, on_lattice
+from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
 from camtorch.warp.sampling import MODES, PADDINGS, as_fill, as_options, coverage, narrow, one_of, sample, widen
 
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers

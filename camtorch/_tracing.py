@@ -1,0 +1,34 @@
+"""Whether a tensor has values that may be looked at, and what is recorded of it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+
+def has_tangent(tensor: Tensor) -> bool:
+    """Whether forward-mode derivatives pass through the tensor."""
+    return forward_ad._current_level >= 0 and forward_ad.unpack_dual(tensor).tangent is not None
+
+
+def in_transform() -> bool:
+    """Whether a transform of torch.func is under way."""
+    return torch._C._functorch.peek_interpreter_stack() is not None
+
+
+def in_graph(tensor: Tensor) -> bool:
+    """Whether derivatives, of either mode, or a transform pass through the tensor."""
+    return tensor.requires_grad or not is_concrete(tensor) or has_tangent(tensor)
+
+
+def is_concrete(tensor: Tensor) -> bool:
+    """Whether the values may be looked at: not while a graph is traced, nor inside vmap, grad or jacfwd."""
+    return not (
+        torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor) or tensor.is_meta
+    )
+
+
+def may_look(tensor: Tensor) -> bool:
+    """Whether the values may be looked at and that costs next to nothing, to take a shorter way with a whole block."""
+    return tensor.is_cpu and is_concrete(tensor) and tensor.numel() > 0
