@@ -1,6 +1,6 @@
-"""Augmentation: a random camera for every picture of a batch, with its mask and its landmarks.
+"""Augmentation: a random camera for every image of a batch, with its mask and its landmarks.
 
-Every call draws anew and moves the picture, a mask and 68 keypoints of each sample. OpenCV goes sample by sample, from
+Every call draws anew and moves the image, a mask and 68 keypoints of each sample. OpenCV goes sample by sample, from
 a lens that it knows to a turned pinhole camera, and cannot do the other cases. kornia's RandomAffine moves the same
 data by an affine map, which needs no camera.
 """
@@ -95,7 +95,7 @@ def _contestants(case: Case, size: tuple[int, int], data: tuple, options: Option
 
 
 def _opencv(case: Case, camera: ct.Camera, data: tuple) -> Run:
-    """Sample by sample: a turned pinhole camera, its map, the picture, the mask and the landmarks."""
+    """Sample by sample: a turned pinhole camera, its map, the image, the mask and the landmarks."""
     matrix = camera.K.cpu().double().numpy()
     distortion = camera.distortion.cpu().double().numpy()
     image, mask, keypoints = (t.cpu().numpy() for t in data)
@@ -110,10 +110,10 @@ def _opencv(case: Case, camera: ct.Camera, data: tuple) -> Run:
             focal = width / 2 / np.tan(np.radians(random.uniform(*case.fov)) / 2)
             target = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
             maps = module.initUndistortRectifyMap(matrix, distortion, rotation, target, (width, height), cv2.CV_32FC1)
-            picture = cv2.remap(image[i, 0], *maps, cv2.INTER_LINEAR)
+            warped = cv2.remap(image[i, 0], *maps, cv2.INTER_LINEAR)
             label = cv2.remap(mask[i, 0], *maps, cv2.INTER_NEAREST)
             points = module.undistortPoints(keypoints[i][:, None], matrix, distortion, R=rotation, P=target)
-            results.append((picture, label, points))
+            results.append((warped, label, points))
         return results
 
     return run

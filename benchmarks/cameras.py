@@ -49,13 +49,13 @@ _WITHIN_90 = ("pinhole", "brown_conrady", "orthographic_fisheye")
 def angles(key: str) -> tuple[int, ...]:
     """Degrees from the axis up to which the errors of a model are looked at.
 
-    The timed domain, and either one inside the picture of a perspective camera or one past its plane.
+    The timed domain, and either one inside the image of a perspective camera or one past its plane.
     """
     return (45, TIMED_ANGLE) if key in _WITHIN_90 else (TIMED_ANGLE, 100)
 
 
 def intrinsics(size: tuple[int, int]) -> tuple[float, float, float, float]:
-    """fx fy cx cy of the sample cameras with another picture, of the same field of view across."""
+    """fx fy cx cy of the sample cameras with another image, of the same field of view across."""
     (height, width), (fx, fy, _, _) = size, INTRINSICS
     return fx * width / SIZE[1], fy * width / SIZE[1], (width - 1) / 2, (height - 1) / 2
 

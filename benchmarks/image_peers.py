@@ -1,4 +1,4 @@
-"""Everyone who can dewarp pictures, as data: per contestant the operations that it has."""
+"""Everyone who can dewarp images, as data: per contestant the operations that it has."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CHANNELS = 3
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be done: `batch` pictures of random noise, which no error of a position can hide in.
+    """What is to be done: `batch` images of random noise, which no error of a position can hide in.
 
     "cached map" is one camera for all of them, into the target that `ct.Dewarp` chose. "fresh maps" are as many
     different cameras, made anew each time, into a pinhole camera of the same K: what every peer can do.
@@ -58,7 +58,7 @@ class Task:
         return ct.Dewarp(self.camera().requires_grad_(False))
 
     def camera(self, batch: int | None = None, dtype: torch.dtype = torch.float32) -> ct.Camera:
-        """The camera of all pictures, or a batch of them."""
+        """The camera of all images, or a batch of them."""
         return cameras.camera(self.key, self.device, dtype, size=self.size, batch=batch)
 
     def fresh(self, *, learns: bool = False, dtype: torch.dtype = torch.float32) -> ct.Warp:
@@ -121,7 +121,7 @@ def gradients(forward: Callable[[Tensor], Tensor], images: Tensor, learns: Itera
 
 
 def opencv(task: Task, kind: int) -> dict[str, Run]:
-    """Tensor in, tensor out: to (H, W, C) and back, picture by picture."""
+    """Tensor in, tensor out: to (H, W, C) and back, image by image."""
     cached = opencv_map(task.key, task.dewarp.source, task.dewarp.target, kind)
     given = task.fresh()
 
@@ -147,7 +147,7 @@ def remap_alone(task: Task) -> dict[str, Run]:
 
 
 def opencv_map(key: str, source: ct.Camera, target: ct.Camera, kind: int) -> tuple[np.ndarray, np.ndarray]:
-    """What `cv2.remap` takes, from the source's to the target's picture."""
+    """What `cv2.remap` takes, from the source's to the target's image."""
     lens, straight = (camera.K.cpu().double().numpy() for camera in (source, target))
     coefficients = source.distortion.cpu().double().numpy()
     initialise = cv2.fisheye.initUndistortRectifyMap if key == "kannala_brandt" else cv2.initUndistortRectifyMap

@@ -1,7 +1,7 @@
 """Images: dewarping with a map that is kept, with maps computed each time, and with gradients.
 
 The error is the largest difference, in grey levels, to `grid_sample` in float64 with positions from a float64 camera,
-over the pixels whose interpolation stays inside the picture. The pictures are noise, whose neighbours differ by up
+over the pixels whose interpolation stays inside the image. The images are noise, whose neighbours differ by up
 to 255: an error of a position of 0.01 px shows as some 2 grey levels. Results in uint8 are up to 0.5 off by rounding.
 """
 
@@ -47,7 +47,7 @@ def run(options: Options) -> tuple[list[Record], list[str]]:
 
 
 def _task(task: Task, options: Options) -> Iterator[Record]:
-    """One kind of picture: speed, then errors."""
+    """One kind of image: speed, then errors."""
     progress(f"{task.name}: preparing")
     everyone = contestants(task)
     timed = []
@@ -75,7 +75,7 @@ def _double(camera: ct.Camera) -> ct.Camera:
 
 
 def _truth(images: Tensor, warp: ct.Warp) -> tuple[Tensor, Tensor]:
-    """(B, C, H, W) in float64, and where no neighbour lies off the picture.
+    """(B, C, H, W) in float64, and where no neighbour lies off the image.
 
     It takes from `warp` its two cameras, and makes the positions and the sampling without it.
     """
@@ -92,7 +92,7 @@ def _truth(images: Tensor, warp: ct.Warp) -> tuple[Tensor, Tensor]:
 
 
 def _threads(key: str, options: Options) -> Iterator[Record]:
-    """A single picture on one thread and on all: who leaves cores idle? Nothing to ask on one thread or on a GPU."""
+    """A single image on one thread and on all: who leaves cores idle? Nothing to ask on one thread or on a GPU."""
     if options.threads == 1 or options.device.type != "cpu":
         return
     task = Task(key, 1, QUICK_SIZES[0][1] if options.quick else THREADS_SIZE, torch.float32, options.device)

@@ -42,7 +42,7 @@ class Camera(GeometryModule):
         intrinsics: (*B, 4) fx, fy, cx, cy in pixels.
         distortion: (*B, n) coefficients in the order of `distortion_names`; those of `ideal`, which are zeros unless
             the model says otherwise, if left out.
-        image_size: (height, width) in pixels, shared by the batch; needed only where a picture is concerned.
+        image_size: (height, width) in pixels, shared by the batch; needed only where an image is concerned.
 
     Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s of the shapes above. An `nn.Parameter`
     and a tensor that requires grad are kept as they are, so that gradients reach the network that predicted
@@ -213,7 +213,7 @@ class Camera(GeometryModule):
 
         Returns:
             pixels (*B, *N, 2), and valid (*B, *N) bool: the point is finite, the chart covers its ray, and the ray
-            lies before the fold of the lens. Whether the pixel is on the picture is another question: `contains`.
+            lies before the fold of the lens. Whether the pixel is on the image is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
         rows, lead, restore = as_rows(points, "points", 3, self.batch_shape, self._tensors, type(self).__name__)
@@ -223,7 +223,7 @@ class Camera(GeometryModule):
         intrinsics, distortion, domain, usable = self._traced(points, intrinsics, distortion)
 
         def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-            ray = formulas.to_ray(domain.chart, x, y, z)
+            ray = formulas.normalise(domain.chart, x, y, z)
             a, b, mask = formulas.see(ray, *self.optics(columns(distortion)), domain, order)
             mask = formulas.both(mask, usable)
             focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
@@ -338,7 +338,7 @@ class Camera(GeometryModule):
     # -- the image
 
     def contains(self, pixels: Tensor) -> Tensor:
-        """Bool (...): whether pixels (..., 2) lie on the picture, its outer pixel edges included."""
+        """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
         height, width = self._size("contains")
         pixels = as_values(pixels, "pixels", type(self).__name__)
         if pixels.ndim == 0 or pixels.shape[-1] != 2:
@@ -367,29 +367,29 @@ class Camera(GeometryModule):
     # made from the original's, and that is where gradients go. From a frozen camera, or under no_grad, it is a copy.
 
     def crop(self, top: int, left: int, height: int, width: int) -> Self:
-        """The camera of the part of the picture whose top-left pixel is (left, top); it may reach outside."""
+        """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside."""
         top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
         return self._edited(shift=(-left, -top), size=(height, width))
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
-        """The camera of the picture with that many more pixels on each side."""
+        """The camera of the image with that many more pixels on each side."""
         height, width = self._size("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
         return self._edited(shift=(left, top), size=(height + top + bottom, width + left + right))
 
     def resize(self, height: int, width: int) -> Self:
-        """The camera of the picture scaled to that size; pixel edges scale, as with align_corners=False."""
+        """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False."""
         old_height, old_width = self._size("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
         return self._edited(scale=(width / old_width, height / old_height), size=(height, width))
 
     def hflip(self) -> Self:
-        """The camera that sees the scene mirrored left to right: its picture is this one's, flipped."""
+        """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
         return self._edited(mirror="x", size=self._size("hflip"))
 
     def vflip(self) -> Self:
-        """The camera that sees the scene mirrored top to bottom: its picture is this one's, flipped."""
+        """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
         return self._edited(mirror="y", size=self._size("vflip"))
 
     def _edited(self, *, size, shift=(0, 0), scale=(1.0, 1.0), mirror: str = "") -> Self:
@@ -426,7 +426,7 @@ class Camera(GeometryModule):
         """The camera of another model, or number of coefficients, that comes closest to this one.
 
         Where the models are related and the numbers allow, it is this camera exactly: its coefficients are taken over
-        bit by bit. Otherwise the squared pixel errors are least over the rays of this camera's picture (without a size:
+        bit by bit. Otherwise the squared pixel errors are least over the rays of this camera's image (without a size:
         over all its rays) that are within `max_angle` and that the new model can express; where the largest error then
         is above the tolerance, and their root mean square below, it is brought down at the expense of smaller ones. The
         result says how good that is; a bad conversion raises no error. Rows of a batch are converted independently.
@@ -437,14 +437,14 @@ class Camera(GeometryModule):
                 related camera has, the model's own at least; where that does not keep the tolerance, those of
                 `fit_counts` are tried, and taken if they keep it or halve the largest error. Rows of a batch that need
                 less have zeros.
-            image_size: (height, width) of the picture, for a camera that does not say or to look at another part.
+            image_size: (height, width) of the image, for a camera that does not say or to look at another part.
             max_angle: radians from the optical axis up to which rays matter; by default all do.
             tolerance: the largest error in pixels that is good enough.
             options: passed on to the model.
 
         Returns:
             A `Conversion`: camera (float64, with parameters of its own, frozen if this camera is), rms and max_error in
-            pixels, max_angle in radians, valid_fraction of the picture.
+            pixels, max_angle in radians, valid_fraction of the image.
 
         Raises:
             TypeError: no camera model. ValueError: an unknown key, a count that the model does not take, a

@@ -1,4 +1,4 @@
-"""Pictures of cameras, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and returns them."""
+"""Images of cameras, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and returns them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FAINT = 1e-3  # px: no colours are spent on what is less, where there is more
 
 @torch.no_grad()
 def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21) -> Axes:
-    """Arrows from where an ideal lens would show what the picture shows, to where it does; grey: pixels without rays.
+    """Arrows from where an ideal lens would show what the image shows, to where it does; grey: pixels without rays.
 
     The ideal lens has the same intrinsics and coefficients that do nothing: Kannala-Brandt's is equidistant,
     Brown-Conrady's perspective. Short arrows are drawn longer, and the title
@@ -85,7 +85,7 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
     """The distance from the principal point over the angle from the axis, as far as it is valid; then a dot.
 
     A band shows the azimuths where they differ. Dashed is the ideal lens. The pale part are the angles that the first
-    camera's picture has.
+    camera's image has.
 
     Args:
         cameras: single cameras.
@@ -137,11 +137,11 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
 
 @torch.no_grad()
 def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation: bool = False) -> Axes:
-    """How far apart two cameras show the same ray, in pixels, over the picture of the first; grey: one shows nothing.
+    """How far apart two cameras show the same ray, in pixels, over the image of the first; grey: one shows nothing.
 
     Args:
-        a: the camera whose picture is shown.
-        b: the other camera, of a picture of the same size, or of none stated.
+        a: the camera whose image is shown.
+        b: the other camera, of an image of the same size, or of none stated.
         ax: by default new ones.
         remove_rotation: whether the rays are turned first, by the one rotation that brings those of the cameras
             closest: two calibrations of one camera may differ by where they look.

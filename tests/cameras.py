@@ -40,7 +40,7 @@ RANGES = {
     "fisheye624": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
 }
 
-# Real calibrations of models that no reference file is of: intrinsics, distortion, picture size
+# Real calibrations of models that no reference file is of: intrinsics, distortion, image size
 CALIBRATIONS = {
     # KITTI-360, calibration/image_02.yaml
     # WoodScape, as its polynomial in pixels: 339.749, -31.988, 48.275, -7.201, and an offset of (3.942, -3.093)
@@ -195,7 +195,7 @@ def fan(end_degrees, angles=45, azimuths=24) -> torch.Tensor:
 
 
 def pixel_lattice(camera, rows=25, columns=33) -> torch.Tensor:
-    """(rows * columns, 2): pixels over the whole picture, its corners included."""
+    """(rows * columns, 2): pixels over the whole image, its corners included."""
     height, width = camera.image_size
     like = {"dtype": camera.intrinsics.dtype}
     v, u = torch.meshgrid(

@@ -36,22 +36,22 @@ def lattice(rows=4, columns=5, size=SIZE):
 
 
 def discs(pixels, size=SIZE, radius=2.5, fine=5):
-    """(N, H, W): one picture of a bright disc for each pixel (N, 2), anti-aliased.
+    """(N, H, W): one image of a bright disc for each pixel (N, 2), anti-aliased.
 
     Small ones: where a lens bends, the centroid of a large disc lies beside its centre, by the square of the radius.
     """
     offsets = (torch.arange(fine) + 0.5) / fine - 0.5
     v = (torch.arange(size[0])[:, None] + offsets).reshape(-1, 1)
     u = (torch.arange(size[1])[:, None] + offsets).reshape(-1)
-    pictures = [((u - x) ** 2 + (v - y) ** 2 < radius**2).float() for x, y in pixels.tolist()]
-    return torch.nn.functional.avg_pool2d(torch.stack(pictures)[:, None], fine)[:, 0]
+    images = [((u - x) ** 2 + (v - y) ** 2 < radius**2).float() for x, y in pixels.tolist()]
+    return torch.nn.functional.avg_pool2d(torch.stack(images)[:, None], fine)[:, 0]
 
 
-def centroids(pictures):
-    """(N, 2) of pictures (N, H, W)."""
-    v, u = torch.meshgrid(*(torch.arange(float(side)) for side in pictures.shape[-2:]), indexing="ij")
-    mass = pictures.sum((-1, -2))
-    return torch.stack(((pictures * u).sum((-1, -2)) / mass, (pictures * v).sum((-1, -2)) / mass), -1)
+def centroids(images):
+    """(N, 2) of images (N, H, W)."""
+    v, u = torch.meshgrid(*(torch.arange(float(side)) for side in images.shape[-2:]), indexing="ij")
+    mass = images.sum((-1, -2))
+    return torch.stack(((images * u).sum((-1, -2)) / mass, (images * v).sum((-1, -2)) / mass), -1)
 
 
 def inner(pixels, valid, size=SIZE, margin=12):
@@ -79,11 +79,11 @@ def test_every_field_moves_together_between_any_two_models(key, which):
     pixels = lattice()
     rays, seen = camera.unproject(pixels)
     points = rays * torch.linspace(0.4, 3, len(rays))[:, None]
-    pictures = discs(pixels)
+    images = discs(pixels)
     gaze = torch.nn.functional.normalize(torch.randn(3), dim=-1)
-    # shows at least a third of a narrow picture: otherwise discs become too small to measure
+    # shows at least a third of a narrow image: otherwise discs become too small to measure
     augmentation = RandomCamera(like, fov=(60, 90), camera=camera, yaw=12, pitch=12, roll=25)
-    out = augmentation(image=pictures, keypoints=pixels, points=points, gaze=gaze)
+    out = augmentation(image=images, keypoints=pixels, points=points, gaze=gaze)
     target, keypoints = out["camera"], out["keypoints"]
     use = inner(keypoints, out["keypoints_valid"] & seen)
     assert use.sum() > 5
@@ -120,16 +120,16 @@ def test_boxes_enclose_warped_masks(preset):
 
 
 def test_a_mount_of_a_pinhole_is_a_homography():
-    """kornia's warp_perspective is the witness, on a picture of the coordinates."""
+    """kornia's warp_perspective is the witness, on an image of the coordinates."""
     camera = pinhole(torch.float64)
     v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
-    picture = torch.stack((u, v))[None].expand(4, -1, -1, -1)
+    image = torch.stack((u, v))[None].expand(4, -1, -1, -1)
     augmentation = RandomMount(camera=camera, yaw=15, pitch=12, roll=40, zoom=(0.8, 1.3))
     generator = torch.Generator().manual_seed(3)
-    out = augmentation(image=picture, keypoints=lattice().double().expand(4, -1, -1), generator=generator)
+    out = augmentation(image=image, keypoints=lattice().double().expand(4, -1, -1), generator=generator)
     homography = out["camera"].K @ out["rotation"] @ torch.linalg.inv(camera.K)
-    witness = kornia.geometry.warp_perspective(picture, homography, SIZE, align_corners=True)
-    inside = kornia.geometry.warp_perspective(torch.ones_like(picture), homography, SIZE, align_corners=True) == 1
+    witness = kornia.geometry.warp_perspective(image, homography, SIZE, align_corners=True)
+    inside = kornia.geometry.warp_perspective(torch.ones_like(image), homography, SIZE, align_corners=True) == 1
     assert inside.float().mean() > 0.4
     torch.testing.assert_close(out["image"][inside], witness[inside], atol=1e-3, rtol=0)
     moved = kornia.geometry.transform_points(homography, lattice().double().expand(4, -1, -1))
@@ -141,7 +141,7 @@ def test_a_mount_of_a_pinhole_is_a_homography():
     [("yaw", (-1, 0)), ("pitch", (0, 1)), ("roll", None)],
 )
 def test_signs_of_the_angles(angle, moves):
-    """Turning right moves the picture left, looking up moves it down, leaning right turns it counterclockwise."""
+    """Turning right moves the image left, looking up moves it down, leaning right turns it counterclockwise."""
     camera = pinhole()
     none = dict.fromkeys(("yaw", "pitch", "roll"), (0, 0))
     augmentation = RandomMount(camera=camera, **{**none, angle: (10, 10)})
@@ -351,7 +351,7 @@ def test_chains_carry_camera_rotation_and_validity_on():
     lost = ~half["keypoints_valid"]
     assert not out["keypoints_valid"][lost].any()
     direct = ct.Warp(batch["camera"], out["camera"], out["rotation"]).valid_mask()
-    # nothing is valid twice that one warp would not see, but for the rim of the picture in between
+    # nothing is valid twice that one warp would not see, but for the rim of the image in between
     assert (out["image_valid"] & ~direct).float().mean() < 0.01
     projected, _ = out["camera"].project(out["points"])
     straight, _ = ct.Warp(batch["camera"], out["camera"], out["rotation"]).transform_points(
@@ -389,7 +389,7 @@ def test_depth_is_that_along_the_new_axis():
     expected = height / (rays @ turned) * rays[..., 2]
     known = out["depth"][0] != 0
     assert known.float().mean() > 0.5
-    # the nearest pixel of the old picture lies up to 0.7 px aside
+    # the nearest pixel of the old image lies up to 0.7 px aside
     assert ((out["depth"][0] - expected).abs()[known] < 0.05).all()
     wrong = (
         (ct.Warp(camera, camera, out["rotation"][0].double())(depth[None, None])[0, 0] - expected).abs()[known].mean()
@@ -413,7 +413,7 @@ def test_jittered_lenses_stay_invertible_and_bounded():
             shift = (moved - edge).norm(dim=-1)[valid & seen].max() / math.hypot(SIZE[0] / 2, SIZE[1] / 2)
             assert amount / 50 < shift < 1.5 * amount, key
             moved = change.target.distortion.std(0) > 0
-            assert moved.any() if key == "tabulated" else moved.all()  # a table goes on beyond the picture
+            assert moved.any() if key == "tabulated" else moved.all()  # a table goes on beyond the image
 
 
 def test_a_family_has_the_field_of_view_that_is_asked_for():
@@ -459,17 +459,17 @@ def test_output_size_and_light():
 def test_chromatic_aberration_scales_red_and_blue():
     camera = pinhole()
     pixels = lattice()[[0, 4, 15, 19]]
-    pictures = discs(pixels)[:, None].expand(-1, 3, -1, -1)
+    images = discs(pixels)[:, None].expand(-1, 3, -1, -1)
     lens = RandomLens(camera=camera, focal=None, centre=None, distortion=None, chromatic=(0.01, 0.02))
     draw = lens.draw(4, torch.Generator().manual_seed(0))
-    out = lens(image=pictures, keypoints=pixels[:, None], draw=draw)
+    out = lens(image=images, keypoints=pixels[:, None], draw=draw)
     centre = (torch.tensor(SIZE[::-1]) - 1) / 2
     green = centroids(out["image"][:, 1]) - centre
     torch.testing.assert_close(green, pixels - centre, atol=0.02, rtol=0)
     for channel, column in ((0, 0), (2, 1)):
         shifted = centroids(out["image"][:, channel]) - centre
         torch.testing.assert_close(shifted, green * (1 + draw["chromatic"][:, column, None].float()), atol=0.05, rtol=0)
-    grey = lens(image=pictures[:, :1], draw=draw)["image"]
+    grey = lens(image=images[:, :1], draw=draw)["image"]
     torch.testing.assert_close(grey, out["image"][:, 1:2])
 
 
@@ -497,7 +497,7 @@ def test_dtypes_stay(dtype):
     assert set(out["mask"].unique().tolist()) <= set(range(5))
 
 
-def test_gradients_reach_pictures_labels_and_a_learning_camera():
+def test_gradients_reach_images_labels_and_a_learning_camera():
     camera = ct.KannalaBrandt([60.0, 60, 39.5, 29.5], [0.02, -0.01, 0.003, -0.001], image_size=(60, 80))
     batch = sample(2, camera)
     batch["image"].requires_grad_()

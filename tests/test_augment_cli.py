@@ -26,7 +26,7 @@ LABELS = {
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """The current folder, with a picture, its camera and labels; all pictures are small."""
+    """The current folder, with an image, its camera and labels; all images are small."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(views, "SCENE_SIZE", (48, 64))
     monkeypatch.setattr(views, "NEW_SIZE", (96, 128))
@@ -55,30 +55,30 @@ def camera():
     )
 
 
-def photograph(known=None, picture=None):
-    picture = torch.full((3, 64, 96), 128, dtype=torch.uint8) if picture is None else picture
-    return views.photograph(picture, camera(), known, "in.png")
+def photograph(known=None, image=None):
+    image = torch.full((3, 64, 96), 128, dtype=torch.uint8) if image is None else image
+    return views.photograph(image, camera(), known, "in.png")
 
 
-def near(picture, x, y, colour):
+def near(image, x, y, colour):
     """How far the colour nearest to `colour` within a pixel of a place is from it."""
     x, y = round(x), round(y)
-    part = picture[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3)
+    part = image[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3)
     return np.abs(part - colour).max(-1).min()
 
 
-def test_without_a_picture_it_shows_the_driver(folder, capsys):
+def test_without_an_image_it_shows_the_driver(folder, capsys):
     augment("--preset", "dms130", "-n", 5)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 6
     assert lines[0].startswith("  1: yaw ")
     assert "22 of 22 points" in lines[0]
     assert lines[-1].startswith("augment.png: ")
-    picture = pixels("augment.png")
-    # three columns of tiles of 4:3, the first picture on two rows and columns
-    assert picture.shape == (1271, 1340, 3)
+    image = pixels("augment.png")
+    # three columns of tiles of 4:3, the first image on two rows and columns
+    assert image.shape == (1271, 1340, 3)
     for colour in (sheet.POINT, sheet.BOX, sheet.GAZE):
-        assert (picture == colour).all(-1).sum() > 200
+        assert (image == colour).all(-1).sum() > 200
 
 
 def test_seeds_decide(folder, capsys):
@@ -116,22 +116,22 @@ def test_a_given_camera_sees_the_driver(folder, capsys):
 def test_marks_lie_where_labels_say(folder):
     view = photograph(labels.read("labels.json", camera()))
     assert view.keypoints_valid.tolist() == [True, True, False]
-    picture = np.array(sheet.marked(view, 640, 960)).astype(int)
-    assert picture.shape == (640, 960, 3)
+    image = np.array(sheet.marked(view, 640, 960)).astype(int)
+    assert image.shape == (640, 960, 3)
     for x, y in LABELS["keypoints"][:2]:
-        assert near(picture, 10 * x + 4.5, 10 * y + 4.5, sheet.POINT) < 8
+        assert near(image, 10 * x + 4.5, 10 * y + 4.5, sheet.POINT) < 8
     x1, y1, x2, y2 = (10 * c + 4.5 for c in LABELS["boxes"][0])
     for x, y in ((x1, (y1 + y2) / 2), (x2, (y1 + y2) / 2), ((x1 + x2) / 2, y1), ((x1 + x2) / 2, y2)):
-        assert near(picture, x, y, sheet.BOX) < 8
+        assert near(image, x, y, sheet.BOX) < 8
     ((start, end),) = sheet._arrows(view)
     assert math.dist(start, LABELS["gaze_from"]) < 1e-4
     middle = [10 * (s + e) / 2 + 4.5 for s, e in zip(start, end, strict=True)]
-    assert near(picture, *middle, sheet.GAZE) < 8
-    assert (picture != 128).any(-1).mean() < 0.05
+    assert near(image, *middle, sheet.GAZE) < 8
+    assert (image != 128).any(-1).mean() < 0.05
 
 
 @pytest.mark.parametrize("preset", ["none", "webcam", "dms130", "surround190", "aria"])
-def test_labels_move_with_the_picture(folder, preset):
+def test_labels_move_with_the_image(folder, preset):
     # a keypoint at each end of the arrow, and a spot of light at one
     plain = photograph(labels.read("labels.json", camera()))
     ((start, end),) = sheet._arrows(plain)
@@ -143,19 +143,19 @@ def test_labels_move_with_the_picture(folder, preset):
     for view in views.augmented(before, views.lens(preset), 3, 0):
         ((start, end),) = sheet._arrows(view)
         torch.testing.assert_close(view.labels.keypoints.tolist(), [start, end], rtol=0, atol=1e-2)
-        weight = (view.picture[0].double() - 128).clamp(min=0) * (view.picture[0] == view.picture[2])
+        weight = (view.image[0].double() - 128).clamp(min=0) * (view.image[0] == view.image[2])
         y, x = torch.meshgrid(*(torch.arange(n) for n in weight.shape), indexing="ij")
         seen = [float((weight * c).sum() / weight.sum()) for c in (x, y)]
         assert math.dist(seen, start) < 0.6
 
 
-def test_what_is_off_the_picture_is_not_drawn(folder):
+def test_what_is_off_the_image_is_not_drawn(folder):
     known = labels.Labels(torch.tensor([[-5.0, 3.0]]), torch.tensor([[200.0, 5, 210, 9]]), *torch.zeros(2, 0, 3))
     assert (np.array(sheet.marked(photograph(known), 128, 192)) == 128).all()
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "RGBA", "P", "I;16"])
-def test_kinds_of_picture(folder, mode):
+def test_kinds_of_image(folder, mode):
     grey = np.full((64, 96), 128, np.uint8)
     grey[:, :48] = 0
     image = Image.fromarray(grey.astype(np.uint16) * 30) if mode == "I;16" else Image.fromarray(grey).convert(mode)
@@ -164,7 +164,7 @@ def test_kinds_of_picture(folder, mode):
     assert (pixels("out.png") == sheet.POINT).all(-1).any()
 
 
-def test_long_and_narrow_pictures(folder):
+def test_long_and_narrow_images(folder):
     for size in ("2000x20", "20x2000"):
         augment(*PHOTO, "-n", 2, "--size", size, "-o", "out.png", "--force")
         assert max(pixels("out.png").shape) < 2000
@@ -187,7 +187,7 @@ def test_columns_leave_little_empty():
         (["--rescale"], "--rescale needs IMAGE"),
         (["--model", "pinhole"], "--model needs --camera FILE"),
         (["--name", "left"], "--name needs --camera FILE"),
-        (["--preset", "fish"], "no preset 'fish'. There are none, the picture's own lens; webcam, a VGA camera"),
+        (["--preset", "fish"], "no preset 'fish'. There are none, the image's own lens; webcam, a VGA camera"),
         (["-n", "0"], "-n must be 1 to 100; got 0"),
         (["-n", "101"], "-n must be 1 to 100"),
         (["-n", "many"], "argument -n: invalid int value"),

@@ -17,8 +17,8 @@ def camera():
     return ct.Pinhole([60.0, 60.0, 39.5, 29.5], image_size=SIZE).requires_grad_(False)
 
 
-def test_a_lattice_invents_no_picture():
-    """A cubic through nodes off the picture may swing onto it."""
+def test_a_lattice_invents_no_image():
+    """A cubic through nodes off the image may swing onto it."""
     source = PRESETS["dms90"].camera()
     wide = {"fov": 200, "yaw": (-90, 90), "pitch": 20, "roll": 20, "image_size": (224, 224)}
     exact, close = (RandomCamera("kannala_brandt", camera=source, tolerance=t, **wide) for t in (0.0, 0.001))
@@ -43,27 +43,27 @@ def test_a_face_goes_back_to_the_camera_it_came_from(camera):
         normalizer(head_pose=list(pose), camera=camera)
 
 
-def test_what_is_no_number_stays_where_it_is_when_a_picture_shrinks(camera):
-    picture = torch.rand(2, 1, *SIZE)
-    picture[0, 0, 30, 40] = math.nan
+def test_what_is_no_number_stays_where_it_is_when_an_image_shrinks(camera):
+    image = torch.rand(2, 1, *SIZE)
+    image[0, 0, 30, 40] = math.nan
     shrunk = torch.tensor([[60.0, 60, 39.5, 29.5], [10.0, 10, 39.5, 29.5]])
     target = ct.Pinhole(shrunk, image_size=SIZE).requires_grad_(False)
-    out = ct.Warp(camera, target, antialias=True)(picture)
+    out = ct.Warp(camera, target, antialias=True)(image)
     assert out[0].isnan().sum() <= 36  # a rounding error above its size, it takes a share of the next level
     assert not out[1].isnan().any()
 
 
 @pytest.mark.parametrize("zoom", [1.0, 0.3, 0.1])
-def test_a_white_picture_on_white_is_white(camera, zoom):
+def test_a_white_image_on_white_is_white(camera, zoom):
     mount = RandomMount(camera=camera, zoom=(zoom, zoom), antialias=True, fill=1.0)
     white = mount(image=torch.ones(1, 1, *SIZE))["image"]
     torch.testing.assert_close(white, torch.ones_like(white))
 
 
-def test_a_list_of_pictures_shows_the_lens_as_a_batch_does(camera):
+def test_a_list_of_images_shows_the_lens_as_a_batch_does(camera):
     lens = RandomLens(camera=camera, chromatic=0.03, vignetting=(0.3, 0.6))
-    pictures, draw = torch.rand(3, 3, *SIZE), lens.draw(3)
-    together, apart = lens(image=pictures, draw=draw)["image"], lens(image=list(pictures), draw=draw)["image"]
+    images, draw = torch.rand(3, 3, *SIZE), lens.draw(3)
+    together, apart = lens(image=images, draw=draw)["image"], lens(image=list(images), draw=draw)["image"]
     torch.testing.assert_close(torch.stack(apart), together, atol=2e-3, rtol=0)
 
 
@@ -110,11 +110,11 @@ def test_a_camera_in_a_batch_of_one_serves_all(camera):
 
 def test_cameras_of_several_sizes(camera):
     cameras = [camera, camera.resize(50, 70)]
-    pictures = [torch.rand(3, 60, 80), torch.rand(3, 50, 70)]
-    out = RandomMount(image_size=(30, 40))(image=pictures, camera=cameras, keypoints=torch.rand(2, 3, 2) * 40)
-    assert [tuple(picture.shape) for picture in out["image"]] == [(3, 30, 40)] * 2
-    out = RandomMount()(image=pictures, camera=cameras)
-    assert [tuple(picture.shape) for picture in out["image"]] == [(3, 60, 80), (3, 50, 70)]
+    images = [torch.rand(3, 60, 80), torch.rand(3, 50, 70)]
+    out = RandomMount(image_size=(30, 40))(image=images, camera=cameras, keypoints=torch.rand(2, 3, 2) * 40)
+    assert [tuple(image.shape) for image in out["image"]] == [(3, 30, 40)] * 2
+    out = RandomMount()(image=images, camera=cameras)
+    assert [tuple(image.shape) for image in out["image"]] == [(3, 60, 80), (3, 50, 70)]
     with pytest.raises(ValueError, match="an empty list of cameras"):
         RandomMount()(keypoints=torch.zeros(0, 3, 2), camera=[])
 
@@ -130,11 +130,11 @@ def test_depth_of_any_kind_of_number(camera, dtype):
 
 def test_what_inference_mode_saw_can_be_inverted_in_training(camera):
     mount = RandomMount(camera=camera)
-    picture = torch.rand(1, 3, *SIZE)
+    image = torch.rand(1, 3, *SIZE)
     with torch.inference_mode():
-        mount(image=picture)
+        mount(image=image)
     weight = torch.ones(1, requires_grad=True)
-    mount.inverse(image=picture * weight)["image"].sum().backward()
+    mount.inverse(image=image * weight)["image"].sum().backward()
     assert torch.isfinite(weight.grad).all()
 
 

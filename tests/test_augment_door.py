@@ -99,11 +99,11 @@ def test_cameras_and_draws(camera):
         mount.inverse(keypoints=points)
     half = RandomMount(p=0.5, image_size=(15, 20))
     draw = {**half.draw(2), "apply": torch.tensor([True, False])}
-    with pytest.raises(ValueError, match="with p < 1 the image_size must be that of the pictures"):
+    with pytest.raises(ValueError, match="with p < 1 the image_size must be that of the images"):
         half(keypoints=points, camera=camera, draw=draw)
 
 
-def test_a_picture_is_no_sample(camera):
+def test_an_image_is_no_sample(camera):
     with pytest.raises(
         TypeError, match=r"RandomMount takes a dict of fields, or keywords, as in image=...; got Tensor"
     ):

@@ -42,7 +42,7 @@ def pinhole():
 
 
 def test_a_pinhole_is_normalised_as_published(pinhole):
-    """A picture of the coordinates holds, after the warp, W^-1 of every pixel."""
+    """An image of the coordinates holds, after the warp, W^-1 of every pixel."""
     sample = batch()
     v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
     sample["image"] = torch.stack((u, v)).expand(3, -1, -1, -1)

@@ -24,7 +24,7 @@ def augmentation(**options):
     return ct.augment.RandomCamera(yaw=12, pitch=8, roll=15, chromatic=0.02, vignetting=(0.1, 0.3), **options)
 
 
-def pictures(seed=0):
+def images(seed=0):
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     mask = np.zeros(SIZE, np.int64)
@@ -49,7 +49,7 @@ def vision(request, monkeypatch):
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", ">i2", "float32", "float64"])
 def test_arrays_come_out_as_they_went_in(dtype):
-    (image, mask, points, boxes), gaze, pose = pictures(), np.array([0.1, -0.2, -0.9]), np.eye(4, dtype=np.float32)
+    (image, mask, points, boxes), gaze, pose = images(), np.array([0.1, -0.2, -0.9]), np.eye(4, dtype=np.float32)
     image = image.astype(dtype)
     torch.manual_seed(3)
     out = ct.augment.numpy.Transform(augmentation())(
@@ -72,7 +72,7 @@ def test_arrays_come_out_as_they_went_in(dtype):
 
 
 def test_layouts_lists_and_what_was_valid_before():
-    image, mask, _, _ = pictures()
+    image, mask, _, _ = images()
     grey = image[..., 0]
     grey.flags.writeable = False
     transform = ct.augment.numpy.Transform(augmentation(camera=camera(), valid_mask=True, image_size=(20, 30)))
@@ -103,7 +103,7 @@ def test_layouts_lists_and_what_was_valid_before():
 
 
 def test_there_and_back():
-    image, _, points, _ = pictures()
+    image, _, points, _ = images()
     transform = ct.augment.numpy.Transform(ct.augment.RandomMount(camera=camera()))
     out = transform(image=image, keypoints=points[:2], gaze=[0.0, 0.6, -0.8])
     back = transform.inverse(**out)
@@ -119,7 +119,7 @@ def test_there_and_back():
 
 
 def test_faces_are_normalised():
-    image, _, points, _ = pictures()
+    image, _, points, _ = images()
     transform = ct.augment.numpy.Transform(ct.augment.FaceNormalizer(focal=40, distance=0.6, image_size=(16, 16)))
     fields = {"rvec": np.array([0.1, 0.2, 0.0]), "tvec": np.array([0.05, -0.02, 0.5])}
     out = transform(image=image, keypoints=points[:1], camera=camera(), **fields)
@@ -131,7 +131,7 @@ def test_faces_are_normalised():
 
 
 def test_errors_name_the_field_and_its_shape():
-    image, mask, points, _ = pictures()
+    image, mask, points, _ = images()
     transform = ct.augment.numpy.Transform(augmentation(camera=camera()))
     cases = [
         (
@@ -158,12 +158,12 @@ def test_errors_name_the_field_and_its_shape():
 
 def test_every_kind_of_a_sample_moves_by_one_draw(vision):
     front_end, tv = vision
-    image, mask, points, boxes = pictures()
-    picture = torch.from_numpy(image).permute(2, 0, 1)
+    image, mask, points, boxes = images()
+    planes = torch.from_numpy(image).permute(2, 0, 1)
     sample = {
-        "image": tv.Image(picture),
+        "image": tv.Image(planes),
         "nested": [tv.Mask(torch.from_numpy(mask).expand(2, -1, -1)), "text", torch.ones(3)],
-        "video": tv.Video(picture.expand(2, 4, -1, -1, -1)),
+        "video": tv.Video(planes.expand(2, 4, -1, -1, -1)),
         "points": tv.KeyPoints(torch.from_numpy(points).reshape(2, 2, 2), canvas_size=SIZE),
         "boxes": tv.BoundingBoxes(torch.from_numpy(boxes) + 0.5, format=tv.BoundingBoxFormat.XYXY, canvas_size=SIZE),
         "camera": camera(),
@@ -192,7 +192,7 @@ def test_every_kind_of_a_sample_moves_by_one_draw(vision):
 @pytest.mark.parametrize("form", ["XYXY", "XYWH", "CXCYWH"])
 def test_boxes_enclose_their_masks_in_every_format(vision, form, dtype):
     front_end, tv = vision
-    _, mask, _, _ = pictures()
+    _, mask, _, _ = images()
     edges = {"XYXY": [12, 9, 22, 17], "XYWH": [12, 9, 10, 8], "CXCYWH": [17, 13, 10, 8]}[form]
     values = torch.tensor([edges, edges]).to(dtype)
     boxes = tv.BoundingBoxes(values, format=tv.BoundingBoxFormat[form], canvas_size=SIZE)
@@ -243,7 +243,7 @@ def test_what_has_no_place_keeps_its_row(vision):
 
 def test_plain_tensors_and_pil_images(vision):
     front_end, _ = vision
-    image = pictures()[0]
+    image = images()[0]
     transform = front_end.Transform(augmentation(), camera())
     want = expected(image)["image"]
     plain = torch.from_numpy(image).permute(2, 0, 1)
@@ -252,14 +252,14 @@ def test_plain_tensors_and_pil_images(vision):
     torch.testing.assert_close(moved, want, rtol=0, atol=0)
     assert other is plain
     torch.manual_seed(3)
-    picture, label = transform(PIL.Image.fromarray(image), 5)
-    assert (picture.mode, label) == ("RGB", 5)
-    np.testing.assert_array_equal(np.asarray(picture), want.permute(1, 2, 0).numpy())
+    moved, label = transform(PIL.Image.fromarray(image), 5)
+    assert (moved.mode, label) == ("RGB", 5)
+    np.testing.assert_array_equal(np.asarray(moved), want.permute(1, 2, 0).numpy())
     for mode in ("L", "RGBA", "CMYK", "F", "I;16"):
         source = PIL.Image.new(mode, SIZE[::-1], 9 if mode in ("L", "F", "I;16") else (9, 9, 9, 9))
-        picture = transform(source)
-        assert (picture.mode, picture.size) == (mode, source.size)
-        assert np.asarray(picture).max() > 5
+        moved = transform(source)
+        assert (moved.mode, moved.size) == (mode, source.size)
+        assert np.asarray(moved).max() > 5
     assert not transform(plain.float()).requires_grad
     assert transform(plain.float().requires_grad_()).requires_grad
     copy = pickle.loads(pickle.dumps(front_end.Transform(augmentation(p=0), camera())))

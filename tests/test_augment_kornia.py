@@ -86,11 +86,11 @@ def test_a_made_augmentation_brings_its_camera_p_and_same_on_batch():
     assert "yaw=(-10, 10)" in repr(aug)
 
 
-# -- labels lie where the pictures show them
+# -- labels lie where the images show them
 
 
 def discs(own, radius=0.09):
-    """Pictures of true discs around rays, and the pixels of their middles."""
+    """Images of true discs around rays, and the pixels of their middles."""
     grid, _ = own.rays()
     middles = torch.tensor([[-0.22, -0.15, 1.0], [0.2, -0.1, 1.0], [0.05, 0.2, 1.0]])
     middles = middles / middles.norm(dim=-1, keepdim=True)
@@ -98,14 +98,14 @@ def discs(own, radius=0.09):
     return ((radius - angles) / 0.02).add(0.5).clamp(0, 1)[None].double(), own.project(middles)[0][None].double()
 
 
-def centroids(own, pictures):
-    """Mean rays of what the pictures show, as pixels: the middle of a disc, whatever the lens does to its outline."""
+def centroids(own, images):
+    """Mean rays of what the images show, as pixels: the middle of a disc, whatever the lens does to its outline."""
     rays, _ = own.rays()
     pixels = own.pixel_grid()
     step = [torch.gradient(rays, dim=dim)[0] for dim in (0, 1)]
     area = torch.linalg.cross(*step).norm(dim=-1)
-    assert pixels.shape[:2] == pictures.shape[-2:]
-    means = (pictures[..., None] * area[..., None] * rays).sum((-3, -2))
+    assert pixels.shape[:2] == images.shape[-2:]
+    means = (images[..., None] * area[..., None] * rays).sum((-3, -2))
     return own.project(means)[0]
 
 
@@ -115,10 +115,10 @@ def test_keypoints_lie_in_the_middle_of_warped_discs(cls, like):
     torch.manual_seed(4)
     options = {} if cls is adapter.RandomMount else {"like": like, "fov": (80, 90)}
     own = camera().double()
-    pictures, middles = discs(own)
+    images, middles = discs(own)
     seq = K.AugmentationSequential(cls(own, **options), data_keys=["input", "keypoints"])
     for _ in range(3):
-        warped, moved = seq(pictures, middles)
+        warped, moved = seq(images, middles)
         found = centroids(augment.cameras.singles(seq[0].last.target)[0].double(), warped[0])
         assert (found - moved[0]).norm(dim=-1).max() < 0.1
 
@@ -126,14 +126,14 @@ def test_keypoints_lie_in_the_middle_of_warped_discs(cls, like):
 def test_keypoints_lie_in_warped_discs_after_flips_and_affine_maps():
     torch.manual_seed(5)
     own = camera().double()
-    pictures, middles = discs(own, radius=0.04)
+    images, middles = discs(own, radius=0.04)
     seq = K.AugmentationSequential(
         adapter.RandomCamera(own),
         K.RandomHorizontalFlip(p=1.0),
         K.RandomAffine(10.0, p=1.0),
         data_keys=["input", "keypoints"],
     )
-    warped, moved = seq(pictures, middles)
+    warped, moved = seq(images, middles)
     pixels = own.pixel_grid()
     found = (warped[0, ..., None] * pixels).sum((-3, -2)) / warped[0].sum((-2, -1))[..., None]
     assert (found - moved[0]).norm(dim=-1).max() < 0.1
@@ -165,7 +165,7 @@ def test_every_box_key_says_the_same():
     assert label == 7
 
 
-def test_boxes_off_the_picture_are_invalid_and_zero():
+def test_boxes_off_the_image_are_invalid_and_zero():
     corners = vertices(2).repeat(1, 2, 1, 1)
     corners[:, 1] += 4000
     boxes = Boxes(corners.clone())
@@ -237,10 +237,10 @@ def test_soft_masks_take_the_resampling_they_ask_for():
 
 def test_lens_colours_and_light_leave_masks_alone():
     aug = adapter.RandomLens(camera(), chromatic=(0.05, 0.05), vignetting=0.5, fill=(0.1, 0.2, 0.3), mode="nearest")
-    picture = images(2, 3)
+    before = images(2, 3)
     seq = K.AugmentationSequential(aug, data_keys=["input", "mask"])
-    image, mask = seq(picture, picture)
-    assert set(mask.unique().tolist()) <= {0.0, *picture.unique().tolist()}
+    image, mask = seq(before, before)
+    assert set(mask.unique().tolist()) <= {0.0, *before.unique().tolist()}
     assert (image[:, :, HEIGHT // 2, WIDTH // 2] > 0).all()
 
 
@@ -287,15 +287,15 @@ def test_same_on_batch_and_p_batch():
     assert applied == {(0.0,) * 3, (1.0,) * 3}
 
 
-def test_keepdim_and_pictures_without_batch():
-    picture = images(1, 3)[0]
-    assert adapter.RandomMount(camera())(picture).shape == (1, 3, *SIZE)
+def test_keepdim_and_images_without_batch():
+    image = images(1, 3)[0]
+    assert adapter.RandomMount(camera())(image).shape == (1, 3, *SIZE)
     kept = adapter.RandomMount(camera(), keepdim=True)
-    assert kept(picture).shape == (3, *SIZE)
-    assert kept(picture[0]).shape == SIZE
-    assert kept.inverse(kept(picture)).shape == (3, *SIZE)
+    assert kept(image).shape == (3, *SIZE)
+    assert kept(image[0]).shape == SIZE
+    assert kept.inverse(kept(image)).shape == (3, *SIZE)
     seq = K.AugmentationSequential(kept, data_keys=["input", "mask"], keepdim=True)
-    assert [value.shape for value in seq(picture, masks(1)[0])] == [(3, *SIZE), (1, *SIZE)]
+    assert [value.shape for value in seq(image, masks(1)[0])] == [(3, *SIZE), (1, *SIZE)]
     flat = masks(2)[:, 0]
     assert [v.shape for v in seq.inverse(*seq(images(2), flat))] == [(2, 1, *SIZE), flat.shape]
 
@@ -462,18 +462,18 @@ def test_videos(data_format, same_on_frame, same_on_batch):
     aug = adapter.RandomCamera(camera(), same_on_batch=same_on_batch)
     video = K.VideoSequential(aug, data_format=data_format, same_on_frame=same_on_frame)
     order = (0, 2, 1, 3, 4) if data_format == "BCTHW" else (0, 1, 2, 3, 4)
-    picture = images(1).expand(clips * frames, -1, -1, -1).unflatten(0, (clips, frames)).permute(order)
+    image = images(1).expand(clips * frames, -1, -1, -1).unflatten(0, (clips, frames)).permute(order)
     mask = masks(1).expand(clips * frames, -1, -1, -1).unflatten(0, (clips, frames)).permute(order)
     seq = K.AugmentationSequential(video, data_keys=KEYS)
     labels = [v(1).expand(clips, frames, *v(1).shape[1:]).contiguous() for v in (points, vertices)]
-    warped, classes, moved, boxes = seq(picture, mask, *labels)
+    warped, classes, moved, boxes = seq(image, mask, *labels)
     params = seq._params
-    assert warped.shape == picture.shape
+    assert warped.shape == image.shape
     assert classes.dtype == torch.int64
     for value in (warped.permute(order), moved, boxes):
         assert torch.equal(value[0, 0], value[0, 1]) == (same_on_frame or same_on_batch)
         assert torch.equal(value[0, 0], value[1, 0]) == same_on_batch
-    assert equal(seq(picture, mask, *labels, params=params), (warped, classes, moved, boxes))
+    assert equal(seq(image, mask, *labels, params=params), (warped, classes, moved, boxes))
     assert aug.last.count == clips * frames
     assert (seq.inverse(warped, classes, moved, boxes)[2] - labels[0]).abs().max() < 1e-3
 

@@ -1,4 +1,4 @@
-"""Evaluation in parts: blocks of points, strips of a map, parts and tiles of pictures change nothing; memory kept."""
+"""Evaluation in parts: blocks of points, strips of a map, parts and tiles of images change nothing; memory kept."""
 
 import math
 
@@ -133,13 +133,13 @@ def test_two_classes_of_one_name_keep_their_own_lens():
     assert ops.MODELS[first._model] is not ops.MODELS[second._model]
 
 
-# -- pictures
+# -- images
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("count", [1, 2, 4, 5])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.uint8, torch.bool])
-def test_parts_of_pictures_change_nothing(threads, count, dtype, monkeypatch):
+def test_parts_of_images_change_nothing(threads, count, dtype, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     generator = torch.Generator().manual_seed(0)
     images = (255 * torch.rand(count, 3, 11, 13, generator=generator)).to(dtype)
@@ -168,7 +168,7 @@ def test_strips_of_a_map_change_nothing(cameras, monkeypatch):
     assert (whole.grid() == -9).any()
 
 
-def test_no_cameras_make_no_pictures():
+def test_no_cameras_make_no_images():
     source = ct.Pinhole(torch.ones(0, 4), image_size=(8, 8)).requires_grad_(False)
     nothing = ct.Warp(source, ct.Pinhole([4.0, 4, 4, 4], image_size=(8, 8)).requires_grad_(False))
     assert nothing(torch.rand(0, 1, 8, 8)).shape == (0, 1, 8, 8)

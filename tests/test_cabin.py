@@ -32,7 +32,7 @@ def centroid(weight: torch.Tensor) -> torch.Tensor:
 
 
 def close_ups(points: torch.Tensor, focal: float, side: int) -> ct.Pinhole:
-    """Cameras whose pictures are around where they see points (N, 3)."""
+    """Cameras whose images are around where they see points (N, 3)."""
     centre = (side - 1) / 2 - focal * points[:, :2] / points[:, 2:]
     return ct.Pinhole(torch.cat([torch.full_like(centre, focal), centre], -1), image_size=(side, side)).requires_grad_(
         False
@@ -83,7 +83,7 @@ def test_seeds_decide():
     assert (first[0] - first[1]).abs().mean() > 0.01
 
 
-def test_a_batch_is_its_pictures_one_by_one():
+def test_a_batch_is_its_images_one_by_one():
     drivers = seeded(2)
     intrinsics = torch.tensor([[40.0, 40, 19.5, 15.5], [60.0, 60, 15.5, 19.5]])
     first, second, both = (
@@ -99,32 +99,32 @@ def test_a_batch_is_its_pictures_one_by_one():
 @pytest.mark.parametrize("grey", [False, True])
 def test_every_ray_has_a_colour(grey):
     rays = ct.Equirectangular([40.0, 40, 125.2, 62.3], image_size=(126, 252)).requires_grad_(False)
-    pictures = render(rays, seeded(3, spread=1.2), samples=1, grey=grey)
-    assert bool(pictures.isfinite().all())
-    assert pictures.min() >= 0
-    assert pictures.max() <= 1
+    images = render(rays, seeded(3, spread=1.2), samples=1, grey=grey)
+    assert bool(images.isfinite().all())
+    assert images.min() >= 0
+    assert images.max() <= 1
     has_ray = rays.unproject(rays.pixel_grid())[1]
     has_ray[:, [0, 1, -2, -1]] = has_ray[[0, 1, -2, -1]] = False
-    assert pictures.amax(1)[:, has_ray].min() > 0
+    assert images.amax(1)[:, has_ray].min() > 0
     if grey:
-        assert torch.equal(pictures[:, 0], pictures[:, 2])
+        assert torch.equal(images[:, 0], images[:, 2])
 
 
 def test_no_ray_is_black_and_background():
     camera = fisheye(60, 200)
-    picture, classes = render(camera, seeded(1), samples=1), render_classes(camera, seeded(1))
+    image, classes = render(camera, seeded(1), samples=1), render_classes(camera, seeded(1))
     assert classes.shape == (1, 1, 200, 200)
     assert classes.dtype == torch.uint8
     no_ray = classes[0] == CLASSES.index("background")
     assert no_ray.any()
-    assert torch.equal(no_ray, picture[0].sum(0, keepdim=True) == 0)
+    assert torch.equal(no_ray, image[0].sum(0, keepdim=True) == 0)
     assert set(classes.unique().tolist()) == set(range(len(CLASSES)))
 
 
 def test_classes_agree_with_colours(friendly):
     camera = pinhole(100, 90, 120)
-    picture, classes = render(camera, friendly, samples=1)[0], render_classes(camera, friendly)[0, 0]
-    means = {name: picture[:, classes == i].mean(1) for i, name in enumerate(CLASSES) if (classes == i).any()}
+    image, classes = render(camera, friendly, samples=1)[0], render_classes(camera, friendly)[0, 0]
+    means = {name: image[:, classes == i].mean(1) for i, name in enumerate(CLASSES) if (classes == i).any()}
     red, green, blue = means["skin"]
     assert red > green > blue
     assert means["hair"].mean() < 0.6 * means["skin"].mean()
@@ -138,9 +138,9 @@ def test_the_iris_is_where_the_pupil_is_seen():
     drivers.gaze = gaze
     points = named(drivers.landmarks(), "right_iris", "left_iris").flatten(0, 1)
     cameras = close_ups(points, 4000, 60)
-    pictures = render(cameras, drivers[[0, 0, 1, 1]], samples=4).amax(1)
-    for picture, pixel in zip(pictures, cameras.project(points[:, None])[0], strict=True):
-        assert (centroid(picture < 0.12) - pixel).abs().max() < 0.5
+    images = render(cameras, drivers[[0, 0, 1, 1]], samples=4).amax(1)
+    for image, pixel in zip(images, cameras.project(points[:, None])[0], strict=True):
+        assert (centroid(image < 0.12) - pixel).abs().max() < 0.5
 
 
 def test_the_mouth_ends_where_the_lips_do(friendly):
@@ -161,9 +161,9 @@ def test_dots_are_centred_on_what_points_project_to():
     drivers = seeded(1, 4)[[0, 0]]
     points = drivers.landmarks()[0, [4, 13], None]
     cameras = close_ups(points[:, 0] + torch.tensor([5e-4, 3e-4, 0]), 550, 30)
-    pictures = render(cameras, drivers, samples=12, dots=points, dot_radius=0.008)
+    images = render(cameras, drivers, samples=12, dots=points, dot_radius=0.008)
     without = render(cameras, drivers, samples=12)
-    shares = (without - pictures)[:, 0] / without[:, 0].clamp(min=1e-3)
+    shares = (without - images)[:, 0] / without[:, 0].clamp(min=1e-3)
     for share, pixel in zip(shares, cameras.project(points)[0], strict=True):
         assert (centroid(share) - pixel).abs().max() < 0.05
 
@@ -176,10 +176,10 @@ def test_a_turned_camera_sees_points_at_their_turned_place(friendly):
     point = named(friendly.landmarks(), "nose_tip")
     turns = torch.stack([turn, torch.eye(3)])
     seen, plain = render(camera, friendly[[0, 0]], turns, samples=4, dots=point, dot_radius=0.04)
-    for picture, at in ((seen, point[0, 0] @ turn.T), (plain, point[0, 0])):
-        green = picture[1] - torch.maximum(picture[0], picture[2])
+    for image, at in ((seen, point[0, 0] @ turn.T), (plain, point[0, 0])):
+        green = image[1] - torch.maximum(image[0], image[2])
         assert (centroid(green.clamp(min=0.3) - 0.3) - camera.project(at)[0]).abs().max() < 0.1
-    # the same ray meets the same thing wherever in the picture it falls
+    # the same ray meets the same thing wherever in the image it falls
     rays = torch.linspace(-0.3, 0.3, 40, dtype=torch.float64)
     rays = torch.stack([rays, rays.flip(0) * 0.5, torch.ones_like(rays)], -1)
     classes = render_classes(camera, friendly[[0, 0]], turns.flip(0))[:, 0]

@@ -17,7 +17,7 @@ MATRIX = "K: [28, 0, 47, 0, 28, 32, 0, 0, 1]\nD: [-0.02, 0.004, -0.003, 0.0006]\
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """The current folder, with a picture and its camera."""
+    """The current folder, with an image and its camera."""
     monkeypatch.chdir(tmp_path)
     Path("camera.yml").write_text(FISHEYE + MATRIX)
     colours = np.random.default_rng(0).integers(0, 256, (64, 96, 3), dtype=np.uint8)
@@ -40,7 +40,7 @@ def refused(capsys, *words):
 
 
 def opened(path):
-    """A picture that keeps no file open."""
+    """An image that keeps no file open."""
     with Image.open(path) as image:
         image.load()
         return image
@@ -56,8 +56,8 @@ def test_dewarp_writes_what_dewarp_makes(folder, capsys):
         "out.png: kannala_brandt dewarped to perspective, 90.0 degrees wide, 80x60, fx 40 fy 40 cx 39.5 cy 29.5; "
         "100.0 % of it is filled and shows 23 % of the photograph\n"
     )
-    picture = torch.from_numpy(np.array(opened("in.png"))).permute(2, 0, 1)[None]
-    expected = ct.Dewarp(camera(), fov=torch.pi / 2, image_size=(60, 80))(picture)[0].permute(1, 2, 0)
+    image = torch.from_numpy(np.array(opened("in.png"))).permute(2, 0, 1)[None]
+    expected = ct.Dewarp(camera(), fov=torch.pi / 2, image_size=(60, 80))(image)[0].permute(1, 2, 0)
     assert np.array_equal(np.array(opened("out.png")), expected.numpy())
     assert [path.name for path in sorted(folder.iterdir())] == ["camera.yml", "in.png", "out.png"]
 
@@ -69,7 +69,7 @@ def test_projections(folder, capsys, projection):
     assert opened("out.png").size == (96, 64)
 
 
-def test_camera_without_size_takes_the_pictures(folder):
+def test_camera_without_size_takes_the_images(folder):
     Path("bare.yml").write_text(MATRIX)
     command("dewarp", "in.png", "--camera", "camera.yml", "-o", "a.png")
     command("dewarp", "in.png", "--camera", "bare.yml", "--model", "kannala_brandt", "-o", "b.png")
@@ -95,7 +95,7 @@ def test_another_resolution_needs_rescale(folder, capsys):
         (["dewarp"], "required: IMAGE, --camera"),
         (["undistort"], "invalid choice: 'undistort'"),
         (["dewarp", "none.png", "--camera", "camera.yml", "-o", "o.png"], "none.png: no such file"),
-        (["dewarp", "camera.yml", "--camera", "camera.yml", "-o", "o.png"], "camera.yml: not a picture"),
+        (["dewarp", "camera.yml", "--camera", "camera.yml", "-o", "o.png"], "camera.yml: not an image"),
         (["dewarp", "cut.png", "--camera", "camera.yml", "-o", "o.png"], "cut.png: "),
         (["dewarp", ".", "--camera", "camera.yml", "-o", "o.png"], ": Is a directory"),
         (["dewarp", "in.png", "--camera", "none.yml", "-o", "o.png"], "none.yml: No such file"),
@@ -109,7 +109,7 @@ def test_another_resolution_needs_rescale(folder, capsys):
         (["dewarp", "in.png", "--camera", "camera.yml", "-o", "in.png"], "in.png: exists already; --force"),
         (
             ["dewarp", "alpha.png", "--camera", "camera.yml", "-o", "o.jpg"],
-            "o.jpg: .jpg files hold no picture of mode RGBA",
+            "o.jpg: .jpg files hold no image of mode RGBA",
         ),
         (["dewarp", "in.png", "--camera", "camera.yml", "--size", "80", "-o", "o.png"], "'80' is not WIDTHxHEIGHT"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--size", "0x9", "-o", "o.png"], "1 to 32768"),
@@ -144,7 +144,7 @@ def test_several_cameras_in_one_file(folder, capsys):
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA", "1", "P", "CMYK", "I;16"])
-def test_kinds_of_picture(folder, mode):
+def test_kinds_of_image(folder, mode):
     ramp = np.broadcast_to(np.linspace(0, 255, 96).astype(np.uint8), (64, 96))
     if mode == "I;16":
         image = Image.fromarray(ramp.astype(np.uint16) * 257)
@@ -156,7 +156,7 @@ def test_kinds_of_picture(folder, mode):
     out = opened("out.tif")
     assert out.mode == {"1": "L", "P": "RGB", "CMYK": "RGB"}.get(mode, mode)
     if mode not in ("1", "P"):
-        # the camera of a picture without distortion: nothing may change
+        # the camera of an image without distortion: nothing may change
         expected = image if mode == "I;16" else image.convert(out.mode)
         assert np.abs(np.asarray(out).astype(int) - np.asarray(expected).astype(int)).max() <= 1
 

@@ -30,7 +30,7 @@ def fisheye(batch=(), seed=0, **options):
 
 
 def pixels_apart(source, result, count=2000, seed=1):
-    """The distances at random pixels of the picture that the result speaks for, measured anew; and which those are."""
+    """The distances at random pixels of the image that the result speaks for, measured anew; and which those are."""
     height, width = source.image_size
     draw = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), **F64)
     pixels = draw * torch.tensor([width, height], **F64) - 0.5
@@ -332,7 +332,7 @@ def test_a_bad_conversion_says_so():
     assert 0 < float(narrow.valid_fraction) < 0.1
 
 
-def test_without_a_picture_all_rays_count():
+def test_without_an_image_all_rays_count():
     source = ct.KannalaBrandt([300.0, 300, 320, 240], [0.02, -0.01, 0.003, -0.001])
     result = source.convert("fisheye624")
     assert result.camera.image_size is None
@@ -360,7 +360,7 @@ def test_the_new_camera_learns_as_the_old_one_did():
     assert bool(half.exact)
 
 
-def test_edited_pictures():
+def test_edited_images():
     source = golden("brown_conrady__d5_dms_ir_62deg")
     for edited in (source.crop(300, 700, 200, 300), source.hflip(), source.resize(100, 160)):
         result = edited.convert("fisheye624")

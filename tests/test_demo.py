@@ -29,14 +29,14 @@ def test_bent_edges_become_straight(studies):
         assert study.bend_after < 0.15
 
 
-def test_keypoints_move_with_the_picture(studies):
+def test_keypoints_move_with_the_image(studies):
     for study in studies:
         assert len(study.keypoints[0]) >= 20
         assert study.keypoint_error < 0.05
 
 
 def test_a_wrong_camera_would_be_noticed():
-    # the measurements must be able to fail: the same picture, dewarped with another k1
+    # the measurements must be able to fail: the same image, dewarped with another k1
     lens = next(lens for lens in dewarping.lenses(320) if lens.title == "Brown-Conrady")
     source = room.render(lens.camera, samples=2)
     wrong = lens.camera.resize(*lens.camera.image_size)
@@ -50,7 +50,7 @@ def test_a_wrong_camera_would_be_noticed():
     assert bends[1] > 3 * bends[0]
 
 
-def test_all_lenses_one_picture(tmp_path, monkeypatch, capsys):
+def test_all_lenses_one_image(tmp_path, monkeypatch, capsys):
     threads = torch.get_num_threads()
     whole = dewarping.run
     monkeypatch.setattr(dewarping, "run", lambda report: whole(report, height=200, samples=2))
@@ -89,10 +89,10 @@ def test_rays_of_any_shape_and_dtype():
 
 
 def test_no_rays_no_light():
-    # a fold of this lens lies inside the picture
+    # a fold of this lens lies inside the image
     camera = dewarping.BrownConrady([100.0, 100, 79.5, 59.5], [-0.6, 0.0, 0.0, 0.0], image_size=(120, 160))
-    picture = room.render(camera, samples=1)
+    image = room.render(camera, samples=1)
     _, valid = camera.rays()
     assert not valid.all()
-    assert (picture[:, ~valid] == 0).all()
-    assert (picture[:, 60, 80] > 0).all()
+    assert (image[:, ~valid] == 0).all()
+    assert (image[:, 60, 80] > 0).all()

@@ -13,7 +13,7 @@ PROJECTIONS = ("perspective", "cylindrical", "equirectangular")
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
 @pytest.mark.parametrize(("key", "name"), REAL)
-def test_real_lenses_fill_most_of_the_picture(key, name, projection):
+def test_real_lenses_fill_most_of_the_image(key, name, projection):
     dewarp = ct.Dewarp(real(key)[name].resize(75, 100), projection=projection)
     assert torch.isfinite(dewarp.target.intrinsics).all()
     assert not any(p.requires_grad for p in dewarp.target.parameters())
@@ -23,7 +23,7 @@ def test_real_lenses_fill_most_of_the_picture(key, name, projection):
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_opencv_issue_23961(projection):
-    """A lens that folds inside its picture, for which OpenCV gives NaN."""
+    """A lens that folds inside its image, for which OpenCV gives NaN."""
     matrix = [[1200.18, -0.14, 951.25], [0, 1199.43, 601.05], [0, 0, 1]]
     lens = (-0.99137, -0.12055, 0.36864, -1.06562)
     camera = ct.KannalaBrandt.from_matrix(matrix, lens, image_size=(1200, 1900), ignore_skew=True)

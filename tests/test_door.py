@@ -173,7 +173,7 @@ def test_a_camera_without_image_size_where_one_is_needed(key, what, call):
         (lambda c: c.pad(-700, 0, 0, 0), ValueError, "(480, -60)"),
     ],
 )
-def test_sizes_of_edited_pictures(key, call, error, shown):
+def test_sizes_of_edited_images(key, call, error, shown):
     camera = ct.MODELS[key](INTRINSICS, image_size=(480, 640))
     with refuses(error, type(camera).__name__, shown):
         call(camera)

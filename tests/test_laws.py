@@ -1,4 +1,4 @@
-"""What holds for every camera model: both directions, their derivatives, what is valid, and edited pictures."""
+"""What holds for every camera model: both directions, their derivatives, what is valid, and edited images."""
 
 import math
 
@@ -45,7 +45,7 @@ def optics(camera):
 
 
 def end_degrees(camera):
-    """How far out a fan makes sense: the perspective chart ends at 90 degrees, short of which pixels run away."""
+    """How far out a fan makes orientation: the perspective chart ends at 90 degrees, short of which pixels run away."""
     return 88.0 if isinstance(optics(camera)[0], Perspective) else 179.0
 
 
@@ -80,15 +80,15 @@ def check_pixels_return(camera, pixels):
     return valid
 
 
-def check_rays_return(camera, rays, on_picture=False):
+def check_rays_return(camera, rays, on_image=False):
     """Back as itself; a lens that is not radial may send two azimuths to one pixel, then the other ray may return."""
     pixels, valid = (t.detach() for t in camera.project(rays))
-    if on_picture:
+    if on_image:
         valid = valid & camera.contains(pixels)
     condition = rad_per_px(camera, rays)
     # a few roundings of pixel and principal point, seen through the conditioning
     limit = 32 * EPS * (1 + (pixels.norm(dim=-1) + camera.intrinsics.detach().norm()) * condition)
-    # within 1e-5 rad of a fold, and where a pixel does not tell rays apart, rounding decides; five pictures away a
+    # within 1e-5 rad of a fold, and where a pixel does not tell rays apart, rounding decides; five images away a
     # prism of fourth order outweighs the lens itself, and turns azimuths by up to a right angle
     near = (pixels - camera.intrinsics[2:].detach()).norm(dim=-1) < 5 * max(camera.image_size)
     clear = valid & near & (condition * camera.intrinsics[0].item() < 1e5) & (limit < 1e-6)
@@ -97,7 +97,7 @@ def check_rays_return(camera, rays, on_picture=False):
     assert valid.all(), (rays[~valid][:3].tolist(), pixels[~valid][:3].tolist())
     same = (again - rays).norm(dim=-1) < limit
     lens = optics(camera)[1]
-    if on_picture or not lens.stages or lens.is_radial:
+    if on_image or not lens.stages or lens.is_radial:
         assert same.all(), (rays[~same][:3].tolist(), again[~same][:3].tolist())
     else:
         there = camera.project(again)[0]
@@ -111,7 +111,7 @@ def test_round_trips_of_calibrations(key, name):
     camera = real(key)[name]
     valid = check_pixels_return(camera, pixel_lattice(camera))
     assert valid.double().mean() > 0.5
-    check_rays_return(camera, fan(end_degrees(camera)), on_picture=True)
+    check_rays_return(camera, fan(end_degrees(camera)), on_image=True)
     check_rays_return(camera, fan(end_degrees(camera)))
 
 
@@ -360,7 +360,7 @@ def test_one_exploded_lens_leaves_the_others_alone(coefficient):
 
 @every_model
 @both_precisions
-def test_pixels_far_beyond_every_picture(key, dtype):
+def test_pixels_far_beyond_every_image(key, dtype):
     """Valid only with the ray that projects there, at any distance."""
     for camera in (one(key).to(dtype), spread(key, dtype)):
         angle = torch.linspace(0, 2 * math.pi, 25, dtype=dtype)[:, None]
@@ -525,7 +525,7 @@ def test_pixels_around_the_image_of_the_fold(key, name, dtype):
     camera = camera.to(dtype)
     rays, valid = camera.unproject(around)
     again, reachable = camera.project(rays)
-    # single precision: looser than on a picture, for some of these lenses fold a thousand times further out
+    # single precision: looser than on an image, for some of these lenses fold a thousand times further out
     limit = pixel_limit(around, px=1e-9 if dtype == torch.float64 else 1e-2)
     right = reachable & ((again - around).norm(dim=-1) < limit)
     assert right[valid].all(), (around[valid & ~right][:3].tolist(), again[valid & ~right][:3].tolist())
@@ -587,7 +587,7 @@ def test_no_points_give_no_pixels(key):
     assert valid.shape == (4, 0)
 
 
-# -- edited pictures
+# -- edited images
 
 EDITS = {
     "crop": (lambda c: c.crop(20, -30, 200, 300), lambda u, v: (u + 30, v - 20), (200, 300)),
@@ -657,7 +657,7 @@ def test_an_edited_camera_keeps_its_gradient(key):
     assert distortion.numel() == 0 or (distortion.grad != 0).any()
 
 
-# -- matrix and picture
+# -- matrix and image
 
 
 @every_model

@@ -1,4 +1,4 @@
-"""Pictures of cameras: what they show is what the cameras say."""
+"""Images of cameras: what they show is what the cameras say."""
 
 import numpy as np
 import pytest
@@ -84,7 +84,7 @@ def test_a_difference_is_that_of_pixels():
     np.testing.assert_allclose(values.compressed(), 5.0, atol=1e-9)
     same = plot.difference(a, a, axes())
     assert "the same to rounding" in same.get_title()
-    assert same.images[0].get_clim() == (0, 1e-6)  # rounding is no picture
+    assert same.images[0].get_clim() == (0, 1e-6)  # rounding is no image
 
 
 def test_a_common_rotation_is_removed_only_if_asked():

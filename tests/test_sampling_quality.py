@@ -30,13 +30,13 @@ def zone_plate(side=512):
     return (0.5 + 0.5 * torch.cos(math.pi * (at[:, None] ** 2 + at**2) / side)).float()[None, None]
 
 
-def alias_energy(picture, shrunk_by):
-    """The energy of what differs from grey where the rings are too fine for the small picture."""
-    side = picture.shape[-1]
+def alias_energy(image, shrunk_by):
+    """The energy of what differs from grey where the rings are too fine for the small image."""
+    side = image.shape[-1]
     at = (torch.arange(side, dtype=torch.float64) - (side - 1) / 2) / (side / 2)  # 1: the frequency of the large pixels
     radius = (at[:, None] ** 2 + at**2).sqrt()
     too_fine = (radius > 1.3 / shrunk_by) & (radius < 1)
-    return (picture[0, 0][too_fine] - 0.5).square().mean()
+    return (image[0, 0][too_fine] - 0.5).square().mean()
 
 
 @pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
@@ -78,10 +78,10 @@ def test_antialias_follows_the_local_scale():
 
 def test_antialias_has_gradients():
     camera = ct.Pinhole([140.0, 140, 79.5, 59.5], image_size=SIZE)
-    picture = torch.rand(1, 1, *SIZE, requires_grad=True)
-    ct.Warp(camera, pinhole((30, 40), 35.0), antialias=True)(picture).square().sum().backward()
-    assert torch.isfinite(picture.grad).all()
-    assert picture.grad.abs().sum() > 0
+    image = torch.rand(1, 1, *SIZE, requires_grad=True)
+    ct.Warp(camera, pinhole((30, 40), 35.0), antialias=True)(image).square().sum().backward()
+    assert torch.isfinite(image.grad).all()
+    assert image.grad.abs().sum() > 0
     assert torch.isfinite(camera.intrinsics.grad).all()
 
 
@@ -91,14 +91,14 @@ def test_antialias_has_gradients():
 @pytest.mark.parametrize("mode", ["bilinear", "nearest", "bicubic"])
 def test_fill_takes_the_place_of_black(mode):
     camera, rotation = pinhole(), turn(25, 10, 30)
-    picture = torch.rand(1, 3, *SIZE)
+    image = torch.rand(1, 3, *SIZE)
     black, filled = (ct.Warp(camera, camera, rotation, mode=mode, fill=fill) for fill in (0.0, (0.2, 0.4, 0.6)))
     value = torch.tensor([0.2, 0.4, 0.6])[:, None, None]
     # filling is warping what differs from the value
-    torch.testing.assert_close(filled(picture), black(picture - value) + value, atol=1e-5, rtol=0)
+    torch.testing.assert_close(filled(image), black(image - value) + value, atol=1e-5, rtol=0)
     whole = ct.Warp(camera, camera, rotation, mode=mode, fill=128)(torch.full((1, 1, *SIZE), 128, dtype=torch.uint8))
     assert (whole == 128).all()
-    assert torch.equal(black(picture, fill=0.5), ct.Warp(camera, camera, rotation, mode=mode, fill=0.5)(picture))
+    assert torch.equal(black(image, fill=0.5), ct.Warp(camera, camera, rotation, mode=mode, fill=0.5)(image))
 
 
 def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
@@ -139,8 +139,8 @@ def test_maps_from_a_lattice_keep_their_tolerance(key, other):
         close = ct.Warp(*cameras, rotation, tolerance=tolerance)
         (grid, mapped, _), (other_grid, other_mapped, _) = exact._sampling(), close._sampling()
         assert torch.equal(mapped, other_mapped)
-        on_picture = (grid.abs() <= 1).all(-1) | (other_grid.abs() <= 1).all(-1)
-        error = ((grid - other_grid) * torch.tensor([SIZE[1] / 2, SIZE[0] / 2])).norm(dim=-1)[mapped & on_picture]
+        on_image = (grid.abs() <= 1).all(-1) | (other_grid.abs() <= 1).all(-1)
+        error = ((grid - other_grid) * torch.tensor([SIZE[1] / 2, SIZE[0] / 2])).norm(dim=-1)[mapped & on_image]
         # two axes, and what the cubics' error varies between nodes
         assert error.numel() == 0 or error.max() < 2 * tolerance
         assert (
@@ -149,7 +149,7 @@ def test_maps_from_a_lattice_keep_their_tolerance(key, other):
         )
 
 
-def test_a_lattice_is_used_and_small_pictures_do_without():
+def test_a_lattice_is_used_and_small_images_do_without():
     camera, target = pinhole(dtype=torch.float64), pinhole(focal=120.0, dtype=torch.float64)
     rotation = turn(10, 5, 20, dtype=torch.float64)
     exact, close = (ct.Warp(camera, target, rotation, tolerance=t).grid() for t in (0.0, 0.1))

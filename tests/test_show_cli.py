@@ -42,7 +42,7 @@ def refused(capsys, *words):
 
 
 def opened(path):
-    """A picture that keeps no file open."""
+    """An image that keeps no file open."""
     with Image.open(path) as image:
         image.load()
         return image
@@ -57,7 +57,7 @@ def test_show_prints_a_summary(folder, capsys):
     assert lines[0] == "camera.yml: camera"
     table = dict(line.split(maxsplit=1) for line in lines[1:6] if not line.startswith(("focal", "principal")))
     assert table["model"] == "KannalaBrandt (kannala_brandt)"
-    assert table["picture"] == "96 x 64"
+    assert table["image"] == "96 x 64"
     text = "\n".join(lines)
     assert "fx 28, fy 28 px" in text
     assert "k1 -0.02, k2 0.004, k3 -0.003, k4 0.0006" in text
@@ -65,7 +65,7 @@ def test_show_prints_a_summary(folder, capsys):
         assert f"\n{label} " in text
 
 
-def test_show_draws_a_picture(folder, capsys):
+def test_show_draws_an_image(folder, capsys):
     pytest.importorskip("matplotlib")
     command("show", "camera.yml", "-o", "out.png")
     assert "out.png: distortion, radius over angle\n" in capsys.readouterr().out
@@ -127,7 +127,7 @@ def test_convert_writes_the_new_camera(folder, capsys):
     command("convert", "camera.yml", "out.json", "--model", "fisheye624", "--format", "camtorch")
     assert capsys.readouterr().out == (
         "out.json: camera, kannala_brandt to fisheye624: exact, "
-        "up to 123.1 degrees from the axis, 100 % of what the picture has rays for\n"
+        "up to 123.1 degrees from the axis, 100 % of what the image has rays for\n"
     )
     camera = ct.load("out.json").camera
     assert (type(camera), camera.image_size) == (ct.Fisheye624, (64, 96))
@@ -165,7 +165,7 @@ def test_convert_overwrites_no_images_unasked(folder, capsys):
     assert list(ct.load("cameras.txt").extrinsics) == list(rig.extrinsics)
 
 
-def test_show_compares_without_a_picture(folder, capsys):
+def test_show_compares_without_an_image(folder, capsys):
     command("convert", "camera.yml", "other.json", "--model", "fisheye624", "--format", "camtorch")
     command("show", "camera.yml", "--against", "other.json")
     assert "against other.json: the same to rounding, over " in capsys.readouterr().out

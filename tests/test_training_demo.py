@@ -5,35 +5,35 @@ from PIL import Image
 
 from camtorch.cli import main
 from camtorch.demo import cabin, training, training_data
-from camtorch.demo.training_data import PLANNED, TEACHERS, Pictures
+from camtorch.demo.training_data import PLANNED, TEACHERS, Samples
 
 
 @pytest.fixture(scope="module")
-def seen() -> Pictures:
+def seen() -> Samples:
     drivers = cabin.random_drivers(12, torch.Generator().manual_seed(0))
     return training_data.photograph(training_data.cameras()[0], drivers)
 
 
-def lesson(name: str, seen: Pictures, seed: int = 1) -> Pictures:
+def lesson(name: str, seen: Samples, seed: int = 1) -> Samples:
     torch.manual_seed(seed)
     return training_data.teacher(name, *training_data.cameras())(seen, torch.Generator().manual_seed(seed))
 
 
 def test_labels_of_lessons_are_where_their_cameras_see_them(seen):
-    for pictures in (seen, lesson("camtorch", seen)):
-        pixels, valid = pictures.camera.project(pictures.points)
+    for images in (seen, lesson("camtorch", seen)):
+        pixels, valid = images.camera.project(images.points)
         assert bool(valid.all())
-        assert (pixels - pictures.keypoints).abs().max() < 0.1
-        assert pictures.seen.float().mean() > 0.9
+        assert (pixels - images.keypoints).abs().max() < 0.1
+        assert images.seen.float().mean() > 0.9
 
 
 def test_the_planned_mount_puts_drivers_into_the_middle_of_the_fisheye():
     like = training_data.cameras()[1]
     drivers = cabin.random_drivers(3, spread=0)
-    pictures = training_data.photograph(like, drivers, PLANNED)
-    middle = pictures.keypoints.mean((0, 1))
+    images = training_data.photograph(like, drivers, PLANNED)
+    middle = images.keypoints.mean((0, 1))
     assert (middle - torch.tensor([47.5, 39.5])).abs().max() < 4
-    assert bool(pictures.seen.all())
+    assert bool(images.seen.all())
 
 
 def test_both_augmentations_turn_and_scale_alike(seen):
@@ -68,7 +68,7 @@ def test_a_small_run_by_the_command_line(tmp_path, monkeypatch, capsys):
     whole = training.run
 
     def small(report):
-        kept.append(whole(report, pictures=8, tests=6, steps=3, seed=2))
+        kept.append(whole(report, images=8, tests=6, steps=3, seed=2))
         return kept[-1]
 
     monkeypatch.setattr(training, "run", small)

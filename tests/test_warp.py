@@ -1,4 +1,4 @@
-"""Laws of Warp: pictures, labels and derivatives move together."""
+"""Laws of Warp: images, labels and derivatives move together."""
 
 import copy
 import math
@@ -27,10 +27,10 @@ def pinhole(size=SIZE, **options):
 
 
 def smooth(size=SIZE, batch=1, dtype=torch.float64):
-    """A picture without detail that interpolation could lose."""
+    """An image without detail that interpolation could lose."""
     v, u = torch.meshgrid(*(torch.arange(side, dtype=dtype) for side in size), indexing="ij")
-    picture = torch.stack((torch.sin(u / 9) * torch.cos(v / 7), u / size[1], v / size[0]))
-    return torch.stack([picture * (1 + 0.1 * i) for i in range(batch)])
+    image = torch.stack((torch.sin(u / 9) * torch.cos(v / 7), u / size[1], v / size[0]))
+    return torch.stack([image * (1 + 0.1 * i) for i in range(batch)])
 
 
 @pytest.mark.parametrize("key", sorted(ct.MODELS))
@@ -38,7 +38,7 @@ def test_the_identity_warp_is_the_identity(key):
     camera = ct.MODELS[key](torch.tensor([60.0, 60.0, 31.5, 23.5], dtype=torch.float64), image_size=SIZE)
     warp = ct.Warp(camera, camera)
     images = smooth()
-    # every pixel has a ray in these cameras, but for the corners of the one whose picture ends at 90 degrees
+    # every pixel has a ray in these cameras, but for the corners of the one whose image ends at 90 degrees
     pixels = camera.pixel_grid()
     seen = camera.unproject(pixels)[1]
     assert seen.all() or key == "orthographic_fisheye"
@@ -49,8 +49,8 @@ def test_the_identity_warp_is_the_identity(key):
     torch.testing.assert_close(moved[seen], pixels[seen], atol=1e-10, rtol=0)
 
 
-def test_the_picture_agrees_with_the_points():
-    """A picture of the coordinates, warped, holds the source coordinates that the inverse gives for each pixel."""
+def test_the_image_agrees_with_the_points():
+    """An image of the coordinates, warped, holds the source coordinates that the inverse gives for each pixel."""
     warp = ct.Warp(fisheye(dtype=torch.float64), pinhole(dtype=torch.float64), turn(10, -5, 3, torch.float64))
     v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
     warped = warp(torch.stack((u, v))[None])[0].movedim(0, -1)
@@ -107,7 +107,7 @@ def test_boxes_enclose_the_curved_outline():
     assert moved[0, 0] < corners[0, 0] - 1  # the corners would miss more than a pixel
 
 
-def test_boxes_off_the_picture_keep_their_place_and_say_so():
+def test_boxes_off_the_image_keep_their_place_and_say_so():
     camera = pinhole(dtype=torch.float64)
     boxes = torch.tensor([[[-50.0, 5.0, -10.0, 9.0], [-5.0, 5.0, 9.0, 9.0], [math.nan, 0.0, 1.0, 1.0]]])
     moved, valid = ct.Warp(camera, camera).transform_boxes(boxes[0])
@@ -129,7 +129,7 @@ def test_labels_keep_dtype_and_values(dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.uint8])
-def test_low_precision_pictures_are_sampled_in_float32(dtype):
+def test_low_precision_images_are_sampled_in_float32(dtype):
     warp = ct.Warp(fisheye(), pinhole(), turn(5)).requires_grad_(False)
     images = (smooth(dtype=torch.float32).abs() * 200).to(dtype)
     expected = warp(images.float())
@@ -212,12 +212,12 @@ def test_derivatives_reach_image_cameras_and_rotation():
     t = torch.tensor([8.0, 8.0, 3.5, 2.5], **options)
     r = torch.tensor([0.01, 0.05, -0.02], **options)
 
-    def picture(images, k, d, t, r):
+    def image(images, k, d, t, r):
         rotation = ct.Extrinsics(r, torch.zeros(3, dtype=torch.float64)).matrix()[:3, :3]
         return ct.Warp(ct.KannalaBrandt(k, d, image_size=size), ct.Pinhole(t, image_size=(6, 8)), rotation)(images)
 
     # bilinear sampling is piecewise smooth: the step of the check must not cross a pixel boundary
-    assert torch.autograd.gradcheck(picture, (images, k, d, t, r), eps=1e-7, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(image, (images, k, d, t, r), eps=1e-7, atol=1e-6, rtol=1e-5)
 
 
 def test_the_grid_is_kept_until_something_changes():
@@ -366,14 +366,14 @@ def test_forward_mode_through_a_kept_grid():
     warp(images)
     step = 1e-6
 
-    def picture(k):
+    def image(k):
         return torch.func.functional_call(warp, {"source.intrinsics": k}, (images,))
 
     k = warp.source.intrinsics.detach()
     with torch.autograd.forward_ad.dual_level():
-        dual = picture(torch.autograd.forward_ad.make_dual(k, shift))
+        dual = image(torch.autograd.forward_ad.make_dual(k, shift))
         tangent = torch.autograd.forward_ad.unpack_dual(dual).tangent
-    expected = (picture(k + step * shift) - picture(k - step * shift)) / (2 * step)
+    expected = (image(k + step * shift) - image(k - step * shift)) / (2 * step)
     # where a sampling position crosses a pixel within the step, the difference is none of one polynomial
     assert ((tangent - expected).abs() < 1e-6).double().mean() > 0.999
 

@@ -50,8 +50,8 @@ def stand_in():
 
         def forward(self, *inputs):
             flat, spec = tree_flatten(inputs if len(inputs) > 1 else inputs[0])
-            pictures = (tv_tensors.Image, tv_tensors.Video, PIL.Image.Image)
-            plain, needed = not any(isinstance(one, pictures) for one in flat), []
+            images = (tv_tensors.Image, tv_tensors.Video, PIL.Image.Image)
+            plain, needed = not any(isinstance(one, images) for one in flat), []
             for one in flat:
                 needs = isinstance(one, self._transformed_types)
                 if isinstance(one, torch.Tensor) and not isinstance(one, TVTensor):

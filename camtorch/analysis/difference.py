@@ -16,7 +16,7 @@ _ROUNDING = 1e-9  # px, far above that of two equal cameras
 
 
 class Difference(NamedTuple):
-    """Two cameras on a lattice (rows, columns) of pixels of the first one's picture."""
+    """Two cameras on a lattice (rows, columns) of pixels of the first one's image."""
 
     apart: Tensor
     """Pixels between the pixel and where the second camera shows its ray, float64."""
@@ -37,7 +37,7 @@ class Difference(NamedTuple):
 
     @property
     def part(self) -> float:
-        """The part of the picture that both have rays for."""
+        """The part of the image that both have rays for."""
         return float(self.both.double().mean())
 
     def __str__(self) -> str:
@@ -50,11 +50,11 @@ class Difference(NamedTuple):
 
 @torch.no_grad()
 def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Difference:
-    """Compare two single cameras over the picture of the first.
+    """Compare two single cameras over the image of the first.
 
     Args:
-        a: the camera whose picture is looked at.
-        b: the other camera, of a picture of the same size, or of none stated.
+        a: the camera whose image is looked at.
+        b: the other camera, of an image of the same size, or of none stated.
         remove_rotation: whether the rays are turned first, by the one rotation that brings those of the cameras
             closest: two calibrations of one camera may differ by where they look.
 
@@ -66,7 +66,7 @@ def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Differ
             raise ValueError(f"single cameras are compared; got batch dims {tuple(camera.batch_shape)}")
     height, width = a._size("a difference")
     if b.image_size not in (None, a.image_size):
-        raise ValueError(f"the cameras' pictures differ in size: {a.image_size} and {b.image_size}")
+        raise ValueError(f"the cameras' images differ in size: {a.image_size} and {b.image_size}")
     scale = _LONG / max(height, width)
     pixels = lattice(a, max(2, round(height * scale)), max(2, round(width * scale))).double()
     rays, seen = a.unproject(pixels)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from camtorch.camera import Camera
 
-_POINTS, _SIDE = 513, 129  # along a line, and on the sides of a lattice over the picture
+_POINTS, _SIDE = 513, 129  # along a line, and on the sides of a lattice over the image
 _ANGLES, _AZIMUTHS = 3601, 32
 _MOST_COEFFICIENTS = 16
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
@@ -18,16 +18,16 @@ CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 @dataclass
 class Summary:
-    """Numbers of a single camera; those of the picture are None for a camera without image size."""
+    """Numbers of a single camera; those of the image are None for a camera without image size."""
 
     camera: Camera
     valid_angle: tuple[float, float]
     """Radians from the axis up to which rays are valid, on the azimuths where that is least and greatest."""
     fov: tuple[float, float, float] | None = None
-    """Radians: horizontal and vertical through the principal point, and on the wider diagonal of the picture, from
+    """Radians: horizontal and vertical through the principal point, and on the wider diagonal of the image, from
     outer edge to outer edge or as far as there are rays."""
     seen: float | None = None
-    """The part of the picture that has rays."""
+    """The part of the image that has rays."""
     corners: tuple[tuple[float, float] | str, ...] | None = None
     """For each of CORNERS how many pixels right and down distortion moves what is there, or why that has no answer."""
 
@@ -39,7 +39,7 @@ class Summary:
         named = zip(camera.distortion_names, camera.distortion.tolist(), strict=True)
         rows = [
             ("model", f"{type(camera).__name__} ({camera.key})"),
-            ("picture", size),
+            ("image", size),
             ("focal length", f"fx {fx:.8g}, fy {fy:.8g} px"),
             ("principal point", f"cx {cx:.8g}, cy {cy:.8g} px"),
             ("coefficients", _shortened([f"{name} {value:.8g}" for name, value in named])),
@@ -51,7 +51,7 @@ class Summary:
         if self.fov is not None:
             wide, tall, across = (f"{math.degrees(angle):.1f}" for angle in self.fov)
             rows.append(("field of view", f"{wide} horizontal, {tall} vertical, {across} diagonal degrees"))
-            rows.append(("has rays", f"{100 * self.seen:.4g} % of the picture"))
+            rows.append(("has rays", f"{100 * self.seen:.4g} % of the image"))
             moves = [m if isinstance(m, str) else f"({m[0]:+.1f}, {m[1]:+.1f})" for m in self.corners]
             texts = [f"{name} {move}" for name, move in zip(CORNERS, moves, strict=True)]
             rows.append(("distortion, px", ", ".join(texts) if len(set(moves)) > 1 else f"corners {moves[0]}"))
@@ -95,7 +95,7 @@ def ideal(camera: Camera) -> Camera:
 
 
 def lattice(camera: Camera, rows: int, columns: int) -> Tensor:
-    """(rows, columns, 2): pixels from outer edge to outer edge of the picture."""
+    """(rows, columns, 2): pixels from outer edge to outer edge of the image."""
     height, width = camera.image_size
     v, u = (torch.linspace(-0.5, side - 0.5, n).to(camera.intrinsics) for side, n in ((height, rows), (width, columns)))
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
@@ -124,7 +124,7 @@ def _fov(camera: Camera) -> tuple[float, float, float]:
 
 
 def _along(camera: Camera, start: tuple[float, float], end: tuple[float, float]) -> float:
-    """The angle, in radians, that a line of the picture takes, as far as it has rays."""
+    """The angle, in radians, that a line of the image takes, as far as it has rays."""
     start, end = (camera.intrinsics.new_tensor(point) for point in (start, end))
     pixels = start + torch.linspace(0, 1, _POINTS).to(start)[:, None] * (end - start)
     rays, valid = camera.unproject(pixels)

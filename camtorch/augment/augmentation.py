@@ -12,12 +12,12 @@ from camtorch._tracing import may_look
 from camtorch.augment.cameras import alone, collate, kind, rows_of
 from camtorch.augment.change import Change, Part
 from camtorch.augment.ranges import Range, draw
-from camtorch.augment.sample import Mover, Sample, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.warp.sampling import as_options
 
 
-class Augmentation(Mover):
+class Augmentation(SampleTransform):
     """A random change of cameras, `sample -> sample`: every field moves by the same warps.
 
     A sample is a dict, or keyword arguments, of any of these fields, of a batch or (without B) of a single sample;
@@ -27,22 +27,22 @@ class Augmentation(Mover):
     * `image` (B, C, H, W); `mask` (B, C, H, W) or (B, H, W), of any dtype, moved by the nearest value; `depth` along z
       and `distance` along the ray, likewise.
     * `keypoints` (B, N, 2) and `polygons` (B, M, K, 2) in pixels, `boxes` (B, M, 4) as x1 y1 x2 y2. Count and order
-      stay; beside them comes `keypoints_valid` and so on, bool: it lies on the new picture (and was valid before, if
+      stay; beside them comes `keypoints_valid` and so on, bool: it lies on the new image (and was valid before, if
       the sample says so).
     * `points` (B, N, 3) of the camera frame; `landmarks` are keypoints or points by their last dim.
     * `gaze`, `directions` (B, *N, 3): turned by R, nothing else. `pitch_yaw` (B, *N, 2): a gaze in the angles of
       ETH-XGaze.
     * `head_pose`, `pose` (B, 4, 4) camera from head; or `rvec` (B, 3) and `tvec` (B, 3), as of OpenCV.
-    * `camera`: the camera of the picture, one for all, a batch, or a list of single ones of any models. What comes out
-      is the camera of the new picture, for which all 3D fields hold.
+    * `camera`: the camera of the image, one for all, a batch, or a list of single ones of any models. What comes out
+      is the camera of the new image, for which all 3D fields hold.
 
     `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
     Everything else stays as it is; unknown names that hold real numbers are refused, as they might be geometry.
 
     Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere would not be exact:
-    near things shift against far ones, which no warp of a picture can do, so no augmentation does it.
+    near things shift against far ones, which no warp of an image can do, so no augmentation does it.
 
-    Gradients go to pictures, labels and a camera that learns; what a lens is jittered by counts as given.
+    Gradients go to images, labels and a camera that learns; what a lens is jittered by counts as given.
     """
 
     ranges: dict[str, Range]
@@ -90,7 +90,7 @@ class Augmentation(Mover):
         return draw(self.ranges, count, self.p, self.same_on_batch, generator)
 
     def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
-        """What a draw does to pictures of `camera` (the augmentation's own if None): a pure function of both."""
+        """What a draw does to images of `camera` (the augmentation's own if None): a pure function of both."""
         camera = self.camera if camera is None else camera
         if camera is None:
             raise ValueError(f"{self._name}: no camera; give one here, in the sample, or as {self._name}(camera=...)")
@@ -102,8 +102,8 @@ class Augmentation(Mover):
         before = {one.image_size for one in (camera if listed else [camera])}
         if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
             raise ValueError(
-                f"{self._name}: with p < 1 the image_size must be that of the pictures, so that all come out alike; "
-                f"got image_size={self.image_size} for pictures of {', '.join(map(str, before))}"
+                f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
+                f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
             )
         if listed:
             groups: dict[tuple, list[int]] = {}
@@ -183,7 +183,7 @@ class Augmentation(Mover):
             A new dict with all fields moved, and their validity, `camera` and `rotation`.
 
         Raises:
-            ValueError: no camera, fields of wrong shapes, pictures that are not of the camera's image_size, an unknown
+            ValueError: no camera, fields of wrong shapes, images that are not of the camera's image_size, an unknown
                 field that might be geometry, a draw of another size. TypeError: a field that is no tensor.
         """
         sample = self._given(sample, fields)
@@ -207,7 +207,7 @@ class Augmentation(Mover):
     ) -> Sample:
         """Move a sample back: by the last call's change, or by that of a `draw` and the `camera` before it.
 
-        What left the picture stays lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
+        What left the image stays lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
         """
         sample = self._given(sample, fields)
         if draw is None and self.last is None:

@@ -24,7 +24,7 @@ def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
 
 
 def on_device(camera: Camera, device: torch.device) -> Camera:
-    """The camera where the pictures are."""
+    """The camera where the images are."""
     if camera.intrinsics.device == device:
         return camera
     return remade(camera, camera.intrinsics.to(device), camera.distortion.to(device), camera.image_size)

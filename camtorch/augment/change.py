@@ -116,7 +116,7 @@ class Change:
         raise IndexError(f"a change of {self.count} samples has no row {i}")
 
     def inverse(self) -> Change:
-        """The change back. What left the picture stays lost, and the light of the lens stays as it is."""
+        """The change back. What left the image stays lost, and the light of the lens stays as it is."""
         if self._inverse is not None:  # with the maps that it has made
             return self._inverse
         parts = [
@@ -146,7 +146,7 @@ class Change:
     # -- what moves
 
     def images(self, images: Tensor, **options) -> Tensor:
-        """Pictures (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
+        """Images (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
             if part.shades is not None and rows.shape[1] == 3:
@@ -169,7 +169,7 @@ class Change:
         return self.each(masks, move, lambda camera, rows: rows)
 
     def valid_mask(self) -> Tensor:
-        """(count, 1, H', W') bool: where the pictures show something."""
+        """(count, 1, H', W') bool: where the images show something."""
         size = self.parts[0].camera.image_size
         everywhere = torch.ones(self.count, 1, *size, dtype=torch.bool, device=self.parts[0].camera.intrinsics.device)
         return self.each(
@@ -179,15 +179,15 @@ class Change:
         )
 
     def points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (count, *N, 2), and valid (count, *N): on the picture."""
+        """Pixels (count, *N, 2), and valid (count, *N): on the image."""
         return self.each(pixels, lambda part, rows: part.warp.transform_points(rows), _where_they_are)
 
     def boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
-            on_picture = camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
-            return rows, on_picture & torch.isfinite(rows).all(-1)
+            on_image = camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
+            return rows, on_image & torch.isfinite(rows).all(-1)
 
         return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
 

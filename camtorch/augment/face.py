@@ -11,7 +11,7 @@ from camtorch._arguments import as_image_size
 from camtorch._tracing import is_concrete
 from camtorch.augment.cameras import alone, remade
 from camtorch.augment.change import Change, Part
-from camtorch.augment.sample import Mover, Sample, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.rotations import check_rotation, rotation_matrix
@@ -21,7 +21,7 @@ from camtorch.warp.warp import Warp
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
 
 
-class FaceNormalizer(Mover):
+class FaceNormalizer(SampleTransform):
     """A virtual pinhole camera in the same place that looks at the face, upright with it, and as from one distance.
 
     With c the face's centre and h the x axis of the head, both seen by the camera: z = c / |c|, y = z x h (unit),
@@ -35,17 +35,17 @@ class FaceNormalizer(Mover):
     Args:
         camera: of samples that do not bring one.
         focal: of the virtual camera at `distance`, in pixels.
-        distance: of the face in the normalised picture, in the unit of the poses.
-        image_size: (height, width) of the normalised picture.
+        distance: of the face in the normalised image, in the unit of the poses.
+        image_size: (height, width) of the normalised image.
         axis: (x, y) pixel in which the face's centre comes to lie; (width / 2, height / 2) by default, as published.
-        mode, padding_mode, fill, antialias, tolerance: of pictures; see `Warp`.
+        mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
         fields, mask_fill, valid_mask: see `Augmentation`.
 
     The defaults are those of ETH-XGaze: focal length 960, 224 x 224 pixels, 600 millimetres; poses in metres take
     `distance=0.6`.
 
     A sample has the fields of an `Augmentation`, among them `head_pose` (B, 4, 4), or `rvec` and `tvec`, camera from
-    head, with the head's x axis from its right eye to its left, as the picture's x axis when the face looks into the
+    head, with the head's x axis from its right eye to its left, as the image's x axis when the face looks into the
     camera. The face's centre is `face_center` (B, 3) if the sample has it, else the origin of the head.
     Beside the moved fields come `scale` (B,), distance / |c|, `camera` and `rotation`.
     """
@@ -148,10 +148,10 @@ class FaceNormalizer(Mover):
 
     @without_graph_in_workers
     def inverse(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
-        """Move what was predicted on a normalised sample back to the frame and the picture of its source camera.
+        """Move what was predicted on a normalised sample back to the frame and the image of its source camera.
 
         The sample has `camera`, `rotation` and `source_camera` as they came out (and `source_rotation`, after other
-        augmentations), and any other fields: gaze, keypoints, 3D points, pictures.
+        augmentations), and any other fields: gaze, keypoints, 3D points, images.
         """
         sample = self._given(sample, fields)
         missing = [name for name in ("camera", "rotation", "source_camera") if name not in sample]

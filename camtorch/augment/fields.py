@@ -190,7 +190,7 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
 def is_batch(named: Mapping[str, tuple[str, object]], camera) -> bool:
     """Whether a sample of name -> (kind, value) is a batch of samples.
 
-    The field that decides is the first of: a picture, pixels, boxes; else cameras with a batch dim, and else any
+    The field that decides is the first of: an image, pixels, boxes; else cameras with a batch dim, and else any
     field with more dims than one sample has.
     """
     if isinstance(camera, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Other lenses like a given one: coefficients moved by what they do to the picture, as far as it stays invertible."""
+"""Other lenses like a given one: coefficients moved by what they do to the image, as far as it stays invertible."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from camtorch.projection.ops import CLASSES
 
 DRAWN = 16
 """How many coefficients have a draw of their own; more take turns."""
-_SMALL = 0.1  # decentering, prism and tilt, whose pictures are lopsided, move less than radial terms: as in real lenses
+_SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
 _STEP = 1e-4
 _HALVINGS = 4
 _SIDE = 9
@@ -23,13 +23,13 @@ _SIDE = 9
 def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     """Distortion coefficients (*B, n) of lenses like that of `camera`.
 
-    Every coefficient moves until it has moved the picture's rim by its amount, together at most by the largest amount.
+    Every coefficient moves until it has moved the image's rim by its amount, together at most by the largest amount.
     Where the new lens could not be inverted at a pixel at which the old one can, its coefficients move half as far,
     or a quarter, and so on, or stay.
 
     Args:
         camera: with image_size, and without batch dims or with those of the amounts.
-        amounts: (*B, 16), shares of the distance from the picture's centre to its corner, signed.
+        amounts: (*B, 16), shares of the distance from the image's centre to its corner, signed.
         nominal: (4,) or (*B, 4), intrinsics of the same lens before anything was drawn: what a coefficient does to the
             rim is measured there.
     """
@@ -129,7 +129,7 @@ def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Ten
 
 
 def _lattice(camera: Camera) -> Tensor:
-    """(81, 2): pixels over the whole picture, its outer edges included."""
+    """(81, 2): pixels over the whole image, its outer edges included."""
     height, width = camera.image_size
     like = {"dtype": torch.promote_types(camera.intrinsics.dtype, torch.float32), "device": camera.intrinsics.device}
     v = torch.linspace(-0.5, height - 0.5, _SIDE, **like)

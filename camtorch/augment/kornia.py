@@ -37,26 +37,26 @@ class CameraAugmentation(GeometricAugmentationBase2D):
 
     Args:
         augmentation: a `camtorch.augment.Augmentation`, for example a `RandomCamera`.
-        camera: the Camera of the pictures, which may learn; by default the augmentation's own. `with_cameras` gives
+        camera: the Camera of the images, which may learn; by default the augmentation's own. `with_cameras` gives
             every sample its own.
         p, p_batch: how likely a sample, and a batch, is augmented at all; p by default as the augmentation says.
         same_on_batch: the same draw for the whole batch; by default as the augmentation says.
-        keepdim: whether pictures without batch dim stay without.
+        keepdim: whether images without batch dim stay without.
 
     Convention:
         - pixel coordinates are ``(x, y)`` at integer pixel centres, as in all of kornia and camtorch.
           ``align_corners`` means nothing; ``resample`` and ``padding_mode`` can be overridden by a call.
-        - keypoints keep their count and order. One without a place in the new picture becomes ``(-1, -1)``;
+        - keypoints keep their count and order. One without a place in the new image becomes ``(-1, -1)``;
           ``aug.change(params).points(keypoints)`` says in addition which ones lie on it.
         - boxes become those that enclose their moved outlines, which are curved; they are not clipped. A box with no
-          part of its outline on the new picture is invalid, which kornia exports as zeros.
+          part of its outline on the new image is invalid, which kornia exports as zeros.
         - masks take the nearest value, the augmentation's `mask_fill` where nothing is seen, and never the colours and
           the light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft ones.
         - the warp is no matrix: ``transform_matrix`` is NaN, also of a container that holds the augmentation. ``last``
           and ``change(params)`` give what there is instead: the cameras before and after, and how far it turned.
         - gaze, poses and 3D points have no data key in kornia, and containers leave them as they are. Turn them
           by ``aug.last.rays(...)``, or call the augmentation itself with samples.
-        - ``inverse`` takes everything back by the inverse warp. What left the picture, or fell between its pixels, is
+        - ``inverse`` takes everything back by the inverse warp. What left the image, or fell between its pixels, is
           lost; boxes have grown; chromatic aberration and vignetting stay.
         - params are tensors, drawn on the CPU wherever the module is. A replay is bit-identical.
     """
@@ -67,7 +67,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
             raise TypeError(f"{name}: augmentation must be one of camtorch.augment; got {type(augmentation).__name__}")
         camera = augmentation.camera if camera is None else camera
         if not isinstance(camera, Camera):
-            raise TypeError(f"{name}: camera must be the Camera of the pictures; got {type(camera).__name__}")
+            raise TypeError(f"{name}: camera must be the Camera of the images; got {type(camera).__name__}")
         if camera.image_size is None or camera.batch_shape:
             raise ValueError(
                 f"{name}: camera must be a single one with image_size=(height, width); got batch dims "
@@ -95,12 +95,12 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         super().set_rng_device_and_dtype(torch.device("cpu"), dtype)
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """Draw, as `Augmentation.draw` does after its gate; pictures must be of the camera's image_size."""
+        """Draw, as `Augmentation.draw` does after its gate; images must be of the camera's image_size."""
         count, size = batch_shape[0], tuple(batch_shape[-2:])
         if size != self.camera.image_size:
             raise ValueError(
-                f"{self._get_name()}: pictures are {size} (height, width), but the camera's image_size is "
-                f"{self.camera.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
+                f"{self._get_name()}: images are {size} (height, width), but the camera's image_size is "
+                f"{self.camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
             )
         drawn = draw(self.augmentation.ranges, count, 1.0, self.same_on_batch, None)
         del drawn["apply"]
@@ -220,12 +220,12 @@ class RandomMount(_Random):
     """`camtorch.augment.RandomMount` for kornia: the camera turned and rolled where it stands, and zoomed.
 
     Args:
-        camera: of the pictures.
+        camera: of the images.
         p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
         options: yaw, pitch, roll, zoom and so on, of `camtorch.augment.RandomMount`.
 
     Convention:
-        as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the picture.
+        as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
     """
 
     _wraps = random.RandomMount
@@ -250,7 +250,7 @@ class RandomCamera(_Random):
 
 
 def with_cameras(params, cameras: Camera | Sequence[Camera]):
-    """Params for pictures whose cameras differ in their numbers: of one augmentation, or the list of a container.
+    """Params for images whose cameras differ in their numbers: of one augmentation, or the list of a container.
 
     `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_cameras(params, cameras))`.
 

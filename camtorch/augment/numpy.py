@@ -30,7 +30,7 @@ _SEEN = "image_valid"
 class Transform:
     """An augmentation, or a `FaceNormalizer`, of one sample of numpy arrays.
 
-    The fields are those of `Augmentation`, without their batch dim, and pictures have their channels last:
+    The fields are those of `Augmentation`, without their batch dim, and images have their channels last:
 
     * `image` (H, W, C) or (H, W), of any real dtype, usually uint8, uint16 or float32; `mask`, `depth`, `distance`
       likewise. `images` and `masks` are lists of such, or arrays (N, H, W) or (N, H, W, C). Three channels are red,
@@ -38,12 +38,12 @@ class Transform:
     * `keypoints` (N, 2); `bboxes` or `boxes` (M, 4) as x1 y1 x2 y2; both in pixels with the centre of the top-left one
       at (0, 0). Boxes between pixel edges, albumentations' "pascal_voc", are these plus 0.5.
     * `gaze` (3,), `head_pose` (4, 4), `rvec` (3,), `tvec` (3,), `points` (N, 3), and all other fields.
-    * `camera`: the camera of the pictures, unless the augmentation has one.
+    * `camera`: the camera of the images, unless the augmentation has one.
 
     Whatever is no field is passed on as it is. All arrays come out with the layout and the dtype that they came in
     with, but coordinates of whole numbers come out in float32. Beside them come `keypoints_valid` (N,), `bboxes_valid`
     (M,) and so on, bool, the new `camera`, and `rotation` (3, 3). Nothing is ever dropped or sorted: what left the
-    picture has a False there. There is no `bbox_params` or `keypoint_params`.
+    image has a False there. There is no `bbox_params` or `keypoint_params`.
 
     Numbers are drawn from torch's generator, `torch.manual_seed`, which DataLoader seeds differently in each of its
     workers, and not from numpy's. The same seed draws the same in every front end. Nothing is differentiated.
@@ -165,7 +165,7 @@ class Transform:
         tensors = {f"{kind}_{name}[{i}]": as_tensor(f"{name}[{i}]", one, size) for i, one in enumerate(value)}
 
         def restore(moved: list[Tensor], size: tuple[int, int]):
-            arrays = [as_array(picture, one) for picture, one in zip(moved, value, strict=True)]
+            arrays = [as_array(image, one) for image, one in zip(moved, value, strict=True)]
             if many:
                 return arrays
             return np.stack(arrays) if arrays else np.zeros((0, *size, *value.shape[3:]), value.dtype)
@@ -198,9 +198,9 @@ def as_tensor(name: str, value, size: tuple[int, int] | None = None) -> Tensor:
     return _tensor(np.moveaxis(value, -1, 0) if len(shape) == 3 else value[None])[None]
 
 
-def as_array(picture: Tensor, like: np.ndarray) -> np.ndarray:
-    """A picture (C, H, W) in the layout and the dtype of an array."""
-    array = picture.detach().cpu().numpy()
+def as_array(image: Tensor, like: np.ndarray) -> np.ndarray:
+    """An image (C, H, W) in the layout and the dtype of an array."""
+    array = image.detach().cpu().numpy()
     array = np.ascontiguousarray(np.moveaxis(array, 0, -1)) if like.ndim == 3 else array[0]
     return array.astype(like.dtype, copy=False)
 

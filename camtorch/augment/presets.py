@@ -68,7 +68,7 @@ PRESETS = {
         (512, 512),
         (190.97847715128717, 190.9733070521226, 254.93170605935475, 256.8974428996504),
         (0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 0.00020293673591811182),
-        "a fisheye of 195 degrees, 154 across the picture: TUM-VI dataset, cam0, 512 pixels (Schubert et al., 2018)",
+        "a fisheye of 195 degrees, 154 across the image: TUM-VI dataset, cam0, 512 pixels (Schubert et al., 2018)",
     ),
     "aria": Preset(
         "fisheye624",

@@ -34,23 +34,23 @@ class RandomCamera(Augmentation):
         pitch: degrees by which it then looks up.
         roll: degrees by which it then leans to its right, clockwise: what it sees turns counterclockwise.
         zoom: factor on the focal lengths.
-        fov: horizontal field of view of the new camera in degrees, from one outer edge of the picture to the other if
-            the axis is in the middle. None: that of the lens, whatever the size of the picture.
+        fov: horizontal field of view of the new camera in degrees, from one outer edge of the image to the other if
+            the axis is in the middle. None: that of the lens, whatever the size of the image.
         focal: factor on the focal lengths, for lenses made alike.
-        centre: how far the principal point moves, as a part of the picture's width and height.
+        centre: how far the principal point moves, as a part of the image's width and height.
         distortion: by what part of the distance from the centre to the corner all coefficients together may move
-            the picture's rim; see `jitter.jittered`, which also keeps the lens invertible over the picture.
-        crop: part of the picture's width and height that is kept, at a random place, and enlarged to the full size.
+            the image's rim; see `jitter.jittered`, which also keeps the lens invertible over the image.
+        crop: part of the image's width and height that is kept, at a random place, and enlarged to the full size.
         chromatic: lateral chromatic aberration: by what factor less one red and blue, each for itself, are larger than
-            green. Shown by pictures of three channels, taken as red, green, blue.
-        vignetting: the part of the light that is lost in the picture's farthest corner; it grows with the square of
+            green. Shown by images of three channels, taken as red, green, blue.
+        vignetting: the part of the light that is lost in the image's farthest corner; it grows with the square of
             the distance from the principal point.
         image_size: (height, width) to come out; the sample's by default. Fields of view are those in width.
         p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
         fields: name -> kind, for fields of other names; "keep" leaves one as it is.
-        mode, padding_mode, fill, antialias, tolerance: of pictures; see `Warp`.
+        mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
         mask_fill: the value of masks where nothing is seen.
-        valid_mask: whether `image_valid` (B, 1, H, W) comes out: where the picture shows something.
+        valid_mask: whether `image_valid` (B, 1, H, W) comes out: where the image shows something.
 
     Raises:
         ValueError: ranges in the wrong order or out of bounds, an unknown name (the text lists those there are).
@@ -212,9 +212,9 @@ def _scaled(camera: Camera, factor: Tensor) -> Camera:
 
 
 def _sized(base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
-    """Intrinsics (*B, 4) of a lens before a picture of another size, showing as much in width or a fov in degrees.
+    """Intrinsics (*B, 4) of a lens before an image of another size, showing as much in width or a fov in degrees.
 
-    The old picture is scaled to the new width, and cropped or padded evenly to the new height.
+    The old image is scaled to the new width, and cropped or padded evenly to the new height.
     """
     (height, width), (fx, fy, cx, cy) = size, base.intrinsics.unbind(-1)
     if base.image_size is None:
@@ -242,7 +242,7 @@ def _plane_width(base: Camera, fov: Tensor) -> Tensor:
 
 
 def _cropped(camera: Camera, share: Tensor, place: Tensor) -> Camera:
-    """The camera of a part of the picture, `share` (*B,) of each side at `place` (*B, 2), enlarged to the full size."""
+    """The camera of a part of the image, `share` (*B,) of each side at `place` (*B, 2), enlarged to the full size."""
     height, width = camera.image_size
     fx, fy, cx, cy = camera.intrinsics.unbind(-1)
     left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height

@@ -31,7 +31,7 @@ def without_graph_in_workers(method: Callable) -> Callable:
     return wrapped
 
 
-class Mover(nn.Module):
+class SampleTransform(nn.Module):
     """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
 
     def __init__(self, camera: Camera | None, fields: Mapping[str, str] | None, mask_fill: float, valid_mask: bool):
@@ -117,13 +117,13 @@ class Mover(nn.Module):
                 raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
             for field, (found, value) in named.items():
                 # one for each sample where there are as many cameras
-                pictures = value if isinstance(value, list) else [value]
-                pictures = pictures[i : i + 1] if isinstance(value, list) and len(cameras) > 1 else pictures
-                for size in {tuple(picture.shape[-2:]) for picture in pictures if found in field_kinds.PICTURES}:
+                images = value if isinstance(value, list) else [value]
+                images = images[i : i + 1] if isinstance(value, list) and len(cameras) > 1 else images
+                for size in {tuple(image.shape[-2:]) for image in images if found in field_kinds.PICTURES}:
                     if size != one.image_size:
                         raise ValueError(
                             f"{self._name}: {field} is {size} (height, width), but the image_size of {name} is "
-                            f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
+                            f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
                         )
 
     def _moved(self, sample: Sample, named: Mapping, batched: bool, change: Change) -> Sample:

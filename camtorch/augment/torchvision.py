@@ -44,12 +44,12 @@ class Transform(v2.Transform):
       of a sample without any of these.
     * `Mask` (..., H, W), by the nearest value.
     * `KeyPoints` (..., 2), for torchvision as for camtorch in pixels whose centres are whole numbers. One that has no
-      place on the new camera becomes (-1, -1); `last.points` also tells which lie on the picture.
+      place on the new camera becomes (-1, -1); `last.points` also tells which lie on the image.
     * `BoundingBoxes` of every format without rotation, whose coordinates are torchvision's, between pixel edges. The
       new ones enclose all of what the old ones did, with whole numbers too, and are not clamped:
       `v2.ClampBoundingBoxes` and `v2.SanitizeBoundingBoxes` follow where wanted. One that has no place on the new
       camera becomes (-1, -1, -1, -1) in XYXY, which has no area.
-    * A `Camera` in the sample is the sample's camera, and comes out as that of the new picture.
+    * A `Camera` in the sample is the sample's camera, and comes out as that of the new image.
 
     Formats and dtypes stay; canvas_size becomes that of the new camera. All else stays as it is, also
     3D labels in plain tensors: `last.rotation` (1, 3, 3), or `last.rays`, turns them. Gradients
@@ -61,7 +61,7 @@ class Transform(v2.Transform):
 
     Raises:
         TypeError: it is no augmentation; a camera that is none.
-        ValueError: no camera, or one with batch dims; pictures, boxes or points that are not of the camera's
+        ValueError: no camera, or one with batch dims; images, boxes or points that are not of the camera's
             image_size; rotated boxes; PIL images of palettes or single bits.
     """
 
@@ -103,7 +103,7 @@ class Transform(v2.Transform):
             if size not in (None, camera.image_size):
                 raise ValueError(
                     f"{_OWNER}: {type(one).__name__} is {size} (height, width), but the camera's image_size is "
-                    f"{camera.image_size}. camera.resize, .crop and .pad give the camera of an edited picture"
+                    f"{camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
                 )
         with torch.no_grad():
             change = self.augmentation.change(camera, self.augmentation.draw(1))
@@ -132,12 +132,12 @@ class Transform(v2.Transform):
             boxes = _boxes(change, plain, inpt.format.value)
             return tv_tensors.wrap(boxes, like=inpt, canvas_size=camera.image_size)
         if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
-            return tv_tensors.wrap(_pictures(change, plain), like=inpt)
-        return inpt if isinstance(inpt, tv_tensors.TVTensor) else _pictures(change, plain)
+            return tv_tensors.wrap(_images(change, plain), like=inpt)
+        return inpt if isinstance(inpt, tv_tensors.TVTensor) else _images(change, plain)
 
 
 def _size(inpt: Any) -> tuple[int, int] | None:
-    """(height, width) of the picture that an input is, or lies on."""
+    """(height, width) of the image that an input is, or lies on."""
     if isinstance(inpt, PIL.Image.Image):
         return inpt.size[::-1]
     if isinstance(inpt, (*_KEYPOINTS, tv_tensors.BoundingBoxes)):
@@ -147,19 +147,19 @@ def _size(inpt: Any) -> tuple[int, int] | None:
     return None if isinstance(inpt, (Camera, tv_tensors.TVTensor)) else tuple(inpt.shape[-2:])
 
 
-def _pictures(change: Change, pictures: Tensor) -> Tensor:
-    """Pictures (..., C, H, W), or (H, W), all of one sample."""
-    frames = pictures.reshape(-1, *pictures.shape[-3:]) if pictures.ndim > 2 else pictures[None, None]
+def _images(change: Change, images: Tensor) -> Tensor:
+    """Images (..., C, H, W), or (H, W), all of one sample."""
+    frames = images.reshape(-1, *images.shape[-3:]) if images.ndim > 2 else images[None, None]
     spread = Change(len(frames), [replace(part, rows=None) for part in change.parts])
     moved = spread.images(frames)
-    return moved.reshape(*pictures.shape[:-2], *moved.shape[-2:])
+    return moved.reshape(*images.shape[:-2], *moved.shape[-2:])
 
 
 def _pil(change: Change, image: PIL.Image.Image) -> PIL.Image.Image:
     if image.mode in ("1", "P", "PA"):
         raise ValueError(
             f"{_OWNER}: values between those of a PIL image of mode {image.mode!r} mean nothing; "
-            "image.convert('RGB') makes it a picture, tv_tensors.Mask(image) labels"
+            "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
         )
     array = np.asarray(image)
     moved = as_array(change.images(as_tensor("image", array))[0], array)

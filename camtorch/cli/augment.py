@@ -1,4 +1,4 @@
-"""A picture with its labels, and what an augmentation makes of both: the views that `sheet` shows."""
+"""An image with its labels, and what an augmentation makes of both: the views that `sheet` shows."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from camtorch.demo import cabin
 from camtorch.models import Pinhole
 
 SCENE_SIZE = (480, 640)
-"""(height, width) of the rendered picture; of a given camera the width is this at most."""
+"""(height, width) of the rendered image; of a given camera the width is this at most."""
 NEW_SIZE = (945, 1260)
-"""(height, width) within which new pictures are made: thrice what a sheet shows, so that its edges are smooth."""
+"""(height, width) within which new images are made: thrice what a sheet shows, so that its edges are smooth."""
 NOTHING = (233, 225, 209)
 """The colour of what no camera saw."""
 
 
 @dataclass
-class View:
-    """A picture, its camera, and labels that hold for both."""
+class LabelledImage:
+    """An image, its camera, and labels that hold for both."""
 
-    picture: Tensor
+    image: Tensor
     """(3, H, W) uint8."""
     camera: Camera
     labels: Labels
@@ -45,7 +45,7 @@ class View:
 
 
 @torch.no_grad()
-def scene(camera: Camera | None = None) -> View:
+def scene(camera: Camera | None = None) -> LabelledImage:
     """The driver that `cabin` renders, seen by a camera, by default a pinhole camera of 105 degrees."""
     height, width = SCENE_SIZE
     if camera is None:
@@ -67,14 +67,14 @@ def scene(camera: Camera | None = None) -> View:
         eyes=drivers.eyes()[0],
         gaze=drivers.gaze.expand(2, 3),
     )
-    picture = (255 * _rendered(camera, drivers)).round().byte()
-    return _before(picture, camera, labels, "a rendered driver")
+    image = (255 * _rendered(camera, drivers)).round().byte()
+    return _before(image, camera, labels, "a rendered driver")
 
 
 def _rendered(camera: Camera, drivers: cabin.Drivers) -> Tensor:
-    """(3, H, W): the picture, a strip at a time on each core: threads that share rays wait for each other."""
+    """(3, H, W): the image, a strip at a time on each core: threads that share rays wait for each other."""
     height, width = camera.image_size
-    rows = 120  # whatever the number of cores, for the same picture
+    rows = 120  # whatever the number of cores, for the same image
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -86,8 +86,8 @@ def _rendered(camera: Camera, drivers: cabin.Drivers) -> Tensor:
 
 
 @torch.no_grad()
-def photograph(picture: Tensor, camera: Camera, labels: Labels | None, title: str) -> View:
-    """A picture, (C, H, W) as `image_files.read` has it; without labels, with a lattice of dots and a box."""
+def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str) -> LabelledImage:
+    """An image, (C, H, W) as `image_files.read` has it; without labels, with a lattice of dots and a box."""
     if labels is None:
         height, width = camera.image_size
         steps = [(torch.arange(n, dtype=torch.float64) + 0.5) * side / n - 0.5 for n, side in ((7, height), (9, width))]
@@ -95,33 +95,35 @@ def photograph(picture: Tensor, camera: Camera, labels: Labels | None, title: st
         box = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]], dtype=torch.float64) - 0.5
         none = torch.zeros(0, 3, dtype=torch.float64)
         labels = Labels(torch.stack([x, y], -1).flatten(0, 1), box, none, none)
-    return _before(_in_colour(picture), camera, labels, title)
+    return _before(_in_colour(image), camera, labels, title)
 
 
-def _in_colour(picture: Tensor) -> Tensor:
-    """(3, H, W) uint8 of any picture; deep ones from their darkest to their brightest, what is clear on paper."""
-    if picture.dtype != torch.uint8:
-        deep = picture.float()
-        picture = (255 * (deep - deep.min()) / (deep.max() - deep.min()).clamp(min=1)).round().byte()
-    if len(picture) in (2, 4):
-        alpha = picture[-1:] / 255
-        picture = (picture[:-1] * alpha + torch.tensor(NOTHING)[:, None, None] * (1 - alpha)).round().byte()
-    return picture.expand(3, -1, -1)
+def _in_colour(image: Tensor) -> Tensor:
+    """(3, H, W) uint8 of any image; deep ones from their darkest to their brightest, what is clear on paper."""
+    if image.dtype != torch.uint8:
+        deep = image.float()
+        image = (255 * (deep - deep.min()) / (deep.max() - deep.min()).clamp(min=1)).round().byte()
+    if len(image) in (2, 4):
+        alpha = image[-1:] / 255
+        image = (image[:-1] * alpha + torch.tensor(NOTHING)[:, None, None] * (1 - alpha)).round().byte()
+    return image.expand(3, -1, -1)
 
 
-def _before(picture: Tensor, camera: Camera, labels: Labels, title: str) -> View:
+def _before(image: Tensor, camera: Camera, labels: Labels, title: str) -> LabelledImage:
     height, width = camera.image_size
     x1, y1, x2, y2 = labels.boxes.unbind(-1)
     overlap = (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
     caption = [f"before: {title}", f"{camera.key}, {_degrees(camera):.0f}° wide"]
-    return View(picture, camera, labels, caption, camera.contains(labels.keypoints), overlap)
+    return LabelledImage(image, camera, labels, caption, camera.contains(labels.keypoints), overlap)
 
 
 # -- augmenting
 
 
 @torch.no_grad()
-def augmented(before: View, like: str | None, count: int, seed: int, size=None, **ranges) -> Iterator[View]:
+def augmented(
+    before: LabelledImage, like: str | None, count: int, seed: int, size=None, **ranges
+) -> Iterator[LabelledImage]:
     """What `count` random cameras make of a view.
 
     Args:
@@ -129,7 +131,7 @@ def augmented(before: View, like: str | None, count: int, seed: int, size=None, 
         like: whose lens they have; see `RandomCamera`.
         count: how many.
         seed: of the draws; the first ones are the same for every count.
-        size: (height, width) of the new pictures; by default that of the old one. They are scaled to fit `NEW_SIZE`
+        size: (height, width) of the new images; by default that of the old one. They are scaled to fit `NEW_SIZE`
             and show the same.
         ranges: of `RandomCamera`.
     """
@@ -144,7 +146,7 @@ def augmented(before: View, like: str | None, count: int, seed: int, size=None, 
     for i in range(count):
         draw = new.draw(1, generator)
         moved = new(
-            image=before.picture,
+            image=before.image,
             keypoints=labels.keypoints,
             boxes=labels.boxes,
             points=labels.eyes,
@@ -158,7 +160,7 @@ def augmented(before: View, like: str | None, count: int, seed: int, size=None, 
         filled = 100 * float(moved["image_valid"].double().mean())
         lens = f"{like or camera.key}, {_degrees(camera):.0f}° wide"
         inside = [f"{int(v.sum())} of {len(v)} {n}" for n, v in zip(("points", "boxes"), valid, strict=True) if len(v)]
-        yield View(
+        yield LabelledImage(
             moved["image"],
             camera,
             Labels(moved["keypoints"], moved["boxes"], moved["points"], moved["gaze"]),
@@ -177,13 +179,13 @@ def lens(preset: str) -> str | None:
     if preset == "none" or preset in PRESETS:
         return None if preset == "none" else preset
     known = "; ".join(f"{name}, {known.origin}" for name, known in PRESETS.items())
-    raise ValueError(f"there is no preset {preset!r}. There are none, the picture's own lens; {known}")
+    raise ValueError(f"there is no preset {preset!r}. There are none, the image's own lens; {known}")
 
 
-def origin(like: str | None, before: View) -> str:
-    """Where the lens of the new pictures comes from."""
+def origin(like: str | None, before: LabelledImage) -> str:
+    """Where the lens of the new images comes from."""
     if like is None:
-        return f"{before.camera.key}: the picture's own lens, as lenses made alike differ"
+        return f"{before.camera.key}: the image's own lens, as lenses made alike differ"
     return f"{like}: {PRESETS[like].origin}"
 
 

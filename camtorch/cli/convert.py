@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy
 
-from camtorch.cli.options import picture_size
+from camtorch.cli.options import parse_size
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -31,17 +31,15 @@ def add(commands) -> None:
     convert.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
     convert.add_argument("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")
     convert.add_argument("--format", help="of OUT; by default what its name says")
-    show = commands.add_parser("show", help="what a calibration says, in numbers and in a picture", allow_abbrev=False)
+    show = commands.add_parser("show", help="what a calibration says, in numbers and in an image", allow_abbrev=False)
     show.set_defaults(run=_show)
     show.add_argument("input", type=Path, metavar="FILE", help="a calibration file")
     show.add_argument("--against", type=Path, metavar="OTHER", help="another calibration of the camera, to compare")
-    show.add_argument("-o", "--output", type=Path, metavar="OUT", help="a picture: distortion, radius over angle")
+    show.add_argument("-o", "--output", type=Path, metavar="OUT", help="an image: distortion, radius over angle")
     for command in (convert, show):
         command.add_argument("--name", help="which camera, in a file with several")
         command.add_argument("--from-model", metavar="KEY", help="the model in the file, where that does not say it")
-        command.add_argument(
-            "--size", type=picture_size, metavar="WxH", help="of pictures, where the file does not say"
-        )
+        command.add_argument("--size", type=parse_size, metavar="WxH", help="of images, where the file does not say")
         command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
 
 
@@ -66,7 +64,7 @@ def _convert(arguments: argparse.Namespace) -> None:
         model = arguments.model or camera.key
         result = camera.convert(model, count=arguments.count, max_angle=None if angle is None else math.radians(angle))
         cameras[name] = result.camera
-        part = "what the picture has rays for" if camera.image_size else "its rays"
+        part = "what the image has rays for" if camera.image_size else "its rays"
         degrees, covered = math.degrees(float(result.max_angle)), 100 * float(result.valid_fraction)
         errors = "exact" if bool(result.exact) else f"rms {result.rms:.3g} px, at most {result.max_error:.3g} px"
         notes.append(
@@ -104,7 +102,7 @@ def _show(arguments: argparse.Namespace) -> None:
         print(f"{arguments.input}: {name}", *summarise(camera).lines(), sep="\n")
     if other is not None:
         compared = difference(camera, other)
-        print(f"against {arguments.against}: {compared}, over {100 * compared.part:.4g} % of the picture")
+        print(f"against {arguments.against}: {compared}, over {100 * compared.part:.4g} % of the image")
     if arguments.output is not None:
         height, width = camera.image_size
         title = f"{arguments.input.name}: {name if name != 'camera' else camera.key}, {width} x {height}"

@@ -1,4 +1,4 @@
-"""Picture files as tensors and back, by Pillow, without surprises."""
+"""Image files as tensors and back, by Pillow, without surprises."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ _ORIENTATION = 0x0112  # the Exif tag
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
 
-class PictureError(ValueError):
-    """A picture file that cannot be read or written. The text names the file and the reason."""
+class ImageFileError(ValueError):
+    """An image file that cannot be read or written. The text names the file and the reason."""
 
 
 def _pillow():
     try:
         from PIL import Image
     except ImportError:
-        raise PictureError("pictures need Pillow: pip install 'camtorch[cli]'") from None
+        raise ImageFileError("images need Pillow: pip install 'camtorch[cli]'") from None
     return Image
 
 
 def read(path) -> tuple[Tensor, int | None]:
-    """A picture as stored, and its Exif orientation: it is not turned, for calibrations know stored pixels.
+    """An image as stored, and its Exif orientation: it is not turned, for calibrations know stored pixels.
 
     Returns:
-        (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey pictures.
-        Other kinds of picture (palette, CMYK, ...) come as RGB or RGBA.
+        (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey images.
+        Other kinds of image (palette, CMYK, ...) come as RGB or RGBA.
 
     Raises:
-        PictureError: no such file, no picture, a damaged one, floating-point pixels, or no Pillow.
+        ImageFileError: no such file, no image, a damaged one, floating-point pixels, or no Pillow.
     """
     pil = _pillow()
     try:
@@ -43,7 +43,7 @@ def read(path) -> tuple[Tensor, int | None]:
             image.load()
             orientation = image.getexif().get(_ORIENTATION)
             if image.mode == "F":
-                raise PictureError(f"{path}: floating-point pixels; 8-bit and 16-bit pictures can be read")
+                raise ImageFileError(f"{path}: floating-point pixels; 8-bit and 16-bit images can be read")
             if image.mode in _DEEP:
                 deep = np.asarray(image).astype(np.int64).clip(0, 65535).astype(np.uint16)
                 return torch.from_numpy(deep)[None], orientation
@@ -53,38 +53,38 @@ def read(path) -> tuple[Tensor, int | None]:
             pixels = torch.from_numpy(np.array(image))
             return (pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)), orientation
     except FileNotFoundError:
-        raise PictureError(f"{path}: no such file") from None
+        raise ImageFileError(f"{path}: no such file") from None
     except pil.UnidentifiedImageError:
-        raise PictureError(f"{path}: not a picture that Pillow can read") from None
-    except PictureError:
+        raise ImageFileError(f"{path}: not an image that Pillow can read") from None
+    except ImageFileError:
         raise
     except (OSError, SyntaxError, ValueError, EOFError, pil.DecompressionBombError) as error:
-        raise PictureError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+        raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def check_target(path, *, force: bool) -> None:
     """Refuse before the work what could not be written after it.
 
     Raises:
-        PictureError: the file exists and `force` is not given, no folder to write to, an unknown file type.
+        ImageFileError: the file exists and `force` is not given, no folder to write to, an unknown file type.
     """
     path = Path(path)
     if path.is_dir():
-        raise PictureError(f"{path}: is a folder")
+        raise ImageFileError(f"{path}: is a folder")
     if path.exists() and not force:
-        raise PictureError(f"{path}: exists already; --force overwrites it")
+        raise ImageFileError(f"{path}: exists already; --force overwrites it")
     if not path.parent.is_dir():
-        raise PictureError(f"{path}: there is no folder {path.parent}")
+        raise ImageFileError(f"{path}: there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK):
-        raise PictureError(f"{path}: the folder {path.parent} cannot be written to")
+        raise ImageFileError(f"{path}: the folder {path.parent} cannot be written to")
     pil = _pillow()
     if pil.registered_extensions().get(path.suffix.lower()) not in pil.SAVE:
-        raise PictureError(f"{path}: no picture can be written as {path.suffix or 'a nameless type'}; try .png")
+        raise ImageFileError(f"{path}: no image can be written as {path.suffix or 'a nameless type'}; try .png")
 
 
-def from_tensor(picture: Tensor):
+def from_tensor(image: Tensor):
     """A Pillow image of (C, H, W) uint8 or (1, H, W) uint16."""
-    pixels = picture.permute(1, 2, 0).contiguous().numpy()
+    pixels = image.permute(1, 2, 0).contiguous().numpy()
     return _pillow().fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
 
 
@@ -92,7 +92,7 @@ def write(path, image, *, orientation: int | None = None) -> None:
     """Write a Pillow image, whole or not at all.
 
     Raises:
-        PictureError: the file type does not take such pixels, or the disk does not take the file.
+        ImageFileError: the file type does not take such pixels, or the disk does not take the file.
     """
     path = Path(path)
     pil = _pillow()
@@ -105,7 +105,7 @@ def write(path, image, *, orientation: int | None = None) -> None:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
             name = file.name
             image.save(file, format=pil.registered_extensions()[path.suffix.lower()], **options)
-        # temporary files are private; a picture gets the rights of any new file
+        # temporary files are private; an image gets the rights of any new file
         mask = os.umask(0)
         os.umask(mask)
         os.chmod(name, 0o666 & ~mask)
@@ -113,8 +113,8 @@ def write(path, image, *, orientation: int | None = None) -> None:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         if isinstance(error, OSError) and "cannot write mode" in str(error):
-            reason = f"{path.suffix} files hold no picture of mode {image.mode}; .png does"
-        raise PictureError(f"{path}: {reason}") from None
+            reason = f"{path.suffix} files hold no image of mode {image.mode}; .png does"
+        raise ImageFileError(f"{path}: {reason}") from None
     finally:
         if name is not None:
             with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Labels of one picture in a JSON file."""
+"""Labels of one image in a JSON file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class LabelsError(ValueError):
 
 @dataclass
 class Labels:
-    """What is known of a picture, in its pixels and its camera's frame; float64."""
+    """What is known of an image, in its pixels and its camera's frame; float64."""
 
     keypoints: Tensor
     """(N, 2) pixels."""
@@ -41,7 +41,7 @@ class Labels:
 
 
 def read(path, camera: Camera) -> Labels:
-    """The labels of a picture of `camera`: an object of keypoints, boxes, gaze and gaze_from, each optional.
+    """The labels of an image of `camera`: an object of keypoints, boxes, gaze and gaze_from, each optional.
 
     Raises:
         LabelsError: no JSON, another structure, other names, numbers that are none, a box whose corners are swapped,
@@ -50,7 +50,7 @@ def read(path, camera: Camera) -> Labels:
     with Path(path).open("rb") as file:
         content = file.read(_LARGEST_FILE + 1)
     if len(content) > _LARGEST_FILE:
-        raise LabelsError(f"{path}: larger than {_LARGEST_FILE >> 20} MiB, more than the labels of one picture")
+        raise LabelsError(f"{path}: larger than {_LARGEST_FILE >> 20} MiB, more than the labels of one image")
     try:
         entries = json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from camtorch import __version__
 from camtorch.cli import convert
-from camtorch.cli.options import picture_size
+from camtorch.cli.options import parse_size
 
 _STRIP_PIXELS = 1 << 21
 _MOST_TILES = 100
@@ -52,9 +52,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"camtorch {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
-    dewarp = commands.add_parser("dewarp", help="undistort a picture", allow_abbrev=False)
+    dewarp = commands.add_parser("dewarp", help="undistort an image", allow_abbrev=False)
     dewarp.set_defaults(run=_dewarp)
-    dewarp.add_argument("image", type=Path, metavar="IMAGE", help="the picture")
+    dewarp.add_argument("image", type=Path, metavar="IMAGE", help="the image")
     dewarp.add_argument(
         "--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective"
     )
@@ -62,22 +62,22 @@ def _parser() -> argparse.ArgumentParser:
         "--fov",
         type=float,
         metavar="DEGREES",
-        help="horizontal field of view of the new picture; by default that of the old one, up to 120 in perspective",
+        help="horizontal field of view of the new image; by default that of the old one, up to 120 in perspective",
     )
     dewarp.add_argument(
-        "--size", type=picture_size, metavar="WxH", help="size of the new picture; by default the old one's"
+        "--size", type=parse_size, metavar="WxH", help="size of the new image; by default the old one's"
     )
 
     augment = commands.add_parser(
         "augment",
-        help="a contact sheet of a picture with its labels as other cameras see them",
-        description="A contact sheet of a picture with its labels as other cameras see them. Without IMAGE the picture "
+        help="a contact sheet of an image with its labels as other cameras see them",
+        description="A contact sheet of an image with its labels as other cameras see them. Without IMAGE the image "
         "is a rendered driver. A RANGE is LOW,HIGH, as in --yaw=-5,20, or a number: so far to either side of doing "
         "nothing, or just that --fov.",
         allow_abbrev=False,
     )
     augment.set_defaults(run=_augment)
-    augment.add_argument("image", type=Path, nargs="?", metavar="IMAGE", help="the picture")
+    augment.add_argument("image", type=Path, nargs="?", metavar="IMAGE", help="the image")
     augment.add_argument(
         "--labels", type=Path, metavar="FILE", help="of IMAGE: JSON of keypoints, boxes, gaze, gaze_from, in pixels"
     )
@@ -85,9 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     augment.add_argument("--list", action="store_true", help="print the presets, and nothing else")
     augment.add_argument("-n", type=int, default=8, metavar="COUNT", help="how many other cameras; 8 by default")
     augment.add_argument("--seed", type=int, default=0, help="of what is drawn; 0 by default")
-    augment.add_argument(
-        "--size", type=picture_size, metavar="WxH", help="of the new pictures; by default the old one's"
-    )
+    augment.add_argument("--size", type=parse_size, metavar="WxH", help="of the new images; by default the old one's")
     for name in ("yaw", "pitch", "roll", "zoom", "fov"):
         augment.add_argument(f"--{name}", type=_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
 
@@ -113,7 +111,7 @@ def _parser() -> argparse.ArgumentParser:
             help="the camera model where the file does not say it: kannala_brandt, brown_conrady ...",
         )
         command.add_argument("--name", help="which camera, in a file with several")
-        command.add_argument("--rescale", action="store_true", help="scale the camera to the picture's resolution")
+        command.add_argument("--rescale", action="store_true", help="scale the camera to the image's resolution")
     for command, output in ((dewarp, None), (augment, Path("augment.png")), (demo, Path("demo.png"))):
         command.add_argument("-o", "--output", type=Path, required=output is None, default=output, metavar="OUT")
         command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
@@ -136,13 +134,13 @@ def _range(text: str) -> float | tuple[float, float]:
 
 
 def _photograph(arguments: argparse.Namespace):
-    """The picture, its Exif orientation, and its camera."""
+    """The image, its Exif orientation, and its camera."""
     from camtorch.cli import images
     from camtorch.cli.cameras import read_camera
 
-    picture, orientation = images.read(arguments.image)
+    image, orientation = images.read(arguments.image)
     camera = read_camera(arguments.camera, arguments.name, arguments.model)
-    size = tuple(picture.shape[-2:])
+    size = tuple(image.shape[-2:])
     if camera.image_size is None:
         camera.image_size = size
         _note(f"{arguments.camera} states no image size; taken to be for {size[1]}x{size[0]}, as {arguments.image} is")
@@ -150,7 +148,7 @@ def _photograph(arguments: argparse.Namespace):
         if not arguments.rescale:
             raise ValueError(_resolutions(arguments, size, camera.image_size))
         camera = camera.resize(*size)
-    return picture, orientation, camera
+    return image, orientation, camera
 
 
 def _dewarp(arguments: argparse.Namespace) -> None:
@@ -165,11 +163,11 @@ def _dewarp(arguments: argparse.Namespace) -> None:
         allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
         raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
     images.check_target(arguments.output, force=arguments.force)
-    picture, orientation, camera = _photograph(arguments)
+    image, orientation, camera = _photograph(arguments)
     size = camera.image_size
     with torch.no_grad():
         warp = Dewarp(camera, projection=arguments.projection, fov=fov and math.radians(fov), image_size=arguments.size)
-        result, filled = _in_strips(warp, picture)
+        result, filled = _in_strips(warp, image)
         lattice = (camera.resize(64, 64).pixel_grid() + 0.5) * torch.tensor([size[1] / 64, size[0] / 64]) - 0.5
         shown = float(warp.transform_points(lattice)[1].double().mean())
     images.write(arguments.output, images.from_tensor(result), orientation=orientation)
@@ -182,8 +180,8 @@ def _dewarp(arguments: argparse.Namespace) -> None:
     )
 
 
-def _in_strips(warp, picture):
-    """The warped picture and the filled part of it, computed in strips that bound the memory of large targets."""
+def _in_strips(warp, image):
+    """The warped image and the filled part of it, computed in strips that bound the memory of large targets."""
     import torch
 
     from camtorch import Warp
@@ -193,7 +191,7 @@ def _in_strips(warp, picture):
     strips, filled = [], 0
     for top in range(0, height, rows):
         strip = Warp(warp.source, warp.target.crop(top, 0, min(rows, height - top), width))
-        strips.append(strip(picture[None])[0])
+        strips.append(strip(image[None])[0])
         filled += int(strip.valid_mask().sum())
         if rows < height and sys.stderr.isatty():
             print(f"\r{min(100, 100 * (top + rows) // height)} %", end="", file=sys.stderr, flush=True)
@@ -202,14 +200,14 @@ def _in_strips(warp, picture):
     return torch.cat(strips, -2), filled / (height * width)
 
 
-def _resolutions(arguments: argparse.Namespace, picture: tuple[int, int], camera: tuple[int, int]) -> str:
-    (height, width), (camera_height, camera_width) = picture, camera
+def _resolutions(arguments: argparse.Namespace, image: tuple[int, int], camera: tuple[int, int]) -> str:
+    (height, width), (camera_height, camera_width) = image, camera
     text = (
         f"{arguments.image} is {width}x{height}, but the camera in {arguments.camera} is for "
-        f"{camera_width}x{camera_height}; --rescale scales the camera to the picture"
+        f"{camera_width}x{camera_height}; --rescale scales the camera to the image"
     )
     if abs(width / camera_width - height / camera_height) * max(camera) > 1:
-        text += ", but their shapes differ too, so the picture may be cropped, which scaling does not undo"
+        text += ", but their shapes differ too, so the image may be cropped, which scaling does not undo"
     return text
 
 
@@ -243,15 +241,15 @@ def _augment(arguments: argparse.Namespace) -> None:
         raise ValueError(f"{arguments.image}: which camera took it? --camera FILE, its OpenCV calibration, says so")
     images.check_target(arguments.output, force=arguments.force)
     if arguments.image is not None:
-        picture, orientation, camera = _photograph(arguments)
+        image, orientation, camera = _photograph(arguments)
         if orientation not in (None, 1):
             _note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
         known = None if arguments.labels is None else labels.read(arguments.labels, camera)
-        before = augment.photograph(picture, camera, known, arguments.image.name)
+        before = augment.photograph(image, camera, known, arguments.image.name)
     elif arguments.camera is not None:
         camera = read_camera(arguments.camera, arguments.name, arguments.model)
         if camera.image_size is None:
-            raise ValueError(f"{arguments.camera} states no image size, which a rendered picture needs")
+            raise ValueError(f"{arguments.camera} states no image size, which a rendered image needs")
         before = augment.scene(camera)
     else:
         before = augment.scene()
@@ -261,9 +259,9 @@ def _augment(arguments: argparse.Namespace) -> None:
     for view in augment.augmented(before, lens, arguments.n, arguments.seed, arguments.size, **ranges):
         print(view.note, flush=True)
         shown.append(view)
-    title = f"One picture, {sheet.counted(arguments.n, 'other camera')}"
-    images.write(arguments.output, sheet.picture(shown, title, augment.origin(lens, before)))
-    print(f"{arguments.output}: the picture before, and as each of them sees it, with what became of the labels")
+    title = f"One image, {sheet.counted(arguments.n, 'other camera')}"
+    images.write(arguments.output, sheet.drawing(shown, title, augment.origin(lens, before)))
+    print(f"{arguments.output}: the image before, and as each of them sees it, with what became of the labels")
 
 
 def _demo(arguments: argparse.Namespace) -> None:
@@ -275,7 +273,7 @@ def _demo(arguments: argparse.Namespace) -> None:
         shown, caption = training, "what each network learned from, and what it finds behind the fisheye"
     images.check_target(arguments.output, force=arguments.force)
     results = shown.run(lambda line: print(line, flush=True))
-    images.write(arguments.output, shown.picture(results))
+    images.write(arguments.output, shown.drawing(results))
     print(f"{arguments.output}: {caption}")
 
 

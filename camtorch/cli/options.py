@@ -1,11 +1,11 @@
-"""The size of a picture, as the command line takes it."""
+"""The size of an image, as the command line takes it."""
 
 import argparse
 
 _LARGEST_SIDE = 32768
 
 
-def picture_size(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """(height, width) of "WIDTHxHEIGHT"."""
     sides = text.lower().split("x")
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() and len(side) < 9 for side in sides):

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import torch
 
-from camtorch.cli.augment import View
+from camtorch.cli.augment import LabelledImage
 
 TILE = (315, 420)
-"""(height, width) within which the new pictures are shown."""
+"""(height, width) within which the new images are shown."""
 POINT, BOX, GAZE = (226, 29, 72), (255, 190, 40), (30, 100, 240)
 """The colours of the marks."""
 _INK, _GREY, _RIM, _PAPER = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 245, 235)
@@ -21,12 +21,12 @@ _SHARP = 3  # marks are drawn that many times as large, and reduced
 _REACH = 0.35  # length of gaze arrows, as a part of the distance to the eyes
 
 
-def picture(views: Sequence[View], title: str, origin: str):
+def image(views: Sequence[LabelledImage], title: str, origin: str):
     """One Pillow image: the view before, and the others, `title` and `origin` above them."""
     from PIL import Image, ImageDraw, ImageFont
 
     large, middle, small = (ImageFont.load_default(size=size) for size in (34, 18, 16))
-    cell = _fitted(views[1].picture, *TILE)
+    cell = _fitted(views[1].image, *TILE)
     cell = cell[0], max(cell[1], _NARROWEST)
     columns, span = _columns(len(views) - 1)
     lot = cell[0] + _BAND + _GAP, cell[1] + _GAP
@@ -53,7 +53,7 @@ def picture(views: Sequence[View], title: str, origin: str):
     return sheet
 
 
-def _legend(sheet, view: View, right: float, top: float, font) -> None:
+def _legend(sheet, view: LabelledImage, right: float, top: float, font) -> None:
     """What the marks are, from the right."""
     from PIL import Image, ImageDraw
 
@@ -84,14 +84,14 @@ def counted(number: int, name: str) -> str:
     return f"{words[number - 1] if number <= len(words) else number} {name}{'s' * (number != 1)}"
 
 
-def marked(view: View, height: int, width: int):
+def marked(view: LabelledImage, height: int, width: int):
     """A Pillow image of a view, as large as fits, with its valid labels."""
     from PIL import Image, ImageDraw
 
-    height, width = _fitted(view.picture, height, width)
-    image = Image.fromarray(view.picture.permute(1, 2, 0).contiguous().numpy())
+    height, width = _fitted(view.image, height, width)
+    image = Image.fromarray(view.image.permute(1, 2, 0).contiguous().numpy())
     image = image.resize((width, height), Image.Resampling.LANCZOS)
-    scale = width / view.picture.shape[-1]
+    scale = width / view.image.shape[-1]
     weight = _SHARP * max(1.0, width / 640)
 
     def place(pixel) -> tuple[float, float]:
@@ -124,8 +124,8 @@ def _box(draw, edges, weight: float) -> None:
         draw.rounded_rectangle(grown, (1 + out) * weight, outline=colour, width=round(width * weight))
 
 
-def _arrows(view: View):
-    """Pixels of the eyes that the picture shows, and of the places at which they look."""
+def _arrows(view: LabelledImage):
+    """Pixels of the eyes that the image shows, and of the places at which they look."""
     labels, camera = view.labels, view.camera
     ends = labels.eyes + _REACH * labels.eyes.norm(dim=-1, keepdim=True) * labels.gaze
     (start, seen), (end, ahead) = camera.project(labels.eyes), camera.project(ends)
@@ -153,10 +153,10 @@ def _arrow(draw, start, end, weight: float) -> None:
         draw.ellipse((start[0] - radius, start[1] - radius, start[0] + radius, start[1] + radius), fill=colour)
 
 
-def _fitted(picture: torch.Tensor, height: int, width: int) -> tuple[int, int]:
+def _fitted(image: torch.Tensor, height: int, width: int) -> tuple[int, int]:
     """The largest (height, width) of that shape within another."""
-    scale = min(height / picture.shape[-2], width / picture.shape[-1])
-    return max(1, round(picture.shape[-2] * scale)), max(1, round(picture.shape[-1] * scale))
+    scale = min(height / image.shape[-2], width / image.shape[-1])
+    return max(1, round(image.shape[-2] * scale)), max(1, round(image.shape[-1] * scale))
 
 
 def _columns(count: int) -> tuple[int, int]:

@@ -31,8 +31,8 @@ _WORTH_IT = 0.5  # of the largest error before: then more coefficients are taken
 class Conversion:
     """A camera of another model and how it differs from the one that it was made of.
 
-    Compared are the pixels at which both see the same rays, on a lattice over the picture of the old camera, its outer
-    edges included; without a picture, on rays in all directions. Each number has the batch shape of the camera.
+    Compared are the pixels at which both see the same rays, on a lattice over the image of the old camera, its outer
+    edges included; without an image, on rays in all directions. Each number has the batch shape of the camera.
     """
 
     camera: Camera
@@ -43,9 +43,9 @@ class Conversion:
     """The largest distance in pixels, up to `max_angle`."""
     max_angle: Tensor
     """The angle from the optical axis, in radians, up to which the new camera has a pixel for each compared ray, and
-    beyond which nothing is promised: the picture's largest, the one asked for, or where the new model ends."""
+    beyond which nothing is promised: the image's largest, the one asked for, or where the new model ends."""
     valid_fraction: Tensor
-    """The part of the picture, of what the old camera has rays for, that lies within `max_angle`."""
+    """The part of the image, of what the old camera has rays for, that lies within `max_angle`."""
     exact: Tensor
     """Bool: the models are related, and the numbers were taken over bit by bit; what differs is rounding."""
     source_name: str = "camera"
@@ -59,7 +59,7 @@ class Conversion:
             worst = "at worst " if self.rms.ndim else ""
             text = f"{worst}rms {float(self.rms.max()):.3g} px, max {float(self.max_error.max()):.3g} px"
         angle, part = math.degrees(float(self.max_angle.min())), 100 * float(self.valid_fraction.min())
-        what = "the picture" if self.camera.image_size else "the rays"
+        what = "the image" if self.camera.image_size else "the rays"
         return f"Conversion({head}{text}, up to {angle:.1f} degrees, {part:.4g} % of {what})"
 
 
@@ -208,13 +208,13 @@ def _converted(task: _Task, count: int) -> _Result:
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
     rows = (~exact).nonzero()[:, 0]
     if len(rows):
-        parameters[rows] = fit(made(parameters), view.sights.of(rows), starts[:, rows], slopes[rows])
+        parameters[rows] = fit(made(parameters), view.observations.of(rows), starts[:, rows], slopes[rows])
     result = _measured(task, parameters, exact)
     # no camera of the model has a largest error below the least root of the mean square
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
-        sights = views.rings(task.of(rows).source, task.image_size, _FIT_SIDE, task.limit).sights
-        evened = _measured(task.of(rows), even_out(made(parameters), sights, parameters[rows]), exact[rows])
+        observations = views.rings(task.of(rows).source, task.image_size, _FIT_SIDE, task.limit).observations
+        evened = _measured(task.of(rows), even_out(made(parameters), observations, parameters[rows]), exact[rows])
         (better,) = (
             (evened.max_error < result.max_error[rows]) & _as_far(evened.max_angle, result.max_angle[rows])
         ).nonzero(as_tuple=True)
@@ -229,10 +229,12 @@ def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
     return _Result(parameters, *numbers, exact)
 
 
-def _numbers(target: Camera, k: Tensor, exact: Tensor, check: views.View, whole: views.View) -> tuple[Tensor, ...]:
+def _numbers(
+    target: Camera, k: Tensor, exact: Tensor, check: views.SampledRays, whole: views.SampledRays
+) -> tuple[Tensor, ...]:
     """rms, max_error, max_angle and valid_fraction, (C,) each."""
 
-    def compared(view: views.View) -> tuple[Tensor, Tensor]:
+    def compared(view: views.SampledRays) -> tuple[Tensor, Tensor]:
         pixels, valid = target.project(view.rays)
         # what was out of the reach of the fit is no part of its result
         reached = see(target, k, view.rays).covered | exact[:, None]

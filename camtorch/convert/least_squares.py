@@ -25,16 +25,16 @@ _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
 
 
-class Sights(NamedTuple):
+class Observations(NamedTuple):
     """What a camera shall see: rays (C, N, 3), pixels (C, N, 2) and weights of the errors (C, N), 0 for no ray."""
 
     rays: Tensor
     pixels: Tensor
     weights: Tensor
 
-    def of(self, rows: Tensor) -> Sights:
+    def of(self, rows: Tensor) -> Observations:
         """Those of some rows."""
-        return Sights(*(t[rows] for t in self))
+        return Observations(*(t[rows] for t in self))
 
 
 class Seen(NamedTuple):
@@ -59,34 +59,34 @@ def see(camera: Camera, k: Tensor, rays: Tensor) -> Seen:
     return Seen(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
 
 
-def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tensor:
+def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tensor) -> Tensor:
     """The parameters (C, 4 + n) at which a camera sees the pixels of the rays as nearly as it can.
 
     Rays that the camera's chart never covers do not count. No row depends on another.
 
     Args:
         camera: gives its optics, not its numbers.
-        sights: what it shall see.
+        observations: what it shall see.
         starts: (S, C, n) coefficients to start from; of what becomes of them the best is kept.
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
     """
     best = best_score = None
-    tiny = _NEARLY_NOTHING**2 * sights.weights.sum(-1)
+    tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
     for start in starts:
         parameters = torch.cat((_intrinsics(camera, start, slopes), start), -1)
         low, high = _bounds(camera, parameters)
         parameters = parameters.clamp(low, high)
-        within = sights._replace(weights=torch.zeros_like(sights.weights))
+        within = observations._replace(weights=torch.zeros_like(observations.weights))
         for _ in range(_ROUNDS):
             # a chart may cover more once its coefficients fit what it covered before
-            weights = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
+            weights = observations.weights * see(camera, parameters[:, 4:], observations.rays).covered
             more = (weights != within.weights).any(-1)
             if best is not None:
                 more = more & (best_score > tiny)
-            within = sights._replace(weights=weights)
+            within = observations._replace(weights=weights)
             parameters = _refine(camera, within, parameters, low, high, more)
         score = _cost(camera, within, parameters)
-        score = score + (sights.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
+        score = score + (observations.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
         if best is None:
             best, best_score = parameters, score
         better = (score < best_score) & (best_score > tiny)
@@ -94,17 +94,17 @@ def fit(camera: Camera, sights: Sights, starts: Tensor, slopes: Tensor) -> Tenso
     return best
 
 
-def even_out(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
+def even_out(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
     """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
 
     Lawson's algorithm: least squares over and over, the weight of a square multiplied by its error each time, approach
     what has the least largest error.
     """
     low, high = _bounds(camera, parameters)
-    covered = sights.weights * see(camera, parameters[:, 4:], sights.rays).covered
-    sights = sights._replace(weights=covered)
+    covered = observations.weights * see(camera, parameters[:, 4:], observations.rays).covered
+    observations = observations._replace(weights=covered)
     best, weights = parameters, covered
-    error = _distances(sights, camera, parameters)
+    error = _distances(observations, camera, parameters)
     least, stale = error.amax(-1), torch.zeros_like(error[:, 0])
     for _ in range(_EVENINGS):
         going = stale < _PATIENCE
@@ -113,9 +113,9 @@ def even_out(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
         # of the error itself, the weight in a square is that of its root
         weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
         weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
-        weighted = sights._replace(weights=weights)
+        weighted = observations._replace(weights=weights)
         parameters = _refine(camera, weighted, parameters, low, high, going, _EVENING_STEPS, _LEAST_DAMPING)
-        error = _distances(sights, camera, parameters)
+        error = _distances(observations, camera, parameters)
         better = going & (error.amax(-1) < least)
         best = torch.where(better[:, None], parameters, best)
         stale = torch.where(error.amax(-1) < 0.999 * least, 0.0, stale + 1)
@@ -123,9 +123,11 @@ def even_out(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
     return best
 
 
-def _distances(sights: Sights, camera: Camera, parameters: Tensor) -> Tensor:
+def _distances(observations: Observations, camera: Camera, parameters: Tensor) -> Tensor:
     """(C, N) pixels."""
-    return torch.linalg.vector_norm(_residuals(sights, parameters, see(camera, parameters[:, 4:], sights.rays)), dim=1)
+    return torch.linalg.vector_norm(
+        _residuals(observations, parameters, see(camera, parameters[:, 4:], observations.rays)), dim=1
+    )
 
 
 def _intrinsics(camera: Camera, k: Tensor, slopes: Tensor) -> Tensor:
@@ -148,39 +150,39 @@ def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _residuals(sights: Sights, parameters: Tensor, seen: Seen) -> Tensor:
+def _residuals(observations: Observations, parameters: Tensor, seen: Seen) -> Tensor:
     """(C, 2, N) pixels."""
     fx, fy, cx, cy = columns(parameters[:, :4])
-    u, v = sights.pixels.unbind(-1)
-    return torch.stack((fx * seen.a + cx - u, fy * seen.b + cy - v), 1) * sights.weights[:, None]
+    u, v = observations.pixels.unbind(-1)
+    return torch.stack((fx * seen.a + cx - u, fy * seen.b + cy - v), 1) * observations.weights[:, None]
 
 
-def _cost(camera: Camera, sights: Sights, parameters: Tensor) -> Tensor:
+def _cost(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
     """(C,) the sum of squares; infinite where a ray that counts is not covered, or the coefficients make no camera."""
-    seen = see(camera, parameters[:, 4:], sights.rays)
-    lost = (~seen.covered & (sights.weights > 0)).any(-1)
-    cost = _residuals(sights, parameters, seen).square().sum((1, 2))
+    seen = see(camera, parameters[:, 4:], observations.rays)
+    lost = (~seen.covered & (observations.weights > 0)).any(-1)
+    cost = _residuals(observations, parameters, seen).square().sum((1, 2))
     defined = camera.defined(parameters[:, 4:].unbind(-1))
     if defined is not None:
         lost = lost | ~(defined > 0)
     return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
 
 
-def _linearised(camera: Camera, sights: Sights, parameters: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+def _linearised(camera: Camera, observations: Observations, parameters: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
     """The residuals (C, 2 N), and their derivatives (C, F, 2 N) by the parameters of indices (F,), 0 to 3 first."""
     k = parameters[:, 4:]
-    seen = see(camera, k, sights.rays)
+    seen = see(camera, k, observations.rays)
     fx, fy, _, _ = columns(parameters[:, :4])
     zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
     derivatives = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
     slopes = torch.stack([torch.stack(pair, 1) for pair in derivatives], 1)
     if len(free) > 4:
         along = torch.eye(k.shape[-1], dtype=k.dtype, device=k.device)[free[4:] - 4]
-        by_k = _derivatives(camera, k, sights.rays, along)
+        by_k = _derivatives(camera, k, observations.rays, along)
         slopes = torch.cat((slopes, by_k * torch.stack((fx, fy), 1)[:, None]), 1)
     # where a derivative is no number, as at the end of a chart, a step goes without it
-    slopes = slopes.nan_to_num(0.0, 0.0, 0.0) * sights.weights[:, None, None]
-    return _residuals(sights, parameters, seen).flatten(1), slopes.flatten(2)
+    slopes = slopes.nan_to_num(0.0, 0.0, 0.0) * observations.weights[:, None, None]
+    return _residuals(observations, parameters, seen).flatten(1), slopes.flatten(2)
 
 
 def _derivatives(camera: Camera, k: Tensor, rays: Tensor, directions: Tensor) -> Tensor:
@@ -201,7 +203,7 @@ def _derivatives(camera: Camera, k: Tensor, rays: Tensor, directions: Tensor) ->
 
 def _refine(
     camera: Camera,
-    sights: Sights,
+    observations: Observations,
     parameters: Tensor,
     low: Tensor,
     high: Tensor,
@@ -211,9 +213,9 @@ def _refine(
 ) -> Tensor:
     """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
     parameters = parameters.clone()
-    cost = _cost(camera, sights, parameters)
+    cost = _cost(camera, observations, parameters)
     damping = torch.full_like(cost, first_damping)
-    tiny = _NOTHING**2 * sights.weights.sum(-1)
+    tiny = _NOTHING**2 * observations.weights.sum(-1)
     going = going & torch.isfinite(cost) & (cost > tiny)
     (free,) = (low < high).any(0).nonzero(as_tuple=True)
     for _ in range(steps):
@@ -221,7 +223,7 @@ def _refine(
         if len(rows) == 0:
             break
         # rows that have settled are left alone, so that each goes the way that it would go alone
-        these, old, weight = sights.of(rows), parameters[rows], damping[rows]
+        these, old, weight = observations.of(rows), parameters[rows], damping[rows]
         residuals, slopes = _linearised(camera, these, old, free)
         # what would leave its bounds stays there, so that the others can move on
         slope = (slopes @ residuals[..., None])[..., 0]

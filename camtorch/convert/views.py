@@ -1,4 +1,4 @@
-"""What a camera sees, on a lattice of its picture or in all directions: what a conversion keeps to."""
+"""What a camera sees, on a lattice of its image or in all directions: what a conversion keeps to."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.convert.least_squares import Sights
+from camtorch.convert.least_squares import Observations
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
 _ANGLES, _AZIMUTHS, _RADII = 181, 16, 64  # at which a camera is looked at as a whole
-_END_AHEAD = math.radians(87)  # of rays, for a camera without a picture that does not see sideways
+_END_AHEAD = math.radians(87)  # of rays, for a camera without an image that does not see sideways
 
 
-class View(NamedTuple):
+class SampledRays(NamedTuple):
     """Rays (C, N, 3) of a camera, its pixels (C, N, 2) of them, and whether it has them, bool (C, N)."""
 
     rays: Tensor
@@ -25,9 +25,9 @@ class View(NamedTuple):
     valid: Tensor
 
     @property
-    def sights(self) -> Sights:
+    def observations(self) -> Observations:
         """What a camera fitted to it shall see."""
-        return Sights(self.rays, self.pixels, self.valid.to(self.pixels.dtype))
+        return Observations(self.rays, self.pixels, self.valid.to(self.pixels.dtype))
 
     @property
     def angles(self) -> Tensor:
@@ -35,19 +35,19 @@ class View(NamedTuple):
         return torch.atan2(torch.hypot(self.rays[..., 0], self.rays[..., 1]), self.rays[..., 2])
 
 
-def view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> View:
-    """side^2 rays on the picture, or in all directions, of which those count that the camera has up to an angle."""
+def view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
+    """side^2 rays on the image, or in all directions, of which those count that the camera has up to an angle."""
     if image_size is None:
         rays = _directions(_reach(camera, limit) * torch.linspace(0, 1, side, **_like(camera)), side)
         rays, found = rays.flatten(1, 2), True
     else:
         rays, found = camera.unproject(_lattice(camera, image_size, side, limit))
     pixels, valid = camera.project(rays)
-    seen = View(rays, pixels, valid & found)
+    seen = SampledRays(rays, pixels, valid & found)
     return seen._replace(valid=seen.valid & (seen.angles <= limit * (1 + 1e-12)))
 
 
-def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> View:
+def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
     """`view`, and rays on circles around the axis, over which the errors of a radial lens change."""
     whole = view(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
@@ -56,11 +56,11 @@ def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: 
     if image_size is not None:
         height, width = image_size
         valid = valid & (pixels >= -0.5).all(-1) & (pixels <= pixels.new_tensor([width - 0.5, height - 0.5])).all(-1)
-    return View(*(torch.cat(pair, 1) for pair in zip(whole, (rays, pixels, valid), strict=True)))
+    return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, (rays, pixels, valid), strict=True)))
 
 
 def _lattice(camera: Camera, image_size: tuple[int, int], side: int, limit: float) -> Tensor:
-    """(C, side^2, 2): pixels of the part of the picture that an angle leaves, its edges included."""
+    """(C, side^2, 2): pixels of the part of the image that an angle leaves, its edges included."""
     height, width = image_size
     count = len(camera.intrinsics)
     low = camera.intrinsics.new_full((count, 2), -0.5)

@@ -55,7 +55,7 @@ class Drivers:
 
     @torch.no_grad()
     def face_box_points(self) -> Tensor:
-        """(B, M, 3): points of the face's outline, whose bounding box in a picture is the face's."""
+        """(B, M, 3): points of the face's outline, whose bounding box in an image is the face's."""
         return self._to_camera(landmarks.face_points(driver.shape_of(self.looks), self._gaze_of_head())[1])
 
     def eyes(self) -> Tensor:
@@ -105,7 +105,7 @@ def _turn(angle: Tensor, axis: int) -> Tensor:
     return matrix
 
 
-# -- pictures
+# -- images
 
 
 def _rays(corners: Tensor, across: float, down: float, turn: Tensor | None) -> Tensor:
@@ -158,14 +158,14 @@ def render(
     dot_radius: float = 0.01,
     grey: bool = False,
 ) -> Tensor:
-    """The pictures (B, 3, H, W) in [0, 1] that a camera takes of drivers; black where it has no rays.
+    """The images (B, 3, H, W) in [0, 1] that a camera takes of drivers; black where it has no rays.
 
     Args:
         camera: with image_size; no batch dims (all drivers share it) or a batch of B.
         drivers: B of them.
         rotation: (3, 3) or (B, 3, 3), turns the camera: what was at p is seen at `rotation @ p`.
         samples: rays per pixel, spread over it as a lattice; their mean is the pixel, as on a sensor.
-        generator: shifts the lattice at random; without it the same picture comes out each time.
+        generator: shifts the lattice at random; without it the same image comes out each time.
         dots: (B, N, 3) points, not turned by `rotation`, that are painted over everything else in the colour `DOT`.
         dot_radius: radians; a dot is all rays within that angle of the direction to its point.
         grey: see as an infrared camera does that brings its own light.
@@ -179,14 +179,14 @@ def render(
         step += 1
     shift = [0.5 / samples] * 2 if generator is None else torch.rand(2, generator=generator).tolist()
     total = 0.0
-    # small pictures are seen several samples at a time: what costs is the number of calls
+    # small images are seen several samples at a time: what costs is the number of calls
     group = max(1, _CHUNK // (len(drivers) * camera.image_size[0] * camera.image_size[1]))
     for some in torch.arange(samples).split(group):
         places = [((i / samples + shift[0]) % 1, (i * step % samples / samples + shift[1]) % 1) for i in some.tolist()]
         rays = torch.cat([_rays(corners, *place, turn) for place in places], 1)
         total = total + _scan(rays, scene, dots, dot_radius)[0].unflatten(1, (len(places), -1)).sum(1)
-    picture = (total / samples).unflatten(1, camera.image_size).permute(0, 3, 1, 2)
-    return torch.where(valid, picture, 0.0)
+    image = (total / samples).unflatten(1, camera.image_size).permute(0, 3, 1, 2)
+    return torch.where(valid, image, 0.0)
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from camtorch.warp.dewarp import Dewarp
 
 @dataclass
 class Study:
-    """What one lens sees, what a `Dewarp` makes of it, and what it should have made; pictures are (3, H, W)."""
+    """What one lens sees, what a `Dewarp` makes of it, and what it should have made; images are (3, H, W)."""
 
     title: str
     warp: Dewarp
@@ -33,10 +33,10 @@ class Study:
     """dB of `dewarped` against `direct`, over valid pixels."""
     bend_before: float
     bend_after: float
-    """Rms distance in px of edges, found in the picture, from straight lines; `lines` is their number."""
+    """Rms distance in px of edges, found in the image, from straight lines; `lines` is their number."""
     lines: int
     shift: float
-    """Distance in px by which `dewarped` lies beside `direct`, found in the pictures."""
+    """Distance in px by which `dewarped` lies beside `direct`, found in the images."""
     keypoints: tuple[Tensor, Tensor]
     """Corners of the room in the source, and where the warp moves them: (N, 2) each."""
     keypoint_error: float
@@ -44,8 +44,8 @@ class Study:
 
 
 @dataclass
-class Lens:
-    """A camera to demonstrate, and how its picture is dewarped."""
+class DemoCamera:
+    """A camera to demonstrate, and how its image is dewarped."""
 
     title: str
     camera: Camera
@@ -58,8 +58,8 @@ class Lens:
     """How the camera hangs in the room, in degrees; the target is level."""
 
 
-def lenses(height: int = 640) -> list[Lens]:
-    """The five lenses, with pictures of about that height in pixels."""
+def lenses(height: int = 640) -> list[DemoCamera]:
+    """The five lenses, with images of about that height in pixels."""
 
     def camera(model, size, intrinsics, *distortion, rows=height):
         values = [torch.tensor(v, dtype=torch.float64) for v in (intrinsics, *distortion)]
@@ -79,16 +79,24 @@ def lenses(height: int = 640) -> list[Lens]:
     size = round(height * 33 / 64), round(height * 44 / 64)
     rows = round(height * 0.75)
     return [
-        Lens("Pinhole, tilted", camera(Pinhole, (480, 640), [331.0, 331.0, 319.5, 239.5]), 70, size, pitch=-9, roll=7),
-        Lens("Brown-Conrady", camera(BrownConrady, (1424, 1900), middle, front, rows=rows), 88, size),
-        Lens("Kannala-Brandt", camera(KannalaBrandt, (1280, 1920), [561.8, 562.4, 957.3, 644.6], surround), 100, size),
-        Lens("Fisheye62", camera(Fisheye62, (480, 640), [242.0503, 242.0503, 319.8053, 240.9679], aria), 90, size),
-        Lens("Fisheye624", camera(Fisheye624, (480, 640), [241.3653, 241.3653, 319.0837, 239.8876], online), 95, size),
+        DemoCamera(
+            "Pinhole, tilted", camera(Pinhole, (480, 640), [331.0, 331.0, 319.5, 239.5]), 70, size, pitch=-9, roll=7
+        ),
+        DemoCamera("Brown-Conrady", camera(BrownConrady, (1424, 1900), middle, front, rows=rows), 88, size),
+        DemoCamera(
+            "Kannala-Brandt", camera(KannalaBrandt, (1280, 1920), [561.8, 562.4, 957.3, 644.6], surround), 100, size
+        ),
+        DemoCamera(
+            "Fisheye62", camera(Fisheye62, (480, 640), [242.0503, 242.0503, 319.8053, 240.9679], aria), 90, size
+        ),
+        DemoCamera(
+            "Fisheye624", camera(Fisheye624, (480, 640), [241.3653, 241.3653, 319.0837, 239.8876], online), 95, size
+        ),
     ]
 
 
 @torch.no_grad()
-def study(lens: Lens, samples: int = 6) -> Study:
+def study(lens: DemoCamera, samples: int = 6) -> Study:
     """Render, dewarp and measure one lens: `samples` rays per pixel of the source, twice as many of the truth."""
     to_camera = _rotation(lens.pitch, lens.roll)
     warp = Dewarp(lens.camera, fov=math.radians(lens.degrees), image_size=lens.size, rotation=to_camera.T)
@@ -148,8 +156,8 @@ def run(report: Callable[[str], None] = print, *, height: int = 640, samples: in
     return studies
 
 
-def picture(studies: list[Study]):
-    """One Pillow image: each study's source, dewarped picture, and tenfold difference from the truth."""
+def drawing(studies: list[Study]):
+    """One Pillow image: each study's source, dewarped image, and tenfold difference from the truth."""
     from PIL import Image, ImageDraw, ImageFont
 
     ink, grey, rim, paper = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 245, 235)
@@ -198,20 +206,20 @@ def _rotation(pitch: float, roll: float) -> Tensor:
 
 
 def _away_from_rim(valid: Tensor) -> Tensor:
-    """Not beside an invalid pixel: there the interpolation mixes in the black around the picture."""
+    """Not beside an invalid pixel: there the interpolation mixes in the black around the image."""
     near = F.max_pool2d((~valid)[None, None].float(), 3, stride=1, padding=1)
     return near[0, 0] == 0
 
 
-# -- measuring in pictures
+# -- measuring in images
 
 
-def _look(picture: Tensor, pixels: Tensor) -> Tensor:
-    """(..., 3) colours of a picture (3, H, W) at pixels (..., 2), bilinear."""
-    height, width = picture.shape[-2:]
+def _look(image: Tensor, pixels: Tensor) -> Tensor:
+    """(..., 3) colours of an image (3, H, W) at pixels (..., 2), bilinear."""
+    height, width = image.shape[-2:]
     grid = (2 * pixels + 1) / pixels.new_tensor([width, height]) - 1
     colours = F.grid_sample(
-        picture[None].to(pixels.dtype), grid.reshape(1, 1, -1, 2), padding_mode="border", align_corners=False
+        image[None].to(pixels.dtype), grid.reshape(1, 1, -1, 2), padding_mode="border", align_corners=False
     )
     return colours[0, :, 0].T.reshape(*pixels.shape[:-1], 3)
 
@@ -220,12 +228,12 @@ _REACH = 3.0  # px to either side in which an edge is sought
 _STEPS = torch.linspace(-_REACH, _REACH, 49, dtype=torch.float64)
 
 
-def _across(picture: Tensor, pixels: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+def _across(image: Tensor, pixels: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     """Where on the normal (N, 2) through each pixel (N, 2) the colour changes, in px, and whether it does at all."""
     offset = pixels.new_zeros(len(pixels))
     for _ in range(4):
         at = pixels + offset[:, None] * normal
-        colours = _look(picture, at[:, None] + _STEPS[:, None] * normal[:, None])
+        colours = _look(image, at[:, None] + _STEPS[:, None] * normal[:, None])
         change = colours[:, -1] - colours[:, 0]
         contrast = change.norm(dim=-1)
         step = ((colours[:, 1:] - colours[:, :-1]) @ (change / contrast.clamp(min=1e-6)[:, None])[..., None])[..., 0]
@@ -244,13 +252,13 @@ def _edges(lines: Tensor, *views: tuple[Tensor, Camera, Tensor]) -> list[list[Te
         points = start + share * (end - start)
         use = room.visible(points)
         places = []
-        for picture, camera, rotation in views:
+        for image, camera, rotation in views:
             pixels, valid = camera.project(points @ rotation.T)
             ahead, _ = camera.project((points + 1e-3 * (end - start)) @ rotation.T)
             along = F.normalize(ahead - pixels, dim=-1)
             normal = torch.stack((-along[:, 1], along[:, 0]), -1)
             inner = camera.crop(8, 8, camera.image_size[0] - 16, camera.image_size[1] - 16).contains(pixels - 8)
-            offset, clear = _across(picture, pixels, normal)
+            offset, clear = _across(image, pixels, normal)
             use = use & valid & inner & clear
             places.append(pixels + offset[:, None] * normal)
         length = (places[-1][use].amax(0) - places[-1][use].amin(0)).norm() if use.any() else 0
@@ -266,11 +274,11 @@ def _bend(lines: list[Tensor]) -> float:
     return math.sqrt(float(sum(squares)) / sum(map(len, lines)))
 
 
-def _shift(picture: Tensor, truth: Tensor, valid: Tensor) -> float:
-    """The length in px of the shift that explains best how a picture differs from the truth, to first order."""
+def _shift(image: Tensor, truth: Tensor, valid: Tensor) -> float:
+    """The length in px of the shift that explains best how an image differs from the truth, to first order."""
     slopes = [(truth.roll(-1, axis) - truth.roll(1, axis)) / 2 for axis in (2, 1)]
     inner = valid.clone()
     inner[[0, -1]], inner[:, [0, -1]] = False, False
     slopes = torch.stack([slope[:, inner].flatten() for slope in slopes], -1)
-    difference = (truth - picture)[:, inner].flatten()
+    difference = (truth - image)[:, inner].flatten()
     return float(torch.linalg.solve(slopes.T @ slopes, slopes.T @ difference).norm())

@@ -158,7 +158,7 @@ def visible(points: Tensor) -> Tensor:
 
 @torch.no_grad()
 def render(camera: Camera, rotation: Tensor | None = None, *, samples: int = 12) -> Tensor:
-    """The picture (3, H, W) in [0, 1] that a camera at the origin takes of the room; black where it has no rays.
+    """The image (3, H, W) in [0, 1] that a camera at the origin takes of the room; black where it has no rays.
 
     Args:
         camera: with image_size and without batch dims.
@@ -175,12 +175,12 @@ def render(camera: Camera, rotation: Tensor | None = None, *, samples: int = 12)
     step = max(1, round(samples * 0.618))
     while math.gcd(step, samples) > 1:
         step += 1
-    picture = torch.zeros(height, width, 3)
+    image = torch.zeros(height, width, 3)
     for i in range(samples):
         across, down = (i + 0.5) / samples, (i * step % samples + 0.5) / samples
         rows = torch.lerp(rays[:, :-1], rays[:, 1:], across)
-        picture += torch.where(valid, radiance(torch.lerp(rows[:-1], rows[1:], down)), 0.0)
-    return (picture / samples).permute(2, 0, 1)
+        image += torch.where(valid, radiance(torch.lerp(rows[:-1], rows[1:], down)), 0.0)
+    return (image / samples).permute(2, 0, 1)
 
 
 def keypoints() -> Tensor:

@@ -43,7 +43,7 @@ def _columns(rows: Tensor) -> Planes:
 
 
 def see(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
-    """Colours (M, 3) and classes (M) of unit rays (M, 3), in the head's frame too, each of one driver's picture."""
+    """Colours (M, 3) and classes (M) of unit rays (M, 3), in the head's frame too, each of one driver's image."""
     rays = torch.where(rays.abs() < 1e-7, 1e-7, rays)
     ray = _columns(rays)
     light = torch.zeros(3, len(rays))

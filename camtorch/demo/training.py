@@ -1,7 +1,7 @@
-"""The demonstration of training: pinhole pictures teach a network that is to work behind a fisheye mounted elsewhere.
+"""The demonstration of training: pinhole images teach a network that is to work behind a fisheye mounted elsewhere.
 
-Four networks start from the same weights and take as many steps on as many pictures. They find landmarks of drivers'
-faces in the picture, and where these are in space. What they learn from differs: see `TEACHERS`.
+Four networks start from the same weights and take as many steps on as many images. They find landmarks of drivers'
+faces in the image, and where these are in space. What they learn from differs: see `TEACHERS`.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor, nn
 
 from camtorch.demo import cabin
-from camtorch.demo.training_data import MOUNT, NAMES, TEACHERS, Augment, Pictures, cameras, photograph, teacher
+from camtorch.demo.training_data import MOUNT, NAMES, TEACHERS, Augment, Samples, cameras, photograph, teacher
 
 _METRE = 40.0  # what a metre of error costs in the loss, where a pixel costs 1
 
 
 @dataclass
 class Result:
-    """What a network learned, and what it then finds in the test pictures."""
+    """What a network learned, and what it then finds in the test images."""
 
     teacher: str
-    lessons: Pictures
-    """A few of the pictures that it learned from."""
-    test: Pictures
+    lessons: Samples
+    """A few of the images that it learned from."""
+    test: Samples
     keypoints: Tensor
     """(B, N, 2), as found."""
     losses: list[float]
@@ -49,7 +49,7 @@ class Result:
 
 
 class Network(nn.Module):
-    """Pictures (B, 3, H, W) of one size to keypoints (B, N, 2) and points (B, N, 3)."""
+    """Samples (B, 3, H, W) of one size to keypoints (B, N, 2) and points (B, N, 3)."""
 
     def __init__(self, size: tuple[int, int], width: int = 16):
         super().__init__()
@@ -70,7 +70,7 @@ class Network(nn.Module):
         return keypoints, 0.2 * found[..., 2:] + found.new_tensor([0, 0, 0.6])
 
 
-def loss_of(found: tuple[Tensor, Tensor], p: Pictures) -> Tensor:
+def loss_of(found: tuple[Tensor, Tensor], p: Samples) -> Tensor:
     """How far off the landmarks that are seen are found, on average."""
     keypoints, points = found
     off = F.smooth_l1_loss(keypoints, p.keypoints, reduction="none", beta=2.0).sum(-1)
@@ -80,7 +80,7 @@ def loss_of(found: tuple[Tensor, Tensor], p: Pictures) -> Tensor:
 
 def learn(
     network: Network,
-    pictures: Pictures,
+    images: Samples,
     augment: Augment,
     steps: int,
     batch: int = 24,
@@ -94,8 +94,8 @@ def learn(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 5e-3, total_steps=steps, pct_start=0.2)
     losses = []
     for step in range(1, steps + 1):
-        chosen = torch.randint(len(pictures), (batch,), generator=generator)
-        lesson = augment(pictures[chosen], generator)
+        chosen = torch.randint(len(images), (batch,), generator=generator)
+        lesson = augment(images[chosen], generator)
         loss = loss_of(network(lesson.image), lesson)
         optimizer.zero_grad()
         loss.backward()
@@ -108,7 +108,7 @@ def learn(
 
 
 @torch.no_grad()
-def examine(name: str, network: Network, lessons: Pictures, test: Pictures, losses: list[float]) -> Result:
+def examine(name: str, network: Network, lessons: Samples, test: Samples, losses: list[float]) -> Result:
     """Have a network find what it has not seen."""
     keypoints, points = (torch.cat(part) for part in zip(*map(network, test.image.split(50)), strict=True))
     pixels = (keypoints - test.keypoints).norm(dim=-1)
@@ -120,7 +120,7 @@ def examine(name: str, network: Network, lessons: Pictures, test: Pictures, loss
 def run(
     report: Callable[[str], None] = print,
     *,
-    pictures: int = 400,
+    images: int = 400,
     tests: int = 150,
     steps: int = 500,
     seed: int = 0,
@@ -129,9 +129,9 @@ def run(
 
     Args:
         report: gets lines on the progress, and those of the table.
-        pictures: how many to learn from; of pinhole and fisheye alike.
-        tests: how many fisheye pictures of other drivers to be examined on.
-        steps: of 24 pictures each.
+        images: how many to learn from; of pinhole and fisheye alike.
+        tests: how many fisheye images of other drivers to be examined on.
+        steps: of 24 images each.
         seed: of everything drawn.
 
     Returns:
@@ -144,14 +144,14 @@ def run(
 
     camera, like = cameras()
     generator = torch.Generator().manual_seed(seed)
-    drivers, others = (cabin.random_drivers(count, generator) for count in (pictures, tests))
-    # A thread for each network keeps the cores busier than many threads on one small picture
+    drivers, others = (cabin.random_drivers(count, generator) for count in (images, tests))
+    # A thread for each network keeps the cores busier than many threads on one small image
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         with torch.random.fork_rng(devices=[]), ThreadPoolExecutor(workers) as pool:
             torch.manual_seed(seed)
-            say(f"rendering {2 * pictures} pictures to learn from and {tests} to be examined on")
+            say(f"rendering {2 * images} images to learn from and {tests} to be examined on")
             seen = photograph(camera, drivers, workers=workers)
             test, bound = (photograph(like, d, MOUNT, workers) for d in (others, drivers))
             first = Network(camera.image_size)
@@ -180,8 +180,8 @@ def run(
     return results
 
 
-def picture(results: list[Result], tests: int = 5):
-    """One Pillow image: for each network two of its lessons, and what it finds in the same test pictures."""
+def drawing(results: list[Result], tests: int = 5):
+    """One Pillow image: for each network two of its lessons, and what it finds in the same test images."""
     from PIL import Image, ImageDraw, ImageFont
 
     ink, grey, rim, paper, found = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 245, 235), (226, 29, 72)
@@ -198,12 +198,12 @@ def picture(results: list[Result], tests: int = 5):
     for row, result in enumerate(results):
         top = head + row * (height + band + gap)
         draw.text((gap, top + 10), TEACHERS[result.teacher], ink, middle)
-        off = f"{result.pixels.median():.1f} px in the picture, {100 * result.metres.median():.0f} cm in space"
+        off = f"{result.pixels.median():.1f} px in the image, {100 * result.metres.median():.0f} cm in space"
         draw.text((left, top + 13), f"off by {off} (medians of {len(result.test)} drivers)", ink, small)
         tiles = [(gap + i * (width + gap), result.lessons, i, None) for i in range(2)]
         tiles += [(left + i * (width + gap), result.test, i, result.keypoints[i]) for i in range(tests)]
-        for x, pictures, i, dots in tiles:
-            image = Image.fromarray((255 * pictures.image[i].permute(1, 2, 0)).round().byte().numpy())
+        for x, images, i, dots in tiles:
+            image = Image.fromarray((255 * images.image[i].permute(1, 2, 0)).round().byte().numpy())
             image = image.resize((width, height), Image.Resampling.LANCZOS)
             marks = Image.new("RGBA", (sharp * width, sharp * height))
             on = ImageDraw.Draw(marks)
@@ -212,7 +212,7 @@ def picture(results: list[Result], tests: int = 5):
                 u, v = (sharp * scale * (float(c) + 0.5) for c in at)
                 on.ellipse([u - radius, v - radius, u + radius, v + radius], **style)
 
-            for at in pictures.keypoints[i]:
+            for at in images.keypoints[i]:
                 circle(at, 11, outline=(255, 255, 255), width=4)
             for at in () if dots is None else dots:
                 circle(at, 8, fill=found, outline=(255, 255, 255), width=1)

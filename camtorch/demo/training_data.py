@@ -20,10 +20,10 @@ NAMES = (
     *("nose_tip", "mouth_right", "mouth_left", "chin"),
 )
 TEACHERS = {
-    "pinhole": "pinhole pictures",
+    "pinhole": "pinhole images",
     "affine": "... with RandomAffine",
     "camtorch": "... with camtorch",
-    "fisheye": "fisheye pictures",
+    "fisheye": "fisheye images",
 }
 """What networks learn from; the last one has what the others lack, and bounds what they can reach."""
 # degrees: between the seats, aimed at both, leaning; built in not quite as planned
@@ -32,15 +32,15 @@ WITHIN = (8.0, 8.0, 10.0)  # of the plan, mounts may be
 
 
 @dataclass
-class Pictures:
+class Samples:
     """Drivers as a camera sees them, a batch of B; `NAMES` are the landmarks.
 
     Attributes:
         image: (B, 3, H, W).
         keypoints: (B, N, 2), landmarks in pixels.
         points: (B, N, 3), the same in metres, in the camera's frame.
-        seen: (B, N) bool, which keypoints lie on the picture.
-        camera: of all pictures, or one for each; None where nobody knows any more.
+        seen: (B, N) bool, which keypoints lie on the image.
+        camera: of all images, or one for each; None where nobody knows any more.
     """
 
     image: Tensor
@@ -52,15 +52,15 @@ class Pictures:
     def __len__(self) -> int:
         return len(self.image)
 
-    def __getitem__(self, index) -> Pictures:
-        return Pictures(self.image[index], self.keypoints[index], self.points[index], self.seen[index], self.camera)
+    def __getitem__(self, index) -> Samples:
+        return Samples(self.image[index], self.keypoints[index], self.points[index], self.seen[index], self.camera)
 
 
-Augment = Callable[[Pictures, torch.Generator], Pictures]
+Augment = Callable[[Samples, torch.Generator], Samples]
 
 
 def cameras() -> tuple[Camera, Camera]:
-    """The pinhole camera, 51 degrees wide, and the part of a fisheye's picture, 130 degrees wide, with the driver."""
+    """The pinhole camera, 51 degrees wide, and the part of a fisheye's image, 130 degrees wide, with the driver."""
     pinhole = Pinhole([100.0, 100.0, 47.5, 39.5], image_size=(80, 96)).requires_grad_(False)
     lens = KannalaBrandt([70.0, 70.0, 79.5, 56.5], [0.02, -0.01, 0.003, -0.001], image_size=(114, 160))
     lens = lens.requires_grad_(False)
@@ -70,15 +70,15 @@ def cameras() -> tuple[Camera, Camera]:
 
 def photograph(
     camera: Camera, drivers: cabin.Drivers, mount: tuple[float, float, float] = (0.0, 0.0, 0.0), workers: int = 1
-) -> Pictures:
-    """Pictures of drivers by a camera turned by yaw, pitch and roll in degrees."""
+) -> Samples:
+    """Samples of drivers by a camera turned by yaw, pitch and roll in degrees."""
     turn = _turn(mount)
     points = drivers.landmarks()[:, [cabin.LANDMARKS.index(name) for name in NAMES]] @ turn.T
     keypoints, seen = camera.project(points)
     parts = [drivers[slice(i, i + 50)] for i in range(0, len(drivers), 50)]
     with ThreadPoolExecutor(workers) as pool:
         image = torch.cat(list(pool.map(lambda part: cabin.render(camera, part, turn, samples=1), parts)))
-    return Pictures(image, keypoints.float(), points.float(), seen & camera.contains(keypoints), camera)
+    return Samples(image, keypoints.float(), points.float(), seen & camera.contains(keypoints), camera)
 
 
 def _turn(mount: tuple[float, float, float]) -> Tensor:
@@ -89,25 +89,25 @@ def _turn(mount: tuple[float, float, float]) -> Tensor:
 
 
 def teacher(name: str, camera: Camera, like: Camera) -> Augment:
-    """What makes lessons for the lens `like` of pictures of `camera`."""
+    """What makes lessons for the lens `like` of images of `camera`."""
     if name == "camtorch":
         yaw, pitch, roll = ((a - b, a + b) for a, b in zip(PLANNED, WITHIN, strict=True))
         options = {"focal": 0.02, "centre": 0.01, "distortion": None, "crop": None, "padding_mode": "border"}
         augment = RandomCamera(like, yaw=yaw, pitch=pitch, roll=roll, camera=camera, **options)
 
-        def by_camera(p: Pictures, generator: torch.Generator) -> Pictures:
+        def by_camera(p: Samples, generator: torch.Generator) -> Samples:
             new = augment(image=p.image, keypoints=p.keypoints, points=p.points, generator=generator)
             seen = new["keypoints_valid"] & p.seen
-            return Pictures(new["image"], new["keypoints"], new["points"], seen, new["camera"])
+            return Samples(new["image"], new["keypoints"], new["points"], seen, new["camera"])
 
         return by_camera
     return _by_affine(camera, like) if name == "affine" else lambda p, generator: p
 
 
 def _by_affine(camera: Camera, like: Camera) -> Augment:
-    """Turns, scales and shifts pictures as `RandomCamera` does with the middle of its own.
+    """Turns, scales and shifts images as `RandomCamera` does with the middle of its own.
 
-    Points turn with the picture, and by the plan's yaw and pitch, which is more than an augmentation in 2D can know.
+    Points turn with the image, and by the plan's yaw and pitch, which is more than an augmentation in 2D can know.
     """
     from kornia.augmentation import RandomAffine
 
@@ -119,13 +119,13 @@ def _by_affine(camera: Camera, like: Camera) -> Augment:
     aim = _turn((*PLANNED[:2], 0.0)).float()
     augment = RandomAffine(roll, shift, (0.98 * scale, 1.02 * scale), p=1.0, padding_mode="border")
 
-    def by_affine(p: Pictures, generator: torch.Generator) -> Pictures:
+    def by_affine(p: Samples, generator: torch.Generator) -> Samples:
         image = augment(p.image)
         linear, step = augment.transform_matrix[:, :2, :2], augment.transform_matrix[:, None, :2, 2]
         keypoints = p.keypoints @ linear.mT + step
         turn = linear / torch.linalg.det(linear).sqrt()[:, None, None]
         points = p.points @ aim.T
         points = torch.cat([points[..., :2] @ turn.mT, points[..., 2:]], -1)
-        return Pictures(image, keypoints, points, p.seen & camera.contains(keypoints), None)
+        return Samples(image, keypoints, points, p.seen & camera.contains(keypoints), None)
 
     return by_affine

@@ -115,9 +115,9 @@ def _wall(along: Tensor, y: Tensor) -> Tensor:
     return torch.where(_between(y, RAIL, RAIL + 0.1) | (y > 1.13), _CREAM, albedo)
 
 
-def _framed(albedo: Tensor, a: Tensor, b: Tensor, box, picture: Tensor) -> Tensor:
+def _framed(albedo: Tensor, a: Tensor, b: Tensor, box, image: Tensor) -> Tensor:
     albedo = torch.where(_inside(a, b, box, -FRAME), _INK, albedo)
-    return torch.where(_inside(a, b, box), picture, albedo)
+    return torch.where(_inside(a, b, box), image, albedo)
 
 
 def _back_wall(x: Tensor, y: Tensor) -> Tensor:
@@ -139,11 +139,11 @@ def _left_wall(z: Tensor, y: Tensor) -> Tensor:
         for start in (2.67, 3.07):
             albedo = torch.where(_inside(z, y, (start, start + 0.32, low, high)), _PETROL * 1.5, albedo)
     albedo = torch.where((z - 2.61) ** 2 + (y - 0.25) ** 2 < 0.03**2, _BRASS, albedo)
-    picture = torch.where(_between(y + 0.35 * z, 0.15, 0.42), _MUSTARD, _CREAM)
-    picture = torch.where((z - 1.45) ** 2 + (y + 0.4) ** 2 < 0.28**2, _TERRACOTTA, picture)
-    picture = torch.where(_inside(z, y, (0.55, 0.95, -0.7, 0.1)), _TEAL, picture)
-    picture = torch.where(_inside(z, y, (1.05, 1.9, -0.02, 0.1)), _INK, picture)
-    return _framed(albedo, z, y, POSTER, picture)
+    image = torch.where(_between(y + 0.35 * z, 0.15, 0.42), _MUSTARD, _CREAM)
+    image = torch.where((z - 1.45) ** 2 + (y + 0.4) ** 2 < 0.28**2, _TERRACOTTA, image)
+    image = torch.where(_inside(z, y, (0.55, 0.95, -0.7, 0.1)), _TEAL, image)
+    image = torch.where(_inside(z, y, (1.05, 1.9, -0.02, 0.1)), _INK, image)
+    return _framed(albedo, z, y, POSTER, image)
 
 
 def _right_wall(z: Tensor, y: Tensor) -> Tensor:

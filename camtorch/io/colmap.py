@@ -146,7 +146,7 @@ def _camera(record: Record, name: str, size: tuple[int, int], values: list[float
         record.fail(f"{len(values)} parameters; {name} has {_parameters(name)}")
     if key == "equirectangular":
         if values != [size[1], size[0]]:
-            record.fail(f"a panorama of {values[0]:g} x {values[1]:g} in a picture of {size[1]} x {size[0]}")
+            record.fail(f"a panorama of {values[0]:g} x {values[1]:g} in an image of {size[1]} x {size[0]}")
         return record.camera(key, panorama(size), [], size)
     fx, fy = values[0], values[focals - 1]
     cx, cy, *distortion = values[focals:]

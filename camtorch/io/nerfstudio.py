@@ -106,7 +106,7 @@ def _equal(one: Record, other: Record) -> bool:
 
 
 def _focal(record: Record, axis: str, side: str) -> float | None:
-    """The focal length along an axis: as such, or by the angle of the picture."""
+    """The focal length along an axis: as such, or by the angle of the image."""
     if f"fl_{axis}" in record:
         return record[f"fl_{axis}"].number()
     for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180)):
@@ -150,7 +150,7 @@ def _pose(record: Record) -> Extrinsics:
 
 
 def panorama(size: tuple[int, int]) -> list[float]:
-    """The intrinsics of the equirectangular picture of the whole sphere."""
+    """The intrinsics of the equirectangular image of the whole sphere."""
     height, width = size
     return [width / (2 * math.pi), height / math.pi, width / 2 - 0.5, height / 2 - 0.5]
 

@@ -100,7 +100,7 @@ class Record:
         return int(number)
 
     def side(self) -> int:
-        """The width or the height of a picture."""
+        """The width or the height of an image."""
         return self.whole(1, LARGEST_SIDE, "number of pixels")
 
     def size(self) -> tuple[int, int]:

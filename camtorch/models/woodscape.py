@@ -38,7 +38,7 @@ class WoodScape(FTheta):
 
         Args:
             coefficients: k1, k2, k3, k4 in pixels.
-            offset: cx_offset, cy_offset: of the axis from the middle of the picture, in pixels.
+            offset: cx_offset, cy_offset: of the axis from the middle of the image, in pixels.
             image_size: (height, width) in pixels.
             aspect_ratio: the file's, by which it scales v.
         """

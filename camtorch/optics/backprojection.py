@@ -41,10 +41,10 @@ class AnglePerRadius:
         by_radius = torch.addcmul(ahead, t, slope[0], value=-2) / torch.addcmul(t, ahead, ahead)
         return factor, (by_radius - factor) / (2 * t + torch.finfo(t.dtype).tiny ** 0.5)
 
-    def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
         ahead = self.ahead(t)
-        return self.ahead.pull(t, -weight / torch.addcmul(t, ahead, ahead))
+        return self.ahead.vjp(t, -weight / torch.addcmul(t, ahead, ahead))
 
 
 class Flat(Perspective):
@@ -123,7 +123,7 @@ class Inverted(Chart):
             scale = scale + (1 - scale * radial(theta2 * scale * scale)) * step
         return scale
 
-    def pull_point(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
         rho2 = torch.addcmul(x * x, y, y)
         t = rho2 * scale * scale
         factor, slope = self._planar.radial.derivatives(t, 1)
@@ -133,7 +133,7 @@ class Inverted(Chart):
         # along times twice the derivative of the scale by rho2; what cancels at the axis is multiplied by rho2
         outwards = torch.addcmul(gz * z, along, scale) / -(rho2 + torch.finfo(z.dtype).tiny ** 0.5)
         ray = torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz
-        return ray, self._planar.radial.pull(t, -along * scale * by_angle) if want_parameters else []
+        return ray, self._planar.radial.vjp(t, -along * scale * by_angle) if want_parameters else []
 
     def on_plane(self, a, b):
         t = torch.addcmul(a * a, b, b)
@@ -147,10 +147,10 @@ class Inverted(Chart):
     def to_ray(self, a, b, order=2):
         return Equidistant().to_ray(*self._planar.at(a, b, order=0).value, order)
 
-    def pull_ray(self, a, b, gx, gy, gz, want_parameters):
+    def to_ray_vjp(self, a, b, gx, gy, gz, want_parameters):
         at = self._planar.at(a, b)
-        (ga, gb), _ = Equidistant().pull_ray(*at.value, gx, gy, gz, False)
-        return at.pull(ga, gb, want_parameters)
+        (ga, gb), _ = Equidistant().to_ray_vjp(*at.value, gx, gy, gz, False)
+        return at.vjp(ga, gb, want_parameters)
 
     def end(self, dtype):
         return FURTHEST

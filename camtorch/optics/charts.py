@@ -34,7 +34,7 @@ class Chart:
 
     The axis (0, 0, 1) is covered by every chart and lies at (0, 0).
 
-    Margins are positive where something holds. Methods named `pull` turn the cotangents of a result into those of
+    Margins are positive where something holds. Methods named `vjp` turn the cotangents of a result into those of
     what it was made from, to first order, with less work than autograd has.
     """
 
@@ -67,7 +67,7 @@ class Chart:
         scale = self.scale(x, y, z, order) if scale is None else scale
         return x * scale, y * scale
 
-    def pull_point(
+    def to_plane_vjp(
         self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
     ) -> tuple[Planes3, list[Tensor]]:
         """The cotangents of a covered ray and of the parameters, these summed over the rays, of that of its point."""
@@ -81,7 +81,7 @@ class Chart:
         """The unit ray of points on the plane; see `to_plane`."""
         raise NotImplementedError
 
-    def pull_ray(
+    def to_ray_vjp(
         self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
     ) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of a point on the plane and of the parameters, these summed, of the cotangent of its ray."""
@@ -103,7 +103,7 @@ class Chart:
         raise NotImplementedError
 
     def usual_end(self, dtype: torch.dtype) -> float | Tensor:
-        """The radius beyond which no picture reaches; inverses are tabulated up to there."""
+        """The radius beyond which no image reaches; inverses are tabulated up to there."""
         return self.end(dtype)
 
     def radii(self, count: int, like: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ class Perspective(Chart):
     def scale(self, x, y, z, order=2):
         return z.reciprocal()
 
-    def pull_point(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
         gx, gy = ga * scale, gb * scale
         return (gx, gy, torch.addcmul(gx * x, gy, y) * -scale), []
 
@@ -155,7 +155,7 @@ class Perspective(Chart):
         z = torch.addcmul(a * a + 1, b, b).rsqrt()
         return a * z, b * z, z
 
-    def pull_ray(self, a, b, gx, gy, gz, want_parameters):
+    def to_ray_vjp(self, a, b, gx, gy, gz, want_parameters):
         z = torch.addcmul(a * a + 1, b, b).rsqrt()
         along = z * z * torch.addcmul(torch.addcmul(gz, gx, a), gy, b)
         return (z * (gx - along * a), z * (gy - along * b)), []
@@ -178,7 +178,7 @@ class Equidistant(Chart):
     def scale(self, x, y, z, order=2):
         return angle_per_radius(torch.addcmul(x * x, y, y), z, order)
 
-    def pull_point(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
         rho2 = torch.addcmul(x * x, y, y)
         along = torch.addcmul(ga * x, gb, y)
         gz = -along / torch.addcmul(rho2, z, z)
@@ -194,7 +194,7 @@ class Equidistant(Chart):
         sinc = sinc_root(theta2, order)
         return a * sinc, b * sinc, cos_root(theta2, order)
 
-    def pull_ray(self, a, b, gx, gy, gz, want_parameters):
+    def to_ray_vjp(self, a, b, gx, gy, gz, want_parameters):
         theta2 = torch.addcmul(a * a, b, b)
         sinc, cos = sinc_root(theta2, 1), cos_root(theta2, 1)
         along = torch.addcmul(gx * a, gy, b) * (cos - sinc) / (theta2 + floor_of(a.dtype)) - gz * sinc

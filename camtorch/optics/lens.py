@@ -44,7 +44,7 @@ class Polynomial:
             for i, x in enumerate(taylor)
         )
 
-    def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
         sums = []
         for _ in self.parameters:
@@ -76,11 +76,11 @@ class Rational:
             ratio.append((n[i] - known) * reciprocal)
         return tuple(ratio)
 
-    def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient."""
         weight = weight / self.denominator(t)
-        above = self.numerator.pull(t, weight)
-        return above + self.denominator.pull(t, -weight * self(t))
+        above = self.numerator.vjp(t, weight)
+        return above + self.denominator.vjp(t, -weight * self(t))
 
 
 @dataclass
@@ -102,14 +102,14 @@ class Planar:
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
-        """All coefficients, in the order in which `pull` gives their cotangents."""
+        """All coefficients, in the order in which `vjp` gives their cotangents."""
         return *(self.radial.parameters if self.radial else ()), *self.tangential, *self.prism
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> PlanarAt:
         """The stage at points; see `PlanarAt`."""
         return PlanarAt(self, a, b, order, t)
 
-    def certify(self, radius: Tensor) -> Planes2:
+    def lower_bound(self, radius: Tensor) -> Planes2:
         """A lower bound of the eigenvalues of the Jacobian's symmetric part at that radius, and an upper bound of how
         far from the centre the points go. Where the first is positive, so are the determinant and the trace.
         """
@@ -152,8 +152,8 @@ class Tilt:
         """The stage at points."""
         return TiltAt(self, a, b)
 
-    def certify(self, radius: Tensor) -> Planes2:
-        """See `Planar.certify`; here the bound is one of the sense itself."""
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = self.parameters
         slope = torch.hypot(r20, r21)
         nearest = r22 - slope * radius
@@ -190,7 +190,7 @@ class Lens:
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
-        """Those of all stages, in the order in which `pull` gives their cotangents."""
+        """Those of all stages, in the order in which `vjp` gives their cotangents."""
         return tuple(p for stage in self.stages for p in stage.parameters)
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
@@ -200,11 +200,11 @@ class Lens:
         """The lens at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
         return LensAt(self.stages, a, b, order, t)
 
-    def certify(self, radius: Tensor) -> Tensor:
-        """(*B, S) ascending radii: positive where the sense is positive on the whole circle."""
+    def lower_bound(self, radius: Tensor) -> Tensor:
+        """(*B, S) ascending radii: positive where the orientation is positive on the whole circle."""
         bounds = []
         for stage in self.stages:
-            least, radius = stage.certify(radius)
+            least, radius = stage.lower_bound(radius)
             bounds.append(least)
             # the next stage sees what any smaller circle becomes as well
             radius = torch.cummax(radius, -1).values

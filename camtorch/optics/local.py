@@ -20,7 +20,7 @@ def total(plane: Tensor) -> Tensor:
     return plane.sum(-1, keepdim=True)
 
 
-def _sense(jacobian: Jacobian) -> Tensor:
+def _orientation(jacobian: Jacobian) -> Tensor:
     ua, ub, va, vb = jacobian
     # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
     return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
@@ -79,13 +79,13 @@ class PlanarAt:
         return ua, ub, va, vb
 
     @property
-    def sense(self) -> Tensor:
+    def orientation(self) -> Tensor:
         """Positive where the map is defined, regular and not turned over."""
-        sense = _sense(self.jacobian)
+        orientation = _orientation(self.jacobian)
         denominator = getattr(self.stage.radial, "denominator", None)
-        return sense if denominator is None else torch.minimum(sense, denominator(self.t))
+        return orientation if denominator is None else torch.minimum(orientation, denominator(self.t))
 
-    def pull(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of the point and of the parameters, these summed over the points."""
         stage, a, b, t = self.stage, self.a, self.b, self.t
         along = torch.addcmul(gu * a, gv, b)
@@ -104,7 +104,7 @@ class PlanarAt:
         point = torch.addcmul(ga, a, outwards), torch.addcmul(gb, b, outwards)
         if not want_parameters:
             return point, []
-        sums = stage.radial.pull(t, along) if stage.radial else []
+        sums = stage.radial.vjp(t, along) if stage.radial else []
         if stage.tangential or stage.prism:
             gu, gv = gu * t, gv * t
             even = total(gu), total(gv)
@@ -139,11 +139,11 @@ class TiltAt:
         return tuple(w * self.reciprocal for w in (ua, ub, va, vb))
 
     @property
-    def sense(self) -> Tensor:
+    def orientation(self) -> Tensor:
         """Positive where the map is defined, regular and not turned over."""
-        return torch.minimum(_sense(self.jacobian), self.depth)
+        return torch.minimum(_orientation(self.jacobian), self.depth)
 
-    def pull(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of the point and of the nine entries of R, these summed over the points."""
         ua, ub, va, vb = self.jacobian
         point = torch.addcmul(ua * gu, va, gv), torch.addcmul(ub * gu, vb, gv)
@@ -180,17 +180,17 @@ class LensAt:
         return chained
 
     @property
-    def sense(self) -> Tensor:
+    def orientation(self) -> Tensor:
         """The smallest of the stages: positive where the lens is defined, regular and not turned over."""
-        least = self.stages[0].sense
+        least = self.stages[0].orientation
         for stage in self.stages[1:]:
-            least = torch.minimum(least, stage.sense)
+            least = torch.minimum(least, stage.orientation)
         return least
 
-    def pull(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of the point and of the parameters, these summed over the points."""
         sums: list[Tensor] = []
         for stage in reversed(self.stages):
-            (gu, gv), here = stage.pull(gu, gv, want_parameters)
+            (gu, gv), here = stage.vjp(gu, gv, want_parameters)
             sums = here + sums
         return (gu, gv), sums

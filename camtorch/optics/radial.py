@@ -39,9 +39,9 @@ class RadiusPolynomial:
             return factor, slope
         return factor, slope, (by_radius[1] - 2 * slope) / (4 * radius * radius)
 
-    def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
-        return self.of_radius.pull(root(t), weight)
+        return self.of_radius.vjp(root(t), weight)
 
 
 class RadiusTable:
@@ -100,15 +100,15 @@ class RadiusTable:
         factor = zeroth / radius + share * (first + place * second + square * third)
         if not order:
             return (factor,)
-        sense = torch.where(behind, -1.0, 1.0)
-        by_radius = (sense * (first + 2 * place * second + 3 * square * third) - factor) / radius
+        orientation = torch.where(behind, -1.0, 1.0)
+        by_radius = (orientation * (first + 2 * place * second + 3 * square * third) - factor) / radius
         slope = by_radius / (2 * radius)
         if order == 1:
             return factor, slope
         twice = (2 * second + 6 * place * third - 2 * by_radius) / radius
         return factor, slope, (twice - 2 * slope) / (4 * radius * radius)
 
-    def pull(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
         radius, _, place, piece = self._at(t)
         weight, sums = weight / radius, []
@@ -152,10 +152,10 @@ def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
     middle = 3 * (after * secants[..., :-1] + before * secants[..., 1:])
     right = torch.cat((3 * secants[..., :1], middle, end), -1)
     slopes = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
-    # between pieces of different sense there is no slope
+    # between pieces of different orientation there is no slope
     turns = torch.cat((zero > 1, secants[..., :-1] * secants[..., 1:] <= 0, zero > 1), -1)
     neighbours = torch.stack((torch.cat((secants[..., :1], secants), -1), torch.cat((secants, secants[..., -1:]), -1)))
-    sense, least = neighbours[0].sign(), neighbours.abs().amin(0)
+    orientation, least = neighbours[0].sign(), neighbours.abs().amin(0)
     # from 0 to 3 a piece is monotone; a little less, and it is flat nowhere
-    ascending = torch.minimum(torch.maximum(slopes * sense, 0.25 * least), 2.5 * least) * sense
+    ascending = torch.minimum(torch.maximum(slopes * orientation, 0.25 * least), 2.5 * least) * orientation
     return torch.where(turns, 0.0, ascending)

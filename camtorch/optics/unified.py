@@ -84,7 +84,7 @@ class Unified(Chart):
         rho2, shifted, sphere, _ = self._shifted(x, y, z)
         return self._below(rho2, shifted, sphere).reciprocal()
 
-    def pull_point(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
         xi, alpha, beta = self._parts()
         rho2, shifted, sphere, distance = self._shifted(x, y, z)
         by_below = torch.addcmul(ga * x, gb, y) * -(scale * scale)

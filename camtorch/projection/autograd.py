@@ -83,7 +83,7 @@ class Project(Function):
         ctx.plain = []
         for block in _blocks(cameras, points):
             here, chart = block.here, block.domain.chart
-            ray = formulas.to_ray(chart, *_planes(points[here]))
+            ray = formulas.normalise(chart, *_planes(points[here]))
             scale = chart.scale(ray.x, ray.y, ray.z, 1)
             a, b, mask = formulas.see(ray, chart, block.domain.lens, block.domain, 1, scale)
             mask = formulas.both(ray.mask, mask, block.usable)
@@ -119,7 +119,7 @@ class Project(Function):
             shrink = mask = None
             gu, gv = by_pixels[0][here], by_pixels[1][here]
             if not plain:
-                x, y, z, shrink, _ = formulas.to_ray(chart, x, y, z)
+                x, y, z, shrink, _ = formulas.normalise(chart, x, y, z)
                 mask = valid[here].to(x.dtype)
                 x, y, z = (formulas.replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
                 # what comes back of an invalid point need not be finite
@@ -128,10 +128,10 @@ class Project(Function):
             at = block.domain.lens.at(*chart.to_plane(x, y, z, 1, scale))
             sums.add_intrinsics(block, gu, gv, *at.value)
             wanted = sums.wants_distortion
-            (ga, gb), by_lens = at.pull(gu * block.intrinsics[0], gv * block.intrinsics[1], wanted)
+            (ga, gb), by_lens = at.vjp(gu * block.intrinsics[0], gv * block.intrinsics[1], wanted)
             by_ray, by_chart = (), []
             if by_points is not None or (wanted and chart.parameters):
-                by_ray, by_chart = chart.pull_point(x, y, z, ga, gb, scale, wanted)
+                by_ray, by_chart = chart.to_plane_vjp(x, y, z, ga, gb, scale, wanted)
             sums.add_optics(block, by_chart + by_lens)
             if by_points is not None:
                 for i, w in enumerate(by_ray):
@@ -185,13 +185,13 @@ class Unproject(Function):
             if not bool(valid[here].all()):
                 # what comes back of an invalid pixel need not be finite
                 gx, gy, gz = (torch.where(valid[here], g, 0.0) for g in (gx, gy, gz))
-            (ga, gb), by_optics = block.domain.chart.pull_ray(a, b, gx, gy, gz, sums.wants_distortion)
+            (ga, gb), by_optics = block.domain.chart.to_ray_vjp(a, b, gx, gy, gz, sums.wants_distortion)
             at = block.domain.lens.at(a, b)
             if at.stages:
                 ua, ub, va, vb = at.jacobian
                 ga, gb = newton_step((ua, va, ub, vb), ga, gb)
                 if sums.wants_distortion:
-                    by_optics = by_optics + at.pull(-ga, -gb)[1]
+                    by_optics = by_optics + at.vjp(-ga, -gb)[1]
             sums.add_optics(block, by_optics)
             focal_x, focal_y, _, _ = block.intrinsics
             ga, gb = ga / focal_x, gb / focal_y

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._tracing import may_look
-from camtorch.projection.fold import AZIMUTHS, Azimuths, azimuth, first_loss, radial_sense
+from camtorch.projection.fold import AZIMUTHS, Azimuths, azimuth, first_loss, radial_orientation
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
@@ -84,14 +84,14 @@ class Domain:
         if self.lens.is_radial:
             inner = self._fold.to(self.k.dtype)
         else:
-            lost = first_loss(self.lens.certify(radii.expand(len(self.k), -1)))
+            lost = first_loss(self.lens.lower_bound(radii.expand(len(self.k), -1)))
             inner = radii[(lost - 1).floor().clamp(0, _RADII - 1).long()].unsqueeze(-1)
         inside = 1 - 4 * torch.finfo(inner.dtype).eps
         return (inner.clamp(max=self.chart.end(inner.dtype)) * inside) ** 2
 
     @_per_camera
     def limits2(self) -> Tensor:
-        """(C, azimuths): the squared radius, up to the next azimuth, before which the sense at the point decides."""
+        """(C, azimuths): the squared radius, up to the next azimuth, before which the orientation decides."""
         return self.azimuths.limits.clamp(max=self.chart.end(self.k.dtype)) ** 2
 
     @_per_camera
@@ -127,7 +127,7 @@ class Domain:
 def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
     """Positive where the lens is regular at the point itself, and its inverse has a derivative."""
     # nearer to zero the reciprocal could leave the floating-point range
-    return torch.nan_to_num(lens.at(a, b).sense, nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
+    return torch.nan_to_num(lens.at(a, b).orientation, nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
 
 
 def _precise(k: Tensor) -> Tensor:
@@ -140,12 +140,12 @@ def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float | T
     most: the largest image that is a number to calculate with.
     """
 
-    def sense(radius: Tensor) -> Tensor:
-        found, image = radial_sense(radial, radius), radius * radial(radius * radius)
+    def orientation(radius: Tensor) -> Tensor:
+        found, image = radial_orientation(radial, radius), radius * radial(radius * radius)
         return torch.where(image < most, found, -1.0)
 
     nodes = chart.radii(2 * _RADII, k).clamp(max=end).expand(len(k), -1)
-    lost = first_loss(sense(nodes)).unsqueeze(-1)
+    lost = first_loss(orientation(nodes)).unsqueeze(-1)
     some = lost < nodes.shape[-1]
 
     def node(index: Tensor) -> Tensor:
@@ -159,9 +159,9 @@ def _fold(radial: Polynomial | Rational, chart: Chart, k: Tensor, end: float | T
     for _ in range(2):
         inner = low + (high - low) * steps
         # the upper end counts as lost, whatever rounding says of it
-        first = (sense(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
+        first = (orientation(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
         low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
-    before, after = sense(low), sense(high)
+    before, after = orientation(low), orientation(high)
     crossing = (before > 0) & (after < 0)
     fraction = torch.where(crossing, before / torch.where(crossing, before - after, 1.0), 0.0)
     return torch.where(some, low + fraction * (high - low), end)

@@ -23,9 +23,9 @@ _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and 
 class Azimuths:
     """The lens of each camera on azimuths and radii of the chart's plane. Graph-free.
 
-    On each azimuth the sense of the lens (positive where it is regular) is followed outwards over the radii. It is
+    On each azimuth the orientation of the lens (positive where it is regular) is followed outwards. It is
     lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
-    dips below zero between them. Up to there the sense changes its sign once at the most, so that its
+    dips below zero between them. Up to there the orientation changes its sign once at the most, so that its
     value at the point itself tells exactly on which side of the fold the point lies.
 
     A lens that is not radial mostly folds where its radial factor does: there its radii are dense.
@@ -42,38 +42,40 @@ class Azimuths:
         at = lens.at(a.flatten(-2), b.flatten(-2))
         x, y = at.value
         shape = (self.count, self.radii.shape[-1])
-        lost = self._lost(lens, at.sense.unflatten(-1, shape))
+        lost = self._lost(lens, at.orientation.unflatten(-1, shape))
         self.limits = self._limits(lost)
         self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
 
-    def _lost(self, lens: Lens, sense: Tensor) -> Tensor:
+    def _lost(self, lens: Lens, orientation: Tensor) -> Tensor:
         """(C, azimuths): `first_loss`, where dips between coarse nodes count only if a closer look finds them."""
-        spared = torch.zeros_like(sense, dtype=torch.bool)
-        last = sense.shape[-1] - 1
-        a, b = (c.unsqueeze(-1) for c in _directions(self.count, sense))
-        steps = torch.linspace(-1, 1, _DIP, dtype=sense.dtype, device=sense.device)
+        spared = torch.zeros_like(orientation, dtype=torch.bool)
+        last = orientation.shape[-1] - 1
+        a, b = (c.unsqueeze(-1) for c in _directions(self.count, orientation))
+        steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
         while True:
-            lost = first_loss(sense, spared)
+            lost = first_loss(orientation, spared)
             node = lost.round().long().clamp(max=last).unsqueeze(-1)
-            assumed = (lost <= last).unsqueeze(-1) & (sense.gather(-1, node) > 0)
+            assumed = (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
             if not bool(assumed.any()):
                 return lost
             radius = _radius_at(self.radii.unsqueeze(-2), (node + steps).clamp(0, last).flatten(-2)).unflatten(
                 -1, (self.count, _DIP)
             )
-            seen = lens.at((a * radius).flatten(-2), (b * radius).flatten(-2)).sense.unflatten(-1, (self.count, _DIP))
+            seen = lens.at((a * radius).flatten(-2), (b * radius).flatten(-2)).orientation.unflatten(
+                -1, (self.count, _DIP)
+            )
             spared_now = assumed & (seen > 0).all(-1, keepdim=True)
             if not bool(spared_now.any()):
                 return lost
             spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
 
     def _limits(self, lost: Tensor) -> Tensor:
-        """(C, azimuths): the radius, up to the next azimuth, before which the sense at the point itself decides."""
+        """(C, azimuths): the radius, up to the next azimuth, before which the orientation decides."""
         limit = _radius_at(self.radii.unsqueeze(-2), lost)
         following = limit.roll(-1, -1)
         nearer, further = torch.minimum(limit, following), torch.maximum(limit, following)
-        # Between two azimuths the fold moves smoothly, and may bulge: the sense tells where it lies. Or it ends there:
-        # then the nearer one is on the safe side.
+        # Between two azimuths the fold moves smoothly, and may bulge: the orientation tells where it lies.
+        # Or it ends there: then the nearer one is on the safe side.
         smooth = ((lost - lost.roll(-1, -1)).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
         return torch.where(smooth, further * (1 + _BULGE), nearer)
 
@@ -131,7 +133,7 @@ def _around(radial: Polynomial | Rational | None, chart: Chart, fine: Tensor) ->
     """(C, radii): the chart's, and more of them the nearer to the fold of the radial factor, if it has one."""
     if radial is None:
         return chart.radii(_COARSE + _CLOSE, fine)
-    fold = _radius_at(fine, first_loss(radial_sense(radial, fine)).unsqueeze(-1))
+    fold = _radius_at(fine, first_loss(radial_orientation(radial, fine)).unsqueeze(-1))
     # without a fold on the chart, the middle of a chart does no harm
     fold = torch.where(fold < torch.inf, fold, 1.0)
     spread = 1 + 0.5 * torch.linspace(-1, 1, _CLOSE, dtype=fine.dtype, device=fine.device) ** 3
@@ -140,9 +142,9 @@ def _around(radial: Polynomial | Rational | None, chart: Chart, fine: Tensor) ->
     return torch.cat((coarse, close), -1).sort(-1).values
 
 
-def radial_sense(radial: Polynomial | Rational, radius: Tensor) -> Tensor:
+def radial_orientation(radial: Polynomial | Rational, radius: Tensor) -> Tensor:
     """Positive where a radial factor is defined, not turned over and ascends."""
-    return Planar(radial).certify(radius)[0]
+    return Planar(radial).lower_bound(radius)[0]
 
 
 def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
@@ -162,18 +164,18 @@ def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
     return torch.cummax(torch.where(before, reach, torch.inf), -1).values
 
 
-def first_loss(sense: Tensor, spared: Tensor | None = None) -> Tensor:
-    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where the sense is first lost; S where it never is.
+def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
+    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where it is first lost; S where it never is.
 
     spared: bool, the nodes next to which no dip is assumed.
     """
-    before, here, after = sense[..., :-2], sense[..., 1:-1], sense[..., 2:]
+    before, here, after = orientation[..., :-2], orientation[..., 1:-1], orientation[..., 2:]
     bend, tilt = before - 2 * here + after, before - after
     bend_safe = torch.where(bend > 0, bend, 1.0)
     dips = (bend > 0) & (tilt.abs() <= bend) & (here - tilt * tilt / (8 * bend_safe) <= 0)
     dips = dips if spared is None else dips & ~spared[..., 1:-1]
     offset = torch.where(dips & (here > 0), tilt / (2 * bend_safe), 0.0)
-    nodes = torch.arange(sense.shape[-1], dtype=sense.dtype, device=sense.device)
+    nodes = torch.arange(orientation.shape[-1], dtype=orientation.dtype, device=orientation.device)
     inner = torch.where(dips | ~(here > 0), nodes[1:-1] + offset, torch.inf)
-    ends = torch.where(sense[..., [0, -1]] > 0, torch.inf, nodes[[0, -1]])
-    return torch.cat((inner, ends), -1).amin(-1).clamp(max=sense.shape[-1])
+    ends = torch.where(orientation[..., [0, -1]] > 0, torch.inf, nodes[[0, -1]])
+    return torch.cat((inner, ends), -1).amin(-1).clamp(max=orientation.shape[-1])

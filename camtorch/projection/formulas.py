@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
 
-INVALID_PIXEL = -1.0  # outside every picture, so that `contains` is False for it as well
+INVALID_PIXEL = -1.0  # outside every image, so that `contains` is False for it as well
 # Between these sizes the formulas need no scaling
 _SMALL, _LARGE = 1e-3, 1e6
 
@@ -37,8 +37,8 @@ class Ray(NamedTuple):
     mask: Tensor | None
 
 
-class Pixels(NamedTuple):
-    """Pixels, and the mask of those that count, or None where all do."""
+class PlanePoints(NamedTuple):
+    """Points (u, v) of the plane, and the mask of those that count, or None where all do."""
 
     u: Tensor
     v: Tensor
@@ -81,7 +81,7 @@ def both(*masks: Tensor | None) -> Tensor | None:
     return product
 
 
-def to_ray(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> Ray:
+def normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> Ray:
     """Points as rays that the chart covers."""
     shrink = valid = None
     if may_look(x):
@@ -123,7 +123,7 @@ def _power_of_two(size: Tensor) -> Tensor:
     return (size.view(integer) & exponent).view(size.dtype)
 
 
-def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int, scale: Tensor | None = None) -> Pixels:
+def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int, scale: Tensor | None = None) -> PlanePoints:
     """Where the lens sends a ray on its own plane, the centre if it sends it nowhere.
 
     lens: it may carry a graph. domain: that of the same lens, without one. scale: the chart's, if it is known.
@@ -136,20 +136,20 @@ def see(ray: Ray, chart: Chart, lens: Lens, domain: Domain, order: int, scale: T
         a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
         a, b = lens.at(a, b, 0, t).value
         mask = both(mask, inside)
-    return Pixels(a, b, mask)
+    return PlanePoints(a, b, mask)
 
 
-def to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> Pixels:
+def to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> PlanePoints:
     """Pixels on the plane of the lens; the centre where they are no numbers, or so large that a square overflows."""
     focal_x, focal_y, centre_x, centre_y = intrinsics
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())
     limit = torch.finfo(far.dtype).max ** 0.25
     if may_look(far) and float(far.amax()) < limit:
-        return Pixels(p, q, None)
+        return PlanePoints(p, q, None)
     mask = (far < limit).to(far.dtype)
     p, q = ((torch.where(mask > 0, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
-    return Pixels(p, q, mask)
+    return PlanePoints(p, q, mask)
 
 
 def clean(mask: Tensor | None, found: Found) -> Planes2:

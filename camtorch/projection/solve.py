@@ -101,7 +101,7 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
     """Newton's method in the plane, from the inverse of the radial factor."""
     a, b = domain.lens.start(u, v)
     if domain.inverse is not None:
-        # a stage may have sent a pixel far off the picture out of the floating-point range
+        # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
     short2 = _short(u) ** 2
@@ -114,7 +114,7 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
         settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
         if count >= _PLANAR_STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
             break
-    # further out than pictures reach a determinant may overflow, and a step seem short
+    # further out than images reach a determinant may overflow, and a step seem short
     inside = domain.inner2.clamp(max=domain.chart.usual_end(u.dtype) ** 2) - t
     solved = torch.minimum(torch.minimum(settled, inside), _reciprocal(jacobian).abs())
     return Found(a, b, solved, torch.ones_like(a))

@@ -24,20 +24,20 @@ _LINE_SAMPLES = 257
 
 
 class Dewarp(Warp):
-    """Undistort pictures: a `Warp` from `camera` to an undistorted camera that it chooses, `dewarp.target`.
+    """Undistort images: a `Warp` from `camera` to an undistorted camera that it chooses, `dewarp.target`.
 
     Args:
         camera: the camera of the given images, with image_size; with a batch dim the target gets one as well.
         projection: "perspective" (straight lines stay straight; up to about 120 degrees), "cylindrical" (vertical lines
             do, for wide views) or "equirectangular" (everything).
         fov: horizontal field of view of the target in radians, centred on its axis. By default the target shows
-            what the picture's middle row and column show, and never more than 120 degrees in perspective.
+            what the image's middle row and column show, and never more than 120 degrees in perspective.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
         options: mode, padding_mode, fill, antialias and tolerance of `Warp`.
 
     The target has square pixels, is chosen once, and does not learn. It is finite for every camera, also where the
-    lens folds inside the picture or sees past 90 degrees.
+    lens folds inside the image or sees past 90 degrees.
 
     Raises:
         ValueError: an unknown projection, a fov outside (0, pi) for perspective or (0, 2 pi], and as `Warp`.
@@ -88,7 +88,7 @@ def _plane_width(projection: str, fov: float) -> float:
 
 
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:
-    """(*B, 4): the target that shows what the middle row and column of the camera's picture show."""
+    """(*B, 4): the target that shows what the middle row and column of the camera's image show."""
     model, widest, tallest = _PROJECTIONS[projection]
     height, width = camera.image_size
     like = {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}
@@ -116,7 +116,7 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     high = torch.where(some, torch.where(shown, plane, -torch.inf).amax(-2), 1.0)
     extent = torch.maximum(high - low, 1e-3 * limit)
     target = plane.new_tensor([size[1], size[0]])
-    # all that is shown fits in, unless that takes a wider picture than the widest
+    # all that is shown fits in, unless that takes a wider image than the widest
     sides = slice(None) if projection == "perspective" else slice(1)
     focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit))[sides].amax(-1)).unsqueeze(-1)
     centre = (target - 1) / 2 - focal * (low + high) / 2

@@ -1,4 +1,4 @@
-"""Where a warp samples: for every pixel of the target, a position on the source's picture, exact or from a lattice."""
+"""Where a warp samples: for every pixel of the target, a position on the source's image, exact or from a lattice."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-OUTSIDE = -9.0  # a sampling position that no picture reaches, not even with its interpolation margin
+OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
 _STRIP = 1 << 19  # pixels
 _FEWEST = 8  # cells along a side from which on a lattice pays
 _STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
-_MARGIN = 0.05  # of half a picture: what lies beyond is not sampled
+_MARGIN = 0.05  # of half an image: what lies beyond is not sampled
 _OVERSHOOT = 0.5  # of the range of its nodes by which a cubic may leave it: 0.27 along each axis
 _CUBIC = 3 / 128  # a cubic through four even nodes misses its middle by this part of their fourth difference
 
@@ -46,7 +46,7 @@ def on_lattice(
 
     Between nodes a cubic is laid through four of them along each axis. Cells where fourth differences say that this
     misses by more than the tolerance, and cells at the limit of what is mapped, are computed pixel by pixel. None if
-    that would be most of the picture.
+    that would be most of the image.
 
     Args:
         exact: see `Exact`.

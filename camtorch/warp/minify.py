@@ -1,4 +1,4 @@
-"""Pictures shrunk without false patterns: sampled in a pyramid of smaller pictures, at each pixel in the right one."""
+"""Images shrunk without false patterns: sampled in a pyramid of smaller images, at each pixel in the right one."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
 def sample_minified(images: Tensor, grid: Tensor, scale: Tensor, mode: str, padding_mode: str) -> Tensor:
     """`sample` of floating-point images, in which a pixel that covers n source pixels takes the mean of about as many.
 
-    The method is mip mapping (Williams, Pyramidal Parametrics, 1983): every level halves the picture by a triangle
+    The method is mip mapping (Williams, Pyramidal Parametrics, 1983): every level halves the image by a triangle
     filter, and between levels is interpolated.
 
     Args:
@@ -53,7 +53,7 @@ def sample_minified(images: Tensor, grid: Tensor, scale: Tensor, mode: str, padd
         half = [max(side // 2, 1) for side in images.shape[-2:]]
         images = F.interpolate(images, half, mode="bilinear", align_corners=False, antialias=True)
         smaller, share = sample(images, grid, mode, padding_mode), (level - n).clamp(0, 1).to(result)
-        # a picture without a share has no part either in what is not a number
+        # an image without a share has no part either in what is not a number
         blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
         result = torch.where(share > 0, blended, result)
     return result

@@ -1,4 +1,4 @@
-"""Pictures at positions: torch's grid_sample for every dtype and every kind of derivative."""
+"""Images at positions: torch's grid_sample for every dtype and every kind of derivative."""
 
 from __future__ import annotations
 
@@ -79,15 +79,15 @@ def as_fill(fill, owner: str) -> tuple[float, ...]:
 
 
 def coverage(images: Tensor, grid: Tensor, mode: str) -> Tensor:
-    """(B, 1, H', W'): what part of a sample comes from the picture, and not from the zeros around it."""
+    """(B, 1, H', W'): what part of a sample comes from the image, and not from the zeros around it."""
     return sample(torch.ones_like(images[:1, :1]).expand(len(grid), -1, -1, -1), grid, mode, "zeros")
 
 
 def _sample_in_parts(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
-    """`_sample_part` with work for every thread, of which grid_sample gives one to each picture.
+    """`_sample_part` with work for every thread, of which grid_sample gives one to each image.
 
-    Pictures that need another dtype go in parts, so that their copies stay in the cache; a part of fewer pictures than
-    threads goes picture by picture, in tiles of rows.
+    Images that need another dtype go in parts, so that their copies stay in the cache; a part of fewer images than
+    threads goes image by image, in tiles of rows.
     """
     threads = torch.get_num_threads()
     step = len(images) if images.dtype in (torch.float32, torch.float64) and len(images) >= threads else threads
@@ -98,13 +98,13 @@ def _sample_in_parts(images: Tensor, grid: Tensor, mode: str, padding_mode: str)
         if len(parts[0]) == step:
             parts[0].copy_(_sample_part(*parts[1:], mode, padding_mode))
         else:
-            for picture in zip(*parts, strict=True):
-                _sample_tiles(*picture, threads, mode, padding_mode)
+            for image in zip(*parts, strict=True):
+                _sample_tiles(*image, threads, mode, padding_mode)
     return result
 
 
 def _sample_tiles(result: Tensor, image: Tensor, grid: Tensor, count: int, mode: str, padding_mode: str) -> None:
-    """One picture (C, H, W) by tiles of rows that share it, and what rows are left over."""
+    """One image (C, H, W) by tiles of rows that share it, and what rows are left over."""
     height = len(grid) // count
     tiles = count * height
     if tiles:

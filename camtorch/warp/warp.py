@@ -22,7 +22,7 @@ _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integer
 
 
 class Warp(GeometryModule):
-    """The picture that `target` would see, made from the picture of `source`, both at one place.
+    """The image that `target` would see, made from the image of `source`, both at one place.
 
     Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are (B, C, H, W). Points, boxes and
     rays move from source to target. A batch of cameras or rotations, of size B, goes sample by sample with
@@ -34,9 +34,9 @@ class Warp(GeometryModule):
         rotation: (3, 3) or (B, 3, 3) rotation matrix; may require grad. None is no rotation.
         mode: "bilinear", "nearest" (masks, labels) or "bicubic".
         padding_mode: "zeros", "border" or "reflection", for pixels that the source sees outside its
-            picture. A pixel without a ray, or whose ray the source cannot map, always takes `fill`.
+            image. A pixel without a ray, or whose ray the source cannot map, always takes `fill`.
         fill: the value of pixels that show nothing, blended in at the rim of "zeros"; one, or one for each channel.
-        antialias: where the picture shrinks, a pixel takes the mean of what it covers, as wide in all directions as in
+        antialias: where the image shrinks, a pixel takes the mean of what it covers, as wide in all directions as in
             the widest; compiled down to a sixteenth. "nearest" does not.
         tolerance: pixels of the source by which sampling positions may be off, as far as fourth differences tell. From
             0.01 on they come from a lattice, several times as fast. Zero is exact; so are labels always, warps
@@ -90,7 +90,7 @@ class Warp(GeometryModule):
         else:
             self.register_buffer("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
 
-    # -- pictures
+    # -- images
 
     def forward(
         self,
@@ -100,7 +100,7 @@ class Warp(GeometryModule):
         padding_mode: str | None = None,
         fill: float | Sequence[float] | None = None,
     ) -> Tensor:
-        """Warp pictures.
+        """Warp images.
 
         Args:
             images: (B, C, H, W) of the source's image_size, floating point, integer or bool.
@@ -119,7 +119,7 @@ class Warp(GeometryModule):
             what = getattr(images, "dtype", type(images).__name__)
             raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}")
         if images.ndim != 4:
-            hint = "One picture goes in as image[None], masks without channels as masks[:, None]"
+            hint = "One image goes in as image[None], masks without channels as masks[:, None]"
             raise ValueError(f"Warp: images must be (B, C, H, W); got shape {tuple(images.shape)}. {hint}")
         size, expected = tuple(images.shape[-2:]), self.source.image_size
         if size != expected:
@@ -164,7 +164,7 @@ class Warp(GeometryModule):
         return self._sampling()[0].clone()
 
     def valid_mask(self) -> Tensor:
-        """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its picture."""
+        """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its image."""
         grid, mapped, _ = self._sampling()
         pixels = (grid.detach() + 1) * grid.new_tensor(self.source.image_size[::-1]) / 2 - 0.5
         return (mapped & self.source.contains(pixels)).unsqueeze(1)
@@ -232,11 +232,11 @@ class Warp(GeometryModule):
     # -- labels
 
     def transform_points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Move pixels (B, *N, 2), or (*N, 2) for cameras without batch, from the source's to the target's picture.
+        """Move pixels (B, *N, 2), or (*N, 2) for cameras without batch, from the source's to the target's image.
 
         Returns:
             pixels of the same shape, and valid (B, *N) bool: the source pixel has a ray, and the target sees
-            it on its picture. Pixels off the picture keep their place; those without one get (-1, -1).
+            it on its image. Pixels off the image keep their place; those without one get (-1, -1).
         """
         moved, mapped = self._move(pixels)
         return moved, mapped & self.target.contains(moved)
@@ -252,7 +252,7 @@ class Warp(GeometryModule):
 
         Returns:
             the boxes that enclose the moved outlines (curved: the edges are sampled), not clipped to the
-            picture, and valid (B, *N) bool: some part of the outline lies on the target's picture. A box
+            image, and valid (B, *N) bool: some part of the outline lies on the target's image. A box
             none of whose outline can be mapped is (-1, -1, -1, -1).
         """
         boxes = as_values(boxes, "boxes", "Warp", self.source.intrinsics.device)
@@ -280,7 +280,7 @@ class Warp(GeometryModule):
         return turn(self.rotation, rays, "rays")
 
     def inverse(self) -> Warp:
-        """The warp from target to source. What lay outside the picture, or between its pixels, stays lost."""
+        """The warp from target to source. What lay outside the image, or between its pixels, stays lost."""
         rotation = None if self.rotation is None else self.rotation.mT
         return Warp(self.target, self.source, rotation, **self.options)
 
