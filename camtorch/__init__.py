@@ -71,3 +71,8 @@ __all__ = [
     "load",
     "save",
 ]
+
+
+def __dir__() -> list[str]:
+    # packages that were imported on the way are not the public surface
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

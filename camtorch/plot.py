@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-import camtorch.analysis.difference
+from camtorch.analysis import difference as differences
 from camtorch.analysis.summary import fan, ideal, lattice
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     Raises:
         ValueError: a batch, no image size, or two different ones. ImportError: no matplotlib.
     """
-    compared = camtorch.difference.difference(a, b, remove_rotation=remove_rotation)
+    compared = differences.difference(a, b, remove_rotation=remove_rotation)
     height, width = a.image_size
     ax = _axes(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
@@ -161,7 +161,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     ax.figure.colorbar(image, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
     turned = ""
     if remove_rotation:
-        turned = f", turned by {math.degrees(camtorch.analysis.difference.angle(compared.rotation)):.3g} degrees"
+        turned = f", turned by {math.degrees(differences.angle(compared.rotation)):.3g} degrees"
     ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
     return ax
 

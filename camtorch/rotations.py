@@ -76,3 +76,25 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
     rows, lead, restore = as_rows(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
     rotation = rotation.to(rows.dtype).expand(*lead, 3, 3).reshape(-1, 3, 3)
     return restore(torch.stack(rotate_planes(rotation, rows.unbind(-1))))
+
+
+def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
+    """(*B, 3, 3), `ray_after = R ray_before`, of a camera that turns right, then looks up, then leans right.
+
+    Args:
+        yaw: (*B,) degrees, about the camera's y axis; pitch about its new x axis, roll about its new z axis.
+        pitch: likewise.
+        roll: likewise.
+    """
+    a, b, c = (torch.deg2rad(angle) for angle in (yaw, pitch, roll))
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+
+    def matrix(*entries: Tensor) -> Tensor:
+        return torch.stack(entries, -1).unflatten(-1, (3, 3))
+
+    turn = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
+    look = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
+    lean = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
+    # of the turned camera's axes as seen by the old one, transposed; sums, which autocast leaves in their precision
+    axes = (((turn[..., None] * look[..., None, :, :]).sum(-2))[..., None] * lean[..., None, :, :]).sum(-2)
+    return axes.mT

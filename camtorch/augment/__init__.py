@@ -9,7 +9,8 @@ from camtorch.augment.change import Change
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.fields import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.presets import PRESETS, Preset
-from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount, mount_rotation
+from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
+from camtorch.rotations import mount_rotation
 from camtorch.warp.polygons import outlines
 
 __all__ = [

@@ -16,7 +16,7 @@ from kornia.constants import Resample, SamplePadding
 from torch import Tensor
 
 from camtorch._module import Memo
-from camtorch.augment import random
+from camtorch.augment import random_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import collate, remade
 from camtorch.augment.change import Change
@@ -228,7 +228,7 @@ class RandomMount(_Random):
         as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
     """
 
-    _wraps = random.RandomMount
+    _wraps = random_camera.RandomMount
 
 
 class RandomLens(_Random):
@@ -237,7 +237,7 @@ class RandomLens(_Random):
     Args and Convention are as in `RandomMount`; after the camera comes `like`.
     """
 
-    _wraps = random.RandomLens
+    _wraps = random_camera.RandomLens
 
 
 class RandomCamera(_Random):
@@ -246,7 +246,7 @@ class RandomCamera(_Random):
     Args and Convention are as in `RandomMount`; after the camera comes `like`.
     """
 
-    _wraps = random.RandomCamera
+    _wraps = random_camera.RandomCamera
 
 
 def with_cameras(params, cameras: Camera | Sequence[Camera]):

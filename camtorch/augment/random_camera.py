@@ -16,6 +16,7 @@ from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import as_range
 from camtorch.camera import MODELS, Camera
+from camtorch.rotations import mount_rotation
 from camtorch.warp.warp import Warp
 
 
@@ -160,28 +161,6 @@ class RandomLens(RandomCamera):
     ):
         none = dict.fromkeys(("yaw", "pitch", "roll", "zoom", "crop"))
         super().__init__(like, fov=fov, focal=focal, centre=centre, distortion=distortion, **none, **options)
-
-
-def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
-    """(*B, 3, 3), `ray_after = R ray_before`, of a camera that turns right, then looks up, then leans right.
-
-    Args:
-        yaw: (*B,) degrees, about the camera's y axis; pitch about its new x axis, roll about its new z axis.
-        pitch: likewise.
-        roll: likewise.
-    """
-    a, b, c = (torch.deg2rad(angle) for angle in (yaw, pitch, roll))
-    zero, one = torch.zeros_like(a), torch.ones_like(a)
-
-    def matrix(*entries: Tensor) -> Tensor:
-        return torch.stack(entries, -1).unflatten(-1, (3, 3))
-
-    turn = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
-    look = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
-    lean = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
-    # of the turned camera's axes as seen by the old one, transposed; sums, which autocast leaves in their precision
-    axes = (((turn[..., None] * look[..., None, :, :]).sum(-2))[..., None] * lean[..., None, :, :]).sum(-2)
-    return axes.mT
 
 
 def _as_like(like: Camera | str | None, owner: str) -> Camera | None:

@@ -45,7 +45,7 @@ def add(commands) -> None:
 
 def _convert(arguments: argparse.Namespace) -> None:
     from camtorch.cli.cameras import read_rig
-    from camtorch.io import entry
+    from camtorch.io import formats
     from camtorch.rig import Rig
 
     path = arguments.output
@@ -74,10 +74,10 @@ def _convert(arguments: argparse.Namespace) -> None:
     # camtorch's own JSON holds every model; the format that the rig comes from may not
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, rig.extrinsics, images=rig.images, format=stays)
-    there = [name for name in entry.rendered(changed, path, arguments.format) if os.path.exists(name)]
+    there = [name for name in formats.rendered(changed, path, arguments.format) if os.path.exists(name)]
     if there and not arguments.force:
         raise ValueError(f"{', '.join(there)}: exists already; --force overwrites it")
-    entry.save(changed, path, arguments.format)
+    formats.save(changed, path, arguments.format)
     print("\n".join(notes))
 
 

@@ -21,7 +21,7 @@ _SHARP = 3  # marks are drawn that many times as large, and reduced
 _REACH = 0.35  # length of gaze arrows, as a part of the distance to the eyes
 
 
-def image(views: Sequence[LabelledImage], title: str, origin: str):
+def drawing(views: Sequence[LabelledImage], title: str, origin: str):
     """One Pillow image: the view before, and the others, `title` and `origin` above them."""
     from PIL import Image, ImageDraw, ImageFont
 
