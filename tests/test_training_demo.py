@@ -3,7 +3,7 @@ import pytest
 import torch
 from PIL import Image
 
-from camtorch.cli import main
+from camtorch.cli.main import main
 from camtorch.demo import cabin, training, training_data
 from camtorch.demo.training_data import PLANNED, TEACHERS, Samples
 
