@@ -18,6 +18,20 @@ def test_load_save_load_is_the_identity(name, tmp_path):
     assert again.format == rig.format
 
 
+@pytest.mark.parametrize("name", SAMPLES)
+def test_a_calibration_is_a_measurement(name):
+    rig = load(name)
+    for module in (*rig.cameras.values(), *rig.extrinsics.values()):
+        assert all(not p.requires_grad and p.dtype == torch.float64 for p in module.parameters())
+        assert not any(t.requires_grad for t in module.buffers())
+    for camera in rig.cameras.values():
+        pixels, _ = camera.project(float64(POINT))
+        assert not pixels.requires_grad
+        pixels, _ = camera.requires_grad_().project(float64(POINT))
+        pixels.sum().backward()
+        assert camera.intrinsics.grad is not None
+
+
 @pytest.mark.parametrize("format", SUFFIXES)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_what_was_loaded_is_written_as_any_format_that_holds_it(name, format, tmp_path):

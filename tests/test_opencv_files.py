@@ -47,6 +47,7 @@ def test_brown_conrady(name):
     assert camera.intrinsics.tolist() == [1064.3, 1065.1, 641.7, 396.4]
     assert camera.distortion.tolist() == [-0.3021, 0.1254, 0.00021, -0.00017, -0.0289]
     assert camera.image_size == (800, 1280)
+    assert not any(p.requires_grad for p in camera.parameters())
 
 
 def test_fisheye_flag_means_kannala_brandt():

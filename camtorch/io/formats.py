@@ -45,7 +45,9 @@ _IN_A_FOLDER = ("cameras.bin", "cameras.txt", "transforms.json")
 
 
 def load(path, format: str | None = None) -> Rig:
-    """The cameras of a calibration file, in float64, with their poses.
+    """The cameras of a calibration file, in float64 and frozen, with their poses.
+
+    A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
 
     Args:
         path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal or camtorch; or the folder
@@ -73,6 +75,8 @@ def load(path, format: str | None = None) -> Rig:
         raise CameraFileError(path, "content", f"cannot be read: {type(error).__name__}: {error}") from None
     if not rig.cameras:
         raise CameraFileError(path, "cameras", "none")
+    for module in (*rig.cameras.values(), *rig.extrinsics.values()):
+        module.requires_grad_(False)
     rig.format = format
     return rig
 

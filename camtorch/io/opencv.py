@@ -39,7 +39,7 @@ _PAIRS = (["1", "2"], ["left", "right"])
 
 
 def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
-    """The camera of an OpenCV YAML, JSON or XML file, in float64.
+    """The camera of an OpenCV YAML, JSON or XML file, in float64 and frozen.
 
     Args:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`) and, where it has them,
@@ -55,7 +55,7 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
     """
     if model is not None and model not in MODELS:
         raise ValueError(f"unknown model {model!r}; known are {', '.join(sorted(MODELS))}")
-    return _File(Record(path, read_mapping(path))).camera(model, name)
+    return _File(Record(path, read_mapping(path))).camera(model, name).requires_grad_(False)
 
 
 def matches(keys: dict) -> bool:
