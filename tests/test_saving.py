@@ -159,6 +159,96 @@ def test_a_crash_leaves_the_old_file(function, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.fixture
+def reconstruction(tmp_path):
+    """COLMAP's files of a camera and a pose, and another rig of the same names."""
+    one, other = (
+        ct.Rig({"1": camera("pinhole", core=[focal, focal, 320, 240])}, {"a.jpg": pose}, images={"a.jpg": "1"})
+        for focal, pose in (
+            (500.0, ct.Extrinsics([0, 0, 0.1], [0, 0, 1])),
+            (600.0, ct.Extrinsics([0, 0, 0.2], [0, 0, 2])),
+        )
+    )
+    ct.save(one, tmp_path, "colmap")
+    return tmp_path, ct.load(tmp_path), other
+
+
+def failing(function, at):
+    """A function that raises at its call of that number, counted from 0."""
+    calls = iter(range(100))
+
+    def call(*arguments):
+        if next(calls) == at:
+            raise OSError("no space left")
+        return function(*arguments)
+
+    return call
+
+
+@pytest.mark.parametrize("function", ["replace", "fsync", "open"])
+@pytest.mark.parametrize("at", range(4))
+def test_files_that_belong_together_change_together(function, at, reconstruction, monkeypatch):
+    folder, before, other = reconstruction
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with monkeypatch.context() as patch:
+        patch.setattr(os, function, failing(getattr(os, function), at))
+        try:
+            ct.save(other, folder, "colmap")
+        except OSError:
+            assert {path.name: path.read_bytes() for path in folder.iterdir()} == files
+            assert_same(ct.load(folder), before)
+        else:
+            assert at >= 2  # two files, opened and flushed once each
+            assert len(list(folder.iterdir())) == len(files)
+            assert ct.load(folder).camera.intrinsics[0] == 600
+
+
+@pytest.mark.parametrize("at", range(4))
+def test_a_crash_leaves_no_mixture(at, reconstruction):
+    """Where the process dies at one of the renames: the old or the new rig, or an error that says so."""
+    folder, _, other = reconstruction
+    ct.save(other, folder / "other.json")
+    code = f"""
+import os, camtorch as ct
+rename, count = os.replace, iter(range(100))
+os.replace = lambda *names: os._exit(7) if next(count) == {at} else rename(*names)
+ct.save(ct.load({str(folder / "other.json")!r}), {str(folder)!r}, "colmap")
+"""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 7
+    try:
+        found = ct.load(folder / "cameras.txt")
+    except (ct.CameraFileError, FileNotFoundError) as error:
+        reasons = ["No such file", "an interrupted save left .images.txt."]
+        assert at > 0 and any(reason in str(error) for reason in reasons)  # noqa: PT017, PT018
+    else:
+        pair = found.camera.intrinsics[0].item(), found.extrinsics["a.jpg"].translation[2].item()
+        assert pair in ((500, 1), (600, 2))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX modes")
+def test_the_umask_is_the_kernels_matter(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "umask", None)
+    ct.save(camera(), tmp_path / "new.json")
+    (tmp_path / "other").touch()
+    assert (tmp_path / "new.json").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX modes")
+def test_what_is_private_is_so_while_it_is_written(tmp_path, monkeypatch):
+    path, seen = tmp_path / "camera.json", []
+    path.touch(mode=0o600)
+    monkeypatch.setattr(os, "fsync", lambda handle: seen.append(stat.S_IMODE(os.fstat(handle).st_mode)))
+    ct.save(camera(), path)
+    assert seen == [0o600]
+
+
+@pytest.mark.parametrize("name", ["\U0001f4f7" * 50 + ".json", "a" * 240 + ".json"])
+def test_names_as_long_as_file_systems_allow(name, tmp_path):
+    ct.save(camera(), tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX modes and links")
 def test_mode_and_links_stay(tmp_path):
     path, link = tmp_path / "camera.json", tmp_path / "link.json"
@@ -169,8 +259,12 @@ def test_mode_and_links_stay(tmp_path):
     assert link.is_symlink()
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
     assert_same(ct.load(path), ct.Rig({"camera": camera()}))
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileNotFoundError, match=r"no such folder: '.*nowhere'"):
         ct.save(camera(), tmp_path / "nowhere" / "camera.json")
+    (tmp_path / "dangling.json").symlink_to(tmp_path / "target.json")
+    ct.save(camera(), tmp_path / "dangling.json")
+    assert (tmp_path / "dangling.json").is_symlink()
+    assert_same(ct.load(tmp_path / "target.json"), ct.Rig({"camera": camera()}))
 
 
 # -- which format

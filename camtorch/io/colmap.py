@@ -16,7 +16,7 @@ from camtorch.io import colmap_images
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import read_bytes, read_text
 from camtorch.io.record import Record
-from camtorch.io.writing import Lossy, number
+from camtorch.io.writing import Lossy, left_over, number
 from camtorch.rig import Rig
 
 # model -> id, key, how many focal lengths, how many coefficients; where a smaller model comes first
@@ -63,6 +63,9 @@ def read(path, text: str | None = None) -> Rig:
         cameras = _from_text(path, read_text(path) if text is None else text)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
+        lost = None if beside is None else left_over(beside)
+        if lost is not None:
+            Record(beside, None, "file").fail(f"missing; an interrupted save left {lost}: rename it, or delete it")
         return Rig(cameras)
     extrinsics, images = {}, {}
     for image in colmap_images.read(beside):

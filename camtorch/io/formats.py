@@ -10,7 +10,7 @@ from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerf
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, read_text
 from camtorch.io.record import Record
-from camtorch.io.writing import write_atomically
+from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
 # what has keys and values, in the order in which their keys are tried
@@ -111,11 +111,14 @@ def save(rig: Rig | Camera, path, format: str | None = None) -> None:
         CameraFileError: something that the format cannot hold; it says what would be lost.
         ValueError: an unknown format, or a suffix that does not say which. OSError: it cannot be written.
     """
-    for name, content in rendered(rig, path, format).items():
+    contents = rendered(rig, path, format)
+    for name in contents:
         folder = os.path.dirname(name)
         if os.path.normpath(folder or ".") == os.path.normpath(path):
             os.makedirs(folder, exist_ok=True)
-        write_atomically(name, content)
+    with replacing(*contents) as files:
+        for file, content in zip(files, contents.values(), strict=True):
+            file.write(content)
 
 
 def rendered(rig: Rig | Camera, path, format: str | None = None) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""What all writers share: what a format cannot hold is an error, numbers keep their last bit, files are whole."""
+"""Writing files: as a whole or not at all (`replacing`), numbers to the last bit, and what a format cannot hold."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import json
 import math
 import os
 import re
+import secrets
 import stat
-import tempfile
-from collections.abc import Collection, Sequence
-from typing import NoReturn
+from collections.abc import Collection, Iterator, Sequence
+from typing import IO, NoReturn
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -19,32 +19,95 @@ from camtorch.io._errors import CameraFileError
 from camtorch.rig import Rig
 
 
-def write_atomically(path, content: bytes) -> None:
-    """Write a file so that, whatever happens, the old or the new content stands there whole."""
-    path = os.path.realpath(path)
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise OSError(errno.EINVAL, "no ordinary file, which could be replaced", path)
-    handle, temporary = tempfile.mkstemp(dir=os.path.dirname(path), prefix=f".{os.path.basename(path)[:100]}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
+@contextlib.contextmanager
+def replacing(*paths: str | os.PathLike[str]) -> Iterator[list[IO[bytes]]]:
+    """Open files to write that take the places of `paths` together at the end of the block; on any error none does.
+
+    All is on the disk before the first place changes. Where a path is a link, what it points to is replaced, and the
+    link stays. Files keep their rights; new ones get those that the process gives to new files.
+
+    Of several files the old ones are moved aside first: a crash leaves some of them missing, and `left_over` finds
+    where they are, but never new ones beside old ones.
+
+    Raises:
+        OSError: no such folder, a place that is taken by anything but an ordinary file, a full disk.
+    """
+    targets = [os.path.realpath(path) for path in paths]
+    with contextlib.ExitStack() as stack:
+        files, new = [], {}  # new: target -> the file beside it
+        for target in targets:
+            file, new[target] = _opened_beside(target)
+            stack.callback(_unlink, new[target])
+            files.append(stack.enter_context(file))
+        yield files
+        for file in files:
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, _mode(path))
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
+            file.close()
+        if len(targets) == 1:
+            os.replace(new[target], target)
+        else:
+            _replace_together(new)
 
 
-def _mode(path: str) -> int:
+def _replace_together(new: dict[str, str]) -> None:
+    """Rename files to the targets that are their keys."""
+    old, placed = {}, []
     try:
-        return stat.S_IMODE(os.stat(path).st_mode)
+        for target in filter(os.path.exists, new):
+            name = _beside(target)
+            os.replace(target, name)
+            old[target] = name
+        for target, name in new.items():
+            os.replace(name, target)
+            placed.append(target)
+    except BaseException:
+        for target in placed:
+            _unlink(target)
+        for target, name in old.items():
+            os.replace(name, target)
+        raise
+    for name in old.values():
+        _unlink(name)
+
+
+def left_over(path: str) -> str | None:
+    """A file beside `path` that a crash within `replacing` left there: the old one, or the new one."""
+    folder, name = os.path.split(path)
+    pattern = re.compile(re.escape(f".{name[:_SHOWN]}.") + "[0-9a-f]{16}[.]part")
+    return min(filter(pattern.fullmatch, os.listdir(folder or ".")), default=None)
+
+
+_SHOWN = 20  # characters of a name, which file systems allow 255 bytes
+
+
+def _beside(path: str) -> str:
+    folder, name = os.path.split(path)
+    return os.path.join(folder, f".{name[:_SHOWN]}.{secrets.token_hex(8)}.part")
+
+
+def _opened_beside(path: str) -> tuple[IO[bytes], str]:
+    """An empty file beside `path` with the rights of the file that it will replace, or of a new one; and its name."""
+    folder, name = os.path.dirname(path), _beside(path)
+    if not os.path.isdir(folder):
+        raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
+    try:
+        mode = os.stat(path).st_mode
     except FileNotFoundError:
-        mask = os.umask(0)  # there is no way to read it without setting it
-        os.umask(mask)
-        return 0o666 & ~mask
+        mode = None
+    if mode is not None and not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "no ordinary file, which could be replaced", path)
+    # 0o666 is what the kernel takes the umask from
+    rights = 0o666 if mode is None else stat.S_IMODE(mode)
+    handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), rights)
+    if mode is not None:
+        os.chmod(name, rights)
+    return os.fdopen(handle, "w+b"), name
+
+
+def _unlink(path: str) -> None:
+    with contextlib.suppress(OSError):
+        os.unlink(path)
 
 
 # -- numbers and texts
