@@ -7,13 +7,13 @@ import operator
 from collections.abc import Callable, Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch._tracing import is_concrete
 
 
 def as_real(value, name: str, owner: str) -> Tensor:
-    """A floating-point tensor of finite numbers: the tensor itself, or made of a list or an array.
+    """A floating-point tensor of finite numbers: the tensor itself, or made of an array, a list, or a list of arrays.
 
     Lists and integers take torch's default dtype, arrays and tensors keep theirs.
 
@@ -25,7 +25,8 @@ def as_real(value, name: str, owner: str) -> Tensor:
         if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
             raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
         try:
-            value = torch.as_tensor(value)
+            stacked = isinstance(value, (list, tuple)) and all(getattr(v, "ndim", 0) for v in value) and len(value)
+            value = torch.stack([torch.as_tensor(v) for v in value]) if stacked else torch.as_tensor(value)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(
                 f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
@@ -37,6 +38,28 @@ def as_real(value, name: str, owner: str) -> Tensor:
     if is_concrete(value) and not bool(torch.isfinite(value).all()):
         raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
     return value
+
+
+def as_vectors(value, name: str, owner: str) -> Tensor:
+    """(*B, 3) vectors, as a tensor of finite numbers: OpenCV's columns (*B, 3, 1) and its array (1, 3) are vectors too.
+
+    A tensor (1, 3) is a batch of one.
+
+    Raises:
+        TypeError: not real numbers. ValueError: another shape, NaN or infinite values.
+    """
+    vectors = as_real(value, name, owner)
+    if vectors.ndim > 1 and vectors.shape[-2:] == (3, 1):
+        flat = vectors.squeeze(-1)
+    elif vectors.shape == (1, 3) and not isinstance(value, (Tensor, list, tuple)):
+        flat = vectors[0]
+    elif vectors.ndim and vectors.shape[-1] == 3:
+        return vectors
+    else:
+        raise ValueError(f"{owner}: {name} must be (*B, 3); got shape {tuple(vectors.shape)}")
+    if isinstance(value, nn.Parameter):  # the module could not own it
+        raise ValueError(f"{owner}: the Parameter {name} must be (*B, 3); got shape {tuple(vectors.shape)}")
+    return flat
 
 
 def as_image_size(value, owner: str) -> tuple[int, int] | None:
@@ -70,6 +93,23 @@ def as_whole(value, name: str, owner: str) -> int:
         raise TypeError(f"{owner}: {name} must be a whole number of pixels; got {value!r}") from None
 
 
+def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
+    """The shape that all shapes broadcast to. torch.broadcast_shapes imports sympy, for a third of a second.
+
+    Raises:
+        ValueError: there is none.
+    """
+    shape: list[int] = []
+    for other in shapes:
+        shape = [1] * (len(other) - len(shape)) + shape
+        for i, side in enumerate(other, len(shape) - len(other)):
+            if side != shape[i] and side != 1:
+                if shape[i] != 1:
+                    raise ValueError(f"shapes {', '.join(str(tuple(s)) for s in shapes)} do not broadcast")
+                shape[i] = side
+    return torch.Size(shape)
+
+
 def as_batch(owner: str, **shapes: Sequence[int]) -> torch.Size:
     """The batch dims, all but the last, that the named shapes broadcast to.
 
@@ -77,8 +117,8 @@ def as_batch(owner: str, **shapes: Sequence[int]) -> torch.Size:
         ValueError: they do not.
     """
     try:
-        return torch.broadcast_shapes(*(shape[:-1] for shape in shapes.values()))
-    except RuntimeError:
+        return broadcast_shapes(*(shape[:-1] for shape in shapes.values()))
+    except ValueError:
         named = " and ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
         raise ValueError(f"{owner}: the batch dims of {named} do not fit together") from None
 
@@ -126,9 +166,9 @@ def as_rows(
     lead, rest = values.shape[: len(batch)], values.shape[len(batch) : -1]
     try:
         if len(lead) < len(batch) or values.ndim <= len(batch):
-            raise RuntimeError
-        lead = lead if lead == batch else torch.broadcast_shapes(lead, batch)
-    except RuntimeError:
+            raise ValueError
+        lead = lead if lead == batch else broadcast_shapes(lead, batch)
+    except ValueError:
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}") from None
     rows = values.to(working_dtype(values, *parameters))
     if rows.shape[: len(lead)] != lead:

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_batch, as_image_size, as_real, as_rows, as_values, as_whole, columns
+from camtorch._arguments import (
+    as_batch,
+    as_image_size,
+    as_real,
+    as_rows,
+    as_values,
+    as_whole,
+    broadcast_shapes,
+    columns,
+)
 from camtorch._module import GeometryModule, Memo
 from camtorch._tracing import has_tangent, in_transform, is_concrete, may_look
 from camtorch.convert.conversion import Conversion, convert
@@ -42,7 +51,8 @@ class Camera(GeometryModule):
         intrinsics: (*B, 4) fx, fy, cx, cy in pixels.
         distortion: (*B, n) coefficients in the order of `distortion_names`; those of `ideal`, which are zeros unless
             the model says otherwise, if left out.
-        image_size: (height, width) in pixels, shared by the batch; needed only where an image is concerned.
+        image_size: (height, width) in pixels, as `image.shape` and not OpenCV's (width, height); shared by the batch,
+            needed only where an image is concerned.
 
     Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s of the shapes above. An `nn.Parameter`
     and a tensor that requires grad are kept as they are, so that gradients reach the network that predicted
@@ -92,6 +102,7 @@ class Camera(GeometryModule):
         intrinsics = as_real(intrinsics, "intrinsics", owner)
         if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
             hint = f". For a matrix K use {owner}.from_matrix" if intrinsics.shape[-2:] == (3, 3) else ""
+            hint = ". A column goes in as intrinsics[..., 0]" if intrinsics.shape[-2:] == (4, 1) else hint
             raise ValueError(
                 f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
             )
@@ -102,11 +113,14 @@ class Camera(GeometryModule):
             distortion = ideal.expand(*intrinsics.shape[:-1], self.default_count)
         distortion = as_real(distortion, "distortion", owner)
         names = self.names_of(distortion.shape[-1]) if distortion.ndim else None
-        if names is None:
+        in_doubt = self._is_column(distortion) and intrinsics.shape[:-1] != distortion.shape[:-1]
+        batch = None if names is None else as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
+        if names is None or batch is None or in_doubt:
+            hint = self._column_hint(distortion) if in_doubt else ""
             raise ValueError(
                 f"{owner}: distortion must be (*B, n) with {self.counts_text()}; got shape {tuple(distortion.shape)}"
+                + hint
             )
-        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
         defined = self.defined(distortion.unbind(-1))
         if defined is not None and is_concrete(distortion) and not bool((defined > 0).all()):
             raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
@@ -118,10 +132,17 @@ class Camera(GeometryModule):
 
     @classmethod
     def from_matrix(cls, K, distortion=None, *, image_size=None, ignore_skew: bool = False) -> Self:  # noqa: N803
-        """A camera from its (*B, 3, 3) matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+        """A camera from its matrix, as OpenCV's calibrations give it.
+
+        Args:
+            K: (*B, 3, 3) [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
+            distortion: (*B, n) coefficients; beside a single matrix, OpenCV's (n, 1) and (1, n) are one camera's too.
+            image_size: (height, width) in pixels; OpenCV says (width, height).
+            ignore_skew: drop the skew K[0, 1], which no model here has.
 
         Raises:
-            ValueError: not such a matrix, or a skew (its K[0, 1]) that is not zero and not to be ignored.
+            ValueError: not such a matrix, or a skew that is not zero and not to be ignored; a column (n, 1) of
+                coefficients beside a batch of matrices.
         """
         K = as_real(K, "K", cls.__name__)  # noqa: N806
         if K.shape[-2:] != (3, 3):
@@ -139,13 +160,35 @@ class Camera(GeometryModule):
         intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
         if distortion is None:
             return cls(intrinsics, image_size=image_size)
+        distortion = as_real(distortion, "distortion", cls.__name__)
+        if K.ndim == 2 == distortion.ndim and 1 in distortion.shape:
+            distortion = distortion.flatten()
+        elif cls._is_column(distortion):
+            raise ValueError(
+                f"{cls.__name__}: distortion {tuple(distortion.shape)} beside K {tuple(K.shape)} leaves a doubt"
+                + cls._column_hint(distortion)
+            )
         return cls(intrinsics, distortion, image_size=image_size)
+
+    @classmethod
+    def _is_column(cls, distortion: Tensor) -> bool:
+        """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
+        count = distortion.shape[-2] if distortion.ndim > 1 and distortion.shape[-1] == 1 else 1
+        return count > 1 and cls.names_of(count) is not None
+
+    @staticmethod
+    def _column_hint(distortion: Tensor) -> str:
+        count = distortion.shape[-2]
+        return (
+            f". The {count} coefficients of one lens, a column in OpenCV, are distortion[..., 0]; one coefficient of "
+            f"each of {count} cameras goes with intrinsics ({count}, 4)"
+        )
 
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the parameters."""
         shapes = self.intrinsics.shape[:-1], self.distortion.shape[:-1]
-        return shapes[0] if shapes[0] == shapes[1] else torch.broadcast_shapes(*shapes)
+        return shapes[0] if shapes[0] == shapes[1] else broadcast_shapes(*shapes)
 
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name for it)

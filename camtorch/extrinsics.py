@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_batch, as_real, as_rows, columns
+from camtorch._arguments import as_batch, as_real, as_rows, as_vectors, broadcast_shapes, columns
 from camtorch._module import GeometryModule
 from camtorch._tracing import is_concrete
-from camtorch.rotations import check_rotation, rotate_planes, rotation_matrix, rotation_vector
+from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
 
 class Extrinsics(GeometryModule):
@@ -16,24 +17,35 @@ class Extrinsics(GeometryModule):
     is a world-to-pixel layer.
 
     Args:
-        rotation: (*B, 3) rotation vectors, axis times angle in radians.
+        rotation: (*B, 3) rotation vectors, axis times angle in radians, or (*B, 3, 3) rotation matrices.
         translation: (*B, 3): the world's origin seen from the camera. The camera stands at `position` = -R^T t.
+
+    Vectors may have OpenCV's shapes: columns (*B, 3, 1), an array (1, 3), a list of V such arrays as a batch of V. A
+    tensor (1, 3) is a batch of one. What has the shape of matrices is taken as matrices where they are rotations or the
+    translation has a dim less; where three vectors (3, 3) beside three translations form a rotation matrix, that is an
+    error that says how to say it.
 
     Plain values become new Parameters; a tensor that requires grad is kept as it is. Gradients are exact at
     zero rotation as well.
 
     Raises:
-        ValueError: a shape that is not (*B, 3), batch dims that do not fit, NaN or infinite values.
+        ValueError: another shape, matrices that are no rotations, batch dims that do not fit, NaN or infinite values.
         TypeError: values that are not numbers.
     """
 
+    rotation: Tensor
+    translation: Tensor
+
     def __init__(self, rotation, translation):
         super().__init__()
-        rotation = as_real(rotation, "rotation", "Extrinsics")
-        translation = as_real(translation, "translation", "Extrinsics")
-        for name, value in (("rotation", rotation), ("translation", translation)):
-            if value.ndim == 0 or value.shape[-1] != 3:
-                raise ValueError(f"Extrinsics: {name} must be (*B, 3); got shape {tuple(value.shape)}")
+        translation = as_vectors(translation, "translation", "Extrinsics")
+        if isinstance(rotation, (list, tuple)):
+            rotation = as_real(rotation, "rotation", "Extrinsics")
+        # columns (3, 3, 1) are vectors without a doubt
+        undecided = tuple(getattr(rotation, "shape", ()))[-2:] == (3, 3)
+        rotation = as_vectors(rotation, "rotation", "Extrinsics")
+        if undecided and _are_matrices(rotation, translation):
+            rotation = rotation_vector(rotation)
         shape = (*as_batch("Extrinsics", rotation=rotation.shape, translation=translation.shape), 3)
         self.hold("rotation", rotation, shape)
         self.hold("translation", translation, shape)
@@ -41,7 +53,7 @@ class Extrinsics(GeometryModule):
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the pose."""
-        return torch.broadcast_shapes(self.rotation.shape, self.translation.shape)[:-1]
+        return broadcast_shapes(self.rotation.shape, self.translation.shape)[:-1]
 
     def forward(self, points_world: Tensor) -> Tensor:
         """World points (*B, *N, 3) to the camera frame, same shape."""
@@ -59,26 +71,46 @@ class Extrinsics(GeometryModule):
         return torch.cat((top, bottom), -2)
 
     @classmethod
-    def from_matrix(cls, matrix) -> Extrinsics:
-        """From (*B, 4, 4) or (*B, 3, 4) matrices [[R, t], ...].
+    def from_matrix(cls, matrix, translation=None) -> Extrinsics:
+        """From matrices.
+
+        Args:
+            matrix: (*B, 4, 4) or (*B, 3, 4) matrices [[R, t], ...]; or R, (*B, 3, 3), beside a translation; or both
+                as a pair (R, t).
+            translation: (*B, 3), or of OpenCV's shapes.
 
         Raises:
             ValueError: another shape, a last row that is not (0, 0, 0, 1), an R that is not a rotation.
         """
+        if translation is None and _is_pair(matrix):
+            matrix, translation = matrix
+        if translation is not None:
+            rotation = as_real(matrix, "rotation", "Extrinsics")
+            if rotation.shape[-2:] != (3, 3):
+                raise ValueError(
+                    "Extrinsics: beside a translation the rotation must be (*B, 3, 3) matrices; got shape "
+                    f"{tuple(rotation.shape)}. Rotation vectors go into Extrinsics(rotation, translation)"
+                )
+            check_rotation(rotation, "rotation", "Extrinsics")
+            translation = as_vectors(translation, "translation", "Extrinsics")
+            return cls(rotation_vector(rotation).unsqueeze(-1), translation)
         matrix = as_real(matrix, "matrix", "Extrinsics")
         if matrix.shape[-2:] not in ((4, 4), (3, 4)):
-            raise ValueError(f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}")
+            hint = ". A rotation goes with its translation: from_matrix(R, t)" if matrix.shape[-2:] == (3, 3) else ""
+            raise ValueError(
+                f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}{hint}"
+            )
         if matrix.shape[-2] == 4 and is_concrete(matrix):
             bottom = matrix[..., 3, :].detach()
             if bool((bottom != bottom.new_tensor([0, 0, 0, 1])).any()):
                 raise ValueError(f"Extrinsics: the last row of matrix must be 0 0 0 1; got {bottom.tolist()}")
         rotation = matrix[..., :3, :3]
         check_rotation(rotation, "matrix", "Extrinsics")
-        return cls(rotation_vector(rotation), matrix[..., :3, 3])
+        return cls(rotation_vector(rotation).unsqueeze(-1), matrix[..., :3, 3])
 
     def inverse(self) -> Extrinsics:
         """World from camera."""
-        return Extrinsics(-self.rotation, self.position).freeze_like(self)
+        return Extrinsics(-self.rotation.unsqueeze(-1), self.position).freeze_like(self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""
@@ -89,7 +121,7 @@ class Extrinsics(GeometryModule):
         columns = rotate_planes(mine.unsqueeze(-3), its.mT.unsqueeze(-1).unbind(-2))
         moved = rotate_planes(mine, other.translation.unsqueeze(-1).unbind(-2))
         product = torch.cat(columns, -1).mT
-        composed = Extrinsics(rotation_vector(product), torch.cat(moved, -1) + self.translation)
+        composed = Extrinsics(rotation_vector(product).unsqueeze(-1), torch.cat(moved, -1) + self.translation)
         return composed.freeze_like(self, other)
 
     @property
@@ -103,3 +135,37 @@ class Extrinsics(GeometryModule):
         if self.batch_shape or not is_concrete(self.rotation):
             return f"batch_shape={tuple(self.batch_shape)}"
         return f"rotation={self.rotation.tolist()}, translation={self.translation.tolist()}"
+
+
+def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
+    """Whether (..., 3) are rotation matrices (*B, 3, 3), and not three vectors each, beside a translation (*B, 3).
+
+    Raises:
+        ValueError: they may be both, or neither.
+    """
+    fewer = translation.ndim < rotation.ndim
+    if not is_concrete(rotation):
+        return fewer
+    if is_rotation(rotation):
+        if translation.shape[-2:] == (3, 3) and not fewer:
+            raise ValueError(
+                f"Extrinsics: rotation {tuple(rotation.shape)} beside translation {tuple(translation.shape)} may be "
+                "rotation matrices or three rotation vectors each, and its values are those of rotation matrices. "
+                "Matrices go into Extrinsics.from_matrix(rotation, translation), vectors in as rotation[..., None]"
+            )
+        return True
+    if fewer:
+        hint = ". Three rotation vectors that share a translation go in as rotation[..., None]"
+        check_rotation(rotation, "rotation", "Extrinsics", hint)
+    return False
+
+
+def _is_pair(matrix) -> bool:
+    """Whether it is (R, t), and not a list of two matrices."""
+    if not isinstance(matrix, (list, tuple)) or len(matrix) != 2:
+        return False
+    try:
+        shapes = [tuple(v.shape) if isinstance(v, Tensor) else np.shape(v) for v in matrix]
+    except ValueError:  # a list that is no array
+        return False
+    return shapes[0][-2:] == (3, 3) and shapes[0] != shapes[1]

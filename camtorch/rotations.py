@@ -45,17 +45,25 @@ def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, .
     return tuple(torch.where(finite, a * x + b * y + c * z, torch.nan) for a, b, c in rows)
 
 
-def check_rotation(matrix: Tensor, name: str, owner: str) -> None:
+def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> None:
     """Raise a ValueError unless (*B, 3, 3) are rotations, to the precision that files store them with."""
-    if not is_concrete(matrix):
-        return
-    values = matrix.detach().double()
-    error = (values @ values.mT - torch.eye(3, dtype=values.dtype, device=values.device)).abs().amax((-1, -2))
-    if not bool((error < 1e-3).all()) or not bool((torch.linalg.det(values) > 0).all()):
+    if is_concrete(matrix) and not is_rotation(matrix):
+        values = matrix.detach().double()
+        error = _rotation_error(values).max().item()
         raise ValueError(
-            f"{owner}: {name} must hold rotation matrices; R R^T misses the identity by {error.max().item():.2g} "
-            f"and det R = {torch.linalg.det(values).tolist()}"
+            f"{owner}: {name} must hold rotation matrices; R R^T misses the identity by {error:.2g} "
+            f"and det R = {torch.linalg.det(values).tolist()}{hint}"
         )
+
+
+def is_rotation(matrix: Tensor) -> bool:
+    """Whether all of (*B, 3, 3) are rotations, to the precision that files store them with."""
+    values = matrix.detach().double()
+    return bool((_rotation_error(values) < 1e-3).all()) and bool((torch.linalg.det(values) > 0).all())
+
+
+def _rotation_error(values: Tensor) -> Tensor:
+    return (values @ values.mT - torch.eye(3, dtype=values.dtype, device=values.device)).abs().amax((-1, -2))
 
 
 def as_rotation(rotation, owner: str) -> Tensor | None:
@@ -64,7 +72,9 @@ def as_rotation(rotation, owner: str) -> Tensor | None:
         return None
     rotation = as_real(rotation, "rotation", owner)
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
-        raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}")
+        hint = ". ct.Extrinsics(vector, (0, 0, 0)).matrix()[..., :3, :3] is the matrix of a rotation vector"
+        hint = hint if rotation.shape[-1:] == (3,) or rotation.shape[-2:] == (3, 1) else ""
+        raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}{hint}")
     check_rotation(rotation, "rotation", owner)
     return rotation if isinstance(rotation, nn.Parameter) or in_graph(rotation) else rotation.detach().clone()
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size
+from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._tracing import is_concrete
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import frozen, remade
@@ -214,7 +214,7 @@ def _plane_width(base: Camera, fov: Tensor) -> Tensor:
     right = torch.stack((half.sin(), torch.zeros_like(half), half.cos()), -1)
     rays = torch.stack((right * right.new_tensor([-1.0, 1.0, 1.0]), right), -2)
     plane = remade(base, right.new_tensor([1.0, 1.0, 0.0, 0.0]), base.distortion, None)
-    ends, valid = plane.project(rays.expand(*torch.broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3))))
+    ends, valid = plane.project(rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3))))
     if is_concrete(valid) and not bool(valid.all()):
         raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
     return ends[..., 1, 0] - ends[..., 0, 0]

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from camtorch._arguments import broadcast_shapes
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.record import Record
@@ -122,7 +123,7 @@ def render(rig: Rig, path) -> str:
 
 def _rows(*tensors: Tensor) -> list[Tensor]:
     """Tensors (*B, n) with equal batch dims, or with none."""
-    batch = torch.broadcast_shapes(*(t.shape[:-1] for t in tensors))
+    batch = broadcast_shapes(*(t.shape[:-1] for t in tensors))
     return [t if t.ndim == 1 else t.expand(*batch, -1) for t in tensors]
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from camtorch._arguments import broadcast_shapes
 from camtorch.optics.lens import Polynomial
 from camtorch.optics.special import root
 
@@ -131,7 +132,7 @@ def _piece(nodes: Sequence[Tensor], place: Tensor) -> Tensor:
 def _pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
     """From each plane's own columns the one of that index."""
     table = torch.stack(torch.broadcast_tensors(*columns), -1)
-    shape = torch.broadcast_shapes(table.shape[:-1], index.shape)
+    shape = broadcast_shapes(table.shape[:-1], index.shape)
     return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from camtorch._arguments import broadcast_shapes
 from camtorch.projection.ops import CLASSES
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def _positions(
 def _(_, source, source_distortion, __, target, target_distortion, rotation, sizes, tolerance):
     shapes = [t.shape[:-1] for t in (source, source_distortion, target, target_distortion)]
     shapes += [] if rotation is None else [rotation.shape[:-2]]
-    count = math.prod(torch.broadcast_shapes(*shapes))
+    count = math.prod(broadcast_shapes(*shapes))
     dtype = torch.promote_types(source.dtype, target.dtype)
     dtype = dtype if rotation is None else torch.promote_types(dtype, rotation.dtype)
     planes = source.new_empty(count, 2, *sizes[2:], dtype=dtype)

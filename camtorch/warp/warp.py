@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_values
+from camtorch._arguments import as_values, broadcast_shapes
 from camtorch._module import GeometryModule, Memo
 from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
@@ -74,8 +74,8 @@ class Warp(GeometryModule):
         self._set_rotation(as_rotation(rotation, "Warp"))
         shapes = [source.batch_shape, target.batch_shape, () if rotation is None else self.rotation.shape[:-2]]
         try:
-            self.batch_shape = torch.broadcast_shapes(*shapes)
-        except RuntimeError:
+            self.batch_shape = broadcast_shapes(*shapes)
+        except ValueError:
             self.batch_shape = None
         if self.batch_shape is None or len(self.batch_shape) > 1:
             raise ValueError(

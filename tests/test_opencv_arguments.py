@@ -1,0 +1,201 @@
+"""What OpenCV's calibrations hand out is taken for what it is, whatever its shape, or refused with a hint."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+
+K = np.array([[300.0, 0.0, 319.5], [0.0, 310.0, 239.5], [0.0, 0.0, 1.0]])
+LENSES = [
+    (ct.KannalaBrandt, 4),
+    (ct.BrownConrady, 4),
+    (ct.BrownConrady, 5),
+    (ct.BrownConrady, 14),
+    (ct.Mei, 5),
+    (ct.FTheta, 3),
+    (ct.UCM, 1),
+    (ct.EUCM, 2),
+]
+lenses = pytest.mark.parametrize(("model", "count"), LENSES)
+
+
+def coefficients(count):
+    return 0.5 + 0.01 * np.arange(count) if count < 3 else 0.01 * np.arange(1.0, count + 1) ** -2
+
+
+@lenses
+@pytest.mark.parametrize("as_tensor", [np.asarray, torch.as_tensor, np.ndarray.tolist])
+def test_coefficients_beside_a_matrix_are_one_camera(model, count, as_tensor):
+    D = coefficients(count)  # noqa: N806
+    for shaped in (D, D.reshape(count, 1), D.reshape(1, count)):
+        camera = model.from_matrix(K, as_tensor(shaped), image_size=(480, 640))
+        assert camera.batch_shape == ()
+        assert camera.distortion.tolist() == pytest.approx(D.tolist(), rel=1e-7)
+        assert camera.intrinsics.tolist() == [300.0, 310.0, 319.5, 239.5]
+
+
+@lenses
+def test_a_column_of_coefficients_elsewhere_is_refused(model, count):
+    if count == 1:
+        pytest.skip("one coefficient is no column")
+    column = coefficients(count).reshape(count, 1)
+    for wrong in (
+        lambda: model([300.0, 310.0, 319.5, 239.5], column),
+        lambda: model(torch.tensor([[300.0, 310.0, 319.5, 239.5]]), column),
+        lambda: model.from_matrix(K[None], column),
+        lambda: model.from_matrix(np.stack([K] * count), column),
+    ):
+        with pytest.raises(ValueError, match=rf"{model.__name__}: distortion.*\({count}, 1\).*distortion\[\.\.\., 0\]"):
+            wrong()
+
+
+def test_batches_of_one_coefficient_remain():
+    intrinsics, K3 = torch.tensor([[300.0, 310.0, 319.5, 239.5]] * 3), np.stack([K] * 3)  # noqa: N806
+    for model in (ct.UCM, ct.FOV, ct.KannalaBrandt):
+        camera = model(intrinsics, torch.full((3, 1), 0.1), image_size=(480, 640))
+        assert camera.batch_shape == (3,)
+        assert camera.hflip().batch_shape == (3,)
+    assert ct.UCM.from_matrix(K3, torch.full((3, 1), 0.1)).batch_shape == (3,)
+    assert ct.UCM([300.0, 310.0, 319.5, 239.5], torch.full((3, 1), 0.1)).batch_shape == (3,)
+
+
+def test_a_batch_of_lenses_beside_one_matrix_remains():
+    assert ct.KannalaBrandt.from_matrix(K, torch.zeros(3, 4)).batch_shape == (3,)
+    assert ct.KannalaBrandt.from_matrix(K[None], torch.zeros(1, 4)).batch_shape == (1,)
+
+
+def test_intrinsics_as_a_column_are_refused_with_a_hint():
+    with pytest.raises(ValueError, match=re.escape("intrinsics[..., 0]")):
+        ct.Pinhole(np.array([[300.0], [310.0], [319.5], [239.5]]))
+
+
+# -- poses
+
+R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+RVEC, TVEC = np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0])
+QUARTER = [0.0, 0.0, np.pi / 2]
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 1), (1, 3)])
+@pytest.mark.parametrize("translation_shape", [(3,), (3, 1), (1, 3)])
+def test_arrays_of_one_pose(shape, translation_shape):
+    extrinsics = ct.Extrinsics(RVEC.reshape(shape), TVEC.reshape(translation_shape))
+    assert extrinsics.rotation.tolist() == RVEC.tolist()
+    assert extrinsics.translation.tolist() == TVEC.tolist()
+    turned = ct.Extrinsics(R, TVEC.reshape(translation_shape))
+    assert turned.batch_shape == ()
+    assert turned.rotation.tolist() == pytest.approx(QUARTER)
+
+
+def test_views_of_a_calibration_are_a_batch():
+    rvecs, tvecs = (tuple(v.reshape(3, 1) * (1 + i) for i in range(3)) for v in (RVEC, TVEC))
+    for convert in (lambda v: v, list, np.array, lambda v: torch.tensor(np.array(v))):
+        extrinsics = ct.Extrinsics(convert(rvecs), convert(tvecs))
+        assert extrinsics.batch_shape == (3,)
+        torch.testing.assert_close(extrinsics.rotation[2].detach(), torch.tensor(3 * RVEC))
+        torch.testing.assert_close(extrinsics.translation[2].detach(), torch.tensor(3 * TVEC))
+
+
+def test_tensor_of_one_row_is_a_batch_of_one():
+    row = torch.zeros(1, 3)
+    assert ct.Extrinsics(row, row).matrix().shape == (1, 4, 4)
+    assert ct.Extrinsics(row.unsqueeze(-1), row).batch_shape == (1,)
+    assert ct.Extrinsics(torch.zeros(3, 1), torch.zeros(3, 1)).batch_shape == ()
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (2,), (3,), (5,), (2, 3)])
+def test_a_rotation_matrix_is_no_three_vectors(batch):
+    turn, move = torch.tensor(R).expand(*batch, 3, 3), torch.tensor(TVEC).expand(*batch, 3)
+    for made in (
+        ct.Extrinsics(turn, move),
+        ct.Extrinsics(turn, TVEC),
+        ct.Extrinsics.from_matrix((turn, move)),
+        ct.Extrinsics.from_matrix([turn, move]),
+        ct.Extrinsics.from_matrix(turn, move),
+    ):
+        assert made.batch_shape == batch
+        matrix = made.matrix()
+        torch.testing.assert_close(matrix[..., :3, :3].detach(), turn)
+        torch.testing.assert_close(matrix[..., :3, 3].detach(), move)
+
+
+def test_gradients_reach_a_predicted_rotation_matrix():
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]])).requires_grad_()
+    ct.Extrinsics(turn, torch.zeros(3))(torch.ones(3)).sum().backward()
+    assert turn.grad.abs().sum() > 0.1
+
+
+def test_three_vectors_are_no_rotation_matrix():
+    vectors, moves = torch.rand(3, 3), torch.rand(3, 3)
+    assert torch.equal(ct.Extrinsics(vectors, moves).rotation, vectors)
+    assert ct.Extrinsics(vectors[..., None], moves).batch_shape == (3,)
+    assert ct.Extrinsics(vectors[..., None], moves[0]).batch_shape == (3,)
+    assert ct.Extrinsics(torch.tensor(R)[..., None], moves).batch_shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: ct.Extrinsics(R, np.zeros((3, 3))), r"from_matrix\(rotation, translation\).*rotation\[\.\.\., None\]"),
+        (lambda: ct.Extrinsics(np.ones((3, 3)), TVEC), r"rotation matrices.*rotation\[\.\.\., None\]"),
+        (lambda: ct.Extrinsics(2 * R, TVEC), "rotation matrices"),
+        (lambda: ct.Extrinsics(-R, TVEC), "rotation matrices.*det"),
+        (lambda: ct.Extrinsics.from_matrix((2 * R, TVEC)), "rotation matrices"),
+        (lambda: ct.Extrinsics.from_matrix(R), r"\(3, 3\).*from_matrix\(R, t\)"),
+        (lambda: ct.Extrinsics.from_matrix((RVEC, TVEC)), r"\(2, 3\)"),
+        (lambda: ct.Extrinsics.from_matrix(RVEC, TVEC), r"\(3,\).*Extrinsics\(rotation, translation\)"),
+        (lambda: ct.Extrinsics(np.zeros((3, 2)), TVEC), r"rotation .*\(3, 2\)"),
+        (lambda: ct.Extrinsics(RVEC, np.zeros((4, 1))), r"translation .*\(4, 1\)"),
+        (lambda: ct.Extrinsics(torch.nn.Parameter(torch.zeros(3, 1)), TVEC), r"Parameter rotation .*\(3, 1\)"),
+    ],
+)
+def test_poses_that_are_in_doubt_or_none(make, says):
+    with pytest.raises(ValueError, match=f"(?s)Extrinsics: .*{says}"):
+        make()
+
+
+def test_a_list_of_matrices_is_a_batch():
+    transform = np.eye(4)
+    assert ct.Extrinsics.from_matrix([transform, transform]).batch_shape == (2,)
+    assert ct.Extrinsics.from_matrix(transform.tolist()).batch_shape == ()
+
+
+def test_a_warp_says_where_a_rotation_vector_goes():
+    camera = ct.Pinhole([300.0, 300.0, 319.5, 239.5], image_size=(480, 640))
+    for wrong in (RVEC, RVEC[:, None]):
+        with pytest.raises(ValueError, match=r"rotation must be .*Extrinsics\(vector"):
+            ct.Warp(camera, camera, wrong)
+
+
+# -- points
+
+
+def test_arrays_of_points():
+    camera = ct.KannalaBrandt.from_matrix(K, coefficients(4), image_size=(480, 640))
+    points = np.random.default_rng(0).normal((0, 0, 4), size=(7, 1, 3))
+    pixels, valid = camera.project(points)
+    assert pixels.shape == (7, 1, 2)
+    assert pixels.dtype == torch.float64
+    assert valid.shape == (7, 1)
+    rays, _ = camera.unproject(pixels.detach().numpy())
+    torch.testing.assert_close(rays.detach(), torch.tensor(points / np.linalg.norm(points, axis=-1, keepdims=True)))
+    whole = np.array([[[320, 240]], [[5, 7]]])
+    torch.testing.assert_close(camera.unproject(whole)[0], camera.unproject(whole.astype(np.float64))[0])
+
+
+def test_the_first_camera_does_not_import_sympy():
+    code = """
+import sys, torch, camtorch as ct
+camera = ct.KannalaBrandt([300, 300, 319.5, 239.5], image_size=(480, 640))
+layer = torch.nn.Sequential(ct.Extrinsics([0, 0, 0.1], [0, 0, 0]), camera)
+layer(torch.rand(10, 3))
+camera.rays()
+ct.Dewarp(camera.requires_grad_(False))(torch.rand(1, 3, 480, 640))
+assert "sympy" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
