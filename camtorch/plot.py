@@ -1,4 +1,4 @@
-"""Images of cameras, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and returns them."""
+"""Plots of cameras, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and returns them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from camtorch.analysis import difference as differences
-from camtorch.analysis.summary import fan, ideal, lattice
+from camtorch.projection.rays import angles_from_axis, followed, ideal, image_lattice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +45,7 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
     height, width = _size(camera)
     ax = _axes(ax)
     step = max(width, height) / count
-    inner = lattice(camera, max(2, round(height / step)) + 1, max(2, round(width / step)) + 1)
+    inner = image_lattice(camera, max(2, round(height / step)) + 1, max(2, round(width / step)) + 1)
     pixels = (inner[1:, 1:] + inner[:-1, :-1]) / 2
     rays, valid = camera.unproject(pixels)
     undistorted, covered = ideal(camera).project(rays)
@@ -115,13 +115,12 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
             angles, low, _ = _radii(ideal(camera))
             ax.plot(np.degrees(angles), low, "--", color=_GREY, linewidth=1, label="ideal", zorder=1)
         if camera.image_size is not None:
-            rays, valid = camera.unproject(lattice(camera, 65, 65))
-            angle = torch.atan2(torch.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
-            far = float(angle[valid].max()) if bool(valid.any()) else 0.0
+            rays, valid = camera.unproject(image_lattice(camera, 65, 65))
+            far = float(angles_from_axis(rays)[valid].max()) if bool(valid.any()) else 0.0
             seen = max(seen, math.degrees(far))
             if i == 0:
                 ax.axvspan(0, seen, color=_PALE, zorder=0)
-            corners = lattice(camera, 2, 2).flatten(0, 1) - camera.intrinsics[2:]
+            corners = image_lattice(camera, 2, 2).flatten(0, 1) - camera.intrinsics[2:]
             shown = max(shown, float(torch.linalg.vector_norm(corners, dim=-1).max()))
     if shown:
         # tangents grow without end
@@ -220,7 +219,7 @@ def _frame(ax: Axes, height: int, width: int) -> None:
 
 def _shade_without_rays(ax: Axes, camera: Camera) -> None:
     height, width = camera.image_size
-    valid = camera.unproject(lattice(camera, 200, 200))[1]
+    valid = camera.unproject(image_lattice(camera, 200, 200))[1]
     shade = np.ma.masked_array(np.ones((200, 200)), valid.numpy(force=True))
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
     ax.imshow(shade, extent=edges, cmap="Greys", vmin=0, vmax=5, interpolation="nearest", zorder=0)
@@ -255,8 +254,7 @@ def _limit(mappable, values: Tensor) -> str:
 def _radii(camera: Camera) -> tuple[np.ndarray, list[float], list[float]]:
     """Angles, and the least and the greatest radius over the azimuths that are valid up to there."""
     angles = torch.linspace(0, math.pi, _ANGLES).to(camera.intrinsics)
-    pixels, valid = camera.project(fan(angles, _AZIMUTHS))
-    valid = valid.long().cumprod(0).bool()
+    pixels, valid = followed(camera, angles, _AZIMUTHS)
     radius = torch.linalg.vector_norm(pixels - camera.intrinsics[2:], dim=-1)
     some = valid.any(-1)
     low, high = (torch.where(valid, radius, end) for end in (torch.inf, -torch.inf))

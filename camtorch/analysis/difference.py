@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.analysis.summary import lattice
 from camtorch.camera import Camera
+from camtorch.projection.rays import image_lattice
 
 _LONG = 400  # pixels of the lattice along the longer side
 _ROUNDING = 1e-9  # px, far above that of two equal cameras
@@ -68,7 +68,7 @@ def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Differ
     if b.image_size not in (None, a.image_size):
         raise ValueError(f"the cameras' images differ in size: {a.image_size} and {b.image_size}")
     scale = _LONG / max(height, width)
-    pixels = lattice(a, max(2, round(height * scale)), max(2, round(width * scale))).double()
+    pixels = image_lattice(a, max(2, round(height * scale)), max(2, round(width * scale))).double()
     rays, seen = a.unproject(pixels)
     turn = torch.eye(3, dtype=torch.float64, device=rays.device)
     if remove_rotation:

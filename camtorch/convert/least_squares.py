@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from camtorch._arguments import columns
+from camtorch.projection.rays import slopes_at_axis
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -22,6 +23,7 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
 _EVENINGS, _EVENING_STEPS, _PATIENCE = 40, 2, 6
 _SETTLED = 1e-8  # the relative decrease of the cost that ends the search
 _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
+_LEAST_SLOPE = 1e-3  # of a lens at the axis, that a fit starts from
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
 
 
@@ -73,7 +75,8 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
     best = best_score = None
     tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
     for start in starts:
-        parameters = torch.cat((_intrinsics(camera, start, slopes), start), -1)
+        focal = slopes[:, :2] / slopes_at_axis(camera.optics, start).clamp(min=_LEAST_SLOPE)
+        parameters = torch.cat((focal, slopes[:, 2:], start), -1)
         low, high = _bounds(camera, parameters)
         parameters = parameters.clamp(low, high)
         within = observations._replace(weights=torch.zeros_like(observations.weights))
@@ -128,16 +131,6 @@ def _distances(observations: Observations, camera: Camera, parameters: Tensor) -
     return torch.linalg.vector_norm(
         _residuals(observations, parameters, see(camera, parameters[:, 4:], observations.rays)), dim=1
     )
-
-
-def _intrinsics(camera: Camera, k: Tensor, slopes: Tensor) -> Tensor:
-    """The (C, 4) intrinsics at which lenses of coefficients (C, n) have these slopes at the axis."""
-    h = 1e-3
-    around = slopes.new_tensor([[h, 0, 1], [-h, 0, 1], [0, h, 1], [0, -h, 1]])
-    seen = see(camera, k, (around / around.norm(dim=-1, keepdim=True)).expand(len(k), 4, 3))
-    mine = torch.stack((seen.a[:, 0] - seen.a[:, 1], seen.b[:, 2] - seen.b[:, 3]), -1) / (2 * h)
-    mine = torch.where(mine > 1e-3, mine, 1.0)
-    return torch.cat((slopes[:, :2] / mine, slopes[:, 2:]), -1)
 
 
 def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,15 +13,18 @@ if TYPE_CHECKING:
     from camtorch.camera import Camera
 
     Model = type[Camera]
+    Models = Mapping[str, Model]
+    Step = tuple[Model, Mapping[str, str]]
+    """A model, and what the coefficients of the one before are called there; those left out are lost."""
 
 _MANY = 33
 
 
-def default_count(model: Model, source: Camera) -> int:
+def default_count(model: Model, source: Camera, models: Models) -> int:
     """How many coefficients the model takes to hold those of a related camera, and its own number at least."""
     if isinstance(source, model):
         return len(source.distortion_names)
-    steps = _path(type(source), model)
+    steps = _path(type(source), model, models)
     if steps is None:
         return model.fit_counts[0] if model.fit_counts else model.default_count
     needed = {_renamed(name, steps) for name in source.distortion_names}
@@ -29,12 +32,14 @@ def default_count(model: Model, source: Camera) -> int:
     return min((n for n, number in held.items() if number == max(held.values())), default=model.default_count)
 
 
-def carried(source: Camera, values: Tensor, model: Model, names: tuple[str, ...]) -> tuple[Tensor, Tensor] | None:
+def carried(
+    source: Camera, values: Tensor, model: Model, names: tuple[str, ...], models: Models
+) -> tuple[Tensor, Tensor] | None:
     """The coefficients (C, n) of a camera as those of a related model, and whether nothing is lost: bool (C,).
 
-    values: (C, its own n). None: the models are not related.
+    values: (C, its own n). models: those that may lie between, by key. None: the models are not related.
     """
-    steps = _path(type(source), model)
+    steps = _path(type(source), model, models)
     if steps is None:
         return None
     result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
@@ -48,30 +53,24 @@ def carried(source: Camera, values: Tensor, model: Model, names: tuple[str, ...]
     return result, lossless
 
 
-Step = tuple["Model", Mapping[str, str]]
-"""A model, and what the coefficients of the one before are called there; those left out are lost."""
-
-
-def _path(start: Model, end: Model) -> list[Step] | None:
+def _path(start: Model, end: Model, models: Models) -> list[Step] | None:
     """The shortest way from a model to a related one."""
     queue, seen = deque([(start, [])]), {start}
     while queue:
         model, steps = queue.popleft()
         if model is end or (model is start and issubclass(start, end)):
             return steps
-        for step in _neighbours(model):
+        for step in _neighbours(model, models):
             if step[0] not in seen:
                 seen.add(step[0])
                 queue.append((step[0], [*steps, step]))
     return None
 
 
-def _neighbours(model: Model) -> Iterator[Step]:
-    from camtorch.camera import MODELS
-
-    for general in (model, *MODELS.values()):
+def _neighbours(model: Model, models: Models) -> Iterator[Step]:
+    for general in (model, *models.values()):
         for key, names in general.special_cases:
-            special = MODELS.get(key)
+            special = models.get(key)
             if special is not None and general is model:
                 yield special, dict(zip(names, _all_names(special), strict=False))
             elif special is model:

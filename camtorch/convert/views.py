@@ -9,6 +9,14 @@ import torch
 from torch import Tensor
 
 from camtorch.convert.least_squares import Observations
+from camtorch.projection.rays import (
+    angles_from_axis,
+    followed,
+    image_edges,
+    pixel_lattice,
+    ray_fan,
+    slopes_at_axis,
+)
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -32,13 +40,13 @@ class SampledRays(NamedTuple):
     @property
     def angles(self) -> Tensor:
         """(C, N) radians from the axis."""
-        return torch.atan2(torch.hypot(self.rays[..., 0], self.rays[..., 1]), self.rays[..., 2])
+        return angles_from_axis(self.rays)
 
 
 def view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
     """side^2 rays on the image, or in all directions, of which those count that the camera has up to an angle."""
     if image_size is None:
-        rays = _directions(_reach(camera, limit) * torch.linspace(0, 1, side, **_like(camera)), side)
+        rays = ray_fan(_reach(camera, limit) * torch.linspace(0, 1, side, **_like(camera)), side)
         rays, found = rays.flatten(1, 2), True
     else:
         rays, found = camera.unproject(_lattice(camera, image_size, side, limit))
@@ -51,66 +59,49 @@ def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: 
     """`view`, and rays on circles around the axis, over which the errors of a radial lens change."""
     whole = view(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
-    rays = _directions(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS).flatten(1, 2)
+    rays = ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS).flatten(1, 2)
     pixels, valid = camera.project(rays)
     if image_size is not None:
-        height, width = image_size
-        valid = valid & (pixels >= -0.5).all(-1) & (pixels <= pixels.new_tensor([width - 0.5, height - 0.5])).all(-1)
+        low, high = image_edges(image_size, pixels)
+        valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
     return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, (rays, pixels, valid), strict=True)))
 
 
 def _lattice(camera: Camera, image_size: tuple[int, int], side: int, limit: float) -> Tensor:
     """(C, side^2, 2): pixels of the part of the image that an angle leaves, its edges included."""
-    height, width = image_size
     count = len(camera.intrinsics)
-    low = camera.intrinsics.new_full((count, 2), -0.5)
-    high = camera.intrinsics.new_tensor([width - 0.5, height - 0.5]).expand(count, 2)
+    low, high = (corner.expand(count, 2) for corner in image_edges(image_size, camera.intrinsics))
     if limit < math.pi:
-        ring, valid = camera.project(_directions(low.new_full((count, 1), limit), 64).flatten(1, 2))
+        ring, valid = camera.project(ray_fan(low.new_full((count, 1), limit), 64).flatten(1, 2))
         closed = valid.all(-1)[:, None] & (limit < math.pi / 2)
         least, most = (torch.where(closed, end, whole) for end, whole in ((ring.amin(1), low), (ring.amax(1), high)))
         inside = (least < high) & (most > low)
         low, high = torch.where(inside, least.clamp(min=low), low), torch.where(inside, most.clamp(max=high), high)
-    steps = torch.linspace(0, 1, side, **_like(camera))[:, None]
-    u, v = (low[:, None] + (high - low)[:, None] * steps).unbind(-1)
-    return torch.stack(torch.broadcast_tensors(u[:, None, :], v[:, :, None]), -1).flatten(1, 2)
-
-
-def _directions(angles: Tensor, azimuths: int) -> Tensor:
-    """(C, K) angles from the axis -> (C, K, azimuths, 3) rays; none of them where panoramas are cut."""
-    phi = (torch.arange(azimuths).to(angles) + 0.25) * (2 * math.pi / azimuths)
-    theta = angles[..., None]
-    z = theta.cos().expand(*angles.shape, azimuths)
-    return torch.stack((theta.sin() * phi.cos(), theta.sin() * phi.sin(), z), -1)
+    return pixel_lattice(low, high, side, side).flatten(1, 2)
 
 
 def _reach(camera: Camera, limit: float) -> Tensor:
     """(C, 1): the angle up to which a camera has rays on some azimuth."""
     angles = torch.linspace(0, math.pi, _ANGLES, **_like(camera))
-    rays = _directions(angles.expand(len(camera.intrinsics), -1), _AZIMUTHS)
-    sees = camera.project(rays)[1].any(-1).long().cumprod(-1)
+    sees = followed(camera, angles.expand(len(camera.intrinsics), -1), _AZIMUTHS)[1].any(-1)
     reach = (angles * sees).amax(-1, keepdim=True)
     return torch.where(reach < math.pi / 2, reach.clamp(max=_END_AHEAD), reach).clamp(max=limit)
 
 
-def slopes_at_axis(camera: Camera) -> Tensor:
+def focal_at_axis(camera: Camera) -> Tensor:
     """(C, 4): the focal lengths at the axis, and the pixel of the axis."""
-    h = 1e-3
-    around = camera.intrinsics.new_tensor([[0, 0, 1], [h, 0, 1], [-h, 0, 1], [0, h, 1], [0, -h, 1]])
-    seen, valid = camera.project(around.expand(len(camera.intrinsics), 5, 3))
-    focal = torch.stack((seen[:, 1, 0] - seen[:, 2, 0], seen[:, 3, 1] - seen[:, 4, 1]), -1) / (2 * h)
+    slopes = slopes_at_axis(camera.optics, camera.distortion)
     stated = camera.intrinsics
-    good = valid.all(-1) & (focal > 0).all(-1)
     fair = torch.isfinite(stated).all(-1) & (stated[:, :2] > 0).all(-1)
-    otherwise = torch.where(fair[:, None], stated, stated.new_tensor([1.0, 1, 0, 0]))
-    return torch.where(good[:, None], torch.cat((focal, seen[:, 0]), -1), otherwise)
+    stated = torch.where(fair[:, None], stated, stated.new_tensor([1.0, 1, 0, 0]))
+    return torch.cat((stated[:, :2] * slopes, stated[:, 2:]), -1)
 
 
 def radii(camera: Camera, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Angles and radii as `Convertible.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
+    """Angles and radii as `Camera.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
     steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
     angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
-    pixels, valid = camera.project(_directions(angles, _AZIMUTHS))
+    pixels, valid = camera.project(ray_fan(angles, _AZIMUTHS))
     plane = (pixels - slopes[:, None, None, 2:]) / slopes[:, None, None, :2]
     radii = (torch.linalg.vector_norm(plane, dim=-1) * valid).sum(-1) / valid.sum(-1).clamp(min=1)
     growth = radii.diff(dim=-1, prepend=torch.zeros_like(radii[:, :1]))
