@@ -5,11 +5,18 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 from torch import Tensor, nn
 
 from camtorch._tracing import is_concrete
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+TensorLike: TypeAlias = "Tensor | ArrayLike"
+"""What parameters and points are made of: a tensor, an array, or lists of numbers."""
 
 
 def as_real(value, name: str, owner: str) -> Tensor:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, overload
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ from camtorch._arguments import (
 )
 from camtorch._module import GeometryModule, Memo
 from camtorch._tracing import has_tangent, in_transform, is_concrete, may_look
-from camtorch.convert.conversion import Conversion, convert
+from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.projection import formulas, ops
@@ -456,6 +457,30 @@ class Camera(GeometryModule):
 
     # -- another model
 
+    @overload
+    def convert(
+        self,
+        model: type[CameraT],
+        *,
+        count: int | None = None,
+        image_size: tuple[int, int] | None = None,
+        max_angle: float | None = None,
+        tolerance: float = 0.1,
+        **options: Any,
+    ) -> Conversion[CameraT]: ...
+
+    @overload
+    def convert(
+        self,
+        model: str,
+        *,
+        count: int | None = None,
+        image_size: tuple[int, int] | None = None,
+        max_angle: float | None = None,
+        tolerance: float = 0.1,
+        **options: Any,
+    ) -> Conversion[Camera]: ...
+
     def convert(
         self,
         model: type[Camera] | str,
@@ -464,8 +489,8 @@ class Camera(GeometryModule):
         image_size: tuple[int, int] | None = None,
         max_angle: float | None = None,
         tolerance: float = 0.1,
-        **options,
-    ) -> Conversion:
+        **options: Any,
+    ) -> Conversion[Camera]:
         """The camera of another model, or number of coefficients, that comes closest to this one.
 
         Where the models are related and the numbers allow, it is this camera exactly: its coefficients are taken over
@@ -494,7 +519,14 @@ class Camera(GeometryModule):
                 `max_angle` that is not positive or beyond pi, a `tolerance` that is not positive.
         """
         return convert(
-            self, model, count=count, image_size=image_size, max_angle=max_angle, tolerance=tolerance, **options
+            self,
+            as_model(model, f"{type(self).__name__}.convert"),
+            MODELS,
+            count=count,
+            image_size=image_size,
+            max_angle=max_angle,
+            tolerance=tolerance,
+            **options,
         )
 
     def extra_repr(self) -> str:
@@ -510,6 +542,24 @@ class Camera(GeometryModule):
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
         return ", ".join(parts)
+
+
+def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
+    """A camera model, or the one of that key in `MODELS`.
+
+    Raises:
+        TypeError: no camera model. ValueError: an unknown key.
+    """
+    if isinstance(model, str):
+        if model not in MODELS:
+            keys = {name.lower(): key for key, cls in MODELS.items() for name in (key, cls.__name__)}
+            close = difflib.get_close_matches(model.lower(), keys, 1)
+            meant = f"did you mean {keys[close[0]]!r}? Known" if close else "known"
+            raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")
+        return MODELS[model]
+    if not (isinstance(model, type) and issubclass(model, Camera) and hasattr(model, "key")):
+        raise TypeError(f"{owner} takes a camera model, or its key in ct.MODELS; got {model!r}")
+    return model
 
 
 def _per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

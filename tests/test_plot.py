@@ -13,7 +13,8 @@ matplotlib.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402
 
 from camtorch import plot  # noqa: E402
-from camtorch.analysis.summary import fan, ideal, summarise  # noqa: E402
+from camtorch.analysis.summary import summarise  # noqa: E402
+from camtorch.projection.rays import ideal, ray_fan  # noqa: E402
 
 SIZE = (480, 640)
 
@@ -71,7 +72,7 @@ def test_the_curve_is_the_radius_and_ends_where_rays_do():
     curve = ax.lines[0]
     angles = torch.from_numpy(np.radians(curve.get_xdata()))
     assert float(angles[-1]) == pytest.approx(summarise(camera).valid_angle[1], abs=0.01)
-    pixels, _ = camera.project(fan(angles[100:101], 256)[0])
+    pixels, _ = camera.project(ray_fan(angles[100:101], 256)[0])
     radius = (pixels - camera.intrinsics[2:]).norm(dim=-1).detach()
     assert float(radius.min()) <= curve.get_ydata()[100] <= float(radius.max())
 

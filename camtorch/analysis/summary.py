@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from camtorch.camera import Camera
 from camtorch.projection.rays import field_of_view, followed, ideal, image_lattice

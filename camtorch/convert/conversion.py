@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -20,22 +19,22 @@ from camtorch.convert.relations import carried, default_count
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
+CameraT = TypeVar("CameraT", bound="Camera", covariant=True)
+
 _FIT_SIDE, _CHECK_SIDE = 33, 193  # of the lattices of pixels to fit to, and to check with
 _ROWS = 64  # of a batch that are worked on at a time
-
-
 _WORTH_IT = 0.5  # of the largest error before: then more coefficients are taken
 
 
 @dataclass
-class Conversion:
+class Conversion(Generic[CameraT]):
     """A camera of another model and how it differs from the one that it was made of.
 
     Compared are the pixels at which both see the same rays, on a lattice over the image of the old camera, its outer
     edges included; without an image, on rays in all directions. Each number has the batch shape of the camera.
     """
 
-    camera: Camera
+    camera: CameraT
     """The new camera."""
     rms: Tensor
     """The root of the mean squared distance in pixels, up to `max_angle`."""
@@ -65,10 +64,17 @@ class Conversion:
 
 @torch.no_grad()
 def convert(
-    source: Camera, model: type[Camera] | str, *, count, image_size, max_angle, tolerance, **options
-) -> Conversion:
-    """See `Camera.convert`."""
-    model = _model(model)
+    source: Camera,
+    model: type[CameraT],
+    models: Mapping[str, type[Camera]],
+    *,
+    count: int | None,
+    image_size: tuple[int, int] | None,
+    max_angle: float | None,
+    tolerance: float,
+    **options: Any,
+) -> Conversion[CameraT]:
+    """See `Camera.convert`; models: all that there are, by key, some of which may relate the two."""
     owner = f"{type(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
     if max_angle is not None and not 0 < float(max_angle) <= math.pi * (1 + 1e-6):
@@ -76,46 +82,31 @@ def convert(
     if not float(tolerance) > 0:
         raise ValueError(f"{owner}: tolerance must be positive; got {tolerance}")
     if count is None:
-        least = default_count(model, source)
-        counts = least, *(n for n in model.fit_counts if n > least)
+        least = default_count(model, source, models)
+        counts: tuple[int, ...] = (least, *(n for n in model.fit_counts if n > least))
     else:
         counts = (as_whole(count, "count", owner),)
     if counts[0] < 0 or model.names_of(counts[0]) is None:
         raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}; got count={count}")
 
-    def made(parameters: Tensor) -> Camera:
+    def made(parameters: Tensor) -> CameraT:
         intrinsics, distortion = parameters[..., :4], parameters[..., 4:]
+        # models without coefficients take no argument for them
         arguments = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
         return model(*arguments, image_size=image_size, **options).double()
 
     limit = math.pi if max_angle is None else min(math.pi, float(max_angle))
     batch = source.batch_shape
     tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
+    task = _Task(source, model, models, made, image_size, limit, float(tolerance))
     parts = [
-        _by_counts(_Task(_with_numbers(source, *numbers), model, made, image_size, limit, float(tolerance)), counts)
+        _by_counts(task._replace(source=_with_numbers(source, *numbers)), counts)
         for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True)
     ]
-    parameters, *numbers = zip(*parts, strict=True)
-    most = max(p.shape[-1] for p in parameters)
-    parameters = torch.cat([_padded(p, most) for p in parameters])
+    most = max(part.parameters.shape[-1] for part in parts)
+    parameters, *numbers = (torch.cat(fields) for fields in zip(*(part.padded(most) for part in parts), strict=True))
     camera = made(parameters.reshape(*batch, most)).freeze_like(source)
-    return Conversion(camera, *(torch.cat(n).reshape(batch) for n in numbers), type(source).__name__)
-
-
-def _model(model) -> type[Camera]:
-    from camtorch.camera import MODELS, Camera
-
-    if isinstance(model, str):
-        if model not in MODELS:
-            by_name = {cls.__name__: key for key, cls in MODELS.items()}
-            close = difflib.get_close_matches(model.lower(), [*MODELS, *map(str.lower, by_name)], 1)
-            lower = {name.lower(): key for name, key in by_name.items()}
-            meant = f"did you mean {lower.get(close[0], close[0])!r}? Known" if close else "known"
-            raise ValueError(f"there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")
-        return MODELS[model]
-    if not (isinstance(model, type) and issubclass(model, Camera) and hasattr(model, "key")):
-        raise TypeError(f"convert takes a camera model, or its key in ct.MODELS; got {model!r}")
-    return model
+    return Conversion(camera, *(n.reshape(batch) for n in numbers), type(source).__name__)
 
 
 def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Camera:
@@ -132,6 +123,7 @@ class _Task(NamedTuple):
 
     source: Camera
     model: type[Camera]
+    models: Mapping[str, type[Camera]]
     made: Callable[[Tensor], Camera]
     image_size: tuple[int, int] | None
     limit: float
@@ -157,18 +149,19 @@ class _Result(NamedTuple):
         if len(rows) == 0:
             return self
         width = max(self.parameters.shape[-1], other.parameters.shape[-1])
-        results = [_padded(self.parameters, width).clone(), *(t.clone() for t in self[1:])]
-        for result, new in zip(results, (_padded(other.parameters, width), *other[1:]), strict=True):
+        results = _Result(*(t.clone() for t in self.padded(width)))
+        for result, new in zip(results, other.padded(width), strict=True):
             result[rows] = new
-        return _Result(*results)
+        return results
 
     def of(self, rows: Tensor) -> _Result:
         """Those of the rows."""
         return _Result(*(t[rows] for t in self))
 
-
-def _padded(parameters: Tensor, width: int) -> Tensor:
-    return torch.nn.functional.pad(parameters, (0, max(width - parameters.shape[-1], 0)))
+    def padded(self, width: int) -> _Result:
+        """With parameters (C, width), zeros after those that there are."""
+        parameters = torch.nn.functional.pad(self.parameters, (0, width - self.parameters.shape[-1]))
+        return self._replace(parameters=parameters)
 
 
 def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
@@ -194,14 +187,14 @@ def _as_far(angle: Tensor, before: Tensor) -> Tensor:
 def _converted(task: _Task, count: int) -> _Result:
     source, model, made = task.source, task.model, task.made
     names = model.names_of(count)
-    slopes = views.slopes_at_axis(source)
+    slopes = views.focal_at_axis(source)
     view = views.view(source, task.image_size, _FIT_SIDE, task.limit)
     fine = views.view(source, task.image_size, _CHECK_SIDE, task.limit)
     starts = model.fit_start(names, *views.radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
-    related = carried(source, source.distortion.nan_to_num(0.0, 0.0, 0.0), model, names)
+    related = carried(source, source.distortion.nan_to_num(0.0, 0.0, 0.0), model, names, task.models)
     if related is not None:
         taken, exact = related[0], related[1] & usable & (source.intrinsics[:, :2] > 0).all(-1)
         starts = torch.cat((starts, taken[None]))

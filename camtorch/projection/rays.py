@@ -42,7 +42,7 @@ def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def ray_fan(angles: Tensor, azimuths: int) -> Tensor:
-    """(*C, K) angles from the axis -> (*C, K, azimuths, 3) rays, evenly around it; none of them where panoramas are cut."""
+    """(*C, K) angles from the axis -> (*C, K, azimuths, 3) rays, evenly around it; none where panoramas are cut."""
     phi = (torch.arange(azimuths).to(angles) + 0.25) * (2 * math.pi / azimuths)
     theta = angles[..., None]
     z = theta.cos().expand(*angles.shape, azimuths)
@@ -56,9 +56,9 @@ def angles_from_axis(rays: Tensor) -> Tensor:
 
 
 def slopes_at_axis(optics: Optics, k: Tensor) -> Tensor:
-    """(C, 2): the derivatives of the sensor's plane by x and y of the ray (x, y, 1) at the axis, of coefficients (C, n).
+    """Derivatives (C, 2) of the point on the sensor by x and y of the ray (x, y, 1), at the axis; k: (C, n).
 
-    Where the coefficients make no lens that is one. Graph-free.
+    One where the coefficients make no lens. Graph-free.
     """
     with torch.inference_mode(False), torch.enable_grad():
         x, y = (k.new_zeros(len(k), 1).requires_grad_() for _ in range(2))
@@ -66,8 +66,8 @@ def slopes_at_axis(optics: Optics, k: Tensor) -> Tensor:
         a, b = chart.to_plane(x, y, torch.ones_like(x), order=1)
         if lens.stages:
             a, b = lens(a, b)
-        slopes = [torch.autograd.grad(plane.sum(), along, retain_graph=True)[0] for plane, along in ((a, x), (b, y))]
-        slopes = torch.cat(slopes, -1)
+        pairs = ((a, x), (b, y))
+        slopes = torch.cat([torch.autograd.grad(to.sum(), of, retain_graph=True)[0] for to, of in pairs], -1)
     return torch.where(torch.isfinite(slopes) & (slopes > 0), slopes, 1.0)
 
 
