@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from camtorch.augment.cameras import frozen
-from camtorch.camera import MODELS, Camera
+from camtorch.camera import Camera
+from camtorch.models import MODELS
 
 
 @dataclass(frozen=True)

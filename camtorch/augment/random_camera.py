@@ -15,7 +15,8 @@ from camtorch.augment.change import Part
 from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import as_range
-from camtorch.camera import MODELS, Camera
+from camtorch.camera import Camera
+from camtorch.models import MODELS
 from camtorch.rotations import mount_rotation
 from camtorch.warp.warp import Warp
 

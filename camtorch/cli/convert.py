@@ -8,8 +8,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy
-
 from camtorch.cli.options import parse_size
 
 if TYPE_CHECKING:
@@ -111,6 +109,7 @@ def _show(arguments: argparse.Namespace) -> None:
 
 
 def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
+    import numpy
     from PIL import Image
 
     from camtorch import plot

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
+import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -31,20 +35,62 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         arguments = _parser().parse_args(argv)
+        with _interrupts_end_the_process():
+            import torch  # noqa: F401 (not before: it takes a second, and --help does without)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             arguments.run(arguments)
         for warning in caught:
             _note(warning.message)
-    except (ValueError, ImportError, OSError) as error:
-        if isinstance(error, OSError) and error.strerror and error.filename:
-            error = f"{error.filename}: {error.strerror}"
-        print("camtorch: error:", " ".join(str(error).split()), file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
-        print("camtorch: interrupted", file=sys.stderr)
+        _say("interrupted")
         return 130
+    except Exception as error:
+        if not (isinstance(error, (ValueError, ImportError, OSError)) or _lacks_memory(error)):
+            raise
+        _say("error: " + " ".join(_reason(error).split()))
+        return 2
     return 0
+
+
+def _say(text: str) -> None:
+    print("camtorch:", text, file=sys.stderr, flush=True)
+
+
+def _note(text: object) -> None:
+    _say(f"note: {text}")
+
+
+def _reason(error: Exception) -> str:
+    if _lacks_memory(error):
+        return f"out of memory: {error}" if str(error) else "out of memory"
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def _lacks_memory(error: Exception) -> bool:
+    """Whether it is that: neither torch nor the loader of shared libraries has a type for it."""
+    words = {RuntimeError: "allocate memory", ImportError: "failed to map segment", OSError: "allocate memory"}
+    return isinstance(error, MemoryError) or any(isinstance(error, t) and w in str(error) for t, w in words.items())
+
+
+@contextlib.contextmanager
+def _interrupts_end_the_process() -> Iterator[None]:
+    """For the import of torch, which loses a KeyboardInterrupt, or aborts by it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: object) -> NoReturn:
+        _say("interrupted")
+        os._exit(130)
+
+    before = signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -116,10 +162,6 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("-o", "--output", type=Path, required=output is None, default=output, metavar="OUT")
         command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
     return parser
-
-
-def _note(text: object) -> None:
-    print("camtorch: note:", text, file=sys.stderr)
 
 
 def _range(text: str) -> float | tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import torch
 
-from camtorch.camera import MODELS, Camera
+from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
@@ -18,6 +18,7 @@ from camtorch.io.filestorage import Value, as_json, as_xml, as_yaml
 from camtorch.io.parsing import read_mapping
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy
+from camtorch.models import MODELS
 from camtorch.rig import Rig
 
 # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left

@@ -9,8 +9,9 @@ from typing import Any, NoReturn
 
 import torch
 
-from camtorch.camera import MODELS, Camera
+from camtorch.camera import Camera
 from camtorch.io._errors import CameraFileError
+from camtorch.models import MODELS
 
 LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000

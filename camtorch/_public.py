@@ -1,0 +1,71 @@
+"""The names that `camtorch` shows: this file imports what `camtorch/__init__.py` hands out at first use."""
+
+from camtorch import augment, io
+from camtorch.camera import MODELS, Camera
+from camtorch.convert.conversion import Conversion
+from camtorch.extrinsics import Extrinsics
+from camtorch.io import CameraFileError, load, save
+from camtorch.models import (
+    EUCM,
+    FOV,
+    UCM,
+    BrownConrady,
+    Cylindrical,
+    Division,
+    DoubleSphere,
+    Equirectangular,
+    Equisolid,
+    Fisheye62,
+    Fisheye624,
+    FisheyeRadTanThinPrism,
+    FTheta,
+    FThetaBackward,
+    KannalaBrandt,
+    Mei,
+    OrthographicFisheye,
+    Pinhole,
+    Stereographic,
+    Tabulated,
+    ThinPrismFisheye,
+    WoodScape,
+)
+from camtorch.rig import Rig
+from camtorch.warp.dewarp import Dewarp
+from camtorch.warp.warp import Warp
+
+__all__ = [
+    "EUCM",
+    "FOV",
+    "MODELS",
+    "UCM",
+    "BrownConrady",
+    "Camera",
+    "CameraFileError",
+    "Conversion",
+    "Cylindrical",
+    "Dewarp",
+    "Division",
+    "DoubleSphere",
+    "Equirectangular",
+    "Equisolid",
+    "Extrinsics",
+    "FTheta",
+    "FThetaBackward",
+    "Fisheye62",
+    "Fisheye624",
+    "FisheyeRadTanThinPrism",
+    "KannalaBrandt",
+    "Mei",
+    "OrthographicFisheye",
+    "Pinhole",
+    "Rig",
+    "Stereographic",
+    "Tabulated",
+    "ThinPrismFisheye",
+    "Warp",
+    "WoodScape",
+    "augment",
+    "io",
+    "load",
+    "save",
+]
