@@ -93,7 +93,7 @@ class Camera(GeometryModule):
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
-        cls._model = ops.register(cls)
+        cls._model = ops.register_camera(cls)
         if "key" in cls.__dict__:
             MODELS[cls.key] = cls
 

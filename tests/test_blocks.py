@@ -130,7 +130,7 @@ def test_two_classes_of_one_name_keep_their_own_lens():
         compiled = torch.compile(camera.unproject, backend="eager", fullgraph=True)
         pixels = camera.project(points)[0].detach()
         torch.testing.assert_close(compiled(pixels)[0], camera.unproject(pixels)[0])
-    assert ops.MODELS[first._model] is not ops.MODELS[second._model]
+    assert ops.OPTICS[first._model] is not ops.OPTICS[second._model]
 
 
 # -- images

@@ -5,8 +5,7 @@ import math
 import torch
 
 from camtorch.camera import Camera
-from camtorch.optics.charts import Perspective
-from camtorch.optics.lens import Lens, Planar, Polynomial, Rational, Tilt
+from camtorch.optics import Lens, Perspective, Planar, Polynomial, Rational, Tilt
 
 
 class BrownConrady(Camera):

@@ -1,8 +1,7 @@
 """The cylindrical panorama."""
 
 from camtorch.camera import Camera
-from camtorch.optics.charts import CylinderChart
-from camtorch.optics.lens import Lens
+from camtorch.optics import CylinderChart, Lens
 
 
 class Cylindrical(Camera):

@@ -1,12 +1,7 @@
 """The division camera."""
 
 from camtorch.camera import Camera
-from camtorch.optics.backprojection import AnglePerRadius, Inverted, flat
-from camtorch.optics.fisheyes import OneDivision
-from camtorch.optics.lens import Lens
-from camtorch.projection import ops
-
-_ANGLES = ops.register_optics("division", flat(AnglePerRadius))
+from camtorch.optics import AnglePerRadius, Inverted, Lens, OneDivision
 
 
 class Division(Camera):
@@ -42,4 +37,4 @@ class Division(Camera):
 
     @staticmethod
     def optics(k):
-        return (OneDivision(k[0]) if len(k) == 1 else Inverted(_ANGLES, k)), Lens()
+        return (OneDivision(k[0]) if len(k) == 1 else Inverted(AnglePerRadius, k)), Lens()

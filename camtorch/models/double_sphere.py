@@ -1,8 +1,7 @@
 """The double sphere camera."""
 
 from camtorch.camera import Camera
-from camtorch.optics.lens import Lens
-from camtorch.optics.unified import Unified
+from camtorch.optics import Lens, Unified
 
 
 class DoubleSphere(Camera):

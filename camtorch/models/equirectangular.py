@@ -1,8 +1,7 @@
 """The equirectangular panorama."""
 
 from camtorch.camera import Camera
-from camtorch.optics.charts import SphereChart
-from camtorch.optics.lens import Lens
+from camtorch.optics import Lens, SphereChart
 
 
 class Equirectangular(Camera):

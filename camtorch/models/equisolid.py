@@ -1,8 +1,8 @@
 """The equisolid fisheye."""
 
 from camtorch.models._polynomial import OddPolynomial
-from camtorch.optics.fisheyes import Equisolid as EquisolidChart
-from camtorch.optics.lens import Lens, Planar, Polynomial
+from camtorch.optics import Equisolid as EquisolidChart
+from camtorch.optics import Lens, Planar, Polynomial
 
 
 class Equisolid(OddPolynomial):

@@ -9,9 +9,7 @@ import torch
 from camtorch._arguments import as_batch, as_real
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
-from camtorch.optics.charts import Equidistant
-from camtorch.optics.lens import Lens, Planar
-from camtorch.optics.radial import RadiusPolynomial
+from camtorch.optics import Equidistant, Lens, Planar, RadiusPolynomial
 
 if TYPE_CHECKING:
     from torch import Tensor

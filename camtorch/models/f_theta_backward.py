@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from camtorch.models.f_theta import FreePolynomial
-from camtorch.optics.backprojection import Inverted, flat
-from camtorch.optics.lens import Lens
-from camtorch.optics.radial import RadiusPolynomial
-from camtorch.projection import ops
-
-_ANGLES = ops.register_optics("f_theta_backward", flat(RadiusPolynomial))
+from camtorch.optics import Inverted, Lens, RadiusPolynomial
 
 
 class FThetaBackward(FreePolynomial):
@@ -27,7 +22,7 @@ class FThetaBackward(FreePolynomial):
 
     @staticmethod
     def optics(k):
-        return Inverted(_ANGLES, k), Lens()
+        return Inverted(RadiusPolynomial, k), Lens()
 
     @classmethod
     def _scaled(cls, coefficients):

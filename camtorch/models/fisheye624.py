@@ -1,8 +1,7 @@
 """The Fisheye624 camera: radial, tangential and thin-prism terms of a fisheye."""
 
 from camtorch.camera import Camera
-from camtorch.optics.charts import Equidistant
-from camtorch.optics.lens import Lens, Planar, Polynomial
+from camtorch.optics import Equidistant, Lens, Planar, Polynomial
 
 
 class Fisheye624(Camera):

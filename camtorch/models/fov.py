@@ -3,8 +3,7 @@
 import math
 
 from camtorch.camera import Camera
-from camtorch.optics.fisheyes import Fov
-from camtorch.optics.lens import Lens
+from camtorch.optics import Fov, Lens
 
 
 class FOV(Camera):

@@ -9,8 +9,7 @@ import torch
 from camtorch._arguments import as_batch, as_real
 from camtorch._tracing import is_concrete
 from camtorch.models._polynomial import OddPolynomial
-from camtorch.optics.charts import Equidistant
-from camtorch.optics.lens import Lens, Planar, Polynomial
+from camtorch.optics import Equidistant, Lens, Planar, Polynomial
 
 if TYPE_CHECKING:
     from typing_extensions import Self

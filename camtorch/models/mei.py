@@ -1,8 +1,7 @@
 """The unified camera with a radial-tangential lens."""
 
 from camtorch.camera import Camera
-from camtorch.optics.lens import Lens, Planar, Polynomial
-from camtorch.optics.unified import Unified
+from camtorch.optics import Lens, Planar, Polynomial, Unified
 
 
 class Mei(Camera):

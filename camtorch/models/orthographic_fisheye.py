@@ -1,8 +1,7 @@
 """The orthographic fisheye."""
 
 from camtorch.models._polynomial import OddPolynomial
-from camtorch.optics.lens import Lens, Planar, Polynomial
-from camtorch.optics.unified import Unified
+from camtorch.optics import Lens, Planar, Polynomial, Unified
 
 
 class OrthographicFisheye(OddPolynomial):

@@ -1,8 +1,7 @@
 """The pinhole camera."""
 
 from camtorch.camera import Camera
-from camtorch.optics.charts import Perspective
-from camtorch.optics.lens import Lens
+from camtorch.optics import Lens, Perspective
 
 
 class Pinhole(Camera):

@@ -10,9 +10,7 @@ import torch
 
 from camtorch._arguments import as_real
 from camtorch.camera import Camera
-from camtorch.optics.charts import EquidistantUpTo
-from camtorch.optics.lens import Lens, Planar
-from camtorch.optics.radial import RadiusTable
+from camtorch.optics import EquidistantUpTo, Lens, Planar, RadiusTable
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -3,8 +3,7 @@
 import torch
 
 from camtorch.camera import Camera
-from camtorch.optics.charts import Equidistant
-from camtorch.optics.lens import Lens, Planar, Polynomial
+from camtorch.optics import Equidistant, Lens, Planar, Polynomial
 
 
 class ThinPrismFisheye(Camera):

@@ -1,1 +1,40 @@
-"""What a camera model is made of: charts (ray to plane) and lenses (plane to plane), with their derivatives."""
+"""What a camera model is made of: a chart from rays to a plane, and a lens of stages on that plane."""
+
+from camtorch.optics.backprojection import Inverted
+from camtorch.optics.charts import (
+    Chart,
+    CylinderChart,
+    Equidistant,
+    EquidistantUpTo,
+    Equisolid,
+    Fov,
+    OneDivision,
+    Perspective,
+    SphereChart,
+)
+from camtorch.optics.lens import Lens, Planar, Tilt
+from camtorch.optics.radial import AnglePerRadius, Polynomial, RadialFactor, RadiusPolynomial, RadiusTable, Rational
+from camtorch.optics.unified import Unified
+
+__all__ = [
+    "AnglePerRadius",
+    "Chart",
+    "CylinderChart",
+    "Equidistant",
+    "EquidistantUpTo",
+    "Equisolid",
+    "Fov",
+    "Inverted",
+    "Lens",
+    "OneDivision",
+    "Perspective",
+    "Planar",
+    "Polynomial",
+    "RadialFactor",
+    "RadiusPolynomial",
+    "RadiusTable",
+    "Rational",
+    "SphereChart",
+    "Tilt",
+    "Unified",
+]

@@ -1,8 +1,8 @@
-"""Lenses: planar maps close to the identity, as a chain of stages with exact derivatives.
+"""Lenses: planar maps close to the identity, as a chain of stages, and what they and their derivatives are at points.
 
 A stage is built from coefficient columns that broadcast against planes of points. `Planar` holds everything that is
-polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor. What a stage is at points is in
-`local`; here is how far out it is certainly regular, and where its inverse starts.
+polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor. `stage.at(points)` has the value, the
+Jacobian, the orientation and the vjp, and computes once what they share.
 """
 
 from __future__ import annotations
@@ -14,73 +14,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch.optics.local import LensAt, PlanarAt, Planes2, TiltAt, total
+from camtorch.optics.radial import RadialFactor, total
+
+Planes2 = tuple[Tensor, Tensor]
+Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
 
 
-class Polynomial:
-    """The radial factor R(t) = 1 + c0 t + c1 t^2 + ... of t = radius^2; radius R(t) is the distorted radius."""
-
-    def __init__(self, coefficients: Sequence[Tensor]):
-        self.parameters = tuple(coefficients)
-
-    def __call__(self, t: Tensor) -> Tensor:
-        return self.derivatives(t, 0)[0]
-
-    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t: Horner's scheme, extended to the Taylor coefficients at t."""
-        # a zero stays a number until it is none: no work for what the highest powers do not have
-        taylor = [self.parameters[-1]] + [0.0] * order
-        for c in (*reversed(self.parameters[:-1]), 1.0):
-            for i in range(order, 0, -1):
-                if isinstance(taylor[i], float):
-                    taylor[i] = taylor[i - 1]
-                else:
-                    taylor[i] = torch.addcmul(taylor[i - 1], taylor[i], t)
-            # two columns in one operation would leave the vectorised loop
-            is_plane = isinstance(c, Tensor) and taylor[0] is not self.parameters[-1]
-            taylor[0] = torch.addcmul(c, taylor[0], t) if is_plane else taylor[0] * t + c
-        return tuple(
-            torch.zeros_like(t) if isinstance(x, float) else x if i < 2 else math.factorial(i) * x
-            for i, x in enumerate(taylor)
-        )
-
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient c."""
-        sums = []
-        for _ in self.parameters:
-            weight = weight * t
-            sums.append(total(weight))
-        return sums
-
-
-class Rational:
-    """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
-
-    def __init__(self, numerator: Sequence[Tensor], denominator: Sequence[Tensor]):
-        self.numerator, self.denominator = Polynomial(numerator), Polynomial(denominator)
-
-    @property
-    def parameters(self) -> tuple[Tensor, ...]:
-        return *self.numerator.parameters, *self.denominator.parameters
-
-    def __call__(self, t: Tensor) -> Tensor:
-        return self.numerator(t) / self.denominator(t)
-
-    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t, from N = R D differentiated by Leibniz' rule."""
-        n, d = self.numerator.derivatives(t, order), self.denominator.derivatives(t, order)
-        reciprocal = d[0].reciprocal()
-        ratio: list[Tensor] = []
-        for i in range(order + 1):
-            known = sum(math.comb(i, j) * ratio[j] * d[i - j] for j in range(i))
-            ratio.append((n[i] - known) * reciprocal)
-        return tuple(ratio)
-
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient."""
-        weight = weight / self.denominator(t)
-        above = self.numerator.vjp(t, weight)
-        return above + self.denominator.vjp(t, -weight * self(t))
+def _orientation(jacobian: Jacobian) -> Tensor:
+    ua, ub, va, vb = jacobian
+    # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
+    return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
 
 
 @dataclass
@@ -92,7 +35,7 @@ class Planar:
     prism: (s0, s1, s2, s3), the thin-prism coefficients.
     """
 
-    radial: Polynomial | Rational | None = None
+    radial: RadialFactor | None = None
     tangential: Sequence[Tensor] = ()
     prism: Sequence[Tensor] = ()
 
@@ -116,10 +59,7 @@ class Planar:
         t = radius * radius
         least, furthest = torch.ones_like(t), radius
         if self.radial:
-            factor, slope = self.radial.derivatives(t, 1)
-            least, furthest = torch.minimum(factor, factor + 2 * t * slope), radius * factor.abs()
-            if isinstance(self.radial, Rational):
-                least = torch.minimum(least, self.radial.denominator(t))
+            least, furthest = self.radial.orientation(radius), radius * self.radial(t).abs()
         if self.tangential:
             p = torch.hypot(*self.tangential)
             least, furthest = least - 6 * p * radius, furthest + 3 * p * t
@@ -133,6 +73,95 @@ class Planar:
         """A point near the one that a stage without a radial factor sends to (u, v)."""
         x, y = self.at(u, v, order=0).value
         return 2 * u - x, 2 * v - y
+
+
+class PlanarAt:
+    """A `Planar` stage at points m = (a, b)."""
+
+    def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
+        """order: 1 if any derivative will be asked for. t: |m|^2, if it is known."""
+        self.stage, self.a, self.b = stage, a, b
+        self.t = torch.addcmul(a * a, b, b) if t is None else t
+        if stage.radial:
+            self.factor, *slope = stage.radial.derivatives(self.t, order)
+            self.slope = slope[0] if order else None
+        if stage.tangential:
+            px, py = stage.tangential
+            self.twice_dot = torch.addcmul(a * (2 * px), b, 2 * py)
+
+    @property
+    def value(self) -> Planes2:
+        stage = self.stage
+        value = [self.a * self.factor, self.b * self.factor] if stage.radial else [self.a, self.b]
+        for i, m in enumerate((self.a, self.b)):
+            even = stage.tangential[i] if stage.tangential else 0
+            if stage.tangential:
+                value[i] = torch.addcmul(value[i], m, self.twice_dot)
+            if stage.prism:
+                even = (even + stage.prism[2 * i]) + stage.prism[2 * i + 1] * self.t
+            if stage.tangential or stage.prism:
+                value[i] = torch.addcmul(value[i], even, self.t)
+        return value[0], value[1]
+
+    @property
+    def jacobian(self) -> Jacobian:
+        stage, a, b, t = self.stage, self.a, self.b, self.t
+        if stage.radial:
+            twice = 2 * self.slope
+            along_a, along_b = twice * a, twice * b
+            ua, vb = torch.addcmul(self.factor, along_a, a), torch.addcmul(self.factor, along_b, b)
+            ub = va = along_a * b
+        else:
+            ua = vb = torch.ones_like(t)
+            ub = va = torch.zeros_like(t)
+        if stage.tangential:
+            px, py = (2 * p for p in stage.tangential)
+            # the gradient of (p . m) t: its Jacobian is symmetric
+            ua = torch.addcmul(ua + self.twice_dot, a, 2 * px)
+            vb = torch.addcmul(vb + self.twice_dot, b, 2 * py)
+            ub = va = torch.addcmul(torch.addcmul(ub, b, px), a, py)
+        if stage.prism:
+            s0, s1, s2, s3 = stage.prism
+            gx, gy = (4 * s1) * t + 2 * s0, (4 * s3) * t + 2 * s2
+            ua, ub = torch.addcmul(ua, gx, a), torch.addcmul(ub, gx, b)
+            va, vb = torch.addcmul(va, gy, a), torch.addcmul(vb, gy, b)
+        return ua, ub, va, vb
+
+    @property
+    def orientation(self) -> Tensor:
+        """Positive where the map is defined, regular and not turned over."""
+        orientation = _orientation(self.jacobian)
+        margin = self.stage.radial.margin(self.t) if self.stage.radial else None
+        return orientation if margin is None else torch.minimum(orientation, margin)
+
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of the point and of the parameters, these summed over the points."""
+        stage, a, b, t = self.stage, self.a, self.b, self.t
+        along = torch.addcmul(gu * a, gv, b)
+        ga, gb = (gu * self.factor, gv * self.factor) if stage.radial else (gu, gv)
+        # what goes along m
+        outwards = along * self.slope * 2 if stage.radial else torch.zeros_like(t)
+        if stage.tangential:
+            px, py = (2 * p for p in stage.tangential)
+            outwards = torch.addcmul(torch.addcmul(outwards, gu, px), gv, py)
+            ga = torch.addcmul(torch.addcmul(ga, gu, self.twice_dot), along, px)
+            gb = torch.addcmul(torch.addcmul(gb, gv, self.twice_dot), along, py)
+        if stage.prism:
+            s0, s1, s2, s3 = stage.prism
+            outwards = torch.addcmul(outwards, gu, (4 * s1) * t + 2 * s0)
+            outwards = torch.addcmul(outwards, gv, (4 * s3) * t + 2 * s2)
+        point = torch.addcmul(ga, a, outwards), torch.addcmul(gb, b, outwards)
+        if not want_parameters:
+            return point, []
+        sums = stage.radial.vjp(t, along) if stage.radial else []
+        if stage.tangential or stage.prism:
+            gu, gv = gu * t, gv * t
+            even = total(gu), total(gv)
+        if stage.tangential:
+            sums += [even[0] + 2 * total(along * a), even[1] + 2 * total(along * b)]
+        if stage.prism:
+            sums += [even[0], total(gu * t), even[1], total(gv * t)]
+        return point, sums
 
 
 class Tilt:
@@ -172,6 +201,49 @@ class Tilt:
         return (r00 * x + r10 * y + r20) * reciprocal, (r01 * x + r11 * y + r21) * reciprocal
 
 
+class TiltAt:
+    """A `Tilt` stage at points."""
+
+    def __init__(self, stage: Tilt, a: Tensor, b: Tensor):
+        self.stage, self.a, self.b = stage, a, b
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = stage.parameters
+        self.depth = r20 * a + r21 * b + r22
+        self.reciprocal = 1 / self.depth
+        scale = r22 * self.reciprocal
+        self.u, self.v = scale * (r00 * a + r01 * b + r02), scale * (r10 * a + r11 * b + r12)
+
+    @property
+    def value(self) -> Planes2:
+        _, _, r02, _, _, r12, _, _, _ = self.stage.parameters
+        return self.u - r02, self.v - r12
+
+    @property
+    def jacobian(self) -> Jacobian:
+        r00, r01, _, r10, r11, _, r20, r21, r22 = self.stage.parameters
+        ua, ub = r22 * r00 - self.u * r20, r22 * r01 - self.u * r21
+        va, vb = r22 * r10 - self.v * r20, r22 * r11 - self.v * r21
+        return tuple(w * self.reciprocal for w in (ua, ub, va, vb))
+
+    @property
+    def orientation(self) -> Tensor:
+        """Positive where the map is defined, regular and not turned over."""
+        return torch.minimum(_orientation(self.jacobian), self.depth)
+
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of the point and of the nine entries of R, these summed over the points."""
+        ua, ub, va, vb = self.jacobian
+        point = torch.addcmul(ua * gu, va, gv), torch.addcmul(ub * gu, vb, gv)
+        if not want_parameters:
+            return point, []
+        r22 = self.stage.parameters[-1]
+        gx, gy = gu * self.reciprocal, gv * self.reciprocal
+        by_depth = -(gx * self.u + gy * self.v)
+        sums = [total(w * c) for w in (r22 * gx, r22 * gy, by_depth) for c in (self.a, self.b, torch.ones_like(self.a))]
+        sums[2], sums[5] = sums[2] - total(gu), sums[5] - total(gv)
+        sums[8] = sums[8] + total(gu * self.u + gv * self.v) / r22
+        return point, sums
+
+
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
@@ -184,7 +256,7 @@ class Lens:
         return len(self.stages) == 1 and self.stages[0].is_radial
 
     @property
-    def radial(self) -> Polynomial | Rational | None:
+    def radial(self) -> RadialFactor | None:
         """The radial factor of the first stage, if it has one."""
         return getattr(self.stages[0], "radial", None)
 
@@ -215,3 +287,41 @@ class Lens:
         for stage in reversed(self.stages[1:]):
             u, v = stage.start(u, v)
         return u, v
+
+
+class LensAt:
+    """A chain of stages at points."""
+
+    def __init__(self, stages: Sequence[Planar | Tilt], a: Tensor, b: Tensor, order: int, t: Tensor | None):
+        self.stages: list[PlanarAt | TiltAt] = []
+        self.value = a, b
+        for stage in stages:
+            here = stage.at(*self.value, order, None if self.stages else t)
+            self.stages.append(here)
+            self.value = here.value
+
+    @property
+    def jacobian(self) -> Jacobian:
+        """Of the whole chain."""
+        chained = self.stages[0].jacobian
+        for stage in self.stages[1:]:
+            ua, ub, va, vb = stage.jacobian
+            pa, pb, qa, qb = chained
+            chained = ua * pa + ub * qa, ua * pb + ub * qb, va * pa + vb * qa, va * pb + vb * qb
+        return chained
+
+    @property
+    def orientation(self) -> Tensor:
+        """The smallest of the stages: positive where the lens is defined, regular and not turned over."""
+        least = self.stages[0].orientation
+        for stage in self.stages[1:]:
+            least = torch.minimum(least, stage.orientation)
+        return least
+
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of the point and of the parameters, these summed over the points."""
+        sums: list[Tensor] = []
+        for stage in reversed(self.stages):
+            (gu, gv), here = stage.vjp(gu, gv, want_parameters)
+            sums = here + sums
+        return (gu, gv), sums

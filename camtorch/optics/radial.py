@@ -1,18 +1,137 @@
-"""Radial factors of lenses whose radius is no odd function of the angle, and so not analytic at the centre."""
+"""Radial factors of lenses: a point m goes to m R(|m|^2). Polynomials, ratios of them, and tables."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
-from camtorch.optics.lens import Polynomial
-from camtorch.optics.special import root
+from camtorch._tracing import register
+from camtorch.optics.special import angle_per_radius, root
+
+FACTORS: dict[str, type[RadialFactor]] = {}
+"""Every class of radial factors by its full name: operators take no classes."""
 
 
-class RadiusPolynomial:
+def total(plane: Tensor) -> Tensor:
+    """(*B, N) -> (*B, 1)."""
+    return plane.sum(-1, keepdim=True)
+
+
+class RadialFactor:
+    """A factor R(t) of t = radius^2, 1 or near it at the centre; radius R(t) is the distorted radius.
+
+    Made of its coefficients, columns that broadcast against planes.
+    """
+
+    name: str
+    """That of the class in `FACTORS`."""
+    parameters: tuple[Tensor, ...]
+    """What the formula learns, in the order in which `vjp` gives the cotangents."""
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        cls.name = register(FACTORS, cls)
+
+    def __call__(self, t: Tensor) -> Tensor:
+        """The factor itself."""
+        raise NotImplementedError
+
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t, up to two."""
+        raise NotImplementedError
+
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+        """The sums over the points of dR/dc weight, for each parameter c."""
+        raise NotImplementedError
+
+    def margin(self, t: Tensor) -> Tensor | None:
+        """Positive where the factor is defined; None where it is so everywhere."""
+        return None
+
+    def orientation(self, radius: Tensor) -> Tensor:
+        """Positive where the factor is defined, not turned over, and the distorted radius ascends."""
+        t = radius * radius
+        factor, slope = self.derivatives(t, 1)
+        least = torch.minimum(factor, factor + 2 * t * slope)
+        margin = self.margin(t)
+        return least if margin is None else torch.minimum(least, margin)
+
+
+class Polynomial(RadialFactor):
+    """The radial factor R(t) = 1 + c0 t + c1 t^2 + ... of t = radius^2; radius R(t) is the distorted radius."""
+
+    def __init__(self, coefficients: Sequence[Tensor]):
+        self.parameters = tuple(coefficients)
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return self.derivatives(t, 0)[0]
+
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t: Horner's scheme, extended to the Taylor coefficients at t."""
+        # a zero stays a number until it is none: no work for what the highest powers do not have
+        taylor = [self.parameters[-1]] + [0.0] * order
+        for c in (*reversed(self.parameters[:-1]), 1.0):
+            for i in range(order, 0, -1):
+                if isinstance(taylor[i], float):
+                    taylor[i] = taylor[i - 1]
+                else:
+                    taylor[i] = torch.addcmul(taylor[i - 1], taylor[i], t)
+            # two columns in one operation would leave the vectorised loop
+            is_plane = isinstance(c, Tensor) and taylor[0] is not self.parameters[-1]
+            taylor[0] = torch.addcmul(c, taylor[0], t) if is_plane else taylor[0] * t + c
+        return tuple(
+            torch.zeros_like(t) if isinstance(x, float) else x if i < 2 else math.factorial(i) * x
+            for i, x in enumerate(taylor)
+        )
+
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+        """The sums over the points of dR/dc weight, for each coefficient c."""
+        sums = []
+        for _ in self.parameters:
+            weight = weight * t
+            sums.append(total(weight))
+        return sums
+
+
+class Rational(RadialFactor):
+    """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
+
+    def __init__(self, numerator: Sequence[Tensor], denominator: Sequence[Tensor]):
+        self.numerator, self.denominator = Polynomial(numerator), Polynomial(denominator)
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        return *self.numerator.parameters, *self.denominator.parameters
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return self.numerator(t) / self.denominator(t)
+
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t, from N = R D differentiated by Leibniz' rule."""
+        n, d = self.numerator.derivatives(t, order), self.denominator.derivatives(t, order)
+        reciprocal = d[0].reciprocal()
+        ratio: list[Tensor] = []
+        for i in range(order + 1):
+            known = sum(math.comb(i, j) * ratio[j] * d[i - j] for j in range(i))
+            ratio.append((n[i] - known) * reciprocal)
+        return tuple(ratio)
+
+    def margin(self, t: Tensor) -> Tensor:
+        """Positive before the pole."""
+        return self.denominator(t)
+
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+        """The sums over the points of dR/dc weight, for each coefficient."""
+        weight = weight / self.denominator(t)
+        above = self.numerator.vjp(t, weight)
+        return above + self.denominator.vjp(t, -weight * self(t))
+
+
+class RadiusPolynomial(RadialFactor):
     """The radial factor R(t) = 1 + c0 s + c1 s^2 + ... of s = radius = sqrt(t).
 
     With odd powers of s the point m R(|m|^2) has one continuous derivative at the centre, and no second one: it depends
@@ -45,7 +164,35 @@ class RadiusPolynomial:
         return self.of_radius.vjp(root(t), weight)
 
 
-class RadiusTable:
+class AnglePerRadius(RadialFactor):
+    """The radial factor theta / r of the ray (r, 0, D), D = 1 + c0 t + c1 t^2 + ... of t = r^2."""
+
+    def __init__(self, coefficients: Sequence[Tensor]):
+        self.ahead = Polynomial(coefficients)
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        return self.ahead.parameters
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return angle_per_radius(t, self.ahead(t))
+
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """The factor and, for order 1, its derivative by t; at the centre finite, for what is multiplied by t."""
+        ahead, *slope = self.ahead.derivatives(t, order)
+        factor = angle_per_radius(t, ahead, 1)
+        if not order:
+            return (factor,)
+        by_radius = torch.addcmul(ahead, t, slope[0], value=-2) / torch.addcmul(t, ahead, ahead)
+        return factor, (by_radius - factor) / (2 * t + torch.finfo(t.dtype).tiny ** 0.5)
+
+    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
+        """The sums over the points of dR/dc weight, for each coefficient c."""
+        ahead = self.ahead(t)
+        return self.ahead.vjp(t, -weight / torch.addcmul(t, ahead, ahead))
+
+
+class RadiusTable(RadialFactor):
     """The radial factor R(t) = r(s) / s of s = radius = sqrt(t), r a monotone cubic spline through (0, 0) and a table.
 
     The spline has two continuous derivatives, but for nodes at which Hyman's filter keeps it monotone (Hyman, "Accurate

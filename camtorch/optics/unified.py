@@ -10,7 +10,7 @@ from torch import Tensor
 
 from camtorch._tracing import may_look
 from camtorch.optics.charts import Chart, Perspective, even_steps_and_ratios, unit
-from camtorch.optics.local import total
+from camtorch.optics.radial import total
 
 
 class Unified(Chart):
@@ -133,7 +133,7 @@ class Unified(Chart):
 
     @staticmethod
     def _ahead(around: Tensor, alpha: Tensor | float) -> Tensor:
-        """Z' of the ray (a, b, z') whose denominator is 1; around = beta (a^2 + b^2)."""
+        """The z' of the ray (a, b, z') whose denominator is 1; around = beta (a^2 + b^2)."""
         if isinstance(alpha, float) and alpha == 0:
             return torch.ones_like(around)
         root = (1 - (2 * alpha - 1) * around).sqrt()

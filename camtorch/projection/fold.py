@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.optics.lens import Planar
+from camtorch.optics.radial_inverse import first_loss
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
-    from camtorch.optics.lens import Lens, Polynomial, Rational
+    from camtorch.optics.lens import Lens
+    from camtorch.optics.radial import RadialFactor
 
 AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # on one azimuth, which stands for all where the lens is radial
@@ -34,8 +35,8 @@ class Azimuths:
     def __init__(self, chart: Chart, lens: Lens, like: Tensor):
         """The tables of cameras (C,): limits (C, azimuths), reach (C, azimuths, radii); like gives dtype and device."""
         fine = chart.radii(_RADII, like)
-        denominator = getattr(lens.radial, "denominator", None)
-        self.has_pole = None if denominator is None else ~(denominator(fine * fine) > 0).all(-1)
+        margin = lens.radial.margin(fine * fine) if lens.radial else None
+        self.has_pole = None if margin is None else ~(margin > 0).all(-1)
         self.count = 1 if lens.is_radial else AZIMUTHS
         self.radii = fine if lens.is_radial else _around(lens.radial, chart, fine)
         a, b = (c[:, None] * self.radii.unsqueeze(-2) for c in _directions(self.count, like))
@@ -129,22 +130,17 @@ def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> 
     return low.clamp(max=length - 2)
 
 
-def _around(radial: Polynomial | Rational | None, chart: Chart, fine: Tensor) -> Tensor:
+def _around(radial: RadialFactor | None, chart: Chart, fine: Tensor) -> Tensor:
     """(C, radii): the chart's, and more of them the nearer to the fold of the radial factor, if it has one."""
     if radial is None:
         return chart.radii(_COARSE + _CLOSE, fine)
-    fold = _radius_at(fine, first_loss(radial_orientation(radial, fine)).unsqueeze(-1))
+    fold = _radius_at(fine, first_loss(radial.orientation(fine)).unsqueeze(-1))
     # without a fold on the chart, the middle of a chart does no harm
     fold = torch.where(fold < torch.inf, fold, 1.0)
     spread = 1 + 0.5 * torch.linspace(-1, 1, _CLOSE, dtype=fine.dtype, device=fine.device) ** 3
     close = (fold * spread).clamp(max=fine[-1])
     coarse = chart.radii(_COARSE, fine).expand(*close.shape[:-1], -1)
     return torch.cat((coarse, close), -1).sort(-1).values
-
-
-def radial_orientation(radial: Polynomial | Rational, radius: Tensor) -> Tensor:
-    """Positive where a radial factor is defined, not turned over and ascends."""
-    return Planar(radial).lower_bound(radius)[0]
 
 
 def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
@@ -162,20 +158,3 @@ def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
     nodes = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
     before = (nodes < lost.unsqueeze(-1)) & (reach < torch.inf)
     return torch.cummax(torch.where(before, reach, torch.inf), -1).values
-
-
-def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
-    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where it is first lost; S where it never is.
-
-    spared: bool, the nodes next to which no dip is assumed.
-    """
-    before, here, after = orientation[..., :-2], orientation[..., 1:-1], orientation[..., 2:]
-    bend, tilt = before - 2 * here + after, before - after
-    bend_safe = torch.where(bend > 0, bend, 1.0)
-    dips = (bend > 0) & (tilt.abs() <= bend) & (here - tilt * tilt / (8 * bend_safe) <= 0)
-    dips = dips if spared is None else dips & ~spared[..., 1:-1]
-    offset = torch.where(dips & (here > 0), tilt / (2 * bend_safe), 0.0)
-    nodes = torch.arange(orientation.shape[-1], dtype=orientation.dtype, device=orientation.device)
-    inner = torch.where(dips | ~(here > 0), nodes[1:-1] + offset, torch.inf)
-    ends = torch.where(orientation[..., [0, -1]] > 0, torch.inf, nodes[[0, -1]])
-    return torch.cat((inner, ends), -1).amin(-1).clamp(max=orientation.shape[-1])

@@ -14,31 +14,24 @@ from torch.utils.checkpoint import checkpoint
 
 from camtorch._arguments import columns
 from camtorch._module import same
-from camtorch.projection.domain import Domain, Optics, table_width
+from camtorch._tracing import register
+from camtorch.optics.radial_inverse import table_width
+from camtorch.projection.domain import Domain, Optics
 from camtorch.projection.fold import AZIMUTHS
-from camtorch.projection.solve import Found, radial_scale_at_last, search
+from camtorch.projection.solve import Found, search
 
 Result = TypeVar("Result")
 
-MODELS: dict[str, Optics] = {}
-"""The optics of every class of cameras, by its full name, and others: operators take no functions."""
+OPTICS: dict[str, Optics] = {}
+"""The optics of every class of cameras, by its full name: operators take no functions."""
 CLASSES: dict[str, type] = {}
 """The classes."""
 
 
-def register(camera_class: type) -> str:
+def register_camera(camera_class: type) -> str:
     """The name under which operators find the optics of a class."""
-    name = register_optics(f"{camera_class.__module__}.{camera_class.__qualname__}", camera_class.optics)
-    CLASSES[name] = camera_class
-    return name
-
-
-def register_optics(wanted: str, optics: Optics) -> str:
-    """The name under which operators find these optics."""
-    name, count = wanted, 2
-    while name in MODELS:  # a class of the same name, made by a function that was called again
-        name, count = f"{wanted}#{count}", count + 1
-    MODELS[name] = optics
+    name = register(CLASSES, camera_class)
+    OPTICS[name] = camera_class.optics
     return name
 
 
@@ -46,14 +39,14 @@ _KEPT = 8
 _domains: list[tuple[str, Tensor, Domain]] = []
 
 
-def domain_of(model: str, k: Tensor, optics: Optics | None = None) -> Domain:
-    """The domain of these values: one of the last ones, or a new one, of given or the model's optics."""
+def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
+    """The domain of these values: one of the last ones, or a new one."""
     for name, values, domain in _domains:
         if name == model and same(values, k):
             return domain
     with torch.inference_mode(False), torch.no_grad():
         values = k.detach().clone()
-        domain = Domain(optics or MODELS[model], values)
+        domain = Domain(optics, values)
     _domains.insert(0, (model, values, domain))
     del _domains[_KEPT:]
     return domain
@@ -62,7 +55,7 @@ def domain_of(model: str, k: Tensor, optics: Optics | None = None) -> Domain:
 @torch.library.custom_op("camtorch::tables", mutates_args=())
 def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`Domain.inner2`, `limits2` and `table` of coefficients (C, n); without columns where the lens needs none."""
-    domain = domain_of(model, k)
+    domain = domain_of(model, k, OPTICS[model])
     empty = k.new_empty(len(k), 0)
     # clones: who gets them may write into them
     return (
@@ -74,20 +67,9 @@ def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @tables.register_fake
 def _(model, k):
-    lens = MODELS[model](columns(k))[1]
+    lens = OPTICS[model](columns(k))[1]
     widths = 1, 0 if lens.is_radial else AZIMUTHS, table_width() if lens.radial else 0
     return tuple(k.new_empty(len(k), width) for width in widths)
-
-
-@torch.library.custom_op("camtorch::radial_scale", mutates_args=())
-def radial_scale(model: str, k: Tensor, r2: Tensor) -> Tensor:
-    """`radial_scale_at_last` of coefficients (C, n) and squared radii (C, N)."""
-    return radial_scale_at_last(domain_of(model, k), r2)
-
-
-@radial_scale.register_fake
-def _(model, k, r2):
-    return torch.empty_like(r2)
 
 
 @torch.library.custom_op("camtorch::search_", mutates_args=("a", "b", "solved"))
@@ -99,7 +81,7 @@ def search_in_place(
         return
     camera, point = (~(solved > 0) & (possible > 0)).nonzero(as_tuple=True)
     if len(camera):
-        found_a, found_b, found = search(domain_of(model, k), camera, u[camera, point], v[camera, point])
+        found_a, found_b, found = search(domain_of(model, k, OPTICS[model]), camera, u[camera, point], v[camera, point])
         a[camera, point], b[camera, point] = found_a, found_b
         solved[camera, point] = torch.where(found, 1.0, -1.0).to(solved.dtype)
 
@@ -128,12 +110,6 @@ def _(model, k, u, v, a, b, solved, possible):
 def _(info, in_dims, model, k):
     results = tables(model, k.movedim(in_dims[1], 0).flatten(0, 1))
     return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
-
-
-@radial_scale.register_vmap
-def _(info, in_dims, model, k, r2):
-    results, dims = _mapped(lambda *inputs: (radial_scale(*inputs),), info, in_dims, model, k, r2)
-    return results[0], dims[0]
 
 
 @search_open.register_vmap

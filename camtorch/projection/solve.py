@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -10,20 +9,18 @@ from torch import Tensor
 
 from camtorch._tracing import may_look
 from camtorch.optics.charts import floor_of
+from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
 from camtorch.projection.domain import regular
 from camtorch.projection.fold import azimuth
 
 if TYPE_CHECKING:
-    from camtorch.optics.lens import Lens
-    from camtorch.optics.local import Jacobian
+    from camtorch.optics.lens import Jacobian, Lens
     from camtorch.projection.domain import Domain
 
 Planes2 = tuple[Tensor, Tensor]
 
 # Steps of Newton's method that most points need, by whether they can be counted while they are made
-_STEPS = {torch.float32: 1, torch.float64: 2}
-_PLANAR_STEPS = {torch.float32: 2, torch.float64: 3}
-_MOST_STEPS = 5
+_STEPS = {torch.float32: 2, torch.float64: 3}
 
 _RADIAL_STEPS = 6  # of third order, from one interval of the table: 1e-2, 1e-6, 1e-18, with a reserve for wild lenses
 _START_ROUNDS = 6
@@ -51,47 +48,12 @@ def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
     return (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v)
 
 
-def radial_scale(domain: Domain, r2: Tensor) -> tuple[Tensor, Tensor]:
-    """The factor s by which the inverse of a radial lens scales points of squared radius r2, and whether that is it.
-
-    Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `RadialInverse.most2`. The second is
-    positive where the last step was so short that the next one would be nothing.
-    """
-    radial, table = domain.lens.radial, domain.inverse
-    scale = table(r2)
-    for count in range(1, _MOST_STEPS + 1):
-        t = r2 * scale * scale
-        factor, slope = radial.derivatives(t, 1)
-        step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
-        scale = scale + step
-        settled = _short(scale) * scale - step.abs()
-        if count >= _STEPS[r2.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
-            break
-    return scale, settled
-
-
-def radial_scale_at_last(domain: Domain, r2: Tensor) -> Tensor:
-    """The factor of `radial_scale` (C, N), by bisection where Newton's method leaves it open."""
-    scale, settled = radial_scale(domain, r2)
-    camera, point = (~(settled > 0)).nonzero(as_tuple=True)
-    if len(camera):
-        radial, wanted = domain.optics_of(camera)[1].radial, r2[camera, point].sqrt()
-        low, high = torch.zeros_like(wanted), domain.inner2[camera, 0].sqrt()
-        for _ in range(2 * -int(math.log2(torch.finfo(r2.dtype).eps))):
-            middle = (low + high) / 2
-            short = middle * radial(middle * middle) < wanted
-            low, high = torch.where(short, middle, low), torch.where(short, high, middle)
-        # on the axis itself nothing is left open
-        scale[camera, point] = high / wanted.clamp(min=torch.finfo(r2.dtype).tiny)
-    return scale
-
-
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
     r2 = torch.addcmul(u * u, v, v)
     eps = torch.finfo(u.dtype).eps
     possible = domain.inverse.most2 * (1 + 8 * eps) - r2
     r2 = torch.minimum(r2, domain.inverse.most2)
-    scale, settled = radial_scale(domain, r2)
+    scale, settled = solve(domain.lens.radial, domain.inverse, r2)
     # a ray's rounding must not carry it across the fold
     inside = domain.inner2 * (1 - 32 * eps) - r2 * scale * scale
     return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
@@ -104,25 +66,20 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
         # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
-    short2 = _short(u) ** 2
-    for count in range(1, _MOST_STEPS + 1):
+    short2 = short(u.dtype) ** 2
+    for count in range(1, MOST_STEPS + 1):
         at = domain.lens.at(a, b)
         jacobian = at.jacobian
         da, db = newton_step(jacobian, u - at.value[0], v - at.value[1])
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
         settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
-        if count >= _PLANAR_STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
+        if count >= _STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
             break
     # further out than images reach a determinant may overflow, and a step seem short
     inside = domain.inner2.clamp(max=domain.chart.usual_end(u.dtype) ** 2) - t
     solved = torch.minimum(torch.minimum(settled, inside), _reciprocal(jacobian).abs())
     return Found(a, b, solved, torch.ones_like(a))
-
-
-def _short(like: Tensor) -> float:
-    # the next step is about its square
-    return torch.finfo(like.dtype).eps ** 0.5 / 8
 
 
 def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes2:

@@ -1,0 +1,304 @@
+"""The inverse of a radial factor: where it folds, a table to start from, Newton's method, and bisection at last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import columns
+from camtorch._module import same
+from camtorch._tracing import may_look
+from camtorch.optics.charts import even_steps_and_ratios
+from camtorch.optics.radial import FACTORS
+
+if TYPE_CHECKING:
+    from camtorch.optics.radial import RadialFactor
+
+RADII = 1024
+"""At how many radii a factor is followed to its fold."""
+_PARTS = 256  # of the interval in which a fold is looked for; twice, then the secant
+_NODES = 1024  # of the table of an inverse
+_HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
+# Steps of Newton's method that most points need, by whether they can be counted while they are made
+_STEPS = {torch.float32: 1, torch.float64: 2}
+MOST_STEPS = 5
+"""Of Newton's method; what then still moves is left to slower methods."""
+
+
+def precise(k: Tensor) -> Tensor:
+    """In double precision, where there is one."""
+    return k if k.device.type == "mps" else k.double()
+
+
+def short(dtype: torch.dtype) -> float:
+    """The relative length of a step of Newton's method after which the next one would be nothing."""
+    # that one is about its square
+    return torch.finfo(dtype).eps ** 0.5 / 8
+
+
+def within(fold: Tensor) -> Tensor:
+    """The squared radius up to which a lens that folds there is certainly regular."""
+    return (fold * (1 - 4 * torch.finfo(fold.dtype).eps)) ** 2
+
+
+# -- the fold
+
+
+def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
+    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where it is first lost; S where it never is.
+
+    spared: bool, the nodes next to which no dip is assumed.
+    """
+    before, here, after = orientation[..., :-2], orientation[..., 1:-1], orientation[..., 2:]
+    bend, tilt = before - 2 * here + after, before - after
+    bend_safe = torch.where(bend > 0, bend, 1.0)
+    dips = (bend > 0) & (tilt.abs() <= bend) & (here - tilt * tilt / (8 * bend_safe) <= 0)
+    dips = dips if spared is None else dips & ~spared[..., 1:-1]
+    offset = torch.where(dips & (here > 0), tilt / (2 * bend_safe), 0.0)
+    nodes = torch.arange(orientation.shape[-1], dtype=orientation.dtype, device=orientation.device)
+    inner = torch.where(dips | ~(here > 0), nodes[1:-1] + offset, torch.inf)
+    ends = torch.where(orientation[..., [0, -1]] > 0, torch.inf, nodes[[0, -1]])
+    return torch.cat((inner, ends), -1).amin(-1).clamp(max=orientation.shape[-1])
+
+
+def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: float) -> Tensor:
+    """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end.
+
+    radii: (RADII,) ascending, at which it is followed from the centre outwards.
+    most: the largest image that is a number to calculate with.
+    """
+
+    def orientation(radius: Tensor) -> Tensor:
+        found, image = radial.orientation(radius), radius * radial(radius * radius)
+        return torch.where(image < most, found, -1.0)
+
+    nodes = radii.clamp(max=end)
+    followed = orientation(nodes)
+    nodes, lost = nodes.expand_as(followed), first_loss(followed).unsqueeze(-1)
+    some = lost < nodes.shape[-1]
+
+    def node(index: Tensor) -> Tensor:
+        return nodes.gather(-1, index.long().clamp(0, nodes.shape[-1] - 1))
+
+    low, high = node((lost - 1).floor()), node(lost.ceil())
+    # at a dip between nodes the upper end is the bottom of its parabola
+    at_dip = node(lost.floor()) + (lost - lost.floor()) * (high - node(lost.floor()))
+    high = torch.where(lost == lost.floor(), high, at_dip)
+    steps = torch.linspace(0, 1, _PARTS + 1, dtype=radii.dtype, device=radii.device)
+    for _ in range(2):
+        inner = low + (high - low) * steps
+        # the upper end counts as lost, whatever rounding says of it
+        first = (orientation(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
+        low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
+    before, after = orientation(low), orientation(high)
+    crossing = (before > 0) & (after < 0)
+    fraction = torch.where(crossing, before / torch.where(crossing, before - after, 1.0), 0.0)
+    return torch.where(some, low + fraction * (high - low), end)
+
+
+# -- the table
+
+
+def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> Tensor:
+    """(C, 2 + 2 nodes): what an `InverseTable` is made of."""
+    end = fold.clamp(max=usual_end)
+    u = torch.linspace(0, 1, _NODES + 1, dtype=fold.dtype, device=fold.device)
+    square = _square(u, end * end)
+    factor = radial(square)
+    r2 = torch.cummax(square * factor * factor, -1).values
+    reach2 = r2[..., -1:]
+    # where the nodes' images lie, and what lies at nodes that are even there
+    at = _variable(r2, reach2).contiguous()
+    cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, _NODES - 1)
+    low, high = at.gather(-1, cell), at.gather(-1, cell + 1)
+    scale = factor.reciprocal()
+    before, step = scale.gather(-1, cell), scale.diff(dim=-1).gather(-1, cell)
+    values = before + ((u - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1) * step
+    wanted = _square(u, reach2)
+    for _ in range(2):
+        t = wanted * values * values
+        factor, slope = radial.derivatives(t, 1)
+        slope = factor + 2 * t * slope
+        correction = (values * factor - 1) / torch.where(slope > 0, slope, 1.0)
+        values = values - torch.maximum(torch.minimum(correction, step.abs()), -step.abs())
+    values = torch.cat((values[..., :-1], scale[..., -1:]), -1)
+    most2 = torch.where(fold > usual_end, torch.inf, reach2)
+    return torch.cat((reach2, most2, values[..., :-1], values.diff(dim=-1)), -1)
+
+
+def _square(u: Tensor, top2: Tensor) -> Tensor:
+    """The inverse of `_variable`."""
+    x = u * (2 - u) * (top2 / (top2 + _HALF_WAY))
+    return _HALF_WAY * x / (1 - x)
+
+
+def _variable(r2: Tensor, top2: Tensor) -> Tensor:
+    x = r2 / (r2 + _HALF_WAY) * ((top2 + _HALF_WAY) / top2)
+    return 1 - (1 - x).clamp(min=0).sqrt()
+
+
+def table_width() -> int:
+    """The number of columns of `tabulate`."""
+    return 2 + 2 * _NODES
+
+
+class InverseTable:
+    """The factor by which the inverse of a radial factor scales a point, tabulated over the point's squared radius r2.
+
+    The table's variable is 1 - sqrt(1 - x), x = r2 / (r2 + 2) scaled to 1 at the fold: it takes the root singularity
+    at the fold out of the inverse, and is as analytic in r2 as that.
+    """
+
+    def __init__(self, table: Tensor):
+        """table: (C, 2 + 2 nodes): its last squared radius, the largest one that has a point, factors and steps."""
+        self.reach2, self.most2 = table[..., :1], table[..., 1:2]
+        self.values, self.steps = table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
+
+    def __call__(self, r2: Tensor) -> Tensor:
+        """The factor for (C, N), to about 1e-6."""
+        position = _variable(r2, self.reach2) * _NODES
+        node = position.to(torch.int32).clamp(0, _NODES - 1)  # NaN becomes some integer
+        fraction = position - node
+        if len(self.values) > 1:
+            node = node + torch.arange(len(self.values), device=r2.device, dtype=torch.int32).unsqueeze(-1) * _NODES
+        node = node.flatten()
+        value, step = (w.flatten().index_select(0, node).view(r2.shape) for w in (self.values, self.steps))
+        return torch.addcmul(value, fraction, step)
+
+
+# -- the solution
+
+
+def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:
+    """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
+
+    Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
+    positive where the last step was so short that the next one would be nothing.
+    """
+    scale = table(r2)
+    for count in range(1, MOST_STEPS + 1):
+        t = r2 * scale * scale
+        factor, slope = radial.derivatives(t, 1)
+        step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
+        scale = scale + step
+        settled = short(scale.dtype) * scale - step.abs()
+        if count >= _STEPS[r2.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
+            break
+    return scale, settled
+
+
+def bisect(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
+    """The factor of `solve` of single points (M,), each with its own coefficients and its own fold."""
+    wanted = r2.sqrt()
+    low, high = torch.zeros_like(wanted), inner2.sqrt()
+    for _ in range(2 * -int(math.log2(torch.finfo(r2.dtype).eps))):
+        middle = (low + high) / 2
+        lower = middle * radial(middle * middle) < wanted
+        low, high = torch.where(lower, middle, low), torch.where(lower, high, middle)
+    # on the axis itself nothing is left open
+    return high / wanted.clamp(min=torch.finfo(r2.dtype).tiny)
+
+
+class RadialInverse:
+    """The inverse of a radial factor, graph-free: for charts whose formula leads the other way.
+
+    radial: the factor. inner2: the squared radius of its fold. most2: that of the fold's image, infinite where there is
+    none; both in the shape of the parameters.
+    """
+
+    def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor], end: float):
+        """Factors of cameras, or of single points.
+
+        Args:
+            factor: a class whose instances are made of their coefficients.
+            parameters: the coefficients, columns (C, 1), or (M,) of single points.
+            end: the radius up to which the factor is used.
+        """
+        parameters = [w.detach() for w in parameters]
+        self.factor, self.radial, self.end = factor, factor(parameters), end
+        self.of_points = parameters[0].ndim < 2
+        self.k = torch.stack(parameters, -1).reshape(-1, len(parameters))
+        k, rows = self.k, None
+        if self.of_points and len(k) > 1:
+            k, rows = k.unique(dim=0, return_inverse=True)
+        inner2, table = _radial_tables(factor.name, k, end)
+        of_each = [w if rows is None else w[rows] for w in (inner2, InverseTable(table).most2)]
+        self.inner2, self.most2 = (w.reshape(parameters[0].shape) for w in of_each)
+
+    def __call__(self, r2: Tensor) -> Tensor:
+        """The factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
+        if self.of_points:
+            return bisect(self.radial, r2, self.inner2)
+        return _radial_scale(self.factor.name, self.k, self.end, r2.reshape(len(self.k), -1)).view_as(r2)
+
+
+_KEPT = 8
+_tables: list[tuple[str, float, Tensor, Tensor, Tensor]] = []
+
+
+@torch.library.custom_op("camtorch::radial_tables", mutates_args=())
+def _radial_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
+    """`RadialInverse.inner2` and the columns of its `InverseTable`."""
+    # clones: who gets them may write into them
+    inner2, table = _kept_tables(name, k, end)
+    return inner2.clone(), table.clone()
+
+
+def _kept_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
+    for kept_name, kept_end, kept_k, inner2, table in _tables:
+        if kept_name == name and kept_end == end and same(kept_k, k):
+            return inner2, table
+    with torch.inference_mode(False), torch.no_grad():
+        values = k.detach().clone()
+        wide = precise(values)
+        radial = FACTORS[name](columns(wide))
+        radii = even_steps_and_ratios(RADII, end, end, wide, torch.positive)
+        fold = fold_of(radial, radii, end, torch.finfo(k.dtype).max ** 0.25)
+        inner2, table = within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
+    _tables.insert(0, (name, end, values, inner2, table))
+    del _tables[_KEPT:]
+    return inner2, table
+
+
+@_radial_tables.register_fake
+def _(name, k, end):
+    return k.new_empty(len(k), 1), k.new_empty(len(k), table_width())
+
+
+@_radial_tables.register_vmap
+def _(info, in_dims, name, k, end):
+    results = _radial_tables(name, k.movedim(in_dims[1], 0).flatten(0, 1), end)
+    return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0)
+
+
+@torch.library.custom_op("camtorch::radial_scale", mutates_args=())
+def _radial_scale(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
+    """`solve` of coefficients (C, n) and squared radii (C, N), by bisection where Newton's method leaves it open."""
+    inner2, table = _kept_tables(name, k, end)
+    scale, settled = solve(FACTORS[name](columns(k)), InverseTable(table), r2)
+    camera, point = (~(settled > 0)).nonzero(as_tuple=True)
+    if len(camera):
+        # a single camera serves all points
+        radial = FACTORS[name](k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT)
+        scale[camera, point] = bisect(radial, r2[camera, point], inner2[camera, 0])
+    return scale
+
+
+@_radial_scale.register_fake
+def _(name, k, end, r2):
+    return torch.empty_like(r2)
+
+
+@_radial_scale.register_vmap
+def _(info, in_dims, name, k, end, r2):
+    _, of_k, _, of_r2 = in_dims
+    r2 = r2.expand(info.batch_size, *r2.shape) if of_r2 is None else r2.movedim(of_r2, 0)
+    if of_k is None:  # what is mapped joins the points
+        found = _radial_scale(name, k, end, r2.movedim(0, 1).flatten(1))
+        return found.unflatten(1, (info.batch_size, -1)), 1
+    found = _radial_scale(name, k.movedim(of_k, 0).flatten(0, 1), end, r2.flatten(0, 1))
+    return found.unflatten(0, (info.batch_size, -1)), 0
