@@ -11,6 +11,7 @@ from camtorch._module import same
 from camtorch.augment.cameras import frozen, remade
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
+from camtorch.warp.polygons import along_edges
 
 DRAWN = 16
 """How many coefficients have a draw of their own; more take turns."""
@@ -18,14 +19,16 @@ _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move les
 _STEP = 1e-4
 _HALVINGS = 4
 _SIDE = 9
+_EDGE_SAMPLES = 32
+_BISECTIONS = 12  # to a tenth of a pixel
 
 
 def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     """Distortion coefficients (*B, n) of lenses like that of `camera`.
 
     Every coefficient moves until it has moved the image's rim by its amount, together at most by the largest amount.
-    Where the new lens could not be inverted at a pixel at which the old one can, its coefficients move half as far,
-    or a quarter, and so on, or stay.
+    Where the new lens could not be inverted on the rim of what the old one shows, its coefficients move as far the
+    other way; or half as far, or a quarter, and so on; or stay.
 
     Args:
         camera: with image_size, and without batch dims or with those of the amounts.
@@ -50,15 +53,16 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=amounts.device)
     share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
     step = amounts[..., columns] * share * _sensitivity(camera, nominal).to(amounts)
-    lattice = _lattice(camera)
-    wanted = camera.unproject(lattice.expand(*camera.batch_shape, *lattice.shape))[1]
+    rim = _rim(camera)
+    unseen = ~camera.unproject(rim)[1]
     result = base.expand_as(step)
     left = torch.ones(step.shape[:-1], dtype=torch.bool, device=step.device)
-    for halving in range(_HALVINGS):
-        candidate, defined = _defined(camera, base + step / 2**halving, base)
+    for part in (sign / 2**halving for halving in range(_HALVINGS) for sign in (1, -1)):
+        candidate, defined = _defined(camera, base + part * step, base)
         numbers = (t.expand(*step.shape[:-1], -1) for t in (camera.intrinsics, candidate))
         lens = remade(camera, *numbers, camera.image_size)
-        invertible = (lens.unproject(lattice.expand(*lens.batch_shape, *lattice.shape))[1] | ~wanted).all(-1) & defined
+        seen = lens.unproject(rim.expand(*lens.batch_shape, *rim.shape[-2:]))[1]
+        invertible = (seen | unseen).all(-1) & defined
         result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
         left = left & ~invertible
         if not bool(left.any()):
@@ -126,6 +130,29 @@ def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Ten
     if sense is None:
         return distortion, torch.ones_like(distortion[..., 0], dtype=torch.bool)
     return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
+
+
+def _rim(camera: Camera) -> Tensor:
+    """(*B, N, 2): the outline of what the lens shows of the image, its outer edges where it shows all of it.
+
+    What is mapped has no holes: a lens that is invertible there is so inside.
+    """
+    height, width = camera.image_size
+    corners = camera.intrinsics.new_tensor([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    outer = along_edges(corners, _EDGE_SAMPLES)
+    outer = outer.expand(*camera.batch_shape, *outer.shape)
+    if bool(camera.unproject(outer)[1].all()):
+        return outer
+    # from the principal point, or where that is off the image from its nearest pixel, as far out as there are rays
+    middle = camera.intrinsics[..., None, 2:].clamp(min=0)
+    middle = torch.minimum(middle, middle.new_tensor([width - 1, height - 1]))
+    low, high = torch.zeros_like(outer[..., :1]), torch.ones_like(outer[..., :1])
+    share = high
+    for _ in range(_BISECTIONS):
+        seen = camera.unproject(middle + share * (outer - middle))[1].unsqueeze(-1)
+        low, high = torch.where(seen, share, low), torch.where(seen, high, share)
+        share = (low + high) / 2
+    return middle + low * (outer - middle)
 
 
 def _lattice(camera: Camera) -> Tensor:

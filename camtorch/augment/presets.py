@@ -1,4 +1,4 @@
-"""Named cameras to take the lens of."""
+"""Cameras that can be asked for by name: calibrated and typical ones, whose lens an augmentation takes."""
 
 from __future__ import annotations
 
@@ -53,9 +53,10 @@ PRESETS = {
     "dms130": Preset(
         "kannala_brandt",
         (800, 1280),
-        (561.2, 560.7, 644.1, 398.3),
-        (0.0312, -0.0521, 0.0473, -0.0188),
-        "typical of an infrared driver camera of 130 degrees; not one calibrated camera",
+        (560.4, 559.9, 644.1, 398.3),
+        (-0.0268, 0.0572, -0.0310, 0.0040),
+        "typical of an infrared driver camera of 130 degrees: the median of the lenses of 120 to 140 degrees of 112 real "
+        "cameras (gyroflow/lens_profiles, CC0), continued without a fold; not one calibrated camera",
     ),
     "surround190": Preset(
         "kannala_brandt",
