@@ -12,7 +12,7 @@ from camtorch._tracing import in_graph
 from camtorch.camera import Camera
 
 
-def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
+def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same model with these numbers; nothing in it learns that is not part of a graph already."""
     held = [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in (intrinsics, distortion)]
     return type(camera)(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
@@ -20,14 +20,14 @@ def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: t
 
 def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same numbers that does not learn."""
-    return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
+    return camera_like(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
 
 
 def on_device(camera: Camera, device: torch.device) -> Camera:
     """The camera where the images are."""
     if camera.intrinsics.device == device:
         return camera
-    return remade(camera, camera.intrinsics.to(device), camera.distortion.to(device), camera.image_size)
+    return camera_like(camera, camera.intrinsics.to(device), camera.distortion.to(device), camera.image_size)
 
 
 def kind(camera: Camera) -> tuple:
@@ -45,7 +45,7 @@ def rows_of(camera: Camera, index: Tensor) -> Camera:
     if not camera.batch_shape:
         return camera
     numbers = (t.expand(*camera.batch_shape, -1)[index] for t in (camera.intrinsics, camera.distortion))
-    return remade(camera, *numbers, camera.image_size)
+    return camera_like(camera, *numbers, camera.image_size)
 
 
 def expanded(camera: Camera, count: int) -> Camera:
@@ -53,13 +53,13 @@ def expanded(camera: Camera, count: int) -> Camera:
     if tuple(camera.batch_shape) == (count,):
         return camera
     numbers = (t.expand(count, t.shape[-1]) for t in (camera.intrinsics, camera.distortion))
-    return remade(camera, *numbers, camera.image_size)
+    return camera_like(camera, *numbers, camera.image_size)
 
 
 def singles(camera: Camera) -> list[Camera]:
     """The cameras of a batch, one by one."""
     numbers = [t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)]
-    return [remade(camera, *(t[i] for t in numbers), camera.image_size) for i in range(camera.batch_shape[0])]
+    return [camera_like(camera, *(t[i] for t in numbers), camera.image_size) for i in range(camera.batch_shape[0])]
 
 
 def joined(cameras: Sequence[Camera], order: Tensor | None = None) -> Camera:
@@ -69,7 +69,7 @@ def joined(cameras: Sequence[Camera], order: Tensor | None = None) -> Camera:
         tensors = [getattr(c, name).expand(*c.batch_shape, -1) for c in cameras]
         number = torch.cat(tensors)
         numbers.append(number if order is None else number[order])
-    return remade(cameras[0], *numbers, cameras[0].image_size)
+    return camera_like(cameras[0], *numbers, cameras[0].image_size)
 
 
 def collate(batch: Sequence[Camera], *, collate_fn_map=None) -> Camera | list[Camera]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from camtorch.augment.cameras import expanded, joined, kind, remade, rows_of, singles
+from camtorch.augment.cameras import expanded, joined, kind, camera_like, rows_of, singles
 from camtorch.camera import Camera
 from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
 from camtorch.warp.sampling import narrow, widen
@@ -80,7 +80,7 @@ class Change:
             source, target = (expanded(c, self.count) for c in (self.parts[0].camera, after[0]))
             pairs = [(getattr(target, n), getattr(source, n)) for n in ("intrinsics", "distortion")]
             numbers = [torch.where(self.gate.to(t.device).unsqueeze(-1), t, s) for t, s in pairs]
-            return remade(target, *numbers, target.image_size)
+            return camera_like(target, *numbers, target.image_size)
         return self._cameras(after)
 
     def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size
 from camtorch._tracing import is_concrete
-from camtorch.augment.cameras import alone, remade
+from camtorch.augment.cameras import alone, camera_like
 from camtorch.augment.change import Change, Part
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
@@ -112,7 +112,7 @@ class FaceNormalizer(SampleTransform):
         rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
         focal = (self.focal / self.distance * distance).expand(-1, 2)
         intrinsics = torch.cat((focal, focal.new_tensor(self.axis).expand(len(focal), 2)), -1)
-        target = remade(Pinhole([1.0, 1.0, 0.0, 0.0]), intrinsics, intrinsics[..., :0], self.image_size)
+        target = camera_like(Pinhole([1.0, 1.0, 0.0, 0.0]), intrinsics, intrinsics[..., :0], self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
     @without_graph_in_workers

@@ -1,14 +1,15 @@
-"""Other lenses like a given one: coefficients moved by what they do to the image, as far as it stays invertible."""
+"""Random lenses like a given one: coefficients moved by what they do to the image, as far as it stays invertible."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from camtorch._module import same
-from camtorch.augment.cameras import frozen, remade
+from camtorch.augment.cameras import frozen, camera_like
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
 from camtorch.warp.polygons import along_edges
@@ -20,7 +21,8 @@ _STEP = 1e-4
 _HALVINGS = 4
 _SIDE = 9
 _EDGE_SAMPLES = 32
-_BISECTIONS = 12  # to a tenth of a pixel
+_AZIMUTHS = 128
+_ANGLES = 64
 
 
 def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
@@ -52,7 +54,8 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     odd = camera.odd_in_x | camera.odd_in_y
     lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=amounts.device)
     share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
-    step = amounts[..., columns] * share * _sensitivity(camera, nominal).to(amounts)
+    usual = camera_like(camera, nominal.detach(), camera.distortion.detach(), camera.image_size)
+    step = amounts[..., columns] * share * _kept(_sensitivity, usual, nominal, camera.distortion).to(amounts)
     rim = _rim(camera)
     unseen = ~camera.unproject(rim)[1]
     result = base.expand_as(step)
@@ -60,7 +63,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     for part in (sign / 2**halving for halving in range(_HALVINGS) for sign in (1, -1)):
         candidate, defined = _defined(camera, base + part * step, base)
         numbers = (t.expand(*step.shape[:-1], -1) for t in (camera.intrinsics, candidate))
-        lens = remade(camera, *numbers, camera.image_size)
+        lens = camera_like(camera, *numbers, camera.image_size)
         seen = lens.unproject(rim.expand(*lens.batch_shape, *rim.shape[-2:]))[1]
         invertible = (seen | unseen).all(-1) & defined
         result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
@@ -84,28 +87,25 @@ def _(model, intrinsics, distortion, size, amounts, nominal):
 
 
 _KEPT = 8
-_known: list[tuple[tuple, tuple[Tensor, Tensor], Tensor]] = []
+_known: list[tuple[tuple, tuple[Tensor, ...], Tensor]] = []
 
 
-def _sensitivity(camera: Camera, nominal: Tensor) -> Tensor:
-    """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner.
-
-    The last results are kept: mostly the lens is always the same one.
-    """
-    options, inputs = (type(camera), camera.image_size), (nominal, camera.distortion)
+def _kept(measure: Callable[[Camera], Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
+    """`measure(camera)`, which depends on these tensors. The last results are kept: mostly the lens is the same one."""
+    options = (measure, type(camera), camera.image_size)
     for known_options, known_inputs, result in _known:
         if known_options == options and all(map(same, known_inputs, inputs)):
             return result
-    result = _measured(remade(camera, nominal.detach(), camera.distortion.detach(), camera.image_size))
+    result = measure(camera)
     _known.insert(0, (options, tuple(t.detach().clone() for t in inputs), result))
     del _known[_KEPT:]
     return result
 
 
-def _measured(camera: Camera) -> Tensor:
-    """`_sensitivity` at the camera's own intrinsics."""
+def _sensitivity(camera: Camera) -> Tensor:
+    """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner."""
     pixels = _lattice(camera)
-    camera = remade(camera, camera.intrinsics.double(), camera.distortion.double(), camera.image_size)
+    camera = camera_like(camera, camera.intrinsics.double(), camera.distortion.double(), camera.image_size)
     batch, count = camera.batch_shape, camera.distortion.shape[-1]
     rays, seen = camera.unproject(pixels.double().expand(*batch, *pixels.shape))
     rays = rays.unsqueeze(-3).expand(*batch, count, *pixels.shape[:-1], 3)
@@ -115,7 +115,7 @@ def _measured(camera: Camera) -> Tensor:
         given = camera.distortion.expand(*batch, count).unsqueeze(-2)
         distortion, _ = _defined(camera, given + change, given)
         intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, count, 4)
-        ends.append(remade(camera, intrinsics, distortion, camera.image_size).project(rays))
+        ends.append(camera_like(camera, intrinsics, distortion, camera.image_size).project(rays))
     (before, valid), (after, also) = ends
     moved = (after - before).norm(dim=-1) / (2 * _STEP)
     most = torch.where(valid & also & seen.unsqueeze(-2), moved, 0.0).amax(-1)
@@ -133,26 +133,33 @@ def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Ten
 
 
 def _rim(camera: Camera) -> Tensor:
-    """(*B, N, 2): the outline of what the lens shows of the image, its outer edges where it shows all of it.
+    """(*B, N, 2): the outline of what the lens shows of the image: of both, the image's edges and where the lens ends.
 
-    What is mapped has no holes: a lens that is invertible there is so inside.
+    What is mapped has no holes: a lens that is invertible on the outline is so inside.
     """
     height, width = camera.image_size
     corners = camera.intrinsics.new_tensor([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-    outer = along_edges(corners, _EDGE_SAMPLES)
-    outer = outer.expand(*camera.batch_shape, *outer.shape)
-    if bool(camera.unproject(outer)[1].all()):
-        return outer
-    # from the principal point, or where that is off the image from its nearest pixel, as far out as there are rays
-    middle = camera.intrinsics[..., None, 2:].clamp(min=0)
-    middle = torch.minimum(middle, middle.new_tensor([width - 1, height - 1]))
-    low, high = torch.zeros_like(outer[..., :1]), torch.ones_like(outer[..., :1])
-    share = high
-    for _ in range(_BISECTIONS):
-        seen = camera.unproject(middle + share * (outer - middle))[1].unsqueeze(-1)
-        low, high = torch.where(seen, share, low), torch.where(seen, high, share)
-        share = (low + high) / 2
-    return middle + low * (outer - middle)
+    edges = along_edges(corners, _EDGE_SAMPLES)
+    ends = _kept(_ends, camera, camera.distortion)
+    ends = ends.to(edges) * camera.intrinsics[..., None, :2] + camera.intrinsics[..., None, 2:]
+    inside = camera.contains(ends)
+    return torch.cat((edges.expand(*ends.shape[:-2], -1, -1), torch.where(inside.unsqueeze(-1), ends, edges[0])), -2)
+
+
+def _ends(camera: Camera) -> Tensor:
+    """(*B, K, 2): on the plane of unit focal length, the last point along every azimuth that the lens maps."""
+    ones = camera.distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
+    plane = camera_like(camera, ones, camera.distortion.detach().double(), None)
+    azimuth = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1, None]
+    share = torch.linspace(0, 1, _ANGLES + 1, dtype=torch.float64, device=ones.device)
+    low, width = 0.0, math.pi
+    for _ in range(2):  # the second time between the last angle that is mapped and the first that is not
+        angle = low + width * share
+        rays = torch.stack(torch.broadcast_tensors(angle.sin() * azimuth.cos(), angle.sin() * azimuth.sin(), angle.cos()), -1)
+        pixels, valid = plane.project(rays.expand(*plane.batch_shape, *rays.shape[-3:]))
+        last = (valid.long().cumprod(-1).sum(-1, keepdim=True) - 1).clamp(min=0)
+        low, width = angle.expand(valid.shape).gather(-1, last), width / _ANGLES
+    return pixels.gather(-2, last.unsqueeze(-1).expand(*last.shape, 2)).squeeze(-2)
 
 
 def _lattice(camera: Camera) -> Tensor:

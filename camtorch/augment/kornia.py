@@ -18,7 +18,7 @@ from torch import Tensor
 from camtorch._module import Memo
 from camtorch.augment import random_camera
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import collate, remade
+from camtorch.augment.cameras import collate, camera_like
 from camtorch.augment.change import Change
 from camtorch.augment.ranges import draw
 from camtorch.camera import Camera
@@ -134,7 +134,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         device = own[0].device if device is None else device
         numbers = [params.get(name, value).to(device) for name, value in zip(_NUMBERS, own, strict=True)]
         same = numbers[0] is own[0] and numbers[1] is own[1]
-        return self.camera if same else remade(self.camera, *numbers, self.camera.image_size)
+        return self.camera if same else camera_like(self.camera, *numbers, self.camera.image_size)
 
     # -- moving
 

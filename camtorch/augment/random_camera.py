@@ -10,7 +10,7 @@ from torch import Tensor
 from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._tracing import is_concrete
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import frozen, remade
+from camtorch.augment.cameras import frozen, camera_like
 from camtorch.augment.change import Part
 from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.presets import PRESETS
@@ -113,19 +113,19 @@ class RandomCamera(Augmentation):
     def _target(self, source: Camera, values: Mapping[str, Tensor], ones: Tensor) -> Camera:
         base = source if self.like is None else self.like
         size = self.image_size or source.image_size
-        base = remade(base, base.intrinsics.to(ones), base.distortion.to(ones), base.image_size)
+        base = camera_like(base, base.intrinsics.to(ones), base.distortion.to(ones), base.image_size)
         fx, fy, cx, cy = _sized(base, size, values.get("fov")).unbind(-1)
         factor = ones * values.get("focal", 1.0) * values.get("zoom", 1.0)
         fx, fy = fx * factor, fy * factor
         if "centre" in values:
             cx, cy = cx + values["centre"][..., 0] * size[1], cy + values["centre"][..., 1] * size[0]
         intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
-        target = remade(base, intrinsics, base.distortion, size)
+        target = camera_like(base, intrinsics, base.distortion, size)
         if "distortion" in values and base.distortion.shape[-1]:
             usual = ones.new_tensor(self.ranges["fov"].middle) if "fov" in values else None
             nominal = _sized(base, size, usual)
             step = jittered(frozen(target, size), values["distortion"], nominal) - base.distortion.detach()
-            target = remade(base, intrinsics, base.distortion + step, size)
+            target = camera_like(base, intrinsics, base.distortion + step, size)
         if "crop" in values:
             target = _cropped(target, values["crop"], values["place"])
         return target
@@ -188,7 +188,7 @@ def _pair(value):
 def _scaled(camera: Camera, factor: Tensor) -> Camera:
     """The camera with focal lengths times a factor (*B,)."""
     scale = torch.stack((factor, factor, torch.ones_like(factor), torch.ones_like(factor)), -1)
-    return remade(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
+    return camera_like(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
 
 
 def _sized(base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
@@ -214,7 +214,7 @@ def _plane_width(base: Camera, fov: Tensor) -> Tensor:
     half = torch.deg2rad(fov) / 2
     right = torch.stack((half.sin(), torch.zeros_like(half), half.cos()), -1)
     rays = torch.stack((right * right.new_tensor([-1.0, 1.0, 1.0]), right), -2)
-    plane = remade(base, right.new_tensor([1.0, 1.0, 0.0, 0.0]), base.distortion, None)
+    plane = camera_like(base, right.new_tensor([1.0, 1.0, 0.0, 0.0]), base.distortion, None)
     ends, valid = plane.project(rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3))))
     if is_concrete(valid) and not bool(valid.all()):
         raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
@@ -227,7 +227,7 @@ def _cropped(camera: Camera, share: Tensor, place: Tensor) -> Camera:
     fx, fy, cx, cy = camera.intrinsics.unbind(-1)
     left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
     cx, cy = (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
-    return remade(camera, torch.stack((fx / share, fy / share, cx, cy), -1), camera.distortion, camera.image_size)
+    return camera_like(camera, torch.stack((fx / share, fy / share, cx, cy), -1), camera.distortion, camera.image_size)
 
 
 def _light(camera: Camera, loss: Tensor) -> Tensor:
