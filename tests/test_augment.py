@@ -383,7 +383,7 @@ def test_depth_is_that_along_the_new_axis():
     rays, _ = camera.rays()
     depth = height / (rays @ normal) * rays[..., 2]
     out = RandomCamera("dms130", camera=camera, fov=(60, 70), yaw=8, pitch=8)(depth=depth[None], distance=depth[None])
-    target = ct.augment.cameras.singles(out["camera"])[0].double() if out["camera"].batch_shape else out["camera"]
+    target = ct.augment.change.singles(out["camera"])[0].double() if out["camera"].batch_shape else out["camera"]
     rays, _ = target.rays()
     turned = out["rotation"][0].double() @ normal
     expected = height / (rays @ turned) * rays[..., 2]

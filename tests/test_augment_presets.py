@@ -10,7 +10,7 @@ WHOLE = [name for name in PRESETS if name != "aria"]
 """Of Aria's, the calibrated polynomial folds before the corners: they lie beyond what the lens lights."""
 
 
-def rim(size, step=1.0):
+def rim(size):
     """(N, 2): the outer edges of an image, a point on every pixel edge."""
     height, width = size
     corners = torch.tensor([[[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]]])
@@ -53,8 +53,7 @@ def test_a_drawn_lens_loses_no_pixel_that_its_like_has(amount):
 
 def test_the_typical_wide_lens_is_as_wide_as_its_name_says():
     camera = PRESETS["dms130"].camera()
-    height, width = camera.image_size
-    *_, cx, cy = camera.intrinsics.tolist()
+    width, cy = camera.image_size[1], float(camera.intrinsics[3])
     left, right = camera.unproject(torch.tensor([[-0.5, cy], [width - 0.5, cy]]))[0]
     across = torch.atan2(right[0], right[2]) - torch.atan2(left[0], left[2])
     assert abs(float(across.rad2deg()) - 130) < 0.5

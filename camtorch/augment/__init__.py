@@ -4,12 +4,12 @@
 """
 
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import collate
 from camtorch.augment.change import Change
+from camtorch.augment.collate import collate
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
+from camtorch.augment.sample import from_pitch_yaw, to_pitch_yaw
 from camtorch.rotations import mount_rotation
 from camtorch.warp.polygons import outlines
 

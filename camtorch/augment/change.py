@@ -1,4 +1,4 @@
-"""What one draw does to a batch: from which camera to which, how far turned, and whether at all."""
+"""A change of cameras: from which to which the samples of a batch go, how far turned, and how all they hold moves."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from camtorch.augment.cameras import expanded, joined, kind, camera_like, rows_of, singles
+from camtorch._tracing import in_graph
 from camtorch.camera import Camera
 from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
 from camtorch.warp.sampling import narrow, widen
@@ -245,3 +245,66 @@ def _both(function: Callable, *results):
     if isinstance(results[0], tuple):
         return tuple(function(pieces) for pieces in zip(*results, strict=True))
     return function(results)
+
+
+# -- cameras as rows of a batch: made anew from other numbers, taken out, put together
+
+
+def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
+    """A camera of the same model with these numbers; nothing in it learns that is not part of a graph already."""
+    held = [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in (intrinsics, distortion)]
+    return type(camera)(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
+
+
+def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
+    """A camera of the same numbers that does not learn."""
+    return camera_like(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
+
+
+def on_device(camera: Camera, device: torch.device) -> Camera:
+    """The camera where the images are."""
+    if camera.intrinsics.device == device:
+        return camera
+    return camera_like(camera, camera.intrinsics.to(device), camera.distortion.to(device), camera.image_size)
+
+
+def kind(camera: Camera) -> tuple:
+    """What cameras must have in common to be rows of one batch."""
+    return type(camera), camera.distortion.shape[-1], camera.image_size
+
+
+def alone(camera: Camera) -> Camera:
+    """A batch of one as the camera that it holds, which serves any number of samples."""
+    return singles(camera)[0] if tuple(camera.batch_shape) == (1,) else camera
+
+
+def rows_of(camera: Camera, index: Tensor) -> Camera:
+    """The cameras of these rows; one without batch dims serves all of them."""
+    if not camera.batch_shape:
+        return camera
+    numbers = (t.expand(*camera.batch_shape, -1)[index] for t in (camera.intrinsics, camera.distortion))
+    return camera_like(camera, *numbers, camera.image_size)
+
+
+def expanded(camera: Camera, count: int) -> Camera:
+    """A batch of `count` rows."""
+    if tuple(camera.batch_shape) == (count,):
+        return camera
+    numbers = (t.expand(count, t.shape[-1]) for t in (camera.intrinsics, camera.distortion))
+    return camera_like(camera, *numbers, camera.image_size)
+
+
+def singles(camera: Camera) -> list[Camera]:
+    """The cameras of a batch, one by one."""
+    numbers = [t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)]
+    return [camera_like(camera, *(t[i] for t in numbers), camera.image_size) for i in range(camera.batch_shape[0])]
+
+
+def joined(cameras: Sequence[Camera], order: Tensor | None = None) -> Camera:
+    """One batch of cameras of one kind that have a batch dim each, in another order if wanted."""
+    numbers = []
+    for name in ("intrinsics", "distortion"):
+        tensors = [getattr(c, name).expand(*c.batch_shape, -1) for c in cameras]
+        number = torch.cat(tensors)
+        numbers.append(number if order is None else number[order])
+    return camera_like(cameras[0], *numbers, cameras[0].image_size)

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size
 from camtorch._tracing import is_concrete
-from camtorch.augment.cameras import alone, camera_like
-from camtorch.augment.change import Change, Part
+from camtorch.augment.change import Change, Part, alone, camera_like
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.models import Pinhole

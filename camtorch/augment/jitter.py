@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch._module import same
-from camtorch.augment.cameras import frozen, camera_like
+from camtorch.augment.change import camera_like, frozen
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
 from camtorch.warp.polygons import along_edges
@@ -155,7 +155,9 @@ def _ends(camera: Camera) -> Tensor:
     low, width = 0.0, math.pi
     for _ in range(2):  # the second time between the last angle that is mapped and the first that is not
         angle = low + width * share
-        rays = torch.stack(torch.broadcast_tensors(angle.sin() * azimuth.cos(), angle.sin() * azimuth.sin(), angle.cos()), -1)
+        rays = torch.stack(
+            torch.broadcast_tensors(angle.sin() * azimuth.cos(), angle.sin() * azimuth.sin(), angle.cos()), -1
+        )
         pixels, valid = plane.project(rays.expand(*plane.batch_shape, *rays.shape[-3:]))
         last = (valid.long().cumprod(-1).sum(-1, keepdim=True) - 1).clamp(min=0)
         low, width = angle.expand(valid.shape).gather(-1, last), width / _ANGLES

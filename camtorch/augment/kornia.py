@@ -17,10 +17,9 @@ from torch import Tensor
 
 from camtorch._module import Memo
 from camtorch.augment import random_camera
-from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import collate, camera_like
-from camtorch.augment.change import Change
-from camtorch.augment.ranges import draw
+from camtorch.augment.augmentation import Augmentation, draw
+from camtorch.augment.change import Change, camera_like
+from camtorch.augment.collate import collate_cameras
 from camtorch.camera import Camera
 from camtorch.warp.sampling import narrow, widen
 
@@ -263,7 +262,7 @@ def with_cameras(params, cameras: Camera | Sequence[Camera]):
         TypeError: they are no cameras.
     """
     if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
-        cameras = collate(cameras)
+        cameras = collate_cameras(cameras)
     if not isinstance(cameras, Camera):
         raise TypeError("with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size")
     found: list[dict] = []

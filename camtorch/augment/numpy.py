@@ -14,16 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment import fields as field_kinds
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import singles
-from camtorch.augment.change import Change
+from camtorch.augment.change import Change, singles
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.sample import Sample
+from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, check, kind_of
 from camtorch.camera import Camera
 
 _OWNER = "numpy.Transform"
-_PICTURES = ("image", "mask", "depth", "distance")
 _SEEN = "image_valid"
 
 
@@ -141,20 +138,20 @@ class Transform:
 
         The latter is a function of what became of the tensors, and of the new image_size; None for what is passed on.
         """
-        if name in field_kinds.OWN or value is None:
+        if name in OWN or value is None:
             return {}, None
         if name == _SEEN or (name.endswith("_valid") and name.removesuffix("_valid") in sample):
             valid = _tensor(np.asarray(value, dtype=bool))
             if name == _SEEN:
                 return {name: valid[None, None]}, lambda moved, size: moved[0][0].cpu().numpy()
             return {name: valid[None]}, lambda moved, size: moved[0].cpu().numpy()
-        kind = field_kinds.kind_of(name, value, self.augmentation.fields, _OWNER)
+        kind = kind_of(name, value, self.augmentation.fields, _OWNER)
         if kind is None:
             return {}, None
-        if kind not in _PICTURES:
+        if kind not in IMAGES:
             value = _checked(name, _numbers(value, kind))
             tensor = _tensor(value)
-            field_kinds.check(kind, name, tensor, False, _OWNER)
+            check(kind, name, tensor, False, _OWNER)
             return {name: tensor[None]}, lambda moved, size: moved[0].cpu().numpy().astype(value.dtype, copy=False)
         camera = sample.get("camera")
         size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
@@ -180,7 +177,7 @@ def _numbers(value, kind: str):
             value = np.asarray(value, np.float32)
         except (TypeError, ValueError):
             return value
-        last = field_kinds.KINDS[kind].last
+        last = KINDS[kind].last
         value = value if value.size or not last else value.reshape(0, last[0])
     return value.astype(np.float32) if isinstance(value, np.ndarray) and value.dtype.kind in "iub" else value
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from camtorch.augment.cameras import frozen
+from camtorch.augment.change import frozen
 from camtorch.camera import Camera
 from camtorch.models import MODELS
 
@@ -55,8 +55,8 @@ PRESETS = {
         (800, 1280),
         (560.4, 559.9, 644.1, 398.3),
         (-0.0268, 0.0572, -0.0310, 0.0040),
-        "typical of an infrared driver camera of 130 degrees: the median of the lenses of 120 to 140 degrees of 112 real "
-        "cameras (gyroflow/lens_profiles, CC0), continued without a fold; not one calibrated camera",
+        "typical of an infrared driver camera of 130 degrees: the median lens of 112 real cameras of 120 to 140 degrees"
+        " (gyroflow/lens_profiles, CC0), continued without a fold; not one calibrated camera",
     ),
     "surround190": Preset(
         "kannala_brandt",

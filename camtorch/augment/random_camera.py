@@ -9,12 +9,10 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._tracing import is_concrete
-from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import frozen, camera_like
-from camtorch.augment.change import Part
+from camtorch.augment.augmentation import Augmentation, as_range
+from camtorch.augment.change import Part, camera_like, frozen
 from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.presets import PRESETS
-from camtorch.augment.ranges import as_range
 from camtorch.camera import Camera
 from camtorch.models import MODELS
 from camtorch.rotations import mount_rotation

@@ -1,21 +1,219 @@
-"""Moving a sample: all of its fields, checked at the door, by one change of cameras."""
+"""A sample: the kinds of fields that it may have, how each is checked, and how all move by one change of cameras."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch.augment import fields as field_kinds
-from camtorch.augment.cameras import alone, on_device, singles
-from camtorch.augment.change import Change
-from camtorch.augment.fields import KEEP, KINDS
+from camtorch.augment.change import Change, alone, on_device, singles
 from camtorch.camera import Camera
+from camtorch.rotations import rotation_matrix, rotation_vector
 
 Sample = dict[str, object]
+
+
+# -- the kinds of fields
+
+KEEP = "keep"
+IMAGES = ("image", "mask", "depth", "distance")
+
+
+@dataclass(frozen=True)
+class Field:
+    """A kind of data."""
+
+    dims: int
+    """The least number of dims of a single sample."""
+    most_dims: int
+    """The most."""
+    last: tuple[int, ...]
+    """What its last dim may be; empty: anything."""
+    shape: str
+    """In words, of a batch."""
+    move: Callable
+    """(change, batch, options) -> batch, or (batch, valid)."""
+    decides: bool = False
+    """Whether its number of dims tells a batch from a single sample."""
+
+
+def _image(change: Change, images: Tensor, options: Mapping) -> Tensor:
+    return change.images(images)
+
+
+def _mask(change: Change, masks: Tensor, options: Mapping) -> Tensor:
+    flat = masks.ndim == 3
+    moved = change.labels(masks.unsqueeze(1) if flat else masks, options["mask_fill"])
+    return moved.squeeze(1) if flat else moved
+
+
+def _depth(change: Change, depth: Tensor, options: Mapping) -> Tensor:
+    flat = depth.ndim == 3
+    moved = change.depth(depth.unsqueeze(1) if flat else depth)
+    return moved.squeeze(1) if flat else moved
+
+
+def _distance(change: Change, distance: Tensor, options: Mapping) -> Tensor:
+    return _mask(change, distance, {"mask_fill": 0.0})
+
+
+def _pixels(change: Change, pixels: Tensor, options: Mapping) -> tuple[Tensor, Tensor]:
+    return change.points(pixels)
+
+
+def _boxes(change: Change, boxes: Tensor, options: Mapping) -> tuple[Tensor, Tensor]:
+    return change.boxes(boxes)
+
+
+def _rays(change: Change, rays: Tensor, options: Mapping) -> Tensor:
+    return change.rays(rays)
+
+
+def _pitch_yaw(change: Change, angles: Tensor, options: Mapping) -> Tensor:
+    return change.rays(angles, from_pitch_yaw, to_pitch_yaw)
+
+
+def _pose(change: Change, pose: Tensor, options: Mapping) -> Tensor:
+    top = change.rays(pose[..., :3, :], _columns, _columns)
+    return torch.cat((top, pose[..., 3:, :].to(top)), -2)
+
+
+def _columns(matrix: Tensor) -> Tensor:
+    return matrix.mT
+
+
+def _rotation_vector(change: Change, rvec: Tensor, options: Mapping) -> Tensor:
+    return change.rays(rvec, lambda r: rotation_matrix(r).mT, lambda columns: rotation_vector(columns.mT))
+
+
+def _rotation(change: Change, rotation: Tensor, options: Mapping) -> Tensor:
+    return change.rays(rotation, _columns, _columns)
+
+
+_MANY = 16
+_RAYS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays)
+_POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose)
+KINDS = {
+    "image": Field(3, 3, (), "(B, C, H, W)", _image, True),
+    "mask": Field(2, 3, (), "(B, C, H, W) or (B, H, W)", _mask),
+    "depth": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along z", _depth),
+    "distance": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along the ray", _distance),
+    "keypoints": Field(2, 2, (2,), "(B, N, 2) pixels x, y", _pixels, True),
+    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
+    "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", _boxes, True),
+    "landmarks": Field(2, 2, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
+    "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _rays),
+    "gaze": _RAYS,
+    "directions": _RAYS,
+    "pitch_yaw": Field(1, _MANY, (2,), "(B, *N, 2) pitch and yaw of a gaze in radians", _pitch_yaw),
+    "head_pose": _POSE,
+    "pose": _POSE,
+    "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector),
+    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _rays),
+    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation),
+}
+_ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
+OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
+
+
+def kind_of(name: str, value, own: Mapping[str, str], owner: str) -> str | None:
+    """The key in `KINDS` of a field, or None if it stays as it is.
+
+    Raises:
+        ValueError: numbers of an unknown name, which might be geometry.
+    """
+    if name in own:
+        return None if own[name] == KEEP else own[name]
+    if name.endswith("_valid"):
+        return None
+    base = name if name in KINDS else _ALIASES.get(name)
+    if base is None:
+        base = max((k for k in KINDS if name.startswith(k + "_")), key=len, default=None)
+        if base is not None and not isinstance(value, (Tensor, np.ndarray, list, tuple)):
+            return None  # image_path, mask_id
+    if base is None and _holds_reals(value):
+        raise ValueError(
+            f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. "
+            f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
+        )
+    return base
+
+
+def _holds_reals(value) -> bool:
+    """Whether there are real numbers in it that might be geometry; a number alone is none."""
+    if isinstance(value, Mapping):
+        return any(map(_holds_reals, value.values()))
+    if isinstance(value, (list, tuple)):
+        return any(isinstance(item, float) or _holds_reals(item) for item in value)
+    if isinstance(value, np.ndarray):
+        return value.ndim > 0 and np.issubdtype(value.dtype, np.floating)
+    return isinstance(value, Tensor) and value.ndim > 0 and value.is_floating_point()
+
+
+def moves(kind: str, value: Tensor) -> Callable:
+    """How values of a kind move."""
+    return _rays if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
+
+
+def as_tensor(value, name: str, kind: str, owner: str) -> Tensor:
+    """The value of a field as a tensor.
+
+    Raises:
+        TypeError: it is neither a tensor nor an array of real numbers.
+    """
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        value = torch.from_numpy(value)
+    if not isinstance(value, Tensor) or value.is_complex():
+        what = f"dtype {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+        raise TypeError(
+            f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{_hint(name)}"
+        )
+    if kind not in IMAGES and not value.is_floating_point():
+        value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
+    return value
+
+
+def _hint(name: str) -> str:
+    return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} leaves it as it is"
+
+
+def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
+    """Raise a ValueError unless a kind takes this shape."""
+    field = KINDS[kind]
+    dims = value.ndim - batched
+    least, most = field.dims, field.most_dims
+    if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
+        what = field.shape if batched else field.shape.replace("(B, ", "(")
+        raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{_hint(name)}")
+    if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
+        raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
+
+
+def is_batch(named: Mapping[str, tuple[str, object]], camera) -> bool:
+    """Whether a sample of name -> (kind, value) is a batch of samples.
+
+    The field that decides is the first of: an image, pixels, boxes; else cameras with a batch dim, and else any
+    field with more dims than one sample has.
+    """
+    if isinstance(camera, (list, tuple)):
+        return True
+    order = list(KINDS)
+    for kind, value in sorted(named.values(), key=lambda pair: (not KINDS[pair[0]].decides, order.index(pair[0]))):
+        if isinstance(value, (list, tuple)):
+            return True
+        if KINDS[kind].decides:
+            return value.ndim > KINDS[kind].dims
+    if isinstance(camera, Camera) and camera.batch_shape:
+        return True
+    return any(value.ndim > KINDS[kind].dims for kind, value in named.values())
+
+
+# -- moving a sample
 
 
 def without_graph_in_workers(method: Callable) -> Callable:
@@ -59,12 +257,12 @@ class SampleTransform(nn.Module):
         """Name -> (kind, value) of the fields that move."""
         named = {}
         for name, value in sample.items():
-            if name in field_kinds.OWN or value is None:
+            if name in OWN or value is None:
                 continue
-            found = field_kinds.kind_of(name, value, self.fields, self._name)
+            found = kind_of(name, value, self.fields, self._name)
             if found is not None:
                 if not isinstance(value, (list, tuple)):
-                    value = field_kinds.as_tensor(value, name, found, self._name)
+                    value = as_tensor(value, name, found, self._name)
                 named[name] = (found, value)
         return named
 
@@ -77,16 +275,16 @@ class SampleTransform(nn.Module):
         named = self._sorted(sample)
         if not named:
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
-        batched = field_kinds.is_batch(named, camera)
+        batched = is_batch(named, camera)
         count = None
         for name, (found, value) in named.items():
             if isinstance(value, (list, tuple)):
-                items = [field_kinds.as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
+                items = [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
                 for i, item in enumerate(items):
-                    field_kinds.check(found, f"{name}[{i}]", item, False, self._name)
+                    check(found, f"{name}[{i}]", item, False, self._name)
                 value, n = items, len(items)
             else:
-                field_kinds.check(found, name, value, batched, self._name)
+                check(found, name, value, batched, self._name)
                 value = value if batched else value.unsqueeze(0)
                 n = len(value)
             named[name] = (found, value)
@@ -119,7 +317,7 @@ class SampleTransform(nn.Module):
                 # one for each sample where there are as many cameras
                 images = value if isinstance(value, list) else [value]
                 images = images[i : i + 1] if isinstance(value, list) and len(cameras) > 1 else images
-                for size in {tuple(image.shape[-2:]) for image in images if found in field_kinds.PICTURES}:
+                for size in {tuple(image.shape[-2:]) for image in images if found in IMAGES}:
                     if size != one.image_size:
                         raise ValueError(
                             f"{self._name}: {field} is {size} (height, width), but the image_size of {name} is "
@@ -166,7 +364,7 @@ class SampleTransform(nn.Module):
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping) -> tuple[Tensor, Tensor | None]:
-        result = field_kinds.moves(found, value)(change, value, options)
+        result = moves(found, value)(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
         return result.to(value.dtype) if value.is_floating_point() else result, valid
@@ -184,3 +382,18 @@ class SampleTransform(nn.Module):
             now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
             valid = now if many else now[0] if batched else now[0].unsqueeze(0)
         put(name, valid)
+
+
+def from_pitch_yaw(angles: Tensor) -> Tensor:
+    """Unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
+
+    Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
+    """
+    pitch, yaw = angles.unbind(-1)
+    return torch.stack((-pitch.cos() * yaw.sin(), -pitch.sin(), -pitch.cos() * yaw.cos()), -1)
+
+
+def to_pitch_yaw(gaze: Tensor) -> Tensor:
+    """Pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
+    x, y, z = gaze.unbind(-1)
+    return torch.stack((torch.atan2(-y, torch.hypot(x, z)), torch.atan2(-x, -z)), -1)

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import singles
-from camtorch.augment.change import Change
+from camtorch.augment.change import Change, singles
 from camtorch.augment.numpy import as_array, as_tensor
 from camtorch.camera import Camera
 

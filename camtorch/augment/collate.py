@@ -1,0 +1,48 @@
+"""Batches for a DataLoader of samples that hold cameras, and labels whose number differs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data._utils.collate import collate as collate_by
+from torch.utils.data._utils.collate import default_collate_fn_map
+
+from camtorch.augment.change import expanded, joined, kind
+from camtorch.camera import Camera
+
+
+def collate(samples: Sequence[object]) -> object:
+    """A batch of samples, of dicts, tuples or whatever they are: the `collate_fn` of a DataLoader.
+
+    As torch's own `default_collate`, which stacks tensors, arrays and numbers; but tensors and arrays whose shapes
+    differ, such as the keypoints of several faces, come as the list of tensors that the augmentations take. Cameras
+    become a batch, or a list where they are of several models or sizes; so they do by `default_collate`.
+
+    Raises:
+        TypeError: what cannot be collated, as by `default_collate`.
+    """
+    return collate_by(samples, collate_fn_map={**default_collate_fn_map, Tensor: _tensors, np.ndarray: _arrays})
+
+
+def _tensors(batch: Sequence[Tensor], *, collate_fn_map=None) -> Tensor | list[Tensor]:
+    if len({tensor.shape for tensor in batch}) > 1:
+        return list(batch)
+    return default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map)
+
+
+def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map=None) -> Tensor | list[Tensor]:
+    return _tensors([torch.as_tensor(array) for array in batch], collate_fn_map=collate_fn_map)
+
+
+def collate_cameras(batch: Sequence[Camera], *, collate_fn_map=None) -> Camera | list[Camera]:
+    """Single cameras as one batch, or as a list where they are of several models or sizes."""
+    if any(camera.batch_shape for camera in batch) or len({kind(camera) for camera in batch}) > 1:
+        return list(batch)
+    return joined([expanded(camera, 1) for camera in batch])
+
+
+# Samples that hold cameras then go through a DataLoader as they are. torch documents this map for the purpose.
+default_collate_fn_map[Camera] = collate_cameras
