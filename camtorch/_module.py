@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -57,6 +57,70 @@ class GeometryModule(nn.Module):
             name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
         }
         return state
+
+
+class BatchedModule(GeometryModule):
+    """A module whose tensors share batch dims, which is indexed and counted by them as a tensor is."""
+
+    tensor_names: ClassVar[tuple[str, ...]]
+    """Of the tensors (*B, n); each may have fewer batch dims, or of size 1, where it is shared."""
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """*B, the batch dims of the parameters."""
+        raise NotImplementedError
+
+    def __getitem__(self, index: Any) -> Self:
+        """The part of the batch that a tensor's index takes: an int, a slice, a mask, a list, or a tuple of them.
+
+        It has no Parameters of its own where this one learns: gradients go to this one's. Of a frozen one the part is
+        frozen, and shares its values where indexing a tensor does.
+
+        Raises:
+            TypeError: no batch. IndexError: an index beyond it.
+        """
+        self._need_batch("indexed")
+        key = index if isinstance(index, tuple) else (index,)
+        key = (*key, slice(None)) if any(part is Ellipsis for part in key) else (*key, ..., slice(None))
+        tensors = {}
+        for name in self.tensor_names:
+            tensor = getattr(self, name)
+            try:
+                rows = tensor.expand(*self.batch_shape, tensor.shape[-1])[key]
+            except IndexError as error:
+                shape = tuple(self.batch_shape)
+                raise IndexError(f"{type(self).__name__}: {index!r} of a batch {shape}: {error}") from None
+            tensors[name] = rows if in_graph(rows) else nn.Parameter(rows, requires_grad=False)
+        return self.with_tensors(**tensors)
+
+    def __len__(self) -> int:
+        """The size of the first batch dim."""
+        self._need_batch("counted")
+        return self.batch_shape[0]
+
+    def __iter__(self) -> Iterator[Self]:
+        """Along the first batch dim."""
+        self._need_batch("iterated over")
+        return (self[i] for i in range(self.batch_shape[0]))
+
+    def __bool__(self) -> bool:
+        return True
+
+    def _need_batch(self, what: str) -> None:
+        if not self.batch_shape:
+            raise TypeError(f"{type(self).__name__}: it has no batch dims, and cannot be {what}")
+
+    def with_tensors(self, **tensors: Tensor) -> Self:
+        """This module with other tensors, whose values are not checked; each is kept or registered as by `hold`."""
+        made = type(self).__new__(type(self))
+        nn.Module.__init__(made)
+        for name, value in self.__dict__.items():
+            if name not in made.__dict__:
+                made.__dict__[name] = Memo() if isinstance(value, Memo) else value
+        made.training = self.training
+        for name, tensor in tensors.items():
+            made.hold(name, tensor, tuple(tensor.shape))
+        return made
 
 
 class Memo:

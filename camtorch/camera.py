@@ -19,7 +19,7 @@ from camtorch._arguments import (
     broadcast_shapes,
     columns,
 )
-from camtorch._module import GeometryModule, Memo
+from camtorch._module import BatchedModule, Memo
 from camtorch._tracing import has_tangent, in_transform, is_concrete, may_look
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
@@ -37,7 +37,7 @@ MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
 
-class Camera(GeometryModule):
+class Camera(BatchedModule):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
     A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
@@ -70,6 +70,7 @@ class Camera(GeometryModule):
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
     """In words, what `defined` asks for."""
+    tensor_names = ("intrinsics", "distortion")
     intrinsics: Tensor
     distortion: Tensor
     distortion_names: tuple[str, ...] = ()
@@ -445,11 +446,9 @@ class Camera(GeometryModule):
         elif mirror == "y":
             cy, odd = size[0] - 1 - cy, self.odd_in_y
         intrinsics = torch.stack((fx * scale[0], fy * scale[1], cx, cy), -1)
-        arguments = [intrinsics]
-        if self.distortion.shape[-1]:
-            sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
-            arguments.append(self.distortion * sign)
-        edited = type(self)(*arguments, image_size=size)
+        sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
+        edited = self.with_tensors(intrinsics=intrinsics, distortion=self.distortion * sign)
+        edited.image_size = as_image_size(size, type(self).__name__)
         for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
             if isinstance(its, nn.Parameter) and not mine.requires_grad:
                 its.requires_grad = False

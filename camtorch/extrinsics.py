@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_batch, as_real, as_rows, as_vectors, broadcast_shapes, columns
-from camtorch._module import GeometryModule
+from camtorch._module import BatchedModule
 from camtorch._tracing import is_concrete
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
 
-class Extrinsics(GeometryModule):
+class Extrinsics(BatchedModule):
     """Camera from world: `p_camera = R p_world + t`, as OpenCV's rvec and tvec. `nn.Sequential(extrinsics, camera)`
     is a world-to-pixel layer.
 
@@ -21,9 +21,9 @@ class Extrinsics(GeometryModule):
         translation: (*B, 3): the world's origin seen from the camera. The camera stands at `position` = -R^T t.
 
     Vectors may have OpenCV's shapes: columns (*B, 3, 1), an array (1, 3), a list of V such arrays as a batch of V. A
-    tensor (1, 3) is a batch of one. What has the shape of matrices is taken as matrices where they are rotations or the
-    translation has a dim less; where three vectors (3, 3) beside three translations form a rotation matrix, that is an
-    error that says how to say it.
+    tensor (1, 3) is a batch of one. What has the shape of matrices is taken as matrices where they are rotations, or
+    the translation has one dim less; where three vectors (3, 3) beside three translations form a rotation matrix, that
+    is an error that says how to say it.
 
     Plain values become new Parameters; a tensor that requires grad is kept as it is. Gradients are exact at
     zero rotation as well.
@@ -33,6 +33,7 @@ class Extrinsics(GeometryModule):
         TypeError: values that are not numbers.
     """
 
+    tensor_names = ("rotation", "translation")
     rotation: Tensor
     translation: Tensor
 
@@ -143,18 +144,18 @@ def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
     Raises:
         ValueError: they may be both, or neither.
     """
-    fewer = translation.ndim < rotation.ndim
+    beside = translation.ndim == rotation.ndim - 1
     if not is_concrete(rotation):
-        return fewer
+        return beside
     if is_rotation(rotation):
-        if translation.shape[-2:] == (3, 3) and not fewer:
+        if translation.shape[-2:] == (3, 3) and not beside:
             raise ValueError(
                 f"Extrinsics: rotation {tuple(rotation.shape)} beside translation {tuple(translation.shape)} may be "
                 "rotation matrices or three rotation vectors each, and its values are those of rotation matrices. "
                 "Matrices go into Extrinsics.from_matrix(rotation, translation), vectors in as rotation[..., None]"
             )
         return True
-    if fewer:
+    if beside:
         hint = ". Three rotation vectors that share a translation go in as rotation[..., None]"
         check_rotation(rotation, "rotation", "Extrinsics", hint)
     return False

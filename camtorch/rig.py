@@ -2,17 +2,120 @@
 
 from __future__ import annotations
 
+from collections.abc import ItemsView, Iterator, KeysView, Mapping, MutableMapping, Sequence, ValuesView
+from typing import TypeVar, cast
+
+from torch import nn
+
+from camtorch._module import BatchedModule
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 
+M = TypeVar("M", bound=BatchedModule)
+_SHOWN = 8
 
-class Rig:
+
+class NamedModules(nn.Module, MutableMapping[str, M]):
+    """Modules by name, in order: a mapping as `nn.ModuleDict`, whose names may have dots, as those of files do.
+
+    Args:
+        kind: the class of the modules.
+        modules: name -> module, also another `NamedModules`, with which this one then shares its modules.
+        names: of the rows of `batch`.
+        batch: a module with one batch dim, each row of which is a module of its own name: 200,000 of them take no more
+            time than one. `mapping[name]` is `batch[row]`, made when it is asked for.
+
+    Raises:
+        TypeError: names that are no strings, modules of another class. ValueError: rows and names that do not fit.
+    """
+
+    batch: M | None
+
+    def __init__(
+        self, kind: type[M], modules: Mapping[str, M] | None = None, names: Sequence[str] = (), batch: M | None = None
+    ):
+        super().__init__()
+        self._kind: type[M] = kind
+        self._places: dict[str, str | int] = {}  # the key of the module, or the row of the batch
+        self.batch = None
+        if isinstance(modules, NamedModules):
+            self._places = dict(modules._places)
+            for key, module in modules._modules.items():
+                self._modules[key] = module
+            self.batch = modules.batch
+        elif modules is not None:
+            for name, module in modules.items():
+                self[name] = module
+        if batch is not None or names:
+            self._add_rows(list(names), batch)
+
+    def _add_rows(self, names: list[str], batch: M | None) -> None:
+        owner = self._kind.__name__
+        if not isinstance(batch, self._kind):
+            raise TypeError(f"{owner}: the batch of named rows must be {owner}; got {type(batch).__name__}")
+        if batch.batch_shape != (len(names),):
+            raise ValueError(f"{owner}: {len(names)} names do not fit a batch {tuple(batch.batch_shape)}")
+        for row, name in enumerate(names):
+            if not isinstance(name, str):
+                raise TypeError(f"{owner}: names must be strings; got {name!r}")
+            if name in self._places:
+                raise ValueError(f"{owner}: the name {name!r} appears twice")
+            self._places[name] = row
+        self.batch = batch
+
+    def __getitem__(self, name: str) -> M:
+        place = self._places[name]
+        return cast(M, self._modules[place] if isinstance(place, str) else cast(M, self.batch)[place])
+
+    def __setitem__(self, name: str, module: M) -> None:
+        if not isinstance(name, str) or not isinstance(module, self._kind):
+            raise TypeError(f"Rig: takes names and {self._kind.__name__}; got {name!r}: {type(module).__name__}")
+        place = self._places.get(name)
+        if not isinstance(place, str):
+            # nn.Module takes no dots; a percent sign before other names than those of its attributes
+            place = name.replace("%", "%25").replace(".", "%2E")
+            place = f"%{place}" if not place or hasattr(self, place) else place
+            self._places[name] = place
+        self._modules[place] = module
+
+    def __delitem__(self, name: str) -> None:
+        place = self._places.pop(name)
+        if isinstance(place, str):
+            del self._modules[place]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._places
+
+    # a module is itself and nothing else, as the sets that nn.Module keeps of them want it
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def __repr__(self) -> str:
+        lines = [f"  {name!r}: {self[name]!r}" for name in list(self)[:_SHOWN]]
+        if len(self) > _SHOWN:
+            lines.append(f"  and {len(self) - _SHOWN} more")
+        return "\n".join((f"{self._kind.__name__} by name:", *lines))
+
+
+class Rig(nn.Module):
     """Cameras by name, and their poses.
+
+    A module: `.to`, `.float`, `state_dict` and `requires_grad_` reach all cameras and poses. And a mapping of names
+    to cameras: `rig["cam0"]`, `len(rig)`, `for name in rig`, `rig.items()`. `rig[name]` and `name in rig` take
+    the names of images as well. `rig.cameras` and `rig.extrinsics` are mappings that may be changed.
 
     Args:
         cameras: name -> Camera.
         extrinsics: name -> Extrinsics, camera from rig, for the cameras that have a pose. For posed images the name is
-            the image's and the Extrinsics are camera from world.
+            the image's and the Extrinsics are camera from world. Or the names and one batch, a pair (names,
+            Extrinsics of batch dims (N,)): that is how a reader gives many images, whose poses are then rows of
+            `rig.extrinsics.batch` and become modules of their own only when they are asked for by name.
         images: image name -> name of the camera that took it, for the extrinsics whose name is no camera's.
         format: the file format that the rig comes from, which `camtorch.save` takes where the suffix allows it.
 
@@ -20,24 +123,27 @@ class Rig:
         ValueError: extrinsics, or an image, without a camera. TypeError: not cameras and Extrinsics.
     """
 
-    cameras: dict[str, Camera]
-    extrinsics: dict[str, Extrinsics]
+    cameras: NamedModules[Camera]
+    extrinsics: NamedModules[Extrinsics]
     images: dict[str, str]
 
     def __init__(
         self,
-        cameras: dict[str, Camera],
-        extrinsics: dict[str, Extrinsics] | None = None,
+        cameras: Mapping[str, Camera],
+        extrinsics: Mapping[str, Extrinsics] | tuple[Sequence[str], Extrinsics] | None = None,
         *,
-        images: dict[str, str] | None = None,
+        images: Mapping[str, str] | None = None,
         format: str | None = None,
     ):
-        self.cameras, self.extrinsics, self.images = dict(cameras), dict(extrinsics or {}), dict(images or {})
+        super().__init__()
+        self.cameras = NamedModules(Camera, cameras)
+        if isinstance(extrinsics, tuple):
+            names, batch = extrinsics
+            self.extrinsics = NamedModules(Extrinsics, names=names, batch=batch)
+        else:
+            self.extrinsics = NamedModules(Extrinsics, extrinsics)
+        self.images = dict(images or {})
         self.format = format
-        for values, kind in ((self.cameras, Camera), (self.extrinsics, Extrinsics)):
-            for name, value in values.items():
-                if not isinstance(name, str) or not isinstance(value, kind):
-                    raise TypeError(f"Rig: takes names and {kind.__name__}; got {name!r}: {type(value).__name__}")
         for image, name in self.images.items():
             if name not in self.cameras:
                 raise ValueError(f"Rig: the image {image!r} is of a camera {name!r}; there are {list(self.cameras)}")
@@ -64,9 +170,43 @@ class Rig:
         found = self.cameras.get(self.images.get(name, name))
         if found is None:
             names = [*self.cameras, *self.images]
-            shown = ", ".join(map(repr, names[:8])) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+            more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+            shown = ", ".join(map(repr, names[:_SHOWN])) + more
             raise ValueError(f"Rig: no camera and no image is called {name!r}; there are {shown}")
         return found
+
+    def __getitem__(self, name: str) -> Camera:
+        """The same as `camera_of`, but that an unknown name is a KeyError."""
+        try:
+            return self.camera_of(name)
+        except ValueError as error:
+            raise KeyError(str(error)) from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.cameras or name in self.images
+
+    def __len__(self) -> int:
+        """The number of cameras."""
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[str]:
+        """Over the names of the cameras."""
+        return iter(self.cameras)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def keys(self) -> KeysView[str]:
+        """The names of the cameras."""
+        return self.cameras.keys()
+
+    def values(self) -> ValuesView[Camera]:
+        """The cameras."""
+        return self.cameras.values()
+
+    def items(self) -> ItemsView[str, Camera]:
+        """The cameras with their names."""
+        return self.cameras.items()
 
     def __repr__(self) -> str:
         lines = [_line(name, camera, self.extrinsics.get(name)) for name, camera in self.cameras.items()]

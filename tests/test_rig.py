@@ -1,0 +1,147 @@
+"""A rig is a module, and a mapping of names to cameras."""
+
+import copy
+import pickle
+import time
+
+import pytest
+import torch
+
+import camtorch as ct
+
+NAMES = ["cam0", "front.left", "images/a.b/0001.jpg", "", "forward", "batch", "50%", "50%25", "2E", "rotation", "ö"]
+
+
+def camera(focal=300.0):
+    return ct.KannalaBrandt([focal, focal, 319.5, 239.5], [0.01, 0.0, 0.0, 0.0], image_size=(480, 640))
+
+
+def rig_of(names, **options):
+    poses = {name: ct.Extrinsics([0.0, 0.0, 0.1 * i], [float(i), 0.0, 0.0]) for i, name in enumerate(names)}
+    return ct.Rig({name: camera(300.0 + i) for i, name in enumerate(names)}, poses, **options)
+
+
+def posed_images(count=5):
+    names = [f"images/{i:06d}.jpg" for i in range(count)]
+    poses = torch.arange(6.0 * count, dtype=torch.float64).view(2, count, 3) / (6 * count)
+    return ct.Rig({"1": camera()}, (names, ct.Extrinsics(*poses)), images=dict.fromkeys(names, "1"))
+
+
+def test_it_is_a_mapping_of_names():
+    rig = rig_of(NAMES)
+    assert list(rig) == list(rig.keys()) == list(rig.cameras) == list(rig.extrinsics) == NAMES
+    assert len(rig) == len(NAMES)
+    assert dict(rig) == dict(rig.items()) == dict(rig.cameras)
+    for i, name in enumerate(NAMES):
+        assert name in rig
+        assert rig[name] is rig.cameras[name]
+        assert rig[name].intrinsics[0] == 300 + i
+        assert rig.extrinsics[name].translation[0] == i
+    assert "cam1" not in rig
+    with pytest.raises(KeyError, match="cam1"):
+        rig["cam1"]
+    with pytest.raises(KeyError):
+        rig.cameras["cam1"]
+    assert rig.extrinsics.get("cam1") is None
+
+
+def test_images_are_known_by_name():
+    rig = posed_images()
+    name = "images/000003.jpg"
+    assert rig[name] is rig["1"]
+    assert name in rig
+    assert list(rig) == ["1"]
+    assert list(rig.extrinsics) == [f"images/{i:06d}.jpg" for i in range(5)]
+
+
+@pytest.mark.parametrize("make", [lambda: rig_of(NAMES), posed_images], ids=["cameras", "images"])
+def test_it_is_a_module(make):
+    rig, other = make(), make()
+    tensors = list(rig.parameters())
+    assert {id(p) for c in rig.values() for p in c.parameters()} <= {id(p) for p in tensors}
+    assert not any(p.requires_grad for p in rig.requires_grad_(False).parameters())
+    assert not any(p.requires_grad for name in rig.extrinsics for p in rig.extrinsics[name].parameters())
+    assert all(p.dtype == torch.float64 for p in rig.double().parameters())
+    assert rig[next(iter(rig))].intrinsics.dtype == torch.float64
+    with torch.no_grad():
+        for p in other.parameters():
+            p.mul_(1.25)
+    rig.load_state_dict(other.state_dict())
+    for name in rig:
+        assert torch.equal(rig[name].intrinsics, other[name].intrinsics.double())
+    for name in rig.extrinsics:
+        assert torch.equal(rig.extrinsics[name].rotation, other.extrinsics[name].rotation.double())
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r))], ids=["deepcopy", "pickle"])
+@pytest.mark.parametrize("make", [lambda: rig_of(NAMES), posed_images], ids=["cameras", "images"])
+def test_copies(make, copied):
+    rig = make()
+    again = copied(rig)
+    assert repr(again) == repr(rig)
+    assert list(again.extrinsics) == list(rig.extrinsics)
+    assert again.images == rig.images
+    with torch.no_grad():
+        for p in again.parameters():
+            p.zero_()
+    assert all(rig[name].intrinsics[0] >= 300 for name in rig)
+    assert rig.extrinsics[list(rig.extrinsics)[-1]].rotation.any()
+
+
+def test_mappings_may_be_changed_and_copies_stay():
+    rig = posed_images()
+    same = ct.Rig(rig.cameras, rig.extrinsics, images=rig.images)
+    first, second = list(rig.extrinsics)[:2]
+    rig.extrinsics[first] = rig.extrinsics[second]
+    rig.cameras["1"] = camera(200.0)
+    assert next(iter(rig.extrinsics)) == first
+    assert torch.equal(rig.extrinsics[first].rotation, same.extrinsics[second].rotation)
+    assert not torch.equal(rig.extrinsics[first].rotation, same.extrinsics[first].rotation)
+    assert rig.camera.intrinsics[0] == 200
+    assert same.camera.intrinsics[0] == 300
+    del rig.extrinsics[second]
+    assert second not in rig.extrinsics
+    assert second in same.extrinsics
+    with pytest.raises(TypeError, match="Camera; got 'a': int"):
+        rig.cameras["a"] = 1
+
+
+def test_a_row_is_the_batch_s():
+    rig = posed_images()
+    pose = rig.extrinsics["images/000002.jpg"]
+    assert pose.batch_shape == ()
+    pose(torch.ones(3)).sum().backward()
+    assert rig.extrinsics.batch.rotation.grad[2].any()
+    assert not rig.extrinsics.batch.rotation.grad[[0, 1, 3, 4]].any()
+    rig.requires_grad_(False)
+    rig.extrinsics["images/000002.jpg"].translation[0] = 7.0
+    assert rig.extrinsics.batch.translation[2, 0] == 7
+    assert rig.extrinsics["images/000002.jpg"].translation[0] == 7
+
+
+@pytest.mark.parametrize(
+    ("extrinsics", "error", "says"),
+    [
+        (
+            (["a"], ct.Extrinsics(torch.zeros(2, 3), torch.zeros(2, 3))),
+            ValueError,
+            r"1 names do not fit a batch \(2,\)",
+        ),
+        ((["a", "a"], ct.Extrinsics(torch.zeros(2, 3), torch.zeros(2, 3))), ValueError, "'a' appears twice"),
+        ((["b"], ct.Extrinsics(torch.zeros(1, 3), torch.zeros(1, 3))), ValueError, "no camera and no image.*'b'"),
+        (([1], ct.Extrinsics(torch.zeros(1, 3), torch.zeros(1, 3))), TypeError, "strings; got 1"),
+        ((["a"], None), TypeError, "got NoneType"),
+        ({"a": camera()}, TypeError, "Extrinsics; got 'a': KannalaBrandt"),
+    ],
+)
+def test_what_fits_nothing_is_refused(extrinsics, error, says):
+    with pytest.raises(error, match=says):
+        ct.Rig({"a": camera()}, extrinsics)
+
+
+def test_two_hundred_thousand_images():
+    start = time.process_time()
+    rig = posed_images(200_000)
+    assert "200000 posed images" in repr(rig)
+    assert rig.extrinsics["images/199999.jpg"].batch_shape == ()
+    assert time.process_time() - start < 5
