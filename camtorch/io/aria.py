@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 
 from camtorch.io import poses
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
+
+NAMES = Names("aria", "Aria", (".json",))
 
 # Projection.Name -> key, how many focal lengths, how many coefficients
 _MODELS = {
@@ -56,7 +59,7 @@ def parse(record: Record) -> Rig:
 
 def render(rig: Rig, path) -> str:
     """The text of a file that projectaria_tools reads."""
-    lossy = Lossy(path, "Aria")
+    lossy = Lossy(path, NAMES.title)
     entries = []
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]

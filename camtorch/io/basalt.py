@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from camtorch.io import poses
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
+
+NAMES = Names("basalt", "Basalt", (".json",))
 
 _CORE = ("fx", "fy", "cx", "cy")
 # camera_type -> key, the names of its coefficients
@@ -58,7 +61,7 @@ def parse(record: Record) -> Rig:
 
 def render(rig: Rig, path) -> str:
     """The text of a file; the cameras lose their names, and the IMU is Basalt's default."""
-    lossy = Lossy(path, "Basalt")
+    lossy = Lossy(path, NAMES.title)
     placed, models, sizes = [], [], []
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]

@@ -11,9 +11,12 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
+
+NAMES = Names("camtorch", "camtorch", (".json",), ("*.json",))
 
 _VERSION = 1
 _DEEPEST_BATCH = 8
@@ -36,10 +39,10 @@ def parse(record: Record) -> Rig:
             images[name] = entry["camera"].text()
         if images.get(name, name) not in cameras:
             entry.fail(f"of the camera {images.get(name, name)!r:.60}, which is not in the file")
-        vectors = _tensor(entry["rotation"], 3), _tensor(entry["translation"], 3)
-        _same_batch(entry, *vectors)
+        rotation, translation = _tensor(entry["rotation"], 3), _tensor(entry["translation"], 3)
+        _same_batch(entry, rotation, translation)
         try:
-            extrinsics[name] = Extrinsics(*vectors)
+            extrinsics[name] = Extrinsics(rotation[..., None], translation)  # columns, which are no matrices
         except ValueError as error:
             entry.fail(error)
     return Rig(cameras, extrinsics, images=images)
@@ -99,7 +102,7 @@ def _flat(record: Record, depth: int) -> tuple[list[float], list[int]]:
 
 def render(rig: Rig, path) -> str:
     """The text of a file. Numbers are float64, which holds those of a float32 camera exactly."""
-    lossy = Lossy(path, "camtorch")
+    lossy = Lossy(path, NAMES.title)
     cameras, extrinsics = {}, {}
     for name, camera in rig.cameras.items():
         intrinsics, distortion = _rows(camera.intrinsics, camera.distortion)

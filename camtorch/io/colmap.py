@@ -5,7 +5,6 @@ Pixel centres are at 0.5 there. Poses are camera from world, as here.
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import re
@@ -14,10 +13,13 @@ import struct
 from camtorch.camera import Camera
 from camtorch.io import colmap_images
 from camtorch.io.nerfstudio import panorama
-from camtorch.io.parsing import read_bytes, read_text
+from camtorch.io.parsing import decoded
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, left_over, number
 from camtorch.rig import Rig
+
+NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
 
 # model -> id, key, how many focal lengths, how many coefficients; where a smaller model comes first
 _MODELS = {
@@ -44,23 +46,20 @@ _MODELS = {
 _COUNTS = {"SIMPLE_RADIAL": 4, "RADIAL": 4, "SIMPLE_FISHEYE": 1, "FISHEYE": 1}
 _IDS = {values[0]: name for name, values in _MODELS.items()}
 _MOST_WORDS = 32
+_LINE = re.compile(rb"^[^\S\n]*([^\s#][^\n]*)", re.MULTILINE)  # no comment
+_CAMERA = re.compile(rb"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)")
 _LARGEST_ID = (1 << 32) - 2  # the one above means none
 
 
-def matches_text(text: str) -> bool:
-    """Whether a file may be a cameras.txt: its first line without # is an id, a model and a size."""
-    lines = (line.strip() for line in io.StringIO(text))
-    line = next((line for line in lines if line and not line.startswith("#")), "")
-    return re.match(r"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)", line) is not None
+def matches(path: str, content: bytes) -> bool:
+    """Whether a file is a cameras.bin, by its name, or a cameras.txt: its first line without # is a camera."""
+    first = _LINE.search(content)
+    return path.endswith(".bin") or (first is not None and _CAMERA.match(first[1]) is not None)
 
 
-def read(path, text: str | None = None) -> Rig:
+def read(path: str, content: bytes) -> Rig:
     """The cameras, called by their ids, and the poses of the images beside them, by the names of the images."""
-    binary = text is None and os.fspath(path).endswith(".bin")
-    if binary:
-        cameras = _from_bytes(path, read_bytes(path))
-    else:
-        cameras = _from_text(path, read_text(path) if text is None else text)
+    cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
         lost = None if beside is None else left_over(beside)
@@ -77,21 +76,21 @@ def read(path, text: str | None = None) -> Rig:
     return Rig(cameras, extrinsics, images=images)
 
 
-def _images_beside(path) -> str | None:
+def _images_beside(path: str) -> str | None:
     """The file of poses that belongs to a file of cameras, which COLMAP calls cameras.txt or cameras.bin."""
-    folder, name = os.path.split(os.fspath(path))
+    folder, name = os.path.split(path)
     stem, suffix = os.path.splitext(name)
     return os.path.join(folder, f"images{suffix}") if stem == "cameras" else None
 
 
-def _from_text(path, text: str) -> dict[str, Camera]:
+def _from_text(path: str, content: bytes) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
-    for i, line in enumerate(io.StringIO(text), 1):
-        words = line.split(maxsplit=_MOST_WORDS)
-        if not words or words[0].startswith("#"):
-            continue
-        record = Record(path, words, f"line {i}")
+    number, position = 1, 0
+    for line in _LINE.finditer(content):
+        number, position = number + content.count(b"\n", position, line.start()), line.start()
+        record = Record(path, decoded(path, line[1]).split(maxsplit=_MOST_WORDS), f"line {number}")
         record.few(len(cameras))
+        words = record.value
         if len(words) < 4:
             record.fail("less than an id, a model, a width and a height")
         identity, name, width, height, *values = record
@@ -105,7 +104,7 @@ def _from_text(path, text: str) -> dict[str, Camera]:
     return cameras
 
 
-def _from_bytes(path, content: bytes) -> dict[str, Camera]:
+def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
     record, position = Record(path, None, "byte 0"), 0
 
@@ -160,12 +159,12 @@ def _camera(record: Record, name: str, size: tuple[int, int], values: list[float
 # -- writing
 
 
-def write(rig: Rig, path) -> dict[str, bytes]:
+def files(rig: Rig, path: str) -> dict[str, bytes]:
     """The files of a rig: cameras, and images beside them where there are poses.
 
     Each camera takes the smallest model that holds its values, and its id where its name is one.
     """
-    lossy = Lossy(path, "COLMAP")
+    lossy = Lossy(path, NAMES.title)
     ids = [int(name) if re.fullmatch(r"0|[1-9]\d{0,9}", name) else -1 for name in rig.cameras]
     if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
@@ -174,9 +173,10 @@ def write(rig: Rig, path) -> dict[str, bytes]:
     for name, camera in rig.cameras.items():
         height, width = lossy.size(name, camera)
         entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
-    path = _file_of(path)
+    if not path.endswith(NAMES.suffixes):  # a folder that is not there yet
+        path = os.path.join(path, "cameras.txt")
     binary = path.endswith(".bin")
-    files = {path: (_as_bytes if binary else _as_text)(entries)}
+    contents = {path: (_as_bytes if binary else _as_text)(entries)}
     beside = _images_beside(path)
     if rig.extrinsics:
         if beside is None:
@@ -187,23 +187,14 @@ def write(rig: Rig, path) -> dict[str, bytes]:
             )
         content = colmap_images.content(lossy, rig, identities, beside, binary)
         if content is not None:
-            files[beside] = content
+            contents[beside] = content
             # COLMAP opens no folder without its points
             points = os.path.join(os.path.dirname(path), "points3D" + os.path.splitext(path)[1])
             if not os.path.exists(points):
-                files[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
+                contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
         lossy.fail("extrinsics", f"none, while {beside} has poses of images, which these cameras would get")
-    return files
-
-
-def _file_of(path) -> str:
-    """The file of cameras: that of a folder is called cameras.txt, unless a cameras.bin is there."""
-    path = os.fspath(path)
-    if path.endswith((".txt", ".bin")) and not os.path.isdir(path):
-        return path
-    kind = "bin" if os.path.exists(os.path.join(path, "cameras.bin")) else "txt"
-    return os.path.join(path, f"cameras.{kind}")
+    return contents
 
 
 def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]]:

@@ -1,50 +1,36 @@
-"""`load` and `save`: which format a file has, or is to have."""
+"""`load` and `save`: each format is asked whether a file is its own; none is known here but by its module.
+
+To add a format, write one file beside this one, as `protocol.py` says, and name it in one of the two lists below.
+One of keys and values (YAML, JSON, XML) has `NAMES`, `matches(keys)`, `parse(record)` and `render(rig, path)`, like
+`basalt.py`; any other has `NAMES`, `matches(path, content)`, `read(path, content)` and `files(rig, path)`, like
+`colmap.py`. `Record` reads values, with errors that say where they stand; `parsing.decoded` gives the text of a
+content; `poses` has rotations; `writing.Lossy` says what would be lost.
+"""
 
 from __future__ import annotations
 
+import fnmatch
 import os
-import re
+from typing import Any
 
 from camtorch.camera import Camera
 from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, opencv, ros
 from camtorch.io._errors import CameraFileError
-from camtorch.io.parsing import parse_mapping, read_text
+from camtorch.io.parsing import parse_mapping, read_bytes
+from camtorch.io.protocol import ContentFormat, KeyFormat
 from camtorch.io.record import Record
 from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
-# what has keys and values, in the order in which their keys are tried
-_BY_KEYS = {
-    "camtorch": camtorch_json,
-    "aria": aria,
-    "basalt": basalt,
-    "mrcal": mrcal,
-    "nerfstudio": nerfstudio,
-    "ros": ros,
-    "kalibr": kalibr,
-    "opencv": opencv,
-}
-FORMATS = (*_BY_KEYS, "colmap")
-_SUFFIXES = {
-    "opencv": (".yml", ".yaml", ".json", ".xml"),
-    "ros": (".yaml", ".yml"),
-    "kalibr": (".yaml", ".yml"),
-    "colmap": (".txt", ".bin"),
-    "nerfstudio": (".json",),
-    "aria": (".json",),
-    "basalt": (".json",),
-    "mrcal": (".cameramodel",),
-    "camtorch": (".json",),
-}
-_NAMES = {
-    r"transforms.*\.json": "nerfstudio",
-    r".*camchain.*\.ya?ml": "kalibr",
-    r".*camera_?info.*\.ya?ml": "ros",
-}
-_IN_A_FOLDER = ("cameras.bin", "cameras.txt", "transforms.json")
+# in the order in which they are asked
+_BY_CONTENT: tuple[ContentFormat, ...] = (colmap,)
+_BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, nerfstudio, ros, kalibr, opencv)
+
+_NAMES = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
+FORMATS = tuple(_NAMES)
 
 
-def load(path, format: str | None = None) -> Rig:
+def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
     """The cameras of a calibration file, in float64 and frozen, with their poses.
 
     A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
@@ -61,16 +47,14 @@ def load(path, format: str | None = None) -> Rig:
 
     Raises:
         CameraFileError: the file cannot be used; it says where and why. OSError: it cannot be opened.
-        ValueError: an unknown format. ImportError: YAML without PyYAML.
+        ValueError: an unknown format. TypeError: no path.
     """
-    format = _known(format)
+    path, format = _path(path, "load"), _known(format)
     if os.path.isdir(path):
-        found = [os.path.join(path, name) for name in _IN_A_FOLDER if os.path.exists(os.path.join(path, name))]
-        if not found:
-            raise CameraFileError(path, "folder", f"has none of {', '.join(_IN_A_FOLDER)}")
-        path = found[0]
+        path = _in_folder(path)
+    content = read_bytes(path)
     try:
-        rig, format = _load(path, format)
+        rig, format = _read(path, content, format)
     except (ArithmeticError, RecursionError, MemoryError) as error:
         raise CameraFileError(path, "content", f"cannot be read: {type(error).__name__}: {error}") from None
     if not rig.cameras:
@@ -81,27 +65,44 @@ def load(path, format: str | None = None) -> Rig:
     return rig
 
 
-def _load(path, format: str | None) -> tuple[Rig, str]:
-    if format == "colmap" or (format is None and os.fspath(path).endswith(".bin")):
-        return colmap.read(path), "colmap"
-    text = read_text(path)
-    if format is None and colmap.matches_text(text):
-        return colmap.read(path, text), "colmap"
-    literal = format == "mrcal" or (format is None and mrcal.matches_text(text))
-    keys = (mrcal.parse_literal if literal else parse_mapping)(path, text)
-    format = format or next((name for name, module in _BY_KEYS.items() if module.matches(keys)), None)
-    if format is None:
-        shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
-        raise CameraFileError(path, "content", f"no format that is known here has the keys {shown}")
-    return _BY_KEYS[format].parse(Record(path, keys)), format
+def _path(path: Any, owner: str) -> str:
+    try:
+        name = os.fsdecode(path)
+    except TypeError:
+        hint = "; it may lie beside others, so name it: file.name" if hasattr(path, "read") else ""
+        raise TypeError(f"{owner} takes the path of a calibration file; got {type(path).__name__}{hint}") from None
+    if "\0" in name:
+        raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
+    return name
 
 
-def save(rig: Rig | Camera, path, format: str | None = None) -> None:
+def _in_folder(path: str) -> str:
+    names = [name for format in _NAMES.values() for name in format.in_folder]
+    found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
+    if found is None:
+        raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
+    return os.path.join(path, found)
+
+
+def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
+    for by_content in _BY_CONTENT:
+        if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
+            return by_content.read(path, content), by_content.NAMES.format
+    keys = parse_mapping(path, content)
+    for by_keys in _BY_KEYS:
+        if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
+            return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
+    shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
+    raise CameraFileError(path, "content", f"no format that is known here has the keys {shown}")
+
+
+def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:
     """Write cameras to a calibration file; what stood there before is replaced as a whole, or stays.
 
     Args:
         rig: a `Rig`, or one camera.
-        path: the file; with COLMAP it may be a folder. There poses go to an images file beside the cameras.
+        path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
+            poses go to an images file beside the cameras; with Nerfstudio one that exists.
         format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch". If left out:
             the format that the rig was loaded from if its files end like this one, else what the name says
             (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
@@ -121,20 +122,27 @@ def save(rig: Rig | Camera, path, format: str | None = None) -> None:
             file.write(content)
 
 
-def rendered(rig: Rig | Camera, path, format: str | None = None) -> dict[str, bytes]:
+def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> dict[str, bytes]:
     """The files that `save` writes, by their paths. Raises what it raises."""
     if isinstance(rig, Camera):
         rig = Rig({"camera": rig})
     if not isinstance(rig, Rig):
         raise TypeError(f"save takes a Rig or a Camera; got {type(rig).__name__}")
+    path = _path(path, "save")
     if not rig.cameras:
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
-    path = os.fspath(path)
     format = _known(format) or _format_of(rig, path)
-    if format != "colmap" and os.path.isdir(path):
-        raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
+    if os.path.isdir(path):
+        inside = [os.path.join(path, name) for name in _NAMES[format].in_folder]
+        if not inside:
+            raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
+        path = next(filter(os.path.exists, inside), inside[-1])
     try:
-        return colmap.write(rig, path) if format == "colmap" else {path: _BY_KEYS[format].render(rig, path).encode()}
+        for by_content in _BY_CONTENT:
+            if by_content.NAMES.format == format:
+                return by_content.files(rig, path)
+        by_keys = next(module for module in _BY_KEYS if module.NAMES.format == format)
+        return {path: by_keys.render(rig, path).encode()}
     except UnicodeEncodeError as error:
         raise CameraFileError(path, "names", f"{error.object!r:.60} is no text that a file can hold") from None
 
@@ -147,19 +155,17 @@ def _known(format: str | None) -> str | None:
 
 
 def _format_of(rig: Rig, path: str) -> str:
-    name = os.path.basename(path).lower()
-    suffix = os.path.splitext(name)[1]
-    fitting = [format for format, suffixes in _SUFFIXES.items() if suffix in suffixes]
-    if rig.format in fitting or (rig.format == "colmap" and os.path.isdir(path)):
+    """The format to write: the rig's own if it may be, else the one that the name of the file means."""
+    folder, file = os.path.isdir(path), os.path.basename(path).lower()
+    fitting = [n for n in _NAMES.values() if (n.in_folder if folder else file.endswith(n.suffixes))]
+    formats = sorted(names.format for names in fitting)
+    if rig.format is not None and rig.format in formats:
         return rig.format
-    if os.path.isdir(path):
-        raise ValueError(f"{path}: is a folder; name a file, or format='colmap'")
-    for pattern, format in _NAMES.items():
-        if re.fullmatch(pattern, name):
-            return format
-    if suffix == ".json":
-        return "camtorch"
-    if len(fitting) == 1:
-        return fitting[0]
-    may = f"it may be {', '.join(sorted(fitting))}" if fitting else f"known are {', '.join(sorted(FORMATS))}"
+    if folder:
+        raise ValueError(f"{path}: is a folder; name a file, or say {' or '.join(f'format={f!r}' for f in formats)}")
+    patterns = {pattern: names.format for names in fitting for pattern in names.patterns}
+    meant = [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]
+    if meant:
+        return patterns[max(meant, key=len)]
+    may = f"it may be {', '.join(formats)}" if formats else f"known are {', '.join(sorted(FORMATS))}"
     raise ValueError(f"{path}: the name does not say the format; {may}. Say which, as in format={'kalibr'!r}")

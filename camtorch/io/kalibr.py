@@ -8,9 +8,12 @@ import re
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, listed
 from camtorch.rig import Rig
+
+NAMES = Names("kalibr", "Kalibr", (".yaml", ".yml"), ("*camchain*",))
 
 # camera_model, distortion_model -> key, how many of its coefficients stand before the intrinsics, how many after
 _MODELS = {
@@ -76,7 +79,7 @@ def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
 
 def render(rig: Rig, path) -> str:
     """The text of a file; the cameras become cam0, cam1, ... in their order."""
-    lossy = Lossy(path, "Kalibr")
+    lossy = Lossy(path, NAMES.title)
     lossy.no_images(rig)
     posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
     first = next(iter(posed.values()), None)

@@ -8,9 +8,12 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
+
+NAMES = Names("nerfstudio", "Nerfstudio", (".json",), ("transforms*.json",), ("transforms.json",))
 
 # camera_model -> key
 _MODELS = {
@@ -157,7 +160,7 @@ def panorama(size: tuple[int, int]) -> list[float]:
 
 def render(rig: Rig, path) -> str:
     """The text of a file: one camera for all, or one for each frame."""
-    lossy = Lossy(path, "Nerfstudio")
+    lossy = Lossy(path, NAMES.title)
     written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
     models = {name: entries.pop("camera_model") for name, entries in written.items()}
     if len(set(models.values())) != 1:

@@ -16,10 +16,13 @@ from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
 from camtorch.io.filestorage import Value, as_json, as_xml, as_yaml
 from camtorch.io.parsing import read_mapping
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy
 from camtorch.models import MODELS
 from camtorch.rig import Rig
+
+NAMES = Names("opencv", "OpenCV", (".yml", ".yaml", ".json", ".xml"), ("*.xml",))
 
 # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
 _NAMES = r"\d*|left|right"
@@ -241,7 +244,7 @@ class _File:
 
 def render(rig: Rig, path) -> str:
     """The text of a file of one camera, or of several of which the second of two may have a pose."""
-    lossy = Lossy(path, "OpenCV")
+    lossy = Lossy(path, NAMES.title)
     lossy.no_images(rig)
     names, ends = list(rig.cameras), list(rig.cameras)
     if not names:

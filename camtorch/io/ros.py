@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, listed, quoted
 from camtorch.rig import Rig
+
+NAMES = Names("ros", "ROS camera_info", (".yaml", ".yml"), ("*camera_info*", "*camerainfo*"))
 
 _MODELS = {
     "plumb_bob": ("brown_conrady", (4, 5)),
@@ -60,7 +63,7 @@ def _numbers(record: Record, count: int | None = None) -> list[float]:
 
 def render(rig: Rig, path) -> str:
     """The text of a file: R is the identity, and P is K."""
-    lossy = Lossy(path, "ROS camera_info")
+    lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)
     lossy.no_pose(rig)
     height, width = lossy.size(name, camera)

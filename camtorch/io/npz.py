@@ -1,0 +1,59 @@
+"""NumPy archives (.npz) of matrices, as `numpy.savez(path, K=K, D=D)` writes them; pickled objects are not read."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+import zlib
+from typing import Any
+
+import numpy as np
+
+from camtorch.io._errors import CameraFileError
+
+_MOST_ARRAYS = 1000
+_LARGEST_ARRAY = 1 << 16  # bytes; that of a camera has 14 numbers
+
+
+def parse_archive(path, content: bytes) -> dict[str, Any]:
+    """The keys of an archive, as `camtorch.io.parsing.parse_mapping`: arrays as lists, single numbers as text.
+
+    Arrays that no camera has, large ones or those of objects, are None.
+
+    Raises:
+        CameraFileError: another archive, a damaged one, or one of very many arrays.
+    """
+    if content.count(b"PK\1\2") > _MOST_ARRAYS:
+        raise CameraFileError(path, "content", f"more than {_MOST_ARRAYS} arrays")
+    keys: dict[str, Any] = {}
+    name = "content"
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for entry in archive.infolist():
+                name, ending = entry.filename[:-4], entry.filename[-4:]
+                if ending != ".npy":
+                    raise ValueError("not an archive of numpy.savez, whose files end in .npy")
+                with archive.open(entry) as file:
+                    keys[name] = _values(file.read(_LARGEST_ARRAY + 1))
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
+        raise CameraFileError(path, f"{name!r:.60}".strip("'"), f"no array of NumPy's: {error}") from None
+    return keys
+
+
+def _values(content: bytes) -> Any:
+    """What an array says, or None."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if len(content) > _LARGEST_ARRAY or dtype.kind not in "fiub" or len(shape) > 4:
+        return None
+    if math.prod(shape) * dtype.itemsize != len(content) - file.tell():
+        raise ValueError("not as much data as it says")
+    file.seek(0)
+    return _texts(np.lib.format.read_array(file, allow_pickle=False).tolist())
+
+
+def _texts(value: Any) -> Any:
+    return [_texts(item) for item in value] if isinstance(value, list) else repr(value)
