@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from camtorch._arguments import as_image_size, as_whole
 from camtorch.convert import views
-from camtorch.convert.least_squares import even_out, fit, see
+from camtorch.convert.least_squares import even_out, fit
+from camtorch.convert.measuring import Reference, measure, reference
 from camtorch.convert.relations import carried, default_count
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 CameraT = TypeVar("CameraT", bound="Camera", covariant=True)
 
-_FIT_SIDE, _CHECK_SIDE = 33, 193  # of the lattices of pixels to fit to, and to check with
+_FIT_SIDE = 33  # of the lattice of pixels to fit to
 _ROWS = 64  # of a batch that are worked on at a time
 _WORTH_IT = 0.5  # of the largest error before: then more coefficients are taken
 
@@ -98,15 +99,21 @@ def convert(
     limit = math.pi if max_angle is None else min(math.pi, float(max_angle))
     batch = source.batch_shape
     tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
-    task = _Task(source, model, models, made, image_size, limit, float(tolerance))
-    parts = [
-        _by_counts(task._replace(source=_with_numbers(source, *numbers)), counts)
-        for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True)
-    ]
+    parts = []
+    for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True):
+        rays = reference(_with_numbers(source, *numbers), image_size, limit)
+        parts.append(_by_counts(_Task(rays, model, models, made, image_size, limit, float(tolerance)), counts))
     most = max(part.parameters.shape[-1] for part in parts)
-    parameters, *numbers = (torch.cat(fields) for fields in zip(*(part.padded(most) for part in parts), strict=True))
-    camera = made(parameters.reshape(*batch, most)).freeze_like(source)
-    return Conversion(camera, *(n.reshape(batch) for n in numbers), type(source).__name__)
+    result = _Result(*map(torch.cat, zip(*(part.padded(most) for part in parts), strict=True)))
+    return Conversion(
+        made(result.parameters.reshape(*batch, most)).freeze_like(source),
+        rms=result.rms.reshape(batch),
+        max_error=result.max_error.reshape(batch),
+        max_angle=result.max_angle.reshape(batch),
+        valid_fraction=result.valid_fraction.reshape(batch),
+        exact=result.exact.reshape(batch),
+        source_name=type(source).__name__,
+    )
 
 
 def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Camera:
@@ -121,7 +128,7 @@ def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Cam
 class _Task(NamedTuple):
     """Some rows to convert."""
 
-    source: Camera
+    source: Reference
     model: type[Camera]
     models: Mapping[str, type[Camera]]
     made: Callable[[Tensor], Camera]
@@ -131,7 +138,8 @@ class _Task(NamedTuple):
 
     def of(self, rows: Tensor) -> _Task:
         """Those of the rows."""
-        return self._replace(source=_with_numbers(self.source, *(t[rows] for t in self.source._tensors)))
+        camera = self.source.camera
+        return self._replace(source=self.source.of(_with_numbers(camera, *(t[rows] for t in camera._tensors)), rows))
 
 
 class _Result(NamedTuple):
@@ -185,12 +193,11 @@ def _as_far(angle: Tensor, before: Tensor) -> Tensor:
 
 
 def _converted(task: _Task, count: int) -> _Result:
-    source, model, made = task.source, task.model, task.made
-    names = model.names_of(count)
+    source, model, made = task.source.camera, task.model, task.made
+    names = model.names_of(count) or ()
     slopes = views.focal_at_axis(source)
     view = views.view(source, task.image_size, _FIT_SIDE, task.limit)
-    fine = views.view(source, task.image_size, _CHECK_SIDE, task.limit)
-    starts = model.fit_start(names, *views.radii(source, slopes, torch.where(fine.valid, fine.angles, 0.0).amax(-1)))
+    starts = model.fit_start(names, *views.radii(source, slopes, task.source.reach))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
@@ -206,8 +213,9 @@ def _converted(task: _Task, count: int) -> _Result:
     # no camera of the model has a largest error below the least root of the mean square
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
-        observations = views.rings(task.of(rows).source, task.image_size, _FIT_SIDE, task.limit).observations
-        evened = _measured(task.of(rows), even_out(made(parameters), observations, parameters[rows]), exact[rows])
+        these = task.of(rows)
+        observations = views.rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit).observations
+        evened = _measured(these, even_out(made(parameters), observations, parameters[rows]), exact[rows])
         (better,) = (
             (evened.max_error < result.max_error[rows]) & _as_far(evened.max_angle, result.max_angle[rows])
         ).nonzero(as_tuple=True)
@@ -216,30 +224,4 @@ def _converted(task: _Task, count: int) -> _Result:
 
 
 def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
-    check = views.view(task.source, task.image_size, _CHECK_SIDE, task.limit)
-    whole = check if task.limit == math.pi else views.view(task.source, task.image_size, _CHECK_SIDE, math.pi)
-    numbers = _numbers(task.made(parameters), parameters[:, 4:], exact, check, whole)
-    return _Result(parameters, *numbers, exact)
-
-
-def _numbers(
-    target: Camera, k: Tensor, exact: Tensor, check: views.SampledRays, whole: views.SampledRays
-) -> tuple[Tensor, ...]:
-    """rms, max_error, max_angle and valid_fraction, (C,) each."""
-
-    def compared(view: views.SampledRays) -> tuple[Tensor, Tensor]:
-        pixels, valid = target.project(view.rays)
-        # what was out of the reach of the fit is no part of its result
-        reached = see(target, k, view.rays).covered | exact[:, None]
-        return torch.linalg.vector_norm(pixels - view.pixels, dim=-1), valid & reached
-
-    errors, mapped = compared(check)
-    first_hole = torch.where(check.valid & ~mapped, check.angles, torch.inf).amin(-1, keepdim=True)
-    inside = check.valid & mapped & (check.angles < first_hole)
-    errors, some = torch.where(inside, errors, 0.0), inside.any(-1)
-    max_angle = torch.where(inside, check.angles, 0.0).amax(-1)
-    rms = (errors.square().sum(-1) / inside.sum(-1).clamp(min=1)).sqrt()
-    rms, max_error = (torch.where(some, number, torch.inf) for number in (rms, errors.amax(-1)))
-    mapped = mapped if whole is check else compared(whole)[1]
-    shown = whole.valid & mapped & (whole.angles <= max_angle[:, None]) & some[:, None]
-    return rms, max_error, max_angle, shown.sum(-1) / whole.valid.sum(-1).clamp(min=1)
+    return _Result(parameters, *measure(task.made(parameters), parameters[:, 4:], exact, task.source), exact)

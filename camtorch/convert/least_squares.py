@@ -72,8 +72,9 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
         starts: (S, C, n) coefficients to start from; of what becomes of them the best is kept.
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
     """
-    best = best_score = None
+    results, scores = [], []
     tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
+    found = torch.zeros_like(tiny, dtype=torch.bool)
     for start in starts:
         focal = slopes[:, :2] / slopes_at_axis(camera.optics, start).clamp(min=_LEAST_SLOPE)
         parameters = torch.cat((focal, slopes[:, 2:], start), -1)
@@ -83,18 +84,16 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
         for _ in range(_ROUNDS):
             # a chart may cover more once its coefficients fit what it covered before
             weights = observations.weights * see(camera, parameters[:, 4:], observations.rays).covered
-            more = (weights != within.weights).any(-1)
-            if best is not None:
-                more = more & (best_score > tiny)
+            more = (weights != within.weights).any(-1) & ~found
             within = observations._replace(weights=weights)
             parameters = _refine(camera, within, parameters, low, high, more)
         score = _cost(camera, within, parameters)
         score = score + (observations.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
-        if best is None:
-            best, best_score = parameters, score
-        better = (score < best_score) & (best_score > tiny)
-        best, best_score = torch.where(better[:, None], parameters, best), torch.where(better, score, best_score)
-    return best
+        found |= score <= tiny
+        results.append(parameters)
+        scores.append(score)
+    best = torch.stack(scores).argmin(0)
+    return torch.stack(results)[best, torch.arange(len(best), device=best.device)]
 
 
 def even_out(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:

@@ -28,7 +28,8 @@ def default_count(model: Model, source: Camera, models: Models) -> int:
     if steps is None:
         return model.fit_counts[0] if model.fit_counts else model.default_count
     needed = {_renamed(name, steps) for name in source.distortion_names}
-    held = {n: len(needed & set(model.names_of(n))) for n in range(model.default_count, _MANY) if model.names_of(n)}
+    named = {n: model.names_of(n) for n in range(model.default_count, _MANY)}
+    held = {n: len(needed & set(names)) for n, names in named.items() if names}
     return min((n for n, number in held.items() if number == max(held.values())), default=model.default_count)
 
 
@@ -55,7 +56,8 @@ def carried(
 
 def _path(start: Model, end: Model, models: Models) -> list[Step] | None:
     """The shortest way from a model to a related one."""
-    queue, seen = deque([(start, [])]), {start}
+    queue: deque[tuple[Model, list[Step]]] = deque([(start, [])])
+    seen = {start}
     while queue:
         model, steps = queue.popleft()
         if model is end or (model is start and issubclass(start, end)):

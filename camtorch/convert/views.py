@@ -1,4 +1,4 @@
-"""What a camera sees, on a lattice of its image or in all directions: what a conversion keeps to."""
+"""What a camera sees, on a lattice over its image or in all directions: what a conversion keeps to."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from camtorch.projection.rays import (
     followed,
     image_edges,
     pixel_lattice,
+    polar_rays,
     ray_fan,
     slopes_at_axis,
 )
@@ -32,6 +33,10 @@ class SampledRays(NamedTuple):
     pixels: Tensor
     valid: Tensor
 
+    def of(self, rows: Tensor) -> SampledRays:
+        """Those of some rows."""
+        return SampledRays(*(t[rows] for t in self))
+
     @property
     def observations(self) -> Observations:
         """What a camera fitted to it shall see."""
@@ -43,16 +48,64 @@ class SampledRays(NamedTuple):
         return angles_from_axis(self.rays)
 
 
+class Lattice(NamedTuple):
+    """Even steps from `low` to `high`, (C, 2) each: over pixels, or over the angles from the axis and azimuths."""
+
+    low: Tensor
+    high: Tensor
+    side: int
+    """The number of nodes along either coordinate, both ends included."""
+    are_pixels: bool
+    limit: float
+    """Radians from the axis, beyond which rays do not count."""
+
+    def of(self, rows: Tensor) -> Lattice:
+        """That of some rows."""
+        return self._replace(low=self.low[rows], high=self.high[rows])
+
+    def nodes(self) -> Tensor:
+        """(C, side^2, 2)."""
+        return pixel_lattice(self.low, self.high, self.side, self.side).flatten(1, 2)
+
+    def between(self, places: Tensor) -> Tensor:
+        """Places (C, N, 2), brought back to where the lattice ends; azimuths go round."""
+        inside = places.clamp(self.low[:, None], self.high[:, None])
+        return inside if self.are_pixels else torch.stack((inside[..., 0], places[..., 1]), -1)
+
+    def sampled(self, camera: Camera, places: Tensor) -> SampledRays:
+        """The rays of a camera at places (C, N, 2)."""
+        if self.are_pixels:
+            rays, found = camera.unproject(places)
+        else:
+            rays = polar_rays(*places.unbind(-1))
+            found = torch.ones_like(rays[..., 0], dtype=torch.bool)
+        pixels, valid = camera.project(rays)
+        return SampledRays(rays, pixels, valid & found & (angles_from_axis(rays) <= self.limit * (1 + 1e-12)))
+
+
+def lattice(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> Lattice:
+    """Over the part of the image that an angle leaves, its edges included; without an image, over all directions."""
+    count = len(camera.intrinsics)
+    if image_size is None:
+        reach = _reach(camera, limit)
+        # no node where panoramas are cut, and the last azimuth is next to the first one
+        first, last = (torch.full_like(reach, (i + 0.25) * 2 * math.pi / side) for i in (0, side - 1))
+        low, high = torch.cat((torch.zeros_like(reach), first), -1), torch.cat((reach, last), -1)
+        return Lattice(low, high, side, False, limit)
+    low, high = (corner.expand(count, 2) for corner in image_edges(image_size, camera.intrinsics))
+    if limit < math.pi:
+        ring, valid = camera.project(ray_fan(low.new_full((count, 1), limit), 64).flatten(1, 2))
+        closed = valid.all(-1)[:, None] & (limit < math.pi / 2)
+        least, most = (torch.where(closed, end, whole) for end, whole in ((ring.amin(1), low), (ring.amax(1), high)))
+        inside = (least < high) & (most > low)
+        low, high = torch.where(inside, least.clamp(min=low), low), torch.where(inside, most.clamp(max=high), high)
+    return Lattice(low, high, side, True, limit)
+
+
 def view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
     """side^2 rays on the image, or in all directions, of which those count that the camera has up to an angle."""
-    if image_size is None:
-        rays = ray_fan(_reach(camera, limit) * torch.linspace(0, 1, side, **_like(camera)), side)
-        rays, found = rays.flatten(1, 2), True
-    else:
-        rays, found = camera.unproject(_lattice(camera, image_size, side, limit))
-    pixels, valid = camera.project(rays)
-    seen = SampledRays(rays, pixels, valid & found)
-    return seen._replace(valid=seen.valid & (seen.angles <= limit * (1 + 1e-12)))
+    nodes = lattice(camera, image_size, side, limit)
+    return nodes.sampled(camera, nodes.nodes())
 
 
 def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
@@ -65,19 +118,6 @@ def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: 
         low, high = image_edges(image_size, pixels)
         valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
     return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, (rays, pixels, valid), strict=True)))
-
-
-def _lattice(camera: Camera, image_size: tuple[int, int], side: int, limit: float) -> Tensor:
-    """(C, side^2, 2): pixels of the part of the image that an angle leaves, its edges included."""
-    count = len(camera.intrinsics)
-    low, high = (corner.expand(count, 2) for corner in image_edges(image_size, camera.intrinsics))
-    if limit < math.pi:
-        ring, valid = camera.project(ray_fan(low.new_full((count, 1), limit), 64).flatten(1, 2))
-        closed = valid.all(-1)[:, None] & (limit < math.pi / 2)
-        least, most = (torch.where(closed, end, whole) for end, whole in ((ring.amin(1), low), (ring.amax(1), high)))
-        inside = (least < high) & (most > low)
-        low, high = torch.where(inside, least.clamp(min=low), low), torch.where(inside, most.clamp(max=high), high)
-    return pixel_lattice(low, high, side, side).flatten(1, 2)
 
 
 def _reach(camera: Camera, limit: float) -> Tensor:

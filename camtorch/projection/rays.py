@@ -43,10 +43,13 @@ def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
 
 def ray_fan(angles: Tensor, azimuths: int) -> Tensor:
     """(*C, K) angles from the axis -> (*C, K, azimuths, 3) rays, evenly around it; none where panoramas are cut."""
-    phi = (torch.arange(azimuths).to(angles) + 0.25) * (2 * math.pi / azimuths)
-    theta = angles[..., None]
-    z = theta.cos().expand(*angles.shape, azimuths)
-    return torch.stack((theta.sin() * phi.cos(), theta.sin() * phi.sin(), z), -1)
+    return polar_rays(angles[..., None], (torch.arange(azimuths).to(angles) + 0.25) * (2 * math.pi / azimuths))
+
+
+def polar_rays(angles: Tensor, azimuths: Tensor) -> Tensor:
+    """(..., 3): unit rays at angles from the axis, on azimuths, both radians (...)."""
+    across = angles.sin()
+    return torch.stack(torch.broadcast_tensors(across * azimuths.cos(), across * azimuths.sin(), angles.cos()), -1)
 
 
 def angles_from_axis(rays: Tensor) -> Tensor:

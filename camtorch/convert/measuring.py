@@ -1,0 +1,124 @@
+"""How far a camera is from the one that it was made of, in the numbers that `Conversion` states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from camtorch.convert import views
+from camtorch.convert.least_squares import see
+from camtorch.projection.rays import image_edges, ray_fan
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+_SIDE = 193  # of the lattice of pixels to compare at
+_PEAKS, _ROUNDS, _RIM = 16, 4, 720  # that are climbed, in so many rounds; rays at the largest angle
+_ROUNDING = 1e-9  # px
+
+
+class Reference(NamedTuple):
+    """The rays of cameras (C,) that others are compared on: up to an angle, and all that the image has."""
+
+    camera: Camera
+    image_size: tuple[int, int] | None
+    lattice: views.Lattice
+    rays: views.SampledRays
+    all_rays: views.SampledRays
+
+    @property
+    def reach(self) -> Tensor:
+        """(C,) the largest angle from the axis, up to the limit; 0 where nothing is seen."""
+        return torch.where(self.rays.valid, self.rays.angles, 0.0).amax(-1)
+
+    def of(self, camera: Camera, rows: Tensor) -> Reference:
+        """That of some rows, and their cameras."""
+        parts = self.lattice.of(rows), self.rays.of(rows), self.all_rays.of(rows)
+        return Reference(camera, self.image_size, *parts)
+
+
+def reference(camera: Camera, image_size: tuple[int, int] | None, limit: float) -> Reference:
+    """The rays of cameras (C,); those count that are up to an angle from the axis."""
+    lattice = views.lattice(camera, image_size, _SIDE, limit)
+    rays = lattice.sampled(camera, lattice.nodes())
+    all_rays = rays if limit == math.pi else views.view(camera, image_size, _SIDE, math.pi)
+    return Reference(camera, image_size, lattice, rays, all_rays)
+
+
+class Measures(NamedTuple):
+    """The numbers of a `Conversion`, (C,) each."""
+
+    rms: Tensor
+    max_error: Tensor
+    max_angle: Tensor
+    valid_fraction: Tensor
+
+
+def measure(target: Camera, k: Tensor, exact: Tensor, source: Reference) -> Measures:
+    """Compare cameras (C,), of coefficients (C, n), with those that they were made of.
+
+    The root of the mean square is that of the lattice's nodes. The largest error is searched: from the highest peaks
+    among the nodes upwards, and on the rim of the largest angle.
+    """
+
+    def compared(rays: views.SampledRays) -> tuple[Tensor, Tensor]:
+        pixels, valid = target.project(rays.rays)
+        # what was out of the reach of the fit is no part of its result
+        reached = see(target, k, rays.rays).covered | exact[:, None]
+        return torch.linalg.vector_norm(pixels - rays.pixels, dim=-1), valid & reached
+
+    rays = source.rays
+    errors, mapped = compared(rays)
+    angles = rays.angles
+    first_hole = torch.where(rays.valid & ~mapped, angles, torch.inf).amin(-1, keepdim=True)
+    inside = rays.valid & mapped & (angles < first_hole)
+    errors, some = torch.where(inside, errors, 0.0), inside.any(-1)
+    max_angle = torch.where(inside, angles, 0.0).amax(-1)
+
+    def error_within(rays: views.SampledRays) -> Tensor:
+        errors, mapped = compared(rays)
+        return torch.where(mapped & rays.valid & (rays.angles <= max_angle[:, None]), errors, 0.0)
+
+    max_error = errors.amax(-1)
+    if bool((max_error > _ROUNDING).any()):
+        max_error = torch.maximum(max_error, _climbed(source, errors, error_within))
+        max_error = torch.maximum(max_error, error_within(_rim(source, max_angle)).amax(-1))
+    rms = (errors.square().sum(-1) / inside.sum(-1).clamp(min=1)).sqrt()
+    rms, max_error = (torch.where(some, number, torch.inf) for number in (rms, max_error))
+    every = source.all_rays
+    mapped = mapped if every is rays else compared(every)[1]
+    shown = every.valid & mapped & (every.angles <= max_angle[:, None]) & some[:, None]
+    return Measures(rms, max_error, max_angle, shown.sum(-1) / every.valid.sum(-1).clamp(min=1))
+
+
+def _climbed(source: Reference, errors: Tensor, error_at: Callable[[views.SampledRays], Tensor]) -> Tensor:
+    """(C,) the largest error near the highest peaks of errors (C, side^2): each moves to the best of finer nodes."""
+    lattice = source.lattice
+    count, side = len(errors), lattice.side
+    field = errors.view(count, 1, side, side)
+    peaks = torch.where(field == max_pool2d(field, 3, 1, 1), field, 0.0).flatten(1)
+    places = lattice.nodes().gather(1, peaks.topk(_PEAKS).indices[..., None].expand(-1, -1, 2))
+    share = torch.linspace(-1, 1, 7, dtype=errors.dtype, device=errors.device)
+    offsets = torch.cartesian_prod(share, share)
+    step = ((lattice.high - lattice.low) / (side - 1))[:, None, None]
+    for _ in range(_ROUNDS):
+        near = lattice.between((places[:, :, None] + step * offsets).flatten(1, 2))
+        found, best = error_at(lattice.sampled(source.camera, near)).unflatten(1, (_PEAKS, -1)).max(-1)
+        places = near.unflatten(1, (_PEAKS, -1)).gather(2, best[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
+        step = step / 3
+    return found.amax(-1)
+
+
+def _rim(source: Reference, angle: Tensor) -> views.SampledRays:
+    """The rays at an angle (C,) from the axis, as far as they are on the image."""
+    rays = ray_fan(angle[:, None] * (1 - 1e-12), _RIM).flatten(1, 2)
+    pixels, valid = source.camera.project(rays)
+    if source.image_size is not None:
+        low, high = image_edges(source.image_size, pixels)
+        valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
+    return views.SampledRays(rays, pixels, valid)
