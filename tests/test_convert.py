@@ -5,7 +5,7 @@ from math import radians
 
 import pytest
 import torch
-from cameras import GOLDEN, KEYS, drawn, golden_camera, make, one
+from cameras import GOLDEN, KEYS, drawn, golden_camera, make, one, pixel_lattice
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -389,6 +389,54 @@ def test_edited_images():
 def test_the_door(arguments, options, error, text):
     with pytest.raises(error, match=text):
         fisheye().convert(*arguments, **options)
+
+
+# -- the largest error is the largest
+
+
+def largest(source, result, rows=481, columns=641):
+    """The largest distance on a lattice far finer than the one that a conversion looks at, and on the rim."""
+    angle = float(result.max_angle)
+    rays, valid = source.unproject(pixel_lattice(source.pad(0, 1, 0, 1), rows, columns) - 0.5)
+    phi = torch.linspace(0, 2 * math.pi, 1441, **F64)
+    rim = torch.stack((math.sin(angle) * phi.cos(), math.sin(angle) * phi.sin(), torch.full_like(phi, math.cos(angle))))
+    pixels, there = source.project(rim.mT)
+    valid = valid & (torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2]) <= angle)
+    rays = torch.cat((rays[valid], rim.mT[there & source.contains(pixels)]))
+    (old, _), (new, mapped) = source.project(rays), result.camera.project(rays)
+    # between the nodes there may be a hole that none of them fell into
+    return float(torch.where(mapped, (new - old).norm(dim=-1), 0.0).max())
+
+
+@pytest.mark.parametrize(
+    ("key", "target", "intrinsics", "distortion"),
+    [
+        ("fisheye62", "cylindrical", [173, 173, 321, 234], [-0.489, -0.449, -0.077, 0.401, 0.047, 0.085, 0.015, 0.003]),
+        ("brown_conrady", "cylindrical", [281, 301, 302, 230], [0.137, -0.146, -1e-3, -2e-3, -0.1, 0.08, -0.11, 0.27]),
+        ("fisheye624", "f_theta", [219, 233, 303, 225],
+         [-1e-3, 0.024, 0.013, 0.038, -0.031, -0.049, 0, -1e-3, 0, -1e-3, -1e-3, -2e-3]),
+        ("orthographic_fisheye", "brown_conrady", [150, 135, 320, 240], [0]),
+        ("pinhole", "cylindrical", [300.0, 300, 320, 240], []),
+    ],
+)  # fmt: skip
+@torch.no_grad()
+def test_nothing_between_the_nodes_is_worse(key, target, intrinsics, distortion):
+    source = make(key, torch.tensor(intrinsics, **F64), torch.tensor(distortion, **F64), image_size=SIZE)
+    for options in ({}, {"max_angle": 0.7}):
+        result = source.convert(target, **options)
+        assert largest(source, result) <= 1.002 * float(result.max_error)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", KEYS)
+@given(data=st.data())
+@settings(max_examples=4)
+def test_nothing_between_the_nodes_of_drawn_cameras_is_worse(key, data):
+    source = data.draw(drawn(key, wild=data.draw(st.booleans()))).requires_grad_(False)
+    angle = data.draw(st.sampled_from([None, 0.3, 0.7, 1.2]))
+    result = source.convert(data.draw(st.sampled_from(KEYS)), max_angle=angle)
+    if bool(torch.isfinite(result.max_error)):
+        assert largest(source, result) <= 1.005 * float(result.max_error) + 1e-9
 
 
 @pytest.mark.parametrize("key", KEYS)

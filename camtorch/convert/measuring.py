@@ -67,13 +67,16 @@ def measure(target: Camera, k: Tensor, exact: Tensor, source: Reference) -> Meas
     """
 
     def compared(rays: views.SampledRays) -> tuple[Tensor, Tensor]:
-        pixels, valid = target.project(rays.rays)
+        pixels, mapped = target.project(rays.rays)
+        return torch.linalg.vector_norm(pixels - rays.pixels, dim=-1), mapped
+
+    def reached(rays: views.SampledRays) -> Tensor:
         # what was out of the reach of the fit is no part of its result
-        reached = see(target, k, rays.rays).covered | exact[:, None]
-        return torch.linalg.vector_norm(pixels - rays.pixels, dim=-1), valid & reached
+        return see(target, k, rays.rays).covered | exact[:, None]
 
     rays = source.rays
     errors, mapped = compared(rays)
+    mapped = mapped & reached(rays)
     angles = rays.angles
     first_hole = torch.where(rays.valid & ~mapped, angles, torch.inf).amin(-1, keepdim=True)
     inside = rays.valid & mapped & (angles < first_hole)
@@ -91,7 +94,7 @@ def measure(target: Camera, k: Tensor, exact: Tensor, source: Reference) -> Meas
     rms = (errors.square().sum(-1) / inside.sum(-1).clamp(min=1)).sqrt()
     rms, max_error = (torch.where(some, number, torch.inf) for number in (rms, max_error))
     every = source.all_rays
-    mapped = mapped if every is rays else compared(every)[1]
+    mapped = mapped if every is rays else compared(every)[1] & reached(every)
     shown = every.valid & mapped & (every.angles <= max_angle[:, None]) & some[:, None]
     return Measures(rms, max_error, max_angle, shown.sum(-1) / every.valid.sum(-1).clamp(min=1))
 
