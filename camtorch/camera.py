@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import torch
 from torch import Tensor, nn
@@ -27,7 +28,9 @@ from camtorch.optics.lens import Lens
 from camtorch.projection import formulas, ops
 from camtorch.projection.autograd import Cameras, Project, Unproject
 from camtorch.projection.domain import Domain
+from camtorch.projection.explanation import explain
 from camtorch.projection.ops import finish, positive, tables, to_planes, without_keeping
+from camtorch.projection.rays import AXES, field_of_view, focal_for
 from camtorch.projection.solve import invert
 
 if TYPE_CHECKING:
@@ -173,6 +176,61 @@ class Camera(BatchedModule):
         return cls(intrinsics, distortion, image_size=image_size)
 
     @classmethod
+    def from_fov(
+        cls,
+        fov: float | Tensor,
+        *,
+        image_size: tuple[int, int],
+        axis: Literal["horizontal", "vertical", "diagonal"] = "horizontal",
+        distortion: Tensor | Sequence[float] | None = None,
+    ) -> Self:
+        """A camera of a field of view given in DEGREES, for images that nothing more is known of.
+
+        Its pixels are square, its principal point is the middle of the image, and its focal length is such that
+        `field_of_view` comes out, with the distortion of the lens. What it guesses can learn.
+
+        Args:
+            fov: degrees, one or (*B,), between the outer edges of the image.
+            image_size: (height, width) in pixels.
+            axis: the field of view that `fov` is: "horizontal", "vertical" or "diagonal".
+            distortion: (*B, n) coefficients; those of `ideal` if left out.
+
+        Raises:
+            ValueError: a field of view that this lens does not reach, one that seems to be in radians (up to 2 pi), an
+                unknown axis.
+        """
+        owner = f"{cls.__name__}.from_fov"
+        size = as_image_size(image_size, owner)
+        if size is None:
+            raise ValueError(f"{owner}: a field of view is one of an image; give its image_size=(height, width)")
+        if axis not in AXES:
+            raise ValueError(f"{owner}: axis must be one of {AXES}; got {axis!r}")
+        fov = torch.tensor(fov, dtype=torch.float64) if isinstance(fov, (int, float)) else fov
+        degrees = as_real(fov, "fov", owner).detach().double()
+        if not bool(((degrees > 0) & (degrees <= 360)).all()):
+            raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
+        if bool((degrees <= 2 * math.pi).any()):
+            raise ValueError(
+                f"{owner}: fov is in degrees; {degrees.tolist()} seems to be radians, which math.degrees() converts. A "
+                "lens as narrow as that has a focal length of width / 2 / tan(fov / 2), which makes its intrinsics"
+            )
+        given = () if distortion is None else (as_real(distortion, "distortion", owner),)
+        plane = cls([1.0, 1.0, 0.0, 0.0], *(t.detach() for t in given)).double()
+        degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
+        focal, reached = focal_for(plane, degrees.deg2rad(), size, axis)
+        centre = focal.new_tensor([(size[1] - 1) / 2, (size[0] - 1) / 2]).expand(*focal.shape, 2)
+        intrinsics = torch.cat((focal[..., None], focal[..., None], centre), -1)
+        intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
+        made = cls(intrinsics, *given, image_size=size)
+        if not bool(reached.all()):
+            widest = made.field_of_view[..., AXES.index(axis)].rad2deg().flatten().tolist()
+            raise ValueError(
+                f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "
+                + ", ".join(f"{angle:.5g}" for angle in widest)
+            )
+        return made
+
+    @classmethod
     def _is_column(cls, distortion: Tensor) -> bool:
         """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
         count = distortion.shape[-2] if distortion.ndim > 1 and distortion.shape[-1] == 1 else 1
@@ -198,6 +256,43 @@ class Camera(BatchedModule):
         fx, fy, cx, cy = self.intrinsics.expand(*self.batch_shape, 4).unbind(-1)
         zero, one = torch.zeros_like(fx), torch.ones_like(fx)
         return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+
+    @property
+    def fx(self) -> Tensor:
+        """(*B,) the horizontal focal length in pixels; gradients go to `intrinsics`."""
+        return self._intrinsic(0)
+
+    @property
+    def fy(self) -> Tensor:
+        """(*B,) the vertical focal length in pixels."""
+        return self._intrinsic(1)
+
+    @property
+    def cx(self) -> Tensor:
+        """(*B,) the principal point across in pixels; 0 is the middle of the leftmost ones."""
+        return self._intrinsic(2)
+
+    @property
+    def cy(self) -> Tensor:
+        """(*B,) the principal point down in pixels."""
+        return self._intrinsic(3)
+
+    def _intrinsic(self, index: int) -> Tensor:
+        return self.intrinsics[..., index].expand(self.batch_shape)
+
+    @property
+    def height(self) -> int:
+        """Of the image, in pixels.
+
+        Raises:
+            ValueError: the camera has no image size.
+        """
+        return self._size("height")[0]
+
+    @property
+    def width(self) -> int:
+        """Of the image, in pixels; see `height`."""
+        return self._size("width")[1]
 
     # -- what a model states
 
@@ -407,6 +502,34 @@ class Camera(BatchedModule):
         """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W)."""
         grid = self.pixel_grid()
         return self.unproject(grid.expand(*self.batch_shape, *grid.shape))
+
+    @property
+    def field_of_view(self) -> Tensor:
+        """(*B, 3) radians: horizontal, vertical and diagonal; without a graph.
+
+        The angle that a line of the image takes, from outer pixel edge to outer pixel edge: the row and the column
+        through the principal point, and the wider of both diagonals. It is the sum of the angles from the optical axis
+        to both sides, so that it goes up to a whole turn, beyond the half where angles between rays end. Where a line
+        is not seen to its ends, because the lens folds inside the image, it is the angle between the outermost points
+        on it that have rays; 0 where none has.
+
+        Raises:
+            ValueError: the camera has no image size.
+        """
+        return field_of_view(self)
+
+    def explain(self, points: Tensor) -> list[str]:
+        """Why points have no pixel, in words; for a person, and slow.
+
+        Args:
+            points: (*B, *N, 3) as for `project`.
+
+        Returns:
+            A line for each point, in the order of `points.flatten(0, -2)`: "valid", or what keeps `project` from it:
+            "the camera itself is unusable: ...", "not finite: ...", "no direction: ...", "the chart does not cover it:
+            ..." or "beyond the fold at ... degrees: ..."; angles from the optical axis, along the azimuth of the point.
+        """
+        return explain(self, points)
 
     # -- the camera of an edited image. It has no Parameters of its own while the original learns: its intrinsics are
     # made from the original's, and that is where gradients go. From a frozen camera, or under no_grad, it is a copy.

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
     CameraT = TypeVar("CameraT", bound=Camera)
 
+AXES = ("horizontal", "vertical", "diagonal")
+"""The lines of an image along which a field of view is."""
+
 _LINE = 513  # points along a line of the image
 
 
@@ -92,6 +95,11 @@ def followed(camera: Camera, angles: Tensor, azimuths: int) -> tuple[Tensor, Ten
     return pixels, valid.long().cumprod(-2).bool()
 
 
+def _between(low: Tensor, high: Tensor) -> Tensor:
+    """(..., 33): from low to high, (..., 1) each."""
+    return low + (high - low) * torch.linspace(0, 1, 33).to(low)
+
+
 @torch.no_grad()
 def field_of_view(camera: Camera) -> Tensor:
     """(*B, 3) radians: horizontal and vertical through the principal point, and on the wider diagonal of the image.
@@ -104,11 +112,58 @@ def field_of_view(camera: Camera) -> Tensor:
     lines = (left, cy, right, cy), (cx, top, cx, bottom), (left, top, right, bottom), (left, bottom, right, top)
     ends = torch.stack([torch.stack(torch.broadcast_tensors(*line, cx)[:4], -1) for line in lines], -2)
     start, along = ends[..., None, :2], ends[..., None, 2:] - ends[..., None, :2]
-    rays, valid = camera.unproject(start + torch.linspace(0, 1, _LINE).to(start)[:, None] * along)
-    x, y, z = rays.double().unbind(-1)
-    # from a turn to the one side to a turn to the other: more than half a circle is no angle between two rays
-    forward = x * along[..., 0] + y * along[..., 1]
-    angles = torch.atan2(torch.hypot(x, y).copysign(forward), z)
-    least, most = torch.where(valid, angles, torch.inf).amin(-1), torch.where(valid, angles, -torch.inf).amax(-1)
-    wide, tall, *diagonals = (most - least).clamp(min=0).to(rays.dtype).unbind(-1)
+    least = start.new_full(start.shape[:-2], torch.inf, dtype=torch.float64)
+    most = -least
+    share = torch.linspace(0, 1, _LINE).to(start).expand(*least.shape, _LINE)
+    for _ in range(4):  # all of the line, then what lies around the ends of what is seen of it
+        rays, valid = camera.unproject(start + share[..., None] * along)
+        x, y, z = rays.double().unbind(-1)
+        # from a turn to the one side to a turn to the other: more than half a circle is no angle between two rays
+        forward = x * along[..., 0] + y * along[..., 1]
+        angles = torch.atan2(torch.hypot(x, y).copysign(forward), z)
+        least = torch.minimum(least, torch.where(valid, angles, torch.inf).amin(-1))
+        most = torch.maximum(most, torch.where(valid, angles, -torch.inf).amax(-1))
+        first, last = valid.long().argmax(-1, True), share.shape[-1] - 1 - valid.flip(-1).long().argmax(-1, True)
+        around = [share.gather(-1, i.clamp(0, share.shape[-1] - 1)) for i in (first - 1, first, last, last + 1)]
+        share = torch.cat((_between(*around[:2]), _between(*around[2:])), -1)
+    wide, tall, *diagonals = (most - least).clamp(min=0).to(start.dtype).unbind(-1)
     return torch.stack((wide, tall, torch.maximum(*diagonals)), -1)
+
+
+@torch.no_grad()
+def focal_for(camera: Camera, fov: Tensor, image_size: tuple[int, int], axis: str) -> tuple[Tensor, Tensor]:
+    """(*B,) the focal length at which an image with its centre on the axis has a field of view; and whether one has.
+
+    Where none has it, it is the focal length of the widest.
+
+    Args:
+        camera: of focal length 1 and principal point 0; float64.
+        fov: (*B,) radians along the `axis`, one of `AXES`.
+        image_size: (height, width).
+        axis: the outer edges between which the angle is, those of the wider diagonal for "diagonal".
+    """
+    height, width = image_size
+    ends = {"horizontal": [(width, 0)], "vertical": [(0, height)], "diagonal": [(width, height), (width, -height)]}[
+        axis
+    ]
+    half = fov.new_tensor(ends) / 2
+
+    def angle(per_pixel: Tensor) -> Tensor:
+        """(*B, K): between both ends, for (*B, K) plane units a pixel; infinite where one has no ray."""
+        toward = per_pixel[..., None, None] * half
+        rays, valid = camera.unproject(torch.stack((toward, -toward), -2))
+        angles = angles_from_axis(rays).sum(-1).amax(-1)
+        return torch.where(valid.flatten(-2).all(-1), angles, torch.inf)
+
+    share = torch.linspace(0, 1, _LINE).to(fov)
+    reach = half.norm(dim=-1).amax()
+    low, high = fov.new_full(fov.shape, 1e-6), fov.new_full(fov.shape, 1e5)
+    scale = low[..., None] * (high / low)[..., None] ** share / reach
+    for _ in range(5):  # the first in even ratios, the others in even steps
+        below = (angle(scale) < fov[..., None]).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _LINE - 1)
+        low, high = scale.gather(-1, below - 1), scale.gather(-1, below)
+        scale = low + (high - low) * share
+    found = angle(torch.cat((low, high), -1))
+    reached = torch.isfinite(found[..., 1]) & (found[..., 1] >= fov)
+    # panoramas end where a whole turn does
+    return 1 / torch.where(reached, high[..., 0], low[..., 0]), reached | (fov - found[..., 0] < 1e-6)

@@ -1,0 +1,244 @@
+"""What a camera is asked most: its numbers, its field of view, its parts, and why a point has no pixel."""
+
+import math
+
+import pytest
+import torch
+from cameras import KEYS, fan, make, one, spread
+
+import camtorch as ct
+
+every_model = pytest.mark.parametrize("key", KEYS)
+SIZE = (480, 640)
+
+
+def test_numbers_by_name():
+    intrinsics = torch.arange(1.0, 25.0).view(3, 2, 4).requires_grad_()
+    camera = ct.KannalaBrandt(intrinsics, torch.zeros(2, 4), image_size=SIZE)
+    for i, name in enumerate(("fx", "fy", "cx", "cy")):
+        assert torch.equal(getattr(camera, name), intrinsics[..., i])
+    camera.cy.sum().backward()
+    assert intrinsics.grad[..., 3].eq(1).all()
+    assert not intrinsics.grad[..., :3].any()
+    assert (camera.height, camera.width) == SIZE
+    assert ct.UCM([1.0, 2.0, 3.0, 4.0], torch.zeros(5, 1)).fy.tolist() == [2.0] * 5
+    with pytest.raises(ValueError, match=r"Pinhole: width needs .*image_size"):
+        ct.Pinhole([1.0, 2.0, 3.0, 4.0]).width  # noqa: B018
+
+
+# -- parts of a batch
+
+
+def batch_of(key):
+    camera = spread(key)
+    scales = torch.tensor([[1.0, 1.1, 0.9], [1.2, 0.8, 1.05]], dtype=torch.float64)[..., None]
+    return make(key, camera.intrinsics.detach() * scales, camera.distortion.detach(), image_size=SIZE)
+
+
+INDICES = {
+    "int": 1,
+    "last": -1,
+    "pair": (1, 2),
+    "slice": slice(0, 1),
+    "column": (slice(None), 0),
+    "list": [1, 0],
+    "ellipsis": (..., 2),
+    "mask": torch.tensor([False, True]),
+    "mask of both": torch.tensor([[True, False, True], [False, True, False]]),
+}
+
+
+@every_model
+def test_parts_of_a_batch_are_its_cameras(key):
+    batch = batch_of(key)
+    points = fan(40, 4, 3)
+    expected = batch.project(points.expand(2, 3, *points.shape))
+    places = torch.arange(6).view(2, 3)
+    for index in INDICES.values():
+        part = batch[index]
+        assert type(part) is type(batch)
+        assert part.image_size == SIZE
+        assert part.distortion_names == batch.distortion_names
+        found = part.project(points.expand(*part.batch_shape, *points.shape))
+        for mine, whole in zip(found, expected, strict=True):
+            torch.testing.assert_close(mine, whole.flatten(0, 1)[places[index]])
+    assert len(batch) == 2
+    assert [len(row) for row in batch] == [3, 3]
+    assert [[float(c.fx.detach()) for c in row] for row in batch] == batch.fx.tolist()
+
+
+def test_gradients_of_a_part_are_the_batch_s_and_frozen_stays_frozen():
+    camera = ct.KannalaBrandt(torch.tensor([[300.0, 300.0, 320.0, 240.0]] * 3), image_size=SIZE)
+    camera[1].project(torch.ones(3))[0].sum().backward()
+    assert camera.intrinsics.grad[1].any()
+    assert not camera.intrinsics.grad[[0, 2]].any()
+    assert not list(camera[1].parameters())
+    frozen = camera.requires_grad_(False)[1]
+    assert [p.requires_grad for p in frozen.parameters()] == [False, False]
+    frozen.intrinsics[0] = 7.0  # shares its values, as a row of a tensor does
+    assert camera.intrinsics[1, 0] == 7
+
+
+def test_parts_of_poses():
+    poses = ct.Extrinsics(torch.rand(4, 3), torch.rand(3))
+    assert len(poses) == 4
+    torch.testing.assert_close(poses[2].matrix(), poses.matrix()[2])
+    torch.testing.assert_close(poses[1:3].matrix(), poses.matrix()[1:3])
+    assert [p.batch_shape for p in poses] == [()] * 4
+
+
+def test_a_single_camera_has_no_parts():
+    camera = ct.Pinhole([300.0, 300.0, 320.0, 240.0])
+    for wrong in (lambda: camera[0], lambda: len(camera), lambda: iter(camera), lambda: list(camera)):
+        with pytest.raises(TypeError, match="Pinhole: it has no batch dims"):
+            wrong()
+    assert camera
+    with pytest.raises(IndexError, match=r"Pinhole: 3 of a batch \(2,\)"):
+        ct.Pinhole(torch.tensor([[300.0, 300.0, 320.0, 240.0]] * 2))[3]
+    with pytest.raises(IndexError, match=r"Pinhole: \(0, 1\) of a batch \(2,\)"):
+        ct.Pinhole(torch.tensor([[300.0, 300.0, 320.0, 240.0]] * 2))[0, 1]
+
+
+# -- field of view
+
+
+@pytest.mark.parametrize("width", [640, 641])
+def test_field_of_view_of_closed_forms(width):
+    size, f = (480, width), 300.0
+    half = width / 2, 240, math.hypot(width / 2, 240)
+    centre = [(width - 1) / 2, 239.5]
+    for model, angle in (
+        (ct.Pinhole, lambda r: math.atan(r / f)),
+        (ct.KannalaBrandt, lambda r: r / f),
+        (ct.Stereographic, lambda r: 2 * math.atan(r / f / 2)),
+    ):
+        camera = model([f, f, *centre], image_size=size).double()
+        expected = [2 * angle(r) for r in half]
+        assert camera.field_of_view.tolist() == pytest.approx(expected, rel=1e-9)
+        assert not camera.field_of_view.requires_grad
+
+
+def test_field_of_view_follows_a_principal_point_that_is_not_the_middle():
+    camera = ct.Pinhole([300.0, 300.0, 99.5, 239.5], image_size=SIZE).double()
+    expected = math.atan(100 / 300) + math.atan(540 / 300)
+    assert camera.field_of_view[0].item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_field_of_view_beyond_half_a_turn_and_up_to_the_fold():
+    assert ct.KannalaBrandt([120.0, 120.0, 319.5, 239.5], image_size=SIZE).field_of_view[0] == pytest.approx(640 / 120)
+    # r = theta - theta^3 / 3 folds at 1 rad, at 200 pixels
+    folded = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [-1 / 3], image_size=SIZE).double()
+    assert folded.field_of_view.tolist() == pytest.approx([2.0] * 3, abs=1e-3)
+    whole = ct.Equirectangular([640 / (2 * math.pi)] * 2 + [319.5, 159.5], image_size=(320, 640)).double()
+    assert whole.field_of_view[:2].tolist() == pytest.approx([2 * math.pi, math.pi], abs=1e-3)
+
+
+@every_model
+def test_field_of_view_of_a_batch_is_that_of_its_cameras(key):
+    batch = batch_of(key)
+    assert batch.field_of_view.shape == (2, 3, 3)
+    torch.testing.assert_close(batch.field_of_view[1, 2], batch[1, 2].field_of_view)
+
+
+# -- from a field of view
+
+
+@every_model
+@pytest.mark.parametrize("axis", ["horizontal", "vertical", "diagonal"])
+@pytest.mark.parametrize("degrees", [25, 60.5, 95])
+def test_a_camera_of_a_field_of_view(key, axis, degrees):
+    camera = ct.MODELS[key].from_fov(degrees, image_size=SIZE, axis=axis)
+    found = camera.double().field_of_view[("horizontal", "vertical", "diagonal").index(axis)]
+    assert math.degrees(found) == pytest.approx(degrees, abs=2e-5)  # float32 focal lengths
+    assert camera.intrinsics[0] == camera.intrinsics[1]
+    assert camera.intrinsics[2:].tolist() == [319.5, 239.5]
+    assert camera.image_size == SIZE
+    assert all(p.requires_grad for p in camera.parameters())
+
+
+@pytest.mark.parametrize("key", [key for key in KEYS if ct.MODELS[key].distortion_names])
+def test_with_the_distortion_of_a_lens(key):
+    lens = one(key)
+    degrees = math.degrees(float(lens.field_of_view[0])) / 2
+    camera = type(lens).from_fov(degrees, image_size=SIZE, distortion=lens.distortion.detach())
+    assert camera.intrinsics.dtype == torch.float64
+    assert torch.equal(camera.distortion, lens.distortion)
+    assert math.degrees(camera.field_of_view[0]) == pytest.approx(degrees, rel=1e-8)
+
+
+def test_fields_of_view_in_a_batch():
+    degrees = torch.tensor([60.0, 120.0, 190.0])
+    camera = ct.KannalaBrandt.from_fov(degrees, image_size=SIZE, distortion=[0.01, 0.0, 0.0, 0.0])
+    torch.testing.assert_close(camera.field_of_view[:, 0].rad2deg(), degrees)
+    one_of_many = ct.KannalaBrandt.from_fov(60, image_size=SIZE, distortion=torch.tensor([[0.01], [0.02]]).expand(2, 2))
+    assert one_of_many.batch_shape == (2,)
+
+
+def test_wide_lenses():
+    for model, fov, size, focal in (
+        (ct.Equirectangular, 360, (320, 640), 640 / (2 * math.pi)),
+        (ct.KannalaBrandt, 220, SIZE, 320 / math.radians(110)),
+        (ct.Pinhole, 60, SIZE, 320 / math.tan(math.pi / 6)),
+    ):
+        assert model.from_fov(fov, image_size=size).fx.item() == pytest.approx(focal, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fov", "options", "says"),
+    [
+        (math.pi / 2, {}, r"degrees; 1\.57.* radians.*math\.degrees"),
+        (0, {}, "above 0"),
+        (-60, {}, "above 0"),
+        (361, {}, "up to 360"),
+        (180, {}, "no horizontal field of view of 180.*179.9"),
+        (200, {"axis": "diagonal"}, "no diagonal field of view of 200"),
+        (60, {"axis": "x"}, "axis must be one of .*'x'"),
+        (60, {"image_size": None}, "image_size"),
+        (float("nan"), {}, "finite"),
+    ],
+)
+def test_fields_of_view_that_no_lens_has(fov, options, says):
+    with pytest.raises(ValueError, match=rf"Pinhole\.from_fov: .*{says}"):
+        ct.Pinhole.from_fov(fov, **({"image_size": SIZE} | options))
+
+
+# -- why a point has no pixel
+
+
+@every_model
+def test_every_point_is_explained(key):
+    camera = one(key)
+    points = torch.cat((fan(180, 9, 5), torch.tensor([[math.nan, 0, 1], [0, 0, 0], [math.inf, 0, 1], [0, 0, -1]])))
+    valid = camera.project(points)[1]
+    lines = camera.explain(points)
+    assert len(lines) == len(points)
+    for line, good in zip(lines, valid.tolist(), strict=True):
+        assert (line == "valid") == good
+        assert good or line.startswith(("not finite: (", "no direction: ", "the chart does not", "beyond the fold at"))
+    assert lines[-4] == "not finite: (nan, 0, 1)"
+    assert lines[-3] == "no direction: (0, 0, 0) is the origin"
+
+
+def test_reasons():
+    fold = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [-1 / 3]).double()  # at 1 rad
+    ray = torch.tensor([0.0, math.sin(2.0), math.cos(2.0)], dtype=torch.float64)
+    assert fold.explain(ray) == ["beyond the fold at 57.30 degrees: 114.59 degrees from the optical axis"]
+    assert fold.explain(torch.tensor([0.0, 0.0, -2.0]))[0].startswith("the chart does not cover it: the backward dir")
+    pinhole = ct.Pinhole([300.0, 300.0, 319.5, 239.5]).double()
+    (line,) = pinhole.explain(ray)
+    assert line.startswith("the chart does not cover it: 114.59 degrees from the optical axis; on this side it ends at")
+    assert float(line.split()[-2]) == pytest.approx(90, abs=0.02)
+
+
+def test_reasons_in_batches_and_of_cameras_that_learning_broke():
+    camera = ct.Mei(torch.tensor([[300.0, 300.0, 319.5, 239.5]] * 4), torch.zeros(4, 5))
+    with torch.no_grad():
+        camera.intrinsics[1, 0] = -3.0
+        camera.intrinsics[2, 3] = math.nan
+        camera.distortion[3, 0] = -1.5
+    lines = camera.explain(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]).expand(4, 2, 3))
+    assert lines[0] == "valid"
+    assert lines[1].startswith("the chart does not cover it")
+    assert lines[2:4] == ["the camera itself is unusable: fx = -3 is not positive"] * 2
+    assert lines[4:6] == ["the camera itself is unusable: cy = nan"] * 2
+    assert lines[6:] == ["the camera itself is unusable: the formula needs xi > -1"] * 2
