@@ -8,9 +8,10 @@ import torch
 from PIL import Image
 
 import camtorch as ct
-from camtorch.cli import augment as views
-from camtorch.cli import labels, sheet
+from camtorch._drawing import BOX, GAZE, POINT
+from camtorch.cli import labelled_image, labels, sheet
 from camtorch.cli.main import main
+from camtorch.demo import example
 
 CAMERA = (
     "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
@@ -28,8 +29,8 @@ LABELS = {
 def folder(tmp_path, monkeypatch):
     """The current folder, with an image, its camera and labels; all images are small."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(views, "SCENE_SIZE", (48, 64))
-    monkeypatch.setattr(views, "NEW_SIZE", (96, 128))
+    monkeypatch.setattr(example, "SIZE", (48, 64))
+    monkeypatch.setattr(labelled_image, "NEW_SIZE", (96, 128))
     Path("camera.yml").write_text(CAMERA)
     Path("labels.json").write_text(json.dumps(LABELS))
     grey = np.full((64, 96, 3), 128, np.uint8)
@@ -57,7 +58,7 @@ def camera():
 
 def photograph(known=None, image=None):
     image = torch.full((3, 64, 96), 128, dtype=torch.uint8) if image is None else image
-    return views.photograph(image, camera(), known, "in.png")
+    return labelled_image.photograph(image, camera(), known, "in.png")
 
 
 def near(image, x, y, colour):
@@ -77,7 +78,7 @@ def test_without_an_image_it_shows_the_driver(folder, capsys):
     image = pixels("augment.png")
     # three columns of tiles of 4:3, the first image on two rows and columns
     assert image.shape == (1271, 1340, 3)
-    for colour in (sheet.POINT, sheet.BOX, sheet.GAZE):
+    for colour in (POINT, BOX, GAZE):
         assert (image == colour).all(-1).sum() > 200
 
 
@@ -119,14 +120,14 @@ def test_marks_lie_where_labels_say(folder):
     image = np.array(sheet.marked(view, 640, 960)).astype(int)
     assert image.shape == (640, 960, 3)
     for x, y in LABELS["keypoints"][:2]:
-        assert near(image, 10 * x + 4.5, 10 * y + 4.5, sheet.POINT) < 8
+        assert near(image, 10 * x + 4.5, 10 * y + 4.5, POINT) < 8
     x1, y1, x2, y2 = (10 * c + 4.5 for c in LABELS["boxes"][0])
     for x, y in ((x1, (y1 + y2) / 2), (x2, (y1 + y2) / 2), ((x1 + x2) / 2, y1), ((x1 + x2) / 2, y2)):
-        assert near(image, x, y, sheet.BOX) < 8
-    ((start, end),) = sheet._arrows(view)
+        assert near(image, x, y, BOX) < 8
+    ((start, end),) = sheet.arrows(view)
     assert math.dist(start, LABELS["gaze_from"]) < 1e-4
     middle = [10 * (s + e) / 2 + 4.5 for s, e in zip(start, end, strict=True)]
-    assert near(image, *middle, sheet.GAZE) < 8
+    assert near(image, *middle, GAZE) < 8
     assert (image != 128).any(-1).mean() < 0.05
 
 
@@ -134,14 +135,14 @@ def test_marks_lie_where_labels_say(folder):
 def test_labels_move_with_the_image(folder, preset):
     # a keypoint at each end of the arrow, and a spot of light at one
     plain = photograph(labels.read("labels.json", camera()))
-    ((start, end),) = sheet._arrows(plain)
+    ((start, end),) = sheet.arrows(plain)
     y, x = torch.meshgrid(torch.arange(64), torch.arange(96), indexing="ij")
     spot = 250 * torch.exp(-((x - start[0]) ** 2 + (y - start[1]) ** 2) / 8)
     known = labels.read("labels.json", camera())
     known.keypoints = torch.tensor([start, end], dtype=torch.float64)
     before = photograph(known, spot.byte().expand(3, -1, -1).contiguous())
-    for view in views.augmented(before, views.lens(preset), 3, 0):
-        ((start, end),) = sheet._arrows(view)
+    for view in labelled_image.augmented(before, labelled_image.lens(preset), 3, 0):
+        ((start, end),) = sheet.arrows(view)
         torch.testing.assert_close(view.labels.keypoints.tolist(), [start, end], rtol=0, atol=1e-2)
         weight = (view.image[0].double() - 128).clamp(min=0) * (view.image[0] == view.image[2])
         y, x = torch.meshgrid(*(torch.arange(n) for n in weight.shape), indexing="ij")
@@ -161,7 +162,7 @@ def test_kinds_of_image(folder, mode):
     image = Image.fromarray(grey.astype(np.uint16) * 30) if mode == "I;16" else Image.fromarray(grey).convert(mode)
     image.save("kind.tif")
     augment("kind.tif", "--camera", "camera.yml", "-n", 1, "-o", "out.png")
-    assert (pixels("out.png") == sheet.POINT).all(-1).any()
+    assert (pixels("out.png") == POINT).all(-1).any()
 
 
 def test_long_and_narrow_images(folder):
@@ -200,8 +201,9 @@ def test_columns_leave_little_empty():
         ([*PHOTO, "--roll", "nan"], "roll must be finite"),
         ([*PHOTO, "--pitch=5,-5"], "pitch must be (low, high)"),
         ([*PHOTO, "--preset", "webcam", "--fov", "200"], "does not reach 200 degrees"),
-        (["-o", "none/out.png"], "there is no folder none"),
-        (["-o", "in.png"], "in.png: exists already"),
+        (["-o", "camera.yml"], "camera.yml: exists already"),
+        ([*PHOTO, "-o", "in.png", "--force"], "in.png: would overwrite in.png, which is read"),
+        ([*PHOTO, "-o", "labels.json", "--force"], "would overwrite labels.json"),
         (["half.png", "--camera", "camera.yml"], "--rescale scales the camera"),
     ],
 )
@@ -260,9 +262,3 @@ def test_empty_labels_are_no_labels(folder, capsys):
     Path("labels.json").write_text("{}")
     augment(*PHOTO, "-n", 1)
     assert "points" not in capsys.readouterr().out
-
-
-def test_without_pillow(folder, capsys, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "PIL", None)
-    augment("-n", 1, expect=2)
-    assert "pip install 'camtorch[cli]'" in capsys.readouterr().err

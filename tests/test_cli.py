@@ -2,6 +2,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -92,7 +93,7 @@ def test_another_resolution_needs_rescale(folder, capsys):
     ("words", "text"),
     [
         ([], "the following arguments are required: COMMAND"),
-        (["dewarp"], "required: IMAGE, --camera"),
+        (["dewarp"], "required: IMAGE"),
         (["undistort"], "invalid choice: 'undistort'"),
         (["dewarp", "none.png", "--camera", "camera.yml", "-o", "o.png"], "none.png: no such file"),
         (["dewarp", "camera.yml", "--camera", "camera.yml", "-o", "o.png"], "camera.yml: not an image"),
@@ -102,11 +103,22 @@ def test_another_resolution_needs_rescale(folder, capsys):
         (["dewarp", "in.png", "--camera", "in.png", "-o", "o.png"], "in.png: byte 0: not text"),
         (["dewarp", "in.png", "--camera", "bad.yml", "-o", "o.png"], "bad.yml: K: a camera matrix has 3 x 3"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--model", "x", "-o", "o.png"], "known are brown_conrady"),
-        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "none/o.png"], "none/o.png: there is no folder"),
-        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "o.docx"], "written as .docx"),
-        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "o"], "written as a nameless type"),
+        (["dewarp", "in.png"], "in.png: which camera took it? --camera FILE"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "in.png/o.png"], "in.png/o.png: "),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "o.ico"], "o.ico: .ico: icons have sizes of their own"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "a\0b.png"], "'a\\x00b.png' is no name of a file"),
+        (["dewarp", "", "--camera", "camera.yml"], "'' is no name of a file"),
+        (
+            ["dewarp", "in.png", "--camera", "camera.yml", "-o", "o.docx"],
+            "o.docx: .docx: no image can be written as that",
+        ),
+        (
+            ["dewarp", "in.png", "--camera", "camera.yml", "-o", "o"],
+            "o: no suffix: no image can be written as that; try .png",
+        ),
         (["dewarp", "in.png", "--camera", "camera.yml", "-o", "."], "is a folder"),
-        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "in.png"], "in.png: exists already; --force"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "cut.png"], "cut.png: exists already; --force"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "-o", "in.png", "--force"], "in.png: would overwrite in.png"),
         (
             ["dewarp", "alpha.png", "--camera", "camera.yml", "-o", "o.jpg"],
             "o.jpg: .jpg files hold no image of mode RGBA",
@@ -135,6 +147,81 @@ def test_force_overwrites_and_keeps_nothing_of_the_old(folder):
     command("dewarp", "in.png", "--camera", "camera.yml", "--force", "-o", "out.png")
     assert opened("out.png").size == (96, 64)
     assert Path("out.png").stat().st_mode & 0o777 == Path("in.png").stat().st_mode & 0o777
+
+
+def test_folders_that_lack_are_made(folder):
+    command("dewarp", "in.png", "--camera", "camera.yml", "-o", "new/folder/out.png")
+    assert opened("new/folder/out.png").size == (96, 64)
+
+
+def test_nothing_that_is_read_is_overwritten(folder, capsys):
+    image, words = Path("in.png").read_bytes(), ["dewarp", "in.png", "--camera", "camera.yml", "--force", "-o"]
+    Path("link.png").symlink_to("in.png")
+    Path("hard.png").hardlink_to("in.png")
+    Path("camera.png").symlink_to("camera.yml")
+    for name in ("in.png", folder / "in.png", "link.png", "hard.png", "camera.png"):
+        assert "which is read; name another file" in refused(capsys, *words, name)
+    assert Path("in.png").read_bytes() == image
+
+
+def test_a_link_to_nothing_is_there_already(folder, capsys):
+    Path("out.png").symlink_to("elsewhere.png")
+    words = ["dewarp", "in.png", "--camera", "camera.yml", "-o", "out.png"]
+    assert "out.png: exists already; --force" in refused(capsys, *words)
+    command(*words, "--force")
+    assert Path("out.png").is_symlink()
+    assert opened("elsewhere.png").size == (96, 64)
+
+
+@pytest.mark.parametrize(
+    ("model", "text"),
+    [
+        (None, None),
+        ("kannala_brandt", None),
+        ("brown_conrady", "camera.yml: fisheye_model: says that the model is kannala_brandt, not brown_conrady"),
+    ],
+)
+def test_the_model_of_the_file_is_not_overruled(folder, capsys, model, text):
+    words = ["dewarp", "in.png", "--camera", "camera.yml", "-o", "out.png"] + (
+        [] if model is None else ["--model", model]
+    )
+    if text is None:
+        command(*words)
+    else:
+        assert text in refused(capsys, *words)
+
+
+def test_the_model_of_a_file_that_means_another_one(folder, capsys):
+    Path("bare.yml").write_text(MATRIX + "camera_model: something\n")
+    words = ["dewarp", "in.png", "--camera", "bare.yml", "-o", "out.png"]
+    assert "--model kannala_brandt" in refused(capsys, *words)
+    command(*words, "--model", "kannala_brandt")
+
+
+def test_what_pillow_does_not_read_is_said(folder, capsys):
+    deep = np.random.default_rng(0).integers(0, 65536, (64, 96, 3)).astype(np.uint16)
+    names = [f"deep.{suffix}" for suffix in ("png", "tif", "ppm")]
+    for name in names:
+        assert cv2.imwrite(name, deep)
+    frames = [Image.new("RGB", (96, 64), colour) for colour in ("red", "blue")]
+    frames[0].save("moving.gif", save_all=True, append_images=frames[1:])
+    for name, text in [*((name, "16 bits a colour; only the upper 8") for name in names), ("moving.gif", "2 images")]:
+        command("dewarp", name, "--camera", "camera.yml", "-o", "out.png", "--force")
+        error = capsys.readouterr().err
+        assert error.startswith(f"camtorch: note: {name} ")
+        assert text in error
+        assert error.count("\n") == 1
+    command("dewarp", "in.png", "--camera", "camera.yml", "-o", "out.png", "--force")
+    assert capsys.readouterr().err == ""
+
+
+def test_pixels_that_16_bits_do_not_hold(folder, capsys):
+    Image.fromarray(np.linspace(0, 1e9, 64 * 96).astype(np.int32).reshape(64, 96)).save("deep.tif")
+    words = ["dewarp", "deep.tif", "--camera", "camera.yml", "-o", "out.tif"]
+    assert "deep.tif: pixels from 0 to 1000000000; 8-bit and 16-bit images" in refused(capsys, *words)
+    Image.fromarray(np.linspace(0, 65535, 64 * 96).astype(np.int32).reshape(64, 96)).save("deep.tif")
+    command(*words)
+    assert opened("out.tif").mode == "I;16"
 
 
 def test_several_cameras_in_one_file(folder, capsys):
@@ -169,12 +256,6 @@ def test_exif_orientation_stays_as_it_is(folder):
     out = opened("out.jpg")
     assert out.size == (96, 64)
     assert out.getexif()[0x0112] == 6
-
-
-def test_without_pillow(folder, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    error = refused(capsys, "dewarp", "in.png", "--camera", "camera.yml", "-o", "out.png")
-    assert "pip install 'camtorch[cli]'" in error
 
 
 def test_runs_as_a_module():

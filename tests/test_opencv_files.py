@@ -296,3 +296,30 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory, intrinsics, distort
     camera = opencv.read(written(path, json.dumps({"camera_matrix": matrix, "dist_coeffs": distortion})))
     assert camera.intrinsics.tolist() == list(intrinsics)
     assert camera.distortion.tolist() == distortion
+
+
+@pytest.mark.parametrize(
+    ("text", "stated", "other"),
+    [
+        ("fisheye_model: 1\nD: [0.1, 0.01, 0.001, 0.0001]\n", "kannala_brandt", "brown_conrady"),
+        ("fisheye_model: 0\nD: [0.1, 0.01, 0.001, 0.0001]\n", "brown_conrady", "kannala_brandt"),
+        ("fisheye_model: 0\n", "pinhole", "kannala_brandt"),
+        ("xi: 1.2\nD: [0.1, 0.01, 0.001, 0.0001]\n", "mei", "ucm"),
+    ],
+)
+def test_a_file_that_states_its_model_is_not_overruled(path, text, stated, other):
+    written(path, f"K: {K}\n{text}")
+    assert opencv.read(path, stated).key == opencv.read(path).key == stated
+    with pytest.raises(CameraFileError, match=f"says that the model is .*, not {other}; leave that out, or correct"):
+        opencv.read(path, other)
+
+
+def test_a_pair_of_a_named_model(path):
+    written(
+        path,
+        f"K1: {K}\nK2: {K}\nD1: [0.1, 0, 0, 0]\nD2: [0.1, 0, 0, 0]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nT: [1, 0, 0]\n",
+    )
+    rig = opencv.read_rig(path, "kannala_brandt")
+    assert [camera.key for camera in rig.cameras.values()] == ["kannala_brandt"] * 2
+    assert list(rig.extrinsics) == ["1", "2"]
+    assert not any(p.requires_grad for camera in rig.cameras.values() for p in camera.parameters())

@@ -48,6 +48,10 @@ def opened(path):
         return image
 
 
+def batch():
+    return ct.KannalaBrandt(torch.tensor([[28.0, 28, 47, 32]] * 2), torch.zeros(2, 4), image_size=(64, 96))
+
+
 # -- show
 
 
@@ -83,9 +87,13 @@ def test_show_draws_an_image(folder, capsys):
         (["show"], "required: FILE"),
         (["show", "none.yml"], "none.yml: No such file"),
         (["show", "bad.yml"], "bad.yml: K: a camera matrix has 3 x 3"),
-        (["show", "camera.yml", "-o", "camera.yml"], "camera.yml: exists already; --force"),
-        (["show", "camera.yml", "-o", "o.docx"], "written as .docx"),
-        (["show", "camera.yml", "-o", "none/o.png"], "there is no folder none"),
+        (["show", "camera.yml", "-o", "bad.yml"], "bad.yml: exists already; --force"),
+        (
+            ["show", "camera.yml", "-o", "camera.yml", "--force"],
+            "camera.yml: would overwrite camera.yml, which is read",
+        ),
+        (["show", "camera.yml", "-o", "o.docx"], "o.docx: .docx: no image can be written as that"),
+        (["show", "camera.yml", "-o", "bad.yml/o.png"], "bad.yml is no folder"),
         (["show", "bare.yml", "--against", "camera.yml"], "bare.yml states no image size; --size says which"),
         (["show", "camera.yml", "--size", "640x480"], "camera.yml: camera is for 96x64, not 640x480"),
         (["show", "bare.yml", "-o", "o.png"], "bare.yml states no image size"),
@@ -93,9 +101,19 @@ def test_show_draws_an_image(folder, capsys):
         (["show", "camera.yml", "--name", "left"], "no camera is called 'left'; there are camera"),
         (["convert", "camera.yml"], "required: OUT"),
         (["convert", "none.yml", "o.yml"], "none.yml: No such file"),
-        (["convert", "camera.yml", "camera.yml", "--model", "fisheye624"], "camera.yml: exists already; --force"),
+        (["convert", "camera.yml", "bad.yml", "--model", "fisheye624"], "bad.yml: exists already; --force"),
+        (["convert", "camera.yml", "camera.yml", "--force"], "camera.yml: would overwrite camera.yml, which is read"),
         (["convert", "camera.yml", ".", "--format", "opencv", "--force"], ".: is a folder; opencv is one file"),
-        (["convert", "camera.yml", "none/o.yml"], "none/o.yml: there is no folder none"),
+        (["convert", "camera.yml", "bad.yml/o.yml"], "bad.yml is no folder"),
+        (["convert", "camera.yml", "a\0b.yml"], "is no name of a file"),
+        (["convert", "a\0b.yml", "o.yml"], "is no name of a file"),
+        (["show", "batch.json"], "batch.json: camera is a batch of (2,) cameras; single ones are shown"),
+        (["show", "camera.yml", "--against", "batch.json"], "batch.json: camera is a batch of (2,) cameras; here one"),
+        (["show", "camera.yml", "--from-model", "pinhole"], "says that the model is kannala_brandt, not pinhole"),
+        (
+            ["show", FILES / "kalibr_camchain.yaml", "--from-model", "pinhole"],
+            "a file of kalibr, which says the models",
+        ),
         (
             ["convert", "camera.yml", "o.yml", "--model", "fisheye63"],
             "did you mean 'fisheye62'? Known are",
@@ -109,6 +127,7 @@ def test_show_draws_an_image(folder, capsys):
 def test_errors_are_one_line_and_leave_nothing(folder, capsys, words, text):
     Path("bad.yml").write_text("K: [1, 2]")
     Path("bare.yml").write_text("K: [28, 0, 47, 0, 28, 32, 0, 0, 1]")
+    ct.save(batch(), "batch.json")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert text in refused(capsys, *words)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
@@ -163,6 +182,19 @@ def test_convert_overwrites_no_images_unasked(folder, capsys):
     assert not Path("cameras.txt").exists()
     command("convert", "rig.json", "cameras.txt", "--force")
     assert list(ct.load("cameras.txt").extrinsics) == list(rig.extrinsics)
+
+
+def test_a_batch_is_converted_and_the_worst_of_it_told(folder, capsys):
+    ct.save(batch(), "batch.json")
+    command("convert", "batch.json", "new/folder/out.json", "--model", "fisheye624")
+    assert "camera, kannala_brandt to fisheye624: exact, up to " in capsys.readouterr().out
+    assert ct.load("new/folder/out.json").camera.batch_shape == (2,)
+
+
+def test_no_file_of_a_folder_that_is_read_is_overwritten(folder, capsys):
+    command("convert", "camera.yml", "model", "--format", "colmap")
+    name = next(Path("model").iterdir())
+    assert "which is read" in refused(capsys, "convert", name, "model", "--format", "colmap", "--force")
 
 
 def test_show_compares_without_an_image(folder, capsys):

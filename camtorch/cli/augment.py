@@ -1,205 +1,109 @@
-"""An image with its labels, and what an augmentation makes of both: the views that `sheet` shows."""
+"""The command `camtorch augment`: a sheet of an image with its labels as other cameras see them."""
 
 from __future__ import annotations
 
-import math
-import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import argparse
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+from camtorch.cli.demo import GET_IT, installed
+from camtorch.cli.options import add_output, add_photograph, parse_path, parse_range, parse_size
+from camtorch.cli.terminal import note
 
-from camtorch.augment import PRESETS, RandomCamera
-from camtorch.camera import Camera
-from camtorch.cli.labels import Labels
-from camtorch.demo import cabin
-from camtorch.models import Pinhole
+if TYPE_CHECKING:
+    from camtorch.cli.labelled_image import LabelledImage
+    from camtorch.cli.options import Commands
 
-SCENE_SIZE = (480, 640)
-"""(height, width) of the rendered image; of a given camera the width is this at most."""
-NEW_SIZE = (945, 1260)
-"""(height, width) within which new images are made: thrice what a sheet shows, so that its edges are smooth."""
-NOTHING = (233, 225, 209)
-"""The colour of what no camera saw."""
+_MOST_IMAGES = 100
 
 
-@dataclass
-class LabelledImage:
-    """An image, its camera, and labels that hold for both."""
-
-    image: Tensor
-    """(3, H, W) uint8."""
-    camera: Camera
-    labels: Labels
-    caption: list[str]
-    keypoints_valid: Tensor
-    """(N,) bool; likewise the boxes'."""
-    boxes_valid: Tensor
-    note: str = ""
-    """The caption, and more, in one line."""
-
-
-# -- what to augment
-
-
-@torch.no_grad()
-def scene(camera: Camera | None = None) -> LabelledImage:
-    """The driver that `cabin` renders, seen by a camera, by default a pinhole camera of 105 degrees."""
-    height, width = SCENE_SIZE
-    if camera is None:
-        focal = width / 2 / math.tan(math.radians(105) / 2)
-        camera = Pinhole([focal, focal, (width - 1) / 2, (height - 1) / 2], image_size=SCENE_SIZE).requires_grad_(False)
-    elif camera.image_size[1] > width:
-        camera = camera.resize(max(1, round(camera.image_size[0] * width / camera.image_size[1])), width)
-    drivers = cabin.random_drivers(1, spread=0)
-    # close by, and looking past the camera: the arrow of a gaze into it would be a point
-    turn = torch.tensor(14.0, dtype=torch.float64).deg2rad()
-    drivers.pose[0, 0, 0] = drivers.pose[0, 2, 2] = turn.cos()
-    drivers.pose[0, 0, 2], drivers.pose[0, 2, 0] = turn.sin(), -turn.sin()
-    drivers.pose[0, :3, 3] = torch.tensor([0.01, 0.0, 0.37])
-    drivers.gaze = torch.nn.functional.normalize(torch.tensor([[-0.6, 0.3, -1.0]], dtype=torch.float64), dim=-1)
-    box = camera.project(drivers.face_box_points()[0])[0].double()
-    labels = Labels(
-        keypoints=camera.project(drivers.landmarks()[0])[0].double(),
-        boxes=torch.cat([box.amin(0), box.amax(0)])[None],
-        eyes=drivers.eyes()[0],
-        gaze=drivers.gaze.expand(2, 3),
+def add(commands: Commands) -> None:
+    """Add the command to a command line."""
+    command = commands.add_parser(
+        "augment",
+        help="a sheet of an image with its labels as other cameras see them",
+        description="A sheet of an image with its labels as other cameras see them. Without IMAGE, in a checkout of "
+        "the repository, the image is a rendered driver. A RANGE is LOW,HIGH, as in --yaw=-5,20, or a number: so far "
+        "to either side of doing nothing, or just that --fov.",
+        allow_abbrev=False,
     )
-    image = (255 * _rendered(camera, drivers)).round().byte()
-    return _before(image, camera, labels, "a rendered driver")
-
-
-def _rendered(camera: Camera, drivers: cabin.Drivers) -> Tensor:
-    """(3, H, W): the image, a strip at a time on each core: threads that share rays wait for each other."""
-    height, width = camera.image_size
-    rows = 120  # whatever the number of cores, for the same image
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            parts = [camera.crop(top, 0, min(rows, height - top), width) for top in range(0, height, rows)]
-            return torch.cat(list(pool.map(lambda part: cabin.render(part, drivers)[0], parts)), -2)
-    finally:
-        torch.set_num_threads(threads)
-
-
-@torch.no_grad()
-def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str) -> LabelledImage:
-    """An image, (C, H, W) as `image_files.read` has it; without labels, with a lattice of dots and a box."""
-    if labels is None:
-        height, width = camera.image_size
-        steps = [(torch.arange(n, dtype=torch.float64) + 0.5) * side / n - 0.5 for n, side in ((7, height), (9, width))]
-        y, x = torch.meshgrid(*steps, indexing="ij")
-        box = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]], dtype=torch.float64) - 0.5
-        none = torch.zeros(0, 3, dtype=torch.float64)
-        labels = Labels(torch.stack([x, y], -1).flatten(0, 1), box, none, none)
-    return _before(_in_colour(image), camera, labels, title)
-
-
-def _in_colour(image: Tensor) -> Tensor:
-    """(3, H, W) uint8 of any image; deep ones from their darkest to their brightest, what is clear on paper."""
-    if image.dtype != torch.uint8:
-        deep = image.float()
-        image = (255 * (deep - deep.min()) / (deep.max() - deep.min()).clamp(min=1)).round().byte()
-    if len(image) in (2, 4):
-        alpha = image[-1:] / 255
-        image = (image[:-1] * alpha + torch.tensor(NOTHING)[:, None, None] * (1 - alpha)).round().byte()
-    return image.expand(3, -1, -1)
-
-
-def _before(image: Tensor, camera: Camera, labels: Labels, title: str) -> LabelledImage:
-    height, width = camera.image_size
-    x1, y1, x2, y2 = labels.boxes.unbind(-1)
-    overlap = (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
-    caption = [f"before: {title}", f"{camera.key}, {_degrees(camera):.0f}° wide"]
-    return LabelledImage(image, camera, labels, caption, camera.contains(labels.keypoints), overlap)
-
-
-# -- augmenting
-
-
-@torch.no_grad()
-def augmented(
-    before: LabelledImage, like: str | None, count: int, seed: int, size=None, **ranges
-) -> Iterator[LabelledImage]:
-    """What `count` random cameras make of a view.
-
-    Args:
-        before: the view.
-        like: whose lens they have; see `RandomCamera`.
-        count: how many.
-        seed: of the draws; the first ones are the same for every count.
-        size: (height, width) of the new images; by default that of the old one. They are scaled to fit `NEW_SIZE`
-            and show the same.
-        ranges: of `RandomCamera`.
-    """
-    height, width = size or before.camera.image_size
-    scale = min(NEW_SIZE[1] / width, NEW_SIZE[0] / height)
-    size = max(1, round(height * scale)), max(1, round(width * scale))
-    new = RandomCamera(
-        like, camera=before.camera, image_size=size, antialias=True, fill=NOTHING, valid_mask=True, **ranges
+    command.set_defaults(run=run)
+    command.add_argument("image", type=parse_path, nargs="?", metavar="IMAGE", help="the image")
+    command.add_argument(
+        "--labels",
+        type=parse_path,
+        metavar="FILE",
+        help="of IMAGE: JSON of keypoints, boxes, gaze, gaze_from, in pixels",
     )
-    labels = before.labels
-    generator = torch.Generator().manual_seed(seed)
-    for i in range(count):
-        draw = new.draw(1, generator)
-        moved = new(
-            image=before.image,
-            keypoints=labels.keypoints,
-            boxes=labels.boxes,
-            points=labels.eyes,
-            gaze=labels.gaze,
-            keypoints_valid=before.keypoints_valid,
-            boxes_valid=before.boxes_valid,
-            draw=draw,
+    command.add_argument("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
+    command.add_argument("--list", action="store_true", help="print the presets, and nothing else")
+    command.add_argument("-n", type=int, default=8, metavar="COUNT", help="how many other cameras; 8 by default")
+    command.add_argument("--seed", type=int, default=0, help="of what is drawn; 0 by default")
+    command.add_argument("--size", type=parse_size, metavar="WxH", help="of the new images; by default the old one's")
+    for name in ("yaw", "pitch", "roll", "zoom", "fov"):
+        command.add_argument(f"--{name}", type=parse_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
+    add_photograph(command)
+    add_output(command, "augment.png", "the sheet")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carry it out."""
+    from camtorch.cli import images, labelled_image, sheet
+
+    if arguments.list:
+        print("\n".join(labelled_image.presets()))
+        return
+    lens = labelled_image.lens(arguments.preset)
+    if not 1 <= arguments.n <= _MOST_IMAGES:
+        raise ValueError(f"-n must be 1 to {_MOST_IMAGES}; got {arguments.n}")
+    if not 0 <= arguments.seed < 1 << 63:
+        raise ValueError(f"--seed must be 0 or more, and below 2 to the 63rd; got {arguments.seed}")
+    needs = {"camera": ("model", "name"), "image": ("labels", "rescale")}
+    for needed, names in needs.items():
+        idle = [name for name in names if getattr(arguments, needed) is None and getattr(arguments, name)]
+        if idle:
+            raise ValueError(f"--{idle[0]} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
+    inputs = (arguments.image, arguments.camera, arguments.labels)
+    images.check_target(arguments.output, force=arguments.force, inputs=inputs)
+    before = _scene(arguments) if arguments.image is None else _photograph(arguments)
+    ranges = {name: getattr(arguments, name) for name in ("yaw", "pitch", "roll", "zoom", "fov")}
+    ranges = {name: value for name, value in ranges.items() if value is not None}
+    shown = [before]
+    for new in labelled_image.augmented(before, lens, arguments.n, arguments.seed, arguments.size, **ranges):
+        print(new.note, flush=True)
+        shown.append(new)
+    title = f"One image, {sheet.counted(arguments.n, 'other camera')}"
+    images.write(arguments.output, sheet.drawing(shown, title, labelled_image.origin(lens, before)))
+    print(f"{arguments.output}: the image before, and as each of them sees it, with what became of the labels")
+
+
+def _photograph(arguments: argparse.Namespace) -> LabelledImage:
+    """The image given, with its labels."""
+    from camtorch.cli import cameras, images, labelled_image, labels
+
+    image, orientation = images.read(arguments.image)
+    height, width = image.shape[-2:]
+    camera = cameras.read_camera_of(arguments.image, (height, width), arguments)
+    if orientation not in (None, 1):
+        note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
+    known = None if arguments.labels is None else labels.read(arguments.labels, camera)
+    return labelled_image.photograph(image, camera, known, arguments.image.name)
+
+
+def _scene(arguments: argparse.Namespace) -> LabelledImage:
+    """The rendered driver, as the camera given sees him."""
+    from camtorch.cli import cameras, labelled_image
+
+    if not installed():
+        raise ValueError(
+            "which image? camtorch augment IMAGE --camera FILE; the driver that is rendered without one comes with "
+            f"the repository: {GET_IT}"
         )
-        camera, valid = moved["camera"], (moved["keypoints_valid"], moved["boxes_valid"])
-        angles = [f"{name} {float(draw[name]):+.1f}°" for name in ("yaw", "pitch", "roll")]
-        filled = 100 * float(moved["image_valid"].double().mean())
-        lens = f"{like or camera.key}, {_degrees(camera):.0f}° wide"
-        inside = [f"{int(v.sum())} of {len(v)} {n}" for n, v in zip(("points", "boxes"), valid, strict=True) if len(v)]
-        yield LabelledImage(
-            moved["image"],
-            camera,
-            Labels(moved["keypoints"], moved["boxes"], moved["points"], moved["gaze"]),
-            ["   ".join(angles), f"{lens}, {filled:.0f} % filled"],
-            *valid,
-            note=f"{i + 1:3}: {', '.join([*angles, lens, f'{filled:.0f} % filled', *inside])}".replace("°", " degrees"),
-        )
+    camera = None
+    if arguments.camera is not None:
+        camera = cameras.read_camera(arguments.camera, arguments.name, arguments.model)
+        if camera.image_size is None:
+            raise ValueError(f"{arguments.camera} states no image size, which a rendered image needs")
+    # not before: what is installed may be without it
+    from camtorch.demo import example
 
-
-def lens(preset: str) -> str | None:
-    """What `augmented` gets as `like` for the name of a preset, or for "none".
-
-    Raises:
-        ValueError: no preset has this name; the text lists those there are.
-    """
-    if preset == "none" or preset in PRESETS:
-        return None if preset == "none" else preset
-    known = "; ".join(f"{name}, {known.origin}" for name, known in PRESETS.items())
-    raise ValueError(f"there is no preset {preset!r}. There are none, the image's own lens; {known}")
-
-
-def origin(like: str | None, before: LabelledImage) -> str:
-    """Where the lens of the new images comes from."""
-    if like is None:
-        return f"{before.camera.key}: the image's own lens, as lenses made alike differ"
-    return f"{like}: {PRESETS[like].origin}"
-
-
-def presets() -> Iterator[str]:
-    """A line about each preset."""
-    for name, preset in PRESETS.items():
-        height, width = preset.image_size
-        yield f"{name:<12} {preset.model:<15} {f'{width}x{height}':<10} {preset.origin}"
-
-
-def _degrees(camera: Camera) -> float:
-    """The horizontal field of view through the principal point, from outer edge to outer edge, or as far as it goes."""
-    cy = float(camera.intrinsics[..., 3])
-    x = torch.linspace(-0.5, camera.image_size[1] - 0.5, 513, dtype=torch.float64)
-    rays, valid = camera.unproject(torch.stack([x, torch.full_like(x, cy)], -1))
-    angle = torch.atan2(rays[..., 0], rays[..., 2])[valid]
-    return math.degrees(float(angle.max() - angle.min())) if len(angle) else 0.0
+    return labelled_image.rendered(example.driver(camera))

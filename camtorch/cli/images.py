@@ -2,120 +2,158 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import tempfile
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
+
+from camtorch.cli.terminal import note
+from camtorch.io.writing import replacing
 
 _ORIENTATION = 0x0112  # the Exif tag
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+_DEEPEST = 65535
+_OTHER_SIZES = ("ICO", "ICNS")  # formats that hold an image in sizes of their own
 
 
 class ImageFileError(ValueError):
     """An image file that cannot be read or written. The text names the file and the reason."""
 
 
-def _pillow():
-    try:
-        from PIL import Image
-    except ImportError:
-        raise ImageFileError("images need Pillow: pip install 'camtorch[cli]'") from None
-    return Image
-
-
-def read(path) -> tuple[Tensor, int | None]:
+def read(path: Path) -> tuple[Tensor, int | None]:
     """An image as stored, and its Exif orientation: it is not turned, for calibrations know stored pixels.
+
+    Notes say what is left out: the lower bits of deep colours, which Pillow does not read, and all but the first image
+    of several.
 
     Returns:
         (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey images.
         Other kinds of image (palette, CMYK, ...) come as RGB or RGBA.
 
     Raises:
-        ImageFileError: no such file, no image, a damaged one, floating-point pixels, or no Pillow.
+        ImageFileError: no such file, no image, a damaged one, floating-point pixels, or more than 16 bits deep.
     """
-    pil = _pillow()
     try:
-        with pil.open(path) as image:
+        with warnings.catch_warnings():
+            # of a large photograph, which is what the user named
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(path)
+        with image:
+            count, cut = getattr(image, "n_frames", 1), _is_cut(image)
             image.load()
-            orientation = image.getexif().get(_ORIENTATION)
-            if image.mode == "F":
-                raise ImageFileError(f"{path}: floating-point pixels; 8-bit and 16-bit images can be read")
-            if image.mode in _DEEP:
-                deep = np.asarray(image).astype(np.int64).clip(0, 65535).astype(np.uint16)
-                return torch.from_numpy(deep)[None], orientation
-            if image.mode not in ("L", "LA", "RGB", "RGBA"):
-                clear = "transparency" in image.info or image.mode in ("PA", "RGBa", "La")
-                image = image.convert("L" if image.mode == "1" else "RGBA" if clear else "RGB")
-            pixels = torch.from_numpy(np.array(image))
-            return (pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)), orientation
+            if count > 1:
+                note(f"{path} holds {count} images; only the first is taken")
+            if cut:
+                note(f"{path} has 16 bits a colour; only the upper 8 are read")
+            return _pixels(path, image), image.getexif().get(_ORIENTATION)
     except FileNotFoundError:
         raise ImageFileError(f"{path}: no such file") from None
-    except pil.UnidentifiedImageError:
+    except UnidentifiedImageError:
         raise ImageFileError(f"{path}: not an image that Pillow can read") from None
+    except Image.DecompressionBombError:
+        most = 2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6
+        raise ImageFileError(f"{path}: more than {most:.0f} million pixels, which are not read") from None
     except ImageFileError:
         raise
-    except (OSError, SyntaxError, ValueError, EOFError, pil.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
-def check_target(path, *, force: bool) -> None:
+def _is_cut(image: Image.Image) -> bool:
+    """Whether Pillow reads 16 bits as 8, before it does: its decoders' arguments tell."""
+    if image.mode in _DEEP:
+        return False
+    for tile in getattr(image, "tile", ()):
+        arguments = tile[3] if isinstance(tile[3], tuple) else (tile[3],)
+        if any(isinstance(argument, str) and ";16" in argument for argument in arguments):
+            return True
+        if tile[0] == "ppm" and isinstance(arguments[-1], int) and arguments[-1] > 255:
+            return True
+    return False
+
+
+def _pixels(path: Path, image: Image.Image) -> Tensor:
+    if image.mode == "F":
+        raise ImageFileError(f"{path}: floating-point pixels; 8-bit and 16-bit images can be read")
+    if image.mode in _DEEP:
+        deep = np.asarray(image)
+        low, high = int(deep.min()), int(deep.max())
+        if low < 0 or high > _DEEPEST:
+            raise ImageFileError(f"{path}: pixels from {low} to {high}; 8-bit and 16-bit images can be read")
+        return torch.from_numpy(deep.astype(np.uint16))[None]
+    if image.mode not in ("L", "LA", "RGB", "RGBA"):
+        clear = "transparency" in image.info or image.mode in ("PA", "RGBa", "La")
+        image = image.convert("L" if image.mode == "1" else "RGBA" if clear else "RGB")
+    pixels = torch.from_numpy(np.array(image))
+    return pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)
+
+
+def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
     """Refuse before the work what could not be written after it.
 
+    Args:
+        path: where an image is to go.
+        force: whether it may take the place of another file.
+        inputs: what is read, which it may not overwrite in any case.
+
     Raises:
-        ImageFileError: the file exists and `force` is not given, no folder to write to, an unknown file type.
+        ImageFileError: see `check_path`; an unknown file type, or one that stores other sizes.
     """
-    path = Path(path)
+    check_path(path, force=force, inputs=inputs)
+    kind = Image.registered_extensions().get(path.suffix.lower())
+    if kind not in Image.SAVE or kind in _OTHER_SIZES:
+        why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"
+        raise ImageFileError(f"{path}: {path.suffix or 'no suffix'}: {why}; try .png")
+
+
+def check_path(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
+    """As `check_target`, for files of any type.
+
+    Raises:
+        ImageFileError: the file is one of the inputs, also by a link; it exists and `force` is not given; there is no
+            folder to write to, nor one to make it in.
+    """
     if path.is_dir():
-        raise ImageFileError(f"{path}: is a folder")
-    if path.exists() and not force:
+        raise ImageFileError(f"{path}: is a folder; name a file in it")
+    for given in inputs:
+        if given is not None and path.exists() and given.exists() and path.samefile(given):
+            raise ImageFileError(f"{path}: would overwrite {given}, which is read; name another file")
+    if os.path.lexists(path) and not force:
         raise ImageFileError(f"{path}: exists already; --force overwrites it")
-    if not path.parent.is_dir():
-        raise ImageFileError(f"{path}: there is no folder {path.parent}")
-    if not os.access(path.parent, os.W_OK):
-        raise ImageFileError(f"{path}: the folder {path.parent} cannot be written to")
-    pil = _pillow()
-    if pil.registered_extensions().get(path.suffix.lower()) not in pil.SAVE:
-        raise ImageFileError(f"{path}: no image can be written as {path.suffix or 'a nameless type'}; try .png")
+    folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+    if not folder.is_dir():
+        raise ImageFileError(f"{path}: {folder} is no folder")
+    if not os.access(folder, os.W_OK):
+        raise ImageFileError(f"{path}: the folder {folder} cannot be written to")
 
 
-def from_tensor(image: Tensor):
+def from_tensor(image: Tensor) -> Image.Image:
     """A Pillow image of (C, H, W) uint8 or (1, H, W) uint16."""
     pixels = image.permute(1, 2, 0).contiguous().numpy()
-    return _pillow().fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
+    return Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
 
 
-def write(path, image, *, orientation: int | None = None) -> None:
-    """Write a Pillow image, whole or not at all.
+def write(path: Path, image: Image.Image, *, orientation: int | None = None) -> None:
+    """Write a Pillow image, whole or not at all; folders that lack are made.
 
     Raises:
         ImageFileError: the file type does not take such pixels, or the disk does not take the file.
     """
-    path = Path(path)
-    pil = _pillow()
-    options: dict = {"quality": 95}
+    options: dict[str, Any] = {"quality": 95}
     if orientation is not None:
-        options["exif"] = pil.Exif()
+        options["exif"] = Image.Exif()
         options["exif"][_ORIENTATION] = orientation
-    name = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            name = file.name
-            image.save(file, format=pil.registered_extensions()[path.suffix.lower()], **options)
-        # temporary files are private; an image gets the rights of any new file
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as (file,):
+            image.save(file, Image.registered_extensions()[path.suffix.lower()], **options)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         if isinstance(error, OSError) and "cannot write mode" in str(error):
             reason = f"{path.suffix} files hold no image of mode {image.mode}; .png does"
         raise ImageFileError(f"{path}: {reason}") from None
-    finally:
-        if name is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(name)

@@ -1,8 +1,22 @@
-"""The size of an image, as the command line takes it."""
+"""Options that several commands have, and how the command line reads paths, sizes and ranges."""
+
+from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    Commands = argparse._SubParsersAction[argparse.ArgumentParser]
 
 _LARGEST_SIDE = 32768
+
+
+def parse_path(text: str) -> Path:
+    """A path that a file can have."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"{text!r} is no name of a file")
+    return Path(text)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -14,3 +28,47 @@ def parse_size(text: str) -> tuple[int, int]:
     if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
         raise argparse.ArgumentTypeError(f"{text!r}: each side must be 1 to {_LARGEST_SIDE} pixels")
     return height, width
+
+
+def parse_range(text: str) -> float | tuple[float, float]:
+    """A number, or two."""
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (1, 2):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor LOW,HIGH, as in -5,20")
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else numbers[0]
+
+
+def add_photograph(command: argparse.ArgumentParser) -> None:
+    """The calibration of an image."""
+    command.add_argument("--camera", type=parse_path, metavar="FILE", help="its calibration, of any format")
+    command.add_argument(
+        "--model",
+        metavar="KEY",
+        help="the camera model where the file does not say it: kannala_brandt, brown_conrady ...",
+    )
+    command.add_argument("--name", help="which camera, in a file with several")
+    command.add_argument("--rescale", action="store_true", help="scale the camera to the image's resolution")
+
+
+def add_calibration(command: argparse.ArgumentParser) -> None:
+    """How to read a calibration that is the command's subject."""
+    command.add_argument("--name", help="which camera, in a file with several")
+    command.add_argument("--from-model", metavar="KEY", help="the model in the file, where that does not say it")
+    command.add_argument("--size", type=parse_size, metavar="WxH", help="of images, where the file does not say")
+
+
+def add_output(command: argparse.ArgumentParser, default: str | None, text: str = "the new image") -> None:
+    """Where the result goes."""
+    usual = f"; {default} by default" if default else ""
+    command.add_argument(
+        "-o", "--output", type=parse_path, default=default and Path(default), metavar="OUT", help=text + usual
+    )
+    add_force(command)
+
+
+def add_force(command: argparse.ArgumentParser) -> None:
+    """Whether OUT may exist."""
+    command.add_argument("--force", action="store_true", help="overwrite OUT if it exists")

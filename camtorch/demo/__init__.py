@@ -1,1 +1,1 @@
-"""Rendered rooms and drivers with exact truth, for the demos. Not part of the wheel."""
+"""Rendered rooms and drivers with exact truth, for the demos: in the repository, not in wheels."""

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from PIL import Image
 from torch import Tensor
 
+from camtorch._drawing import GREY, INK, MARGIN, MIDDLE, PAPER, POINT, Marks, Sheet, shown
 from camtorch.camera import Camera
 from camtorch.demo import room
 from camtorch.models import BrownConrady, Fisheye62, Fisheye624, KannalaBrandt, Pinhole
@@ -156,45 +158,33 @@ def run(report: Callable[[str], None] = print, *, height: int = 640, samples: in
     return studies
 
 
-def drawing(studies: list[Study]):
-    """One Pillow image: each study's source, dewarped image, and tenfold difference from the truth."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    ink, grey, rim, paper = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 245, 235)
-    gap, band, head = 20, 44, 96
+def drawing(studies: list[Study]) -> Image.Image:
+    """One image: each study's source, dewarped image, and tenfold difference from the truth."""
+    band, head = 44, 96
     height, width = studies[0].dewarped.shape[-2:]
     widest = max(round(height * s.source.shape[-1] / s.source.shape[-2]) for s in studies)
-    sheet = Image.new(
-        "RGB", (widest + 2 * width + 4 * gap, head + len(studies) * (height + band + gap) + gap // 2), paper
-    )
-    draw = ImageDraw.Draw(sheet)
-    large, middle, small = (ImageFont.load_default(size=size) for size in (34, 21, 17))
-    columns = gap, 2 * gap + widest, 3 * gap + widest + width
-    draw.text((gap, 14), "One room, five lenses", ink, large)
-    for x, text in zip(
-        columns,
-        ("what the lens sees", "dewarped, dots moved by the same warp", "off the true view, tenfold"),
-        strict=True,
-    ):
-        draw.text((x, 66), text, grey, small)
+    columns = MARGIN, 2 * MARGIN + widest, 3 * MARGIN + widest + width
+    whole = head + len(studies) * (height + band + MARGIN) + MARGIN // 2
+    sheet = Sheet(widest + 2 * width + 4 * MARGIN, whole, "One room, five lenses")
+    captions = "what the lens sees", "dewarped, dots moved by the same warp", "off the true view, tenfold"
+    for x, text in zip(columns, captions, strict=True):
+        sheet.text((x, 66), text, colour=GREY)
     for row, s in enumerate(studies):
-        top = head + row * (height + band + gap)
-        draw.text((columns[0], top + 10), s.title, ink, middle)
+        top = head + row * (height + band + MARGIN)
+        sheet.text((columns[0], top + 10), s.title, size=MIDDLE)
         numbers = f"PSNR {s.psnr:.1f} dB     edges bent by {s.bend_before:.2f} px, now by {s.bend_after:.2f} px"
-        draw.text((columns[1], top + 13), numbers, ink, small)
+        sheet.text((columns[1], top + 13), numbers)
         off = (10 * (s.dewarped - s.direct).abs().mean(0) * s.valid).clamp(max=1)
-        difference = torch.lerp(*(torch.tensor(c)[:, None, None] / 255 for c in (paper, ink)), off)
-        for x, content, marks in zip(columns, (s.source, s.dewarped, difference), (*s.keypoints, ()), strict=True):
-            image = Image.fromarray((255 * content.permute(1, 2, 0)).round().byte().numpy())
-            scale = height / image.height
-            image = image.resize((round(image.width * scale), height), Image.Resampling.LANCZOS)
-            left = x + (widest - image.width) // 2 * (x == columns[0])
-            sheet.paste(image, (left, top + band))
-            draw.rectangle((left - 1, top + band - 1, left + image.width, top + band + height), outline=rim)
-            for u, v in marks:
-                at = left + (float(u) + 0.5) * scale - 0.5, top + band + (float(v) + 0.5) * scale - 0.5
-                draw.ellipse((at[0] - 1.5, at[1] - 1.5, at[0] + 1.5, at[1] + 1.5), fill=(226, 29, 72))
-    return sheet
+        difference = torch.lerp(*(torch.tensor(c)[:, None, None] / 255 for c in (PAPER, INK)), off)
+        for x, content, points in zip(columns, (s.source, s.dewarped, difference), (*s.keypoints, ()), strict=True):
+            scale = height / content.shape[-2]
+            image = shown(content, height, round(content.shape[-1] * scale))
+            marks = Marks(image.width, height, scale)
+            for at in points:
+                marks.circle(at, 1.5, fill=POINT)
+            marks.over(image)
+            sheet.put(image, (x + (widest - image.width) // 2 * (x == columns[0]), top + band))
+    return sheet.image
 
 
 def _rotation(pitch: float, roll: float) -> Tensor:

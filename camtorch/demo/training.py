@@ -16,8 +16,10 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from PIL import Image
 from torch import Tensor, nn
 
+from camtorch._drawing import GREY, MARGIN, MIDDLE, POINT, Marks, Sheet, shown
 from camtorch.demo import cabin
 from camtorch.demo.training_data import MOUNT, NAMES, TEACHERS, Augment, Samples, cameras, photograph, teacher
 
@@ -29,7 +31,7 @@ class Result:
     """What a network learned, and what it then finds in the test images."""
 
     teacher: str
-    lessons: Samples
+    training_images: Samples
     """A few of the images that it learned from."""
     test: Samples
     keypoints: Tensor
@@ -95,8 +97,8 @@ def learn(
     losses = []
     for step in range(1, steps + 1):
         chosen = torch.randint(len(images), (batch,), generator=generator)
-        lesson = augment(images[chosen], generator)
-        loss = loss_of(network(lesson.image), lesson)
+        seen = augment(images[chosen], generator)
+        loss = loss_of(network(seen.image), seen)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -108,13 +110,13 @@ def learn(
 
 
 @torch.no_grad()
-def examine(name: str, network: Network, lessons: Samples, test: Samples, losses: list[float]) -> Result:
+def examine(name: str, network: Network, training_images: Samples, test: Samples, losses: list[float]) -> Result:
     """Have a network find what it has not seen."""
     keypoints, points = (torch.cat(part) for part in zip(*map(network, test.image.split(50)), strict=True))
     pixels = (keypoints - test.keypoints).norm(dim=-1)
     eyes = (test.keypoints[:, :2].mean(1) - test.keypoints[:, 2:4].mean(1)).norm(dim=-1, keepdim=True)
     metres = (points - test.points).norm(dim=-1)
-    return Result(name, lessons, test, keypoints, losses, pixels, pixels / eyes, metres)
+    return Result(name, training_images, test, keypoints, losses, pixels, pixels / eyes, metres)
 
 
 def run(
@@ -166,8 +168,8 @@ def run(
                     say(f"{TEACHERS[name]:<24} step {step} of {steps}, loss {loss:.2f}")
 
                 losses = learn(network, source, augment, steps, seed=seed, report=tell)
-                lessons = augment(source[:2], torch.Generator().manual_seed(seed))
-                return examine(name, network, lessons, test, losses)
+                examples = augment(source[:2], torch.Generator().manual_seed(seed))
+                return examine(name, network, examples, test, losses)
 
             # the slowest first
             studies = {name: pool.submit(study, name) for name in ("camtorch", "affine", "pinhole", "fisheye")}
@@ -180,44 +182,29 @@ def run(
     return results
 
 
-def drawing(results: list[Result], tests: int = 5):
-    """One Pillow image: for each network two of its lessons, and what it finds in the same test images."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    ink, grey, rim, paper, found = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 245, 235), (226, 29, 72)
-    gap, band, head, scale, sharp = 16, 44, 100, 2.5, 3
+def drawing(results: list[Result], tests: int = 5) -> Image.Image:
+    """One image: for each network two images that it learned from, and what it finds in the same test images."""
+    band, head, scale = 44, 100, 2.5
     height, width = (round(scale * side) for side in results[0].test.image.shape[-2:])
-    left = 2 * (width + gap) + 2 * gap
-    size = left + tests * (width + gap) + gap, head + len(results) * (height + band + gap)
-    sheet = Image.new("RGB", size, paper)
-    draw = ImageDraw.Draw(sheet)
-    large, middle, small = (ImageFont.load_default(size=size) for size in (34, 21, 17))
-    draw.text((gap, 14), "One network, four educations", ink, large)
-    draw.text((gap, 66), "what it learned from", grey, small)
-    draw.text((left, 66), "behind a fisheye mounted elsewhere: rings are true, dots are found", grey, small)
+    left = 2 * (width + MARGIN) + 2 * MARGIN
+    size = left + tests * (width + MARGIN), head + len(results) * (height + band + MARGIN)
+    sheet = Sheet(*size, "One network, four educations")
+    sheet.text((MARGIN, 66), "what it learned from", colour=GREY)
+    sheet.text((left, 66), "behind a fisheye mounted elsewhere: rings are true, dots are found", colour=GREY)
     for row, result in enumerate(results):
-        top = head + row * (height + band + gap)
-        draw.text((gap, top + 10), TEACHERS[result.teacher], ink, middle)
+        top = head + row * (height + band + MARGIN)
+        sheet.text((MARGIN, top + 10), TEACHERS[result.teacher], size=MIDDLE)
         off = f"{result.pixels.median():.1f} px in the image, {100 * result.metres.median():.0f} cm in space"
-        draw.text((left, top + 13), f"off by {off} (medians of {len(result.test)} drivers)", ink, small)
-        tiles = [(gap + i * (width + gap), result.lessons, i, None) for i in range(2)]
-        tiles += [(left + i * (width + gap), result.test, i, result.keypoints[i]) for i in range(tests)]
-        for x, images, i, dots in tiles:
-            image = Image.fromarray((255 * images.image[i].permute(1, 2, 0)).round().byte().numpy())
-            image = image.resize((width, height), Image.Resampling.LANCZOS)
-            marks = Image.new("RGBA", (sharp * width, sharp * height))
-            on = ImageDraw.Draw(marks)
-
-            def circle(at, radius, on=on, **style):
-                u, v = (sharp * scale * (float(c) + 0.5) for c in at)
-                on.ellipse([u - radius, v - radius, u + radius, v + radius], **style)
-
+        sheet.text((left, top + 13), f"off by {off} (medians of {len(result.test)} drivers)")
+        tiles = [(MARGIN + i * (width + MARGIN), result.training_images, i, False) for i in range(2)]
+        tiles += [(left + i * (width + MARGIN), result.test, i, True) for i in range(tests)]
+        for x, images, i, tested in tiles:
+            image = shown(images.image[i], height, width)
+            marks = Marks(width, height, scale)
             for at in images.keypoints[i]:
-                circle(at, 11, outline=(255, 255, 255), width=4)
-            for at in () if dots is None else dots:
-                circle(at, 8, fill=found, outline=(255, 255, 255), width=1)
-            marks = marks.reduce(sharp)
-            image.paste(marks, (0, 0), marks)
-            sheet.paste(image, (x, top + band))
-            draw.rectangle((x - 1, top + band - 1, x + width, top + band + height), outline=rim)
-    return sheet
+                marks.circle(at, 11 / 3, outline=(255, 255, 255), width=4 / 3)
+            for at in result.keypoints[i] if tested else ():
+                marks.circle(at, 8 / 3, fill=POINT, outline=(255, 255, 255), width=1 / 3)
+            marks.over(image)
+            sheet.put(image, (x, top + band))
+    return sheet.image

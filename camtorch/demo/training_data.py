@@ -89,7 +89,7 @@ def _turn(mount: tuple[float, float, float]) -> Tensor:
 
 
 def teacher(name: str, camera: Camera, like: Camera) -> Augment:
-    """What makes lessons for the lens `like` of images of `camera`."""
+    """What makes of samples of `camera` those that a network for the lens `like` learns from."""
     if name == "camtorch":
         yaw, pitch, roll = ((a - b, a + b) for a, b in zip(PLANNED, WITHIN, strict=True))
         options = {"focal": 0.02, "centre": 0.01, "distortion": None, "crop": None, "padding_mode": "border"}

@@ -6,6 +6,7 @@ import math
 import os
 import re
 import warnings
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import torch
@@ -48,18 +49,30 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
     Args:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`) and, where it has them,
             distortion coefficients (`distortion_coefficients`, `distCoeffs`, `D`), `image_width` and `image_height`.
-        model: a key of `camtorch.MODELS`. If left out: without coefficients a pinhole, with a true `fisheye_model` a
-            Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning where 4 coefficients could be
-            of two models.
+        model: a key of `camtorch.MODELS`, for a file that leaves it open. If left out: without coefficients a pinhole,
+            with a true `fisheye_model` a Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning
+            where 4 coefficients could be of two models.
         name: which camera of a file with several: the end of its keys, "1" for `M1` and `D1`.
 
     Raises:
-        CameraFileError: not one usable camera in the file.
-        OSError: no such file, or it cannot be opened. ValueError: an unknown model. ImportError: YAML without PyYAML.
+        CameraFileError: not one usable camera in the file, or one of another model than `model`.
+        OSError: no such file, or it cannot be opened. ValueError: an unknown model.
     """
+    return _File(Record(path, read_mapping(path))).camera(_known(model), name).requires_grad_(False)
+
+
+def read_rig(path, model: str | None = None) -> Rig:
+    """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
+    rig = parse(Record(path, read_mapping(path)), _known(model))
+    for layer in (*rig.cameras.values(), *rig.extrinsics.values()):
+        layer.requires_grad_(False)
+    return rig
+
+
+def _known(model: str | None) -> str | None:
     if model is not None and model not in MODELS:
         raise ValueError(f"unknown model {model!r}; known are {', '.join(sorted(MODELS))}")
-    return _File(Record(path, read_mapping(path))).camera(model, name).requires_grad_(False)
+    return model
 
 
 def matches(keys: dict) -> bool:
@@ -67,14 +80,14 @@ def matches(keys: dict) -> bool:
     return any(_MATRIX.fullmatch(key) for key in keys)
 
 
-def parse(record: Record) -> Rig:
+def parse(record: Record, model: str | None = None) -> Rig:
     """The cameras of a file, called by the ends of their keys; `X2 = R X1 + T` of a pair."""
     file = _File(record)
     names = sorted(file.by_name(_MATRIX), key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     if not names:
-        file.camera(None, None)
+        file.camera(model, None)
     record.few(len(names))
-    cameras = {name or "camera": file.camera(None, name) for name in names}
+    cameras = {name or "camera": file.camera(model, name) for name in names}
     extrinsics = {}
     if names in _PAIRS and (("R" in record and "T" in record) or ("rvec" in record and "tvec" in record)):
         here = poses.pose(record, [0.0] * 3, [0.0] * 3)
@@ -119,7 +132,10 @@ class _File:
         if xi_key:  # cv2.omnidir
             xi = self.record[xi_key]
             distortion = [*(self.numbers(xi_key) if isinstance(xi.value, (dict, list)) else [xi.number()]), *distortion]
-        kind = MODELS[model or ("mei" if xi_key else self.model(distortion))]
+        fitting, place = (("mei",), xi_key) if xi_key else self.fitting()
+        if place is not None and model is not None and model not in fitting:
+            self.fail(place, f"says that the model is {fitting[0]}, not {model}; leave that out, or correct the file")
+        kind = MODELS[model or ("mei" if xi_key else self.model(distortion, place))]
         arguments = [torch.tensor([fx, fy, cx, cy], dtype=torch.float64)]
         if distortion:
             if kind.names_of(len(distortion)) is None or not kind.distortion_names:
@@ -161,20 +177,28 @@ class _File:
         self.found[pattern] = named
         return named
 
-    def model(self, distortion: list[float]) -> str:
+    def fitting(self) -> tuple[Sequence[str], str | None]:
+        """The models that the flag of fisheyes leaves open, and its key, None where there is none."""
+        key = self.find(_FISHEYE)
+        if key is None:
+            return list(MODELS), None
+        flag = self.record[key].value
+        if not isinstance(flag, (str, bool)):
+            self.fail(key, "is neither true nor false")
+        no = str(flag).strip().lower() in ("", "0", "0.", "0.0", "false", "no", "off", "n")
+        return ("brown_conrady", "pinhole") if no else ("kannala_brandt",), key
+
+    def model(self, distortion: list[float], flag: str | None) -> str:
+        """The model where nobody names it; `flag` is the key of the flag of fisheyes."""
         if self.find(_OTHER_LENS) is not None:
             self.fail(
                 self.find(_OTHER_LENS),
                 "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
                 "or --model kannala_brandt",
             )
-        key = self.find(_FISHEYE)
-        flag = "0" if key is None else self.record[key].value
-        if not isinstance(flag, (str, bool)):
-            self.fail(key, "is neither true nor false")
-        if str(flag).strip().lower() not in ("", "0", "0.", "0.0", "false", "no", "off", "n"):
+        if flag is not None and "kannala_brandt" in self.fitting()[0]:
             return "kannala_brandt"
-        if len(distortion) == _FISHEYE_COUNT and key is None:
+        if len(distortion) == _FISHEYE_COUNT and flag is None:
             warnings.warn(
                 f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
                 "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt')",

@@ -1,0 +1,165 @@
+"""An image with its labels, and what an augmentation makes of both: what `sheet` shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from camtorch.augment import PRESETS, RandomCamera
+from camtorch.camera import Camera
+from camtorch.cli.labels import Labels
+from camtorch.projection.rays import field_of_view
+
+if TYPE_CHECKING:
+    from camtorch.demo.example import Example
+
+NEW_SIZE = (945, 1260)
+"""(height, width) within which new images are made: thrice what a sheet shows, so that its edges are smooth."""
+NOTHING = (233, 225, 209)
+"""The colour of what no camera saw."""
+
+
+@dataclass
+class LabelledImage:
+    """An image, its camera, and labels that hold for both."""
+
+    image: Tensor
+    """(3, H, W) uint8."""
+    camera: Camera
+    labels: Labels
+    caption: list[str]
+    keypoints_valid: Tensor
+    """(N,) bool; likewise the boxes'."""
+    boxes_valid: Tensor
+    note: str = ""
+    """The caption, and more, in one line."""
+
+
+# -- what to augment
+
+
+def rendered(example: Example) -> LabelledImage:
+    """The driver that is shown where no image is given."""
+    labels = Labels(example.keypoints, example.boxes, example.eyes, example.gaze)
+    return _before(example.image, example.camera, labels, "a rendered driver")
+
+
+@torch.no_grad()
+def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str) -> LabelledImage:
+    """An image, (C, H, W) as `images.read` has it; without labels, with a lattice of dots and a box."""
+    if labels is None:
+        height, width = camera.image_size
+        steps = [(torch.arange(n, dtype=torch.float64) + 0.5) * side / n - 0.5 for n, side in ((7, height), (9, width))]
+        y, x = torch.meshgrid(*steps, indexing="ij")
+        box = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]], dtype=torch.float64) - 0.5
+        none = torch.zeros(0, 3, dtype=torch.float64)
+        labels = Labels(torch.stack([x, y], -1).flatten(0, 1), box, none, none)
+    return _before(_in_colour(image), camera, labels, title)
+
+
+def _in_colour(image: Tensor) -> Tensor:
+    """(3, H, W) uint8 of any image; deep ones from their darkest to their brightest, what is clear on paper."""
+    if image.dtype != torch.uint8:
+        deep = image.float()
+        image = (255 * (deep - deep.min()) / (deep.max() - deep.min()).clamp(min=1)).round().byte()
+    if len(image) in (2, 4):
+        alpha = image[-1:] / 255
+        image = (image[:-1] * alpha + torch.tensor(NOTHING)[:, None, None] * (1 - alpha)).round().byte()
+    return image.expand(3, -1, -1)
+
+
+def _before(image: Tensor, camera: Camera, labels: Labels, title: str) -> LabelledImage:
+    height, width = camera.image_size
+    x1, y1, x2, y2 = labels.boxes.unbind(-1)
+    overlap = (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
+    caption = [f"before: {title}", f"{camera.key}, {_degrees(camera):.0f}° wide"]
+    return LabelledImage(image, camera, labels, caption, camera.contains(labels.keypoints), overlap)
+
+
+# -- augmenting
+
+
+@torch.no_grad()
+def augmented(
+    before: LabelledImage, like: str | None, count: int, seed: int, size: tuple[int, int] | None = None, **ranges: Any
+) -> Iterator[LabelledImage]:
+    """What `count` random cameras make of an image.
+
+    Args:
+        before: the image.
+        like: whose lens they have; see `RandomCamera`.
+        count: how many.
+        seed: of the draws; the first ones are the same for every count.
+        size: (height, width) of the new images; by default that of the old one. They are scaled to fit `NEW_SIZE`
+            and show the same.
+        ranges: of `RandomCamera`.
+    """
+    height, width = size or before.camera.image_size
+    scale = min(NEW_SIZE[1] / width, NEW_SIZE[0] / height)
+    size = max(1, round(height * scale)), max(1, round(width * scale))
+    new = RandomCamera(
+        like, camera=before.camera, image_size=size, antialias=True, fill=NOTHING, valid_mask=True, **ranges
+    )
+    labels = before.labels
+    generator = torch.Generator().manual_seed(seed)
+    for i in range(count):
+        draw = new.draw(1, generator)
+        moved = new(
+            image=before.image,
+            keypoints=labels.keypoints,
+            boxes=labels.boxes,
+            points=labels.eyes,
+            gaze=labels.gaze,
+            keypoints_valid=before.keypoints_valid,
+            boxes_valid=before.boxes_valid,
+            draw=draw,
+        )
+        camera, valid = moved["camera"], (moved["keypoints_valid"], moved["boxes_valid"])
+        angles = [f"{name} {float(draw[name]):+.1f}°" for name in ("yaw", "pitch", "roll")]
+        filled = 100 * float(moved["image_valid"].double().mean())
+        lens = f"{like or camera.key}, {_degrees(camera):.0f}° wide"
+        inside = [f"{int(v.sum())} of {len(v)} {n}" for n, v in zip(("points", "boxes"), valid, strict=True) if len(v)]
+        yield LabelledImage(
+            moved["image"],
+            camera,
+            Labels(moved["keypoints"], moved["boxes"], moved["points"], moved["gaze"]),
+            ["   ".join(angles), f"{lens}, {filled:.0f} % filled"],
+            *valid,
+            note=f"{i + 1:3}: {', '.join([*angles, lens, f'{filled:.0f} % filled', *inside])}".replace("°", " degrees"),
+        )
+
+
+def lens(preset: str) -> str | None:
+    """What `augmented` gets as `like` for the name of a preset, or for "none".
+
+    Raises:
+        ValueError: no preset has this name; the text lists those there are.
+    """
+    if preset == "none" or preset in PRESETS:
+        return None if preset == "none" else preset
+    known = "; ".join(f"{name}, {known.origin}" for name, known in PRESETS.items())
+    raise ValueError(f"there is no preset {preset!r}. There are none, the image's own lens; {known}")
+
+
+def origin(like: str | None, before: LabelledImage) -> str:
+    """Where the lens of the new images comes from."""
+    if like is None:
+        return f"{before.camera.key}: the image's own lens, as lenses made alike differ"
+    return f"{like}: {PRESETS[like].origin}"
+
+
+def presets() -> Iterator[str]:
+    """A line about each preset."""
+    for name, preset in PRESETS.items():
+        height, width = preset.image_size
+        yield f"{name:<12} {preset.model:<15} {f'{width}x{height}':<10} {preset.origin}"
+
+
+def _degrees(camera: Camera) -> float:
+    """The horizontal field of view."""
+    return math.degrees(float(field_of_view(camera)[0]))

@@ -1,0 +1,72 @@
+"""The command `camtorch show`: what a calibration says, in numbers and in an image."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from camtorch.cli.options import add_calibration, add_output, parse_path
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+    from camtorch.cli.options import Commands
+
+
+def add(commands: Commands) -> None:
+    """Add the command to a command line."""
+    command = commands.add_parser(
+        "show", help="what a calibration says, in numbers and in an image", allow_abbrev=False
+    )
+    command.set_defaults(run=run)
+    command.add_argument("input", type=parse_path, metavar="FILE", help="a calibration file")
+    command.add_argument("--against", type=parse_path, metavar="OTHER", help="another calibration, to compare with")
+    add_calibration(command)
+    add_output(command, None, "an image: distortion, radius over angle")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carry it out."""
+    from camtorch.analysis.difference import difference
+    from camtorch.analysis.summary import summarise
+    from camtorch.cli import images
+    from camtorch.cli.cameras import read_other, read_rig
+
+    path, output, against = arguments.input, arguments.output, arguments.against
+    if output is not None:
+        images.check_target(output, force=arguments.force, inputs=(path, against))
+    cameras = read_rig(path, arguments.name, arguments.from_model, arguments.size).cameras
+    single = output is not None or against is not None
+    if single and len(cameras) > 1:
+        raise ValueError(f"{path}: --name says which camera is meant: {', '.join(cameras)}")
+    ((name, camera), *_), other = cameras.items(), None
+    if single and camera.image_size is None:
+        raise ValueError(f"{path} states no image size; --size says which")
+    if against is not None:
+        other = read_other(against, arguments.name)
+    for name, camera in cameras.items():
+        if camera.batch_shape:
+            raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; single ones are shown")
+        print(f"{path}: {name}", *summarise(camera).lines(), sep="\n")
+    if other is not None:
+        compared = difference(camera, other)
+        print(f"against {against}: {compared}, over {100 * compared.part:.4g} % of the image")
+    if output is not None:
+        height, width = camera.image_size
+        _draw(output, camera, other, f"{path.name}: {name if name != 'camera' else camera.key}, {width} x {height}")
+        print(f"{output}: distortion, radius over angle{', difference' if other is not None else ''}")
+
+
+def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
+    import numpy as np
+    from PIL import Image
+
+    from camtorch import plot
+    from camtorch.cli import images
+
+    figure = plot.portrait(camera, other, title=title)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # after `portrait` said what to install
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    images.write(path, Image.fromarray(np.array(canvas.buffer_rgba())[..., :3]))
