@@ -13,6 +13,7 @@ from camtorch.optics.charts import Perspective
 from camtorch.projection import autograd, ops
 from camtorch.projection.solve import invert
 from camtorch.warp import grid, sampling
+from camtorch.warp.grid import Sampling
 
 every_model = pytest.mark.parametrize("key", KEYS)
 
@@ -143,11 +144,12 @@ def test_parts_of_images_change_nothing(threads, count, dtype, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     generator = torch.Generator().manual_seed(0)
     images = (255 * torch.rand(count, 3, 11, 13, generator=generator)).to(dtype)
-    grid = 2.4 * torch.rand(count, 7, 5, 2, generator=generator) - 1.2
+    positions = 2.4 * torch.rand(count, 7, 5, 2, generator=generator) - 1.2
+    where = Sampling(positions, torch.ones(count, 7, 5, dtype=torch.bool), None)
     for mode in ("bilinear", "nearest", "bicubic"):
-        result = sampling.sample(images, grid, mode, "zeros")
+        result = sampling.render(images, where, mode, "zeros", (0.0,))
         wide = images.double() if dtype == torch.float64 else images.float()
-        expected = F.grid_sample(wide, grid.to(wide.dtype), mode, "zeros", align_corners=False)
+        expected = F.grid_sample(wide, positions.to(wide.dtype), mode, "zeros", align_corners=False)
         if dtype == torch.uint8:
             expected = expected.round().clamp(0, 255)
         assert result.dtype == dtype

@@ -1,26 +1,24 @@
-"""What compiled code calls instead of tracing it: the map of a warp with a tolerance."""
+"""What compiled code calls instead of tracing it: the positions of a warp with a tolerance, as one operator."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
+from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
-
-if TYPE_CHECKING:
-    from camtorch.warp.warp import Warp
+from camtorch.warp.grid import tabulate
 
 
-def positions(warp: Warp) -> tuple[Tensor, Tensor]:
-    """`positions.Exact` of all pixels of a warp that does not learn, as one operator."""
-    cameras = [n for c in (warp.source, warp.target) for n in (c._model, c.intrinsics, c.distortion)]
-    sizes = [*warp.source.image_size, *warp.target.image_size]
-    planes, mapped = _positions(*cameras, warp.rotation, sizes, warp.tolerance)
+def positions(source: Camera, target: Camera, rotation: Tensor | None, tolerance: float) -> tuple[Tensor, Tensor]:
+    """`grid.tabulate` of all pixels, between cameras that do not learn."""
+    cameras = [n for c in (source, target) for n in (c._model, c.intrinsics, c.distortion)]
+    sizes = [side for camera in (source, target) for side in camera._size("Warp")]
+    planes, mapped = _positions(*cameras, rotation, sizes, tolerance)
     return planes.movedim(1, -1), mapped
 
 
@@ -36,9 +34,7 @@ def _positions(
     sizes: Sequence[int],
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
-    """The map of a compiled warp with a tolerance: its planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
-    from camtorch.warp.warp import Warp
-
+    """The positions: planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
     cameras = []
     for model, intrinsics, distortion, size in (
         (source_model, source_intrinsics, source_distortion, sizes[:2]),
@@ -47,7 +43,7 @@ def _positions(
         numbers = [intrinsics, distortion] if distortion.shape[-1] else [intrinsics]
         camera = CLASSES[model](*(t.detach() for t in numbers), image_size=tuple(size))
         cameras.append(camera.requires_grad_(False))
-    grid, mapped = Warp(*cameras, rotation, tolerance=tolerance)._tabulate()
+    grid, mapped = tabulate(cameras[0], cameras[1], rotation, tolerance)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 

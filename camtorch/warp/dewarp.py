@@ -11,7 +11,7 @@ from camtorch._arguments import as_image_size
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
 from camtorch.rotations import as_rotation, turn
-from camtorch.warp.warp import Warp
+from camtorch.warp.warp import Warp, as_sized
 
 _WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold
 # projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for
@@ -55,11 +55,8 @@ class Dewarp(Warp):
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
-        if not isinstance(camera, Camera):
-            raise TypeError(f"Dewarp: camera must be a Camera; got {type(camera).__name__}")
-        if camera.image_size is None:
-            raise ValueError("Dewarp: the camera needs an image_size=(height, width)")
-        size = as_image_size(image_size, "Dewarp") or camera.image_size
+        own = as_sized(camera, "camera", "Dewarp")._size("Dewarp")
+        size = as_image_size(image_size, "Dewarp") or own
         rotation = as_rotation(rotation, "Dewarp")
         model = _PROJECTIONS[projection][0]
         with torch.no_grad():

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch._tracing import in_transform, is_concrete, may_look
+from camtorch.camera import Camera
+from camtorch.rotations import turn
+
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
+_FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 _STRIP = 1 << 19  # pixels
 _FEWEST = 8  # cells along a side from which on a lattice pays
 _STEP = 8  # pixels between the nodes of a lattice
@@ -23,24 +30,103 @@ Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 `grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is."""
 
 
-def in_strips(exact: Exact, pixels: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """`exact` of pixels (h, w, 2) for `count` cameras, by strips: memory for what is in between is used again."""
-    rows = max(_STRIP // max(count * pixels.shape[1], 1), 1)
-    strips = pixels.split(rows)
-    if len(strips) == 1:
-        return exact(pixels)
-    grid = mapped = None
-    for i, strip in enumerate(strips):
-        here = slice(i * rows, i * rows + len(strip))
-        part, seen = exact(strip)
-        if grid is None:
-            grid, mapped = (t.new_empty(count, len(pixels), *t.shape[2:]) for t in (part, seen))
-        grid[:, here], mapped[:, here] = part, seen
+class Sampling(NamedTuple):
+    """Where some rows of a target, or all of them, sample the source's image."""
+
+    grid: Tensor
+    """(B or 1, h, W', 2): positions as of `grid_sample`, `OUTSIDE` where there is none."""
+    mapped: Tensor
+    """(B or 1, h, W') bool: the pixel has a ray, and the source maps it."""
+    scale: Tensor | None
+    """(B or 1, h, W'): see `local_scale`; None where nobody asks for it."""
+
+
+def tabulate(
+    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float = 0.0, rows: range | None = None
+) -> tuple[Tensor, Tensor]:
+    """The sampling positions of a target's pixels, and which of them are mapped: see `Exact`.
+
+    Args:
+        source: the camera of the images.
+        target: the camera of the images to make.
+        rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`, or None.
+        tolerance: see `Warp`; above zero the CPU may take `on_lattice`.
+        rows: of the target; all by default.
+    """
+    height, width = target._size("Warp")
+    rows = range(height) if rows is None else rows
+    like = target.intrinsics.new_empty(0, dtype=torch.promote_types(target.intrinsics.dtype, torch.float32))
+    exact = partial(_positions, source, target, rotation)
+    if in_transform() or not is_concrete(target.intrinsics):
+        return exact(_pixels(rows, width, like))
+    if tolerance and like.is_cpu:
+        found = on_lattice(exact, rows, width, source._size("Warp"), tolerance, like)
+        if found is not None:
+            return found
+    # by strips: memory for what is in between is used again
+    count = max(math.prod(c.batch_shape) for c in (source, target))
+    count = count if rotation is None else max(count, math.prod(rotation.shape[:-2]))
+    step = max(_STRIP // max(count * width, 1), 1)
+    part, seen = exact(_pixels(rows[:step], width, like))
+    if len(rows) <= step:
+        return part, seen
+    grid, mapped = (t.new_empty(len(t), len(rows), *t.shape[2:]) for t in (part, seen))
+    grid[:, :step], mapped[:, :step] = part, seen
+    for i in range(step, len(rows), step):
+        here = slice(i, i + step)
+        grid[:, here], mapped[:, here] = exact(_pixels(rows[here], width, like))
     return grid, mapped
 
 
+def _pixels(rows: range, width: int, like: Tensor) -> Tensor:
+    """(len(rows), width, 2): the centres of the pixels."""
+    v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
+    u = torch.arange(width, dtype=like.dtype, device=like.device)
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
+
+def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `Exact`."""
+    if pixels.ndim == 3:
+        pixels = pixels.expand(*target.batch_shape, *pixels.shape)
+    rays, has_ray = target.unproject(pixels)
+    if rays.ndim == 3:
+        rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
+    seen, mapped = source.project(turn(None if rotation is None else rotation.mT, rays, "rays"))
+    mapped = mapped & has_ray
+    position = torch.stack(
+        [
+            (plane * (2 / size) + (1 / size - 1)).clamp(-_FAR, _FAR)
+            for plane, size in zip(seen.unbind(-1), source._size("Warp")[::-1], strict=True)
+        ]
+    )
+    if not (may_look(mapped) and bool(mapped.all())):
+        position = torch.where(mapped, position, OUTSIDE)
+    return position.movedim(0, -1), mapped
+
+
+def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
+    """(B, H', W'): how many source pixels lie between neighbours of the target, in the direction with more of them.
+
+    Args:
+        grid: (B, H', W', 2), sampling positions.
+        mapped: (B, H', W') bool: there is such a position.
+        size: (height, width) of the source.
+    """
+    half = grid.new_tensor([size[1] / 2, size[0] / 2])
+    scale = grid.new_zeros(grid.shape[:-1])
+    for dim in (1, 2):
+        n = grid.shape[dim] - 1
+        step = ((grid.narrow(dim, 1, n) - grid.narrow(dim, 0, n)) * half).norm(dim=-1)
+        step = step * (mapped.narrow(dim, 1, n) & mapped.narrow(dim, 0, n))
+        for start in (0, 1):
+            here = scale.narrow(dim, start, n)
+            here.copy_(torch.maximum(here, step))
+    return scale
+
+
 def on_lattice(
-    exact: Exact, size: tuple[int, int], source: tuple[int, int], tolerance: float, like: Tensor
+    exact: Exact, rows: range, width: int, source: tuple[int, int], tolerance: float, like: Tensor
 ) -> tuple[Tensor, Tensor] | None:
     """Positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
@@ -50,41 +136,39 @@ def on_lattice(
 
     Args:
         exact: see `Exact`.
-        size: (height, width) of the target.
+        rows: of the target.
+        width: of the target.
         source: (height, width) of the source, in whose pixels the tolerance is.
         tolerance: positive, in pixels.
         like: a tensor of the dtype and on the device to compute in.
     """
-    height, width = size
-    rows, columns = math.ceil(height / _STEP), math.ceil(width / _STEP)
-    if min(rows, columns) < _FEWEST:
+    height, n, m = len(rows), math.ceil(len(rows) / _STEP), math.ceil(width / _STEP)  # n by m cells
+    if min(n, m) < _FEWEST:
         return None
-    steps = [(torch.arange(n + 3, dtype=like.dtype, device=like.device) - 1) * _STEP for n in (rows, columns)]
-    v, u = torch.meshgrid(*steps, indexing="ij")
-    nodes, mapped = exact(torch.stack((u, v), -1))
-    nodes = nodes.movedim(-1, 1)  # (B, 2, rows + 3, columns + 3)
+    v, u = ((torch.arange(k + 3, dtype=like.dtype, device=like.device) - 1) * _STEP for k in (n, m))
+    nodes, mapped = exact(torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"), -1))
+    nodes = nodes.movedim(-1, 1)  # (B, 2, n + 3, m + 3)
     some, open_cells = _open_cells(nodes, mapped, source, tolerance)
     most = int(open_cells.sum((1, 2)).max()) if open_cells.numel() else 0
-    if most > rows * columns / 2:
+    if most > n * m / 2:
         return None
-    planes = _interpolated(nodes, rows, columns)  # (B, 2, 8 rows, 8 columns)
-    blocks = planes.unflatten(2, (rows, _STEP)).unflatten(4, (columns, _STEP))
+    planes = _interpolated(nodes, n, m)  # (B, 2, 8 n, 8 m)
+    blocks = planes.unflatten(2, (n, _STEP)).unflatten(4, (m, _STEP))
     camera, i, j = (~some).nonzero(as_tuple=True)
     blocks[camera, :, i, :, j] = OUTSIDE
     seen = some[:, :, None, :, None].expand(-1, -1, _STEP, -1, _STEP).flatten(3, 4).flatten(1, 2)
     if most:
         # as many cells of every camera as the one with the most has: more of them exact does no harm
         cells = open_cells.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
-        i, j = cells // columns, cells % columns
+        i, j = cells // m, cells % m
         offset = torch.arange(_STEP, dtype=like.dtype, device=like.device)
         down, across = (i[..., None, None] * _STEP + offset[:, None]), (j[..., None, None] * _STEP + offset)
-        pixels = torch.stack(torch.broadcast_tensors(across, down), -1)  # (B, cells, 8, 8, 2)
+        pixels = torch.stack(torch.broadcast_tensors(across, down + rows.start), -1)  # (B, cells, 8, 8, 2)
         positions, known = exact(pixels.flatten(2, 3))
         camera = torch.arange(len(cells), device=like.device)[:, None]
         blocks[camera, :, i, :, j] = positions.unflatten(2, (_STEP, _STEP)).movedim(-1, 2)
-        seen.unflatten(1, (rows, _STEP)).unflatten(3, (columns, _STEP))[camera, i, :, j] = known.unflatten(
-            2, (_STEP, -1)
-        )
+        known = known.unflatten(2, (_STEP, _STEP))
+        seen.unflatten(1, (n, _STEP)).unflatten(3, (m, _STEP))[camera, i, :, j] = known
     return planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width]
 
 

@@ -1,49 +1,333 @@
-"""Images at positions: torch's grid_sample for every dtype and every kind of derivative."""
+"""Images at positions: torch's grid_sample for every dtype and derivative, filled, antialiased, in bounded memory."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Literal, TypedDict, TypeVar, get_args
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._tracing import in_graph, in_transform, is_concrete
+from camtorch._tracing import in_graph, in_transform, is_concrete, may_look
+from camtorch.warp.grid import Sampling
+
+Mode = Literal["nearest", "bilinear", "bicubic"]
+PaddingMode = Literal["zeros", "border", "reflection"]
+Fill = float | Sequence[float]
+Name = TypeVar("Name", bound=str)
+MODES: tuple[Mode, ...] = get_args(Mode)
+PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
 # Between two pixel centres the interpolation is a polynomial; as many nodes determine it
 _NODES = {"nearest": (), "bilinear": (0.0, 1.0), "bicubic": (0.0, 1 / 3, 2 / 3, 1.0)}
-MODES = tuple(_NODES)
-PADDINGS = ("zeros", "border", "reflection")
+_REACH = {"nearest": 1, "bilinear": 1, "bicubic": 2}  # pixels to either side of a position that have a part in it
+_LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
+_TILE = 512  # pixels along the sides of what is then sampled at a time
+_TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth
+_SIGNED = {2: torch.int16, 4: torch.int32, 8: torch.int64}  # torch gathers no wide unsigned integers
 
 
-def sample(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
+def render(
+    images: Tensor,
+    where: Sampling,
+    mode: Mode,
+    padding_mode: PaddingMode,
+    fill: tuple[float, ...],
+    kept: dict[int, Pyramid] | None = None,
+) -> Tensor:
+    """The images that a warp makes.
+
+    Images that are computed in another dtype are copied in parts, large ones as far as a tile of the target reads.
+
+    Args:
+        images: (B or 1, C, H, W), floating point, integer or bool.
+        where: positions of B cameras, or of one for all images.
+        mode: one of `MODES`.
+        padding_mode: one of `PADDINGS`.
+        fill: the value of pixels that show nothing, one or C.
+        kept: holds the halves of the images from one call to the next.
+
+    Returns:
+        (B, C, h, W') of the dtype of the images. Half precision is sampled in float32; integers are rounded and stay
+        in their range, bool is true from one half on; the nearest integers are those of the image.
+    """
+    dtype = images.dtype
+    count = images.shape[0] if where.grid.shape[0] == 1 else where.grid.shape[0]
+    images = images.expand(count, -1, -1, -1)
+    if mode == "nearest":
+        where = where._replace(scale=None)
+    if not dtype.is_floating_point:
+        images, where = images.detach(), where._replace(grid=where.grid.detach())
+        if mode == "nearest" and dtype.itemsize > 2:
+            return _pick(images, where, padding_mode, fill)
+    where = where._replace(grid=where.grid.to(_wide(dtype)))
+    plain = images.is_cpu and not any(in_graph(t) for t in (images, where.grid)) and not in_transform()
+    if not plain or dtype == _wide(dtype):
+        levels = Pyramid(images) if kept is None else kept.setdefault(0, Pyramid(images))
+        return narrow(_render(levels.images, where.grid, where, levels, mode, padding_mode, fill), dtype)
+    large = math.prod(images.shape[1:]) > _LARGE
+    step = 1 if large else torch.get_num_threads()
+    result = images.new_empty(*images.shape[:2], *where.grid.shape[1:3])
+    for i in range(0, count, step):
+        part = slice(i, i + step)
+        levels = Pyramid(images[part]) if kept is None else kept.setdefault(i, Pyramid(images[part]))
+        here = where if len(where.grid) == 1 else Sampling(*(t if t is None else t[part] for t in where))
+        if large:
+            _render_tiles(result[part], levels, here, mode, padding_mode, fill)
+        else:
+            made = _render(widen(images[part]), here.grid, here, levels, mode, padding_mode, fill)
+            result[part] = narrow(made, dtype)
+    return result
+
+
+def _render_tiles(
+    result: Tensor,
+    levels: Pyramid,
+    where: Sampling,
+    mode: Mode,
+    padding_mode: PaddingMode,
+    fill: tuple[float, ...],
+) -> None:
+    """One image in tiles of the target, each from a copy of what it reads."""
+    for top in range(0, result.shape[2], _TILE):
+        for left in range(0, result.shape[3], _TILE):
+            tile = (..., slice(top, top + _TILE), slice(left, left + _TILE))
+            here = Sampling(where.grid[(*tile, slice(None))], *(t if t is None else t[tile] for t in where[1:]))
+            images, grid = _read(levels.images, here, mode, padding_mode)
+            result[tile] = narrow(_render(images, grid, here, levels, mode, padding_mode, fill), result.dtype)
+
+
+def _read(images: Tensor, where: Sampling, mode: Mode, padding_mode: PaddingMode) -> tuple[Tensor, Tensor]:
+    """The part of the images that is read, as of `widen`, and the positions on it.
+
+    What is cut off at the image's own edges alone, or has no part in the result, leaves the padding as it is.
+    """
+    slices, axes = [], []
+    sides, planes = images.shape[:-3:-1], where.grid.unbind(-1)
+    ranges = [[float(end) for end in torch.aminmax(plane)] for plane in planes]
+    if any(low < -1 or high > 1 for low, high in ranges):
+        read = where.mapped
+        if padding_mode == "zeros":
+            margins = (1 + 2 * _REACH[mode] / side for side in sides)
+            across, down = (plane.abs() < margin for plane, margin in zip(planes, margins, strict=True))
+            read = across & down
+        bounds = (torch.inf, torch.amin), (-torch.inf, torch.amax)
+        ranges = [[float(pick(torch.where(read, plane, none))) for none, pick in bounds] for plane in planes]
+    for plane, side, ends in zip(planes, sides, ranges, strict=True):
+        first, last = ((end + 1) * side / 2 - 0.5 for end in ends)
+        if padding_mode == "reflection" and (first < 0 or last > side - 1):
+            first, last = 0.0, side - 1.0
+        # one more pixel for what is lost in rounding
+        start = int(min(max(first - _REACH[mode], 0), side - 1))
+        stop = int(min(max(last + _REACH[mode] + 2, start + 1), side))
+        slices.append(slice(start, stop))
+        axes.append(((plane + 1) * side - 2 * start) / (stop - start) - 1)
+    return widen(images[(..., *slices[::-1])]), torch.stack(axes, -1)
+
+
+def _render(
+    images: Tensor,
+    grid: Tensor,
+    where: Sampling,
+    levels: Pyramid,
+    mode: Mode,
+    padding_mode: PaddingMode,
+    fill: tuple[float, ...],
+) -> Tensor:
+    """Images of a dtype to compute in, or a part of them, at positions `grid` on it, filled and antialiased."""
+    minifies = where.scale is not None
+    # what lies beyond the rim is left out by coverage: at small levels the rim's pixels are wide
+    beyond: PaddingMode = "border" if minifies and padding_mode == "zeros" else padding_mode
+    result = sample(images, grid, mode, beyond)
+    if where.scale is not None:
+        result = _minified(result, levels, where.grid, where.scale, mode, beyond)
+    if any(fill) or padding_mode != "zeros" or minifies:
+        value = result.new_tensor(fill)[:, None, None]
+        if padding_mode == "zeros":
+            # what part of a sample comes from the image, and not from the zeros around it
+            ones = images.new_ones(1, 1, *images.shape[-2:]).expand(grid.shape[0], -1, -1, -1)
+            covered = sample(ones, grid, mode, "zeros")
+            result = torch.where(covered != 0, result * covered, 0) if minifies else result
+            result = result + value * (1 - covered)
+        else:
+            result = torch.where(where.mapped.unsqueeze(1), result, value)
+    return result
+
+
+class Pyramid:
+    """Images, and their half, which is a pyramid again, as soon as it is asked for.
+
+    The method is mip mapping (Williams, Pyramidal Parametrics, 1983): every level halves the image by a triangle
+    filter, and between levels is interpolated.
+    """
+
+    def __init__(self, images: Tensor):
+        self.images = images
+
+    @cached_property
+    def half(self) -> Pyramid:
+        """Of a dtype to compute in."""
+        size = [max(side // 2, 1) for side in self.images.shape[-2:]]
+        # a copy in another dtype is large
+        channels = self.images.split(1 if self.images.dtype != _wide(self.images.dtype) else self.images.shape[1], 1)
+        halves = [F.interpolate(widen(c), size, mode="bilinear", align_corners=False, antialias=True) for c in channels]
+        return Pyramid(torch.cat(halves, 1))
+
+
+def _minified(
+    result: Tensor, levels: Pyramid, grid: Tensor, scale: Tensor, mode: Mode, padding_mode: PaddingMode
+) -> Tensor:
+    """The result of `sample`, in which a pixel that covers n source pixels takes the mean of about as many.
+
+    Args:
+        result: (B, C, H', W'), sampled from the images themselves.
+        levels: of these images.
+        grid: (B or 1, H', W', 2).
+        scale: (B or 1, H', W') of `local_scale`.
+        mode: see `sample`.
+        padding_mode: see `sample`.
+    """
+    level = scale.clamp(min=1).log2().unsqueeze(1)
+    last = min(levels.images.shape[-2:]).bit_length() - 1
+    wanted = int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS
+    for n in range(min(wanted, last)):
+        levels = levels.half
+        smaller, share = sample(levels.images, grid, mode, padding_mode), (level - n).clamp(0, 1).to(result)
+        # an image without a share has no part either in what is not a number
+        blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
+        result = torch.where(share > 0, blended, result)
+    return result
+
+
+def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
     """`grid_sample` with align_corners=False.
 
     Args:
-        images: (B, C, H, W), floating point, integer or bool.
-        grid: (B, H', W', 2), normalised positions.
+        images: (B, C, H, W) of a dtype to compute in.
+        grid: (B or 1, H', W', 2), normalised positions.
         mode: one of `MODES`.
         padding_mode: one of `PADDINGS`.
 
     Returns:
-        (B, C, H', W') of the dtype of the images. Half precision is sampled in float32; integers are rounded
-        and stay in their range, bool is true from one half on.
+        (B, C, H', W'). On a CPU, and unless it is compiled, an infinite or NaN pixel has a part in those samples alone
+        in which it has a weight.
     """
-    dtype = images.dtype
-    if not dtype.is_floating_point:
-        images, grid = images.detach(), grid.detach()
-    plain = images.is_cpu and not any(in_graph(t) for t in (images, grid)) and not in_transform()
-    if plain or not dtype.is_floating_point:
-        return (_sample_in_parts if plain else _sample_part)(images, grid, mode, padding_mode)
-    wide = torch.promote_types(dtype, torch.float32)
-    images, grid = images.to(wide), grid.to(wide)
+    grid = grid.to(images.dtype).expand(images.shape[0], -1, -1, -1)
     if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
-        return F.grid_sample(images, grid, mode, padding_mode, align_corners=False).to(dtype)
-    return _Sample.apply(images, grid, mode, padding_mode).to(dtype)
+        return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
+    if images.is_cpu and not any(in_graph(t) for t in (images, grid)) and not in_transform():
+        return _sample(images, grid, mode, padding_mode)
+    result: Tensor = _Sample.apply(images, grid, mode, padding_mode)
+    return result
 
 
-def as_options(owner: str, mode: str, padding_mode: str, fill, antialias: bool, tolerance: float) -> dict:
+def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
+    """On a CPU, with work for every thread, of which grid_sample gives one to each image."""
+    threads = torch.get_num_threads()
+    if len(images) >= threads:
+        result = F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
+    else:
+        result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
+        for image in zip(result, images, grid, strict=True):
+            _sample_tiles(*image, threads, mode, padding_mode)
+    if mode != "nearest" and not math.isfinite(result.sum()):
+        _sample_again(result, images, grid, mode, padding_mode)
+    return result
+
+
+def _sample_tiles(result: Tensor, image: Tensor, grid: Tensor, count: int, mode: Mode, padding_mode: PaddingMode):
+    """One image (C, H, W) by tiles of rows that share it, and what rows are left over."""
+    height = len(grid) // count
+    tiles = count * height
+    if tiles:
+        images = image.expand(count, *image.shape)
+        parts = grid[:tiles].unflatten(0, (count, height))
+        sampled = F.grid_sample(images, parts, mode, padding_mode, align_corners=False)
+        result[:, :tiles].unflatten(1, (count, height)).copy_(sampled.movedim(0, 1))
+    if tiles < len(grid):
+        rest = F.grid_sample(image[None], grid[None, tiles:], mode, padding_mode, align_corners=False)
+        result[:, tiles:] = rest[0]
+
+
+def _sample_again(result: Tensor, images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> None:
+    """Where the result is not finite, pixels without a weight, but for rounding, lose their part in it."""
+    b, y, x = (~torch.isfinite(result)).any(1).nonzero(as_tuple=True)
+    height, width = images.shape[-2:]
+    columns, rows = (
+        _taps(position, side, mode, padding_mode)
+        for position, side in zip(grid[b, y, x].unbind(-1), (width, height), strict=True)
+    )
+    total = result.new_zeros(len(b), result.shape[1])
+    for j, by_row in rows:
+        for i, by_column in columns:
+            weight = (by_row * by_column).unsqueeze(-1)
+            total += torch.where(weight != 0, weight * images[b, :, j, i], 0)
+    result[b, :, y, x] = total
+
+
+def _taps(position: Tensor, side: int, mode: Mode, padding_mode: PaddingMode) -> list[tuple[Tensor, Tensor]]:
+    """The pixels along an axis that have a part in positions (K,), and their weights, both (K,)."""
+    u = ((position + 1) * side - 1) / 2
+    if mode == "bilinear":
+        u = _padded(u, side, padding_mode)  # of neighbouring pixels it is the same
+    cell = u.floor()
+    t = u - cell
+    if mode == "bilinear":
+        weights = [1 - t, t]
+    else:  # the cubic convolution of torch and OpenCV: Keys, 1981, with a = -3/4
+        near, far = (lambda d: (1.25 * d - 2.25) * d * d + 1), (lambda d: ((-0.75 * d + 3.75) * d - 6) * d + 3)
+        weights = [far(t + 1), near(t), near(1 - t), far(2 - t)]
+    lost = 4 * side * torch.finfo(u.dtype).eps  # in rounding the position
+    taps = []
+    for k, weight in enumerate(weights, start=1 - len(weights) // 2):
+        pixel = _padded(cell + k, side, padding_mode)
+        known = (pixel >= 0) & (pixel <= side - 1) & (weight.abs() > lost)
+        taps.append((pixel.clamp(0, side - 1).long(), torch.where(known, weight, 0)))
+    return taps
+
+
+def _padded(u: Tensor, side: int, padding_mode: PaddingMode) -> Tensor:
+    """Pixel coordinates on the image, those of what is repeated or reflected beyond it; "zeros" leaves them."""
+    if padding_mode == "zeros":
+        return u
+    if padding_mode == "reflection":
+        u = (u + 0.5).remainder(2 * side) - 0.5
+        u = torch.minimum(u, 2 * side - 1 - u)
+    return u.clamp(0, side - 1)
+
+
+def _pick(images: Tensor, where: Sampling, padding_mode: PaddingMode, fill: tuple[float, ...]) -> Tensor:
+    """The nearest of integers (B, C, H, W), moved and not computed with: no float holds every id."""
+    count, channels, height, width = images.shape
+    u, v = (
+        _padded(((position + 1) * side - 1) / 2, side, padding_mode).round()
+        for position, side in zip(where.grid.unbind(-1), (width, height), strict=True)
+    )
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    seen = (inside if padding_mode == "zeros" else where.mapped).unsqueeze(1)
+    index = torch.where(inside, v.long() * width + u.long(), 0).flatten(1).unsqueeze(1)
+    pixels = images.view(_SIGNED[images.dtype.itemsize]).flatten(2)
+    picked = pixels.gather(2, index.expand(count, channels, -1)).view(images.dtype)
+    limits = torch.iinfo(images.dtype)
+    values = [min(max(round(value), limits.min), limits.max) for value in fill]
+    value = torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None]
+    return torch.where(seen, picked.unflatten(2, where.grid.shape[1:3]), value)
+
+
+class Options(TypedDict):
+    """What a `Warp` takes by name."""
+
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: tuple[float, ...]
+    antialias: bool
+    tolerance: float
+
+
+def as_options(owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool, tolerance: float) -> Options:
     """The checked options of a `Warp`, by name.
 
     Raises:
@@ -60,17 +344,19 @@ def as_options(owner: str, mode: str, padding_mode: str, fill, antialias: bool, 
     }
 
 
-def one_of(value: str, allowed: tuple[str, ...], name: str, owner: str) -> str:
+def one_of(value: str, allowed: tuple[Name, ...], name: str, owner: str) -> Name:
     """The value, if it is allowed."""
-    if value not in allowed:
-        raise ValueError(f"{owner}: {name} must be one of {allowed}; got {value!r}")
-    return value
+    for known in allowed:
+        if value == known:
+            return known
+    raise ValueError(f"{owner}: {name} must be one of {allowed}; got {value!r}")
 
 
-def as_fill(fill, owner: str) -> tuple[float, ...]:
-    """One value or one for each channel, as a tuple."""
+def as_fill(fill: Fill, owner: str) -> tuple[float, ...]:
+    """One value or one for each channel, as a tuple; integers, which may be ids, stay what they are."""
     try:
-        values = tuple(map(float, fill)) if isinstance(fill, Iterable) else (float(fill),)
+        given = tuple(fill) if isinstance(fill, Iterable) else (fill,)
+        values = tuple(value if isinstance(value, int) else float(value) for value in given)
     except (TypeError, ValueError):
         raise TypeError(f"{owner}: fill must be a number or one for each channel; got {fill!r}") from None
     if not values or not all(map(math.isfinite, values)):
@@ -78,53 +364,16 @@ def as_fill(fill, owner: str) -> tuple[float, ...]:
     return values
 
 
-def coverage(images: Tensor, grid: Tensor, mode: str) -> Tensor:
-    """(B, 1, H', W'): what part of a sample comes from the image, and not from the zeros around it."""
-    return sample(torch.ones_like(images[:1, :1]).expand(len(grid), -1, -1, -1), grid, mode, "zeros")
-
-
-def _sample_in_parts(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
-    """`_sample_part` with work for every thread, of which grid_sample gives one to each image.
-
-    Images that need another dtype go in parts, so that their copies stay in the cache; a part of fewer images than
-    threads goes image by image, in tiles of rows.
-    """
-    threads = torch.get_num_threads()
-    step = len(images) if images.dtype in (torch.float32, torch.float64) and len(images) >= threads else threads
-    if step == len(images):
-        return _sample_part(images, grid, mode, padding_mode)
-    result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
-    for parts in zip(*(t.split(step) for t in (result, images, grid)), strict=True):
-        if len(parts[0]) == step:
-            parts[0].copy_(_sample_part(*parts[1:], mode, padding_mode))
-        else:
-            for image in zip(*parts, strict=True):
-                _sample_tiles(*image, threads, mode, padding_mode)
-    return result
-
-
-def _sample_tiles(result: Tensor, image: Tensor, grid: Tensor, count: int, mode: str, padding_mode: str) -> None:
-    """One image (C, H, W) by tiles of rows that share it, and what rows are left over."""
-    height = len(grid) // count
-    tiles = count * height
-    if tiles:
-        images = image.expand(count, *image.shape)
-        sampled = _sample_part(images, grid[:tiles].unflatten(0, (count, height)), mode, padding_mode)
-        result[:, :tiles].unflatten(1, (count, height)).copy_(sampled.movedim(0, 1))
-    if tiles < len(grid):
-        result[:, tiles:] = _sample_part(image.unsqueeze(0), grid[tiles:].unsqueeze(0), mode, padding_mode)[0]
-
-
-def _sample_part(images: Tensor, grid: Tensor, mode: str, padding_mode: str) -> Tensor:
-    dtype = images.dtype
-    images = widen(images)
-    return narrow(F.grid_sample(images, grid.to(images.dtype), mode, padding_mode, align_corners=False), dtype)
+def _wide(dtype: torch.dtype) -> torch.dtype:
+    """The dtype to compute in: every value, a class id too, is exact in it, up to 2^53."""
+    if dtype.is_floating_point:
+        return torch.promote_types(dtype, torch.float32)
+    return torch.float64 if dtype.itemsize > 2 else torch.float32
 
 
 def widen(images: Tensor) -> Tensor:
-    """In a floating-point dtype in which every value, a class id too, is exact."""
-    wide = torch.float64 if not images.is_floating_point() and images.dtype.itemsize > 2 else torch.float32
-    return images.to(torch.promote_types(images.dtype, wide) if images.is_floating_point() else wide)
+    """In the dtype to compute in."""
+    return images.to(_wide(images.dtype))
 
 
 def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
@@ -134,8 +383,8 @@ def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
     if not dtype.is_floating_point and values.is_floating_point():
         low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
         # the largest int64 is no float64: the next one would wrap around
-        high = high if int(float(high)) == high else math.nextafter(float(high), 0.0)
-        values = values.round().clamp(low, high)
+        top = float(high) if int(float(high)) == high else math.nextafter(float(high), 0.0)
+        values = values.round().clamp(float(low), top)
     return values.to(dtype)
 
 
@@ -147,7 +396,7 @@ class _Sample(torch.autograd.Function):
     @staticmethod
     def forward(images, grid, mode, padding_mode):
         if images.is_cpu and is_concrete(images) and is_concrete(grid):
-            return _sample_in_parts(images, grid, mode, padding_mode)
+            return _sample(images, grid, mode, padding_mode)
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
 
     @staticmethod

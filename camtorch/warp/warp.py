@@ -3,22 +3,45 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import as_values, broadcast_shapes
 from camtorch._module import GeometryModule, Memo
-from camtorch._tracing import in_transform, is_concrete, may_look
+from camtorch._tracing import in_graph, in_transform, is_concrete
 from camtorch.camera import Camera
 from camtorch.rotations import as_rotation, turn
-from camtorch.warp import compiled, minify
-from camtorch.warp.grid import OUTSIDE, in_strips, on_lattice
+from camtorch.warp import compiled
+from camtorch.warp.grid import Sampling, local_scale, tabulate
 from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
-from camtorch.warp.sampling import MODES, PADDINGS, as_fill, as_options, coverage, narrow, one_of, sample, widen
+from camtorch.warp.sampling import (
+    MODES,
+    PADDINGS,
+    Fill,
+    Mode,
+    Options,
+    PaddingMode,
+    Pyramid,
+    as_fill,
+    as_options,
+    one_of,
+    render,
+)
 
-_FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
+_MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
+_STRIP = 1 << 21  # pixels of such a strip
+
+
+def as_sized(camera: Camera, name: str, owner: str) -> Camera:
+    """The camera, if it is one and knows the size of its image."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"{owner}: {name} must be a Camera; got {type(camera).__name__}")
+    if camera.image_size is None:
+        raise ValueError(f"{owner}: the {name} needs an image_size=(height, width)")
+    return camera
 
 
 class Warp(GeometryModule):
@@ -50,38 +73,42 @@ class Warp(GeometryModule):
         TypeError: source or target is not a Camera.
     """
 
+    source: Camera
+    target: Camera
+    rotation: Tensor | None
+    _pinned: Sampling | None
+
     def __init__(
         self,
         source: Camera,
         target: Camera,
         rotation: Tensor | None = None,
         *,
-        mode: str = "bilinear",
-        padding_mode: str = "zeros",
-        fill: float | Sequence[float] = 0.0,
+        mode: Mode = "bilinear",
+        padding_mode: PaddingMode = "zeros",
+        fill: Fill = 0.0,
         antialias: bool = False,
         tolerance: float = 0.0,
     ):
         super().__init__()
-        for name, camera in (("source", source), ("target", target)):
-            if not isinstance(camera, Camera):
-                raise TypeError(f"Warp: {name} must be a Camera; got {type(camera).__name__}")
-            if camera.image_size is None:
-                raise ValueError(f"Warp: the {name} camera needs an image_size=(height, width)")
-        self.source, self.target = source, target
+        self.source, self.target = as_sized(source, "source", "Warp"), as_sized(target, "target", "Warp")
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
-        self.mode, self.padding_mode, self.fill, self.antialias, self.tolerance = options.values()
+        self.mode, self.padding_mode, self.fill = options["mode"], options["padding_mode"], options["fill"]
+        self.antialias, self.tolerance = options["antialias"], options["tolerance"]
         self._set_rotation(as_rotation(rotation, "Warp"))
-        shapes = [source.batch_shape, target.batch_shape, () if rotation is None else self.rotation.shape[:-2]]
+        turned = () if self.rotation is None else self.rotation.shape[:-2]
+        shapes = [tuple(shape) for shape in (source.batch_shape, target.batch_shape, turned)]
+        batch: tuple[int, ...] | None
         try:
-            self.batch_shape = broadcast_shapes(*shapes)
+            batch = broadcast_shapes(*shapes)
         except ValueError:
-            self.batch_shape = None
-        if self.batch_shape is None or len(self.batch_shape) > 1:
+            batch = None
+        if batch is None or len(batch) > 1:
             raise ValueError(
                 "Warp: source, target and rotation may each have one batch dim, of one size; "
-                f"got {', '.join(str(tuple(s)) for s in shapes)}"
+                f"got {', '.join(map(str, shapes))}"
             )
+        self.batch_shape = torch.Size(batch)
         self._memo, self._pinned = Memo(), None
 
     def _set_rotation(self, rotation: Tensor | None) -> None:
@@ -92,13 +119,25 @@ class Warp(GeometryModule):
 
     # -- images
 
+    if TYPE_CHECKING:
+
+        def __call__(
+            self,
+            images: Tensor,
+            *,
+            mode: Mode | None = None,
+            padding_mode: PaddingMode | None = None,
+            fill: Fill | None = None,
+        ) -> Tensor:
+            """`forward`, whose result nn.Module does not tell."""
+
     def forward(
         self,
         images: Tensor,
         *,
-        mode: str | None = None,
-        padding_mode: str | None = None,
-        fill: float | Sequence[float] | None = None,
+        mode: Mode | None = None,
+        padding_mode: PaddingMode | None = None,
+        fill: Fill | None = None,
     ) -> Tensor:
         """Warp images.
 
@@ -110,75 +149,167 @@ class Warp(GeometryModule):
 
         Returns:
             (B, C, H', W') of the target's image_size and of the same dtype. Half precision is sampled in float32;
-            integers are rounded and stay in their range, bool is true from one half on.
+            integers are rounded and stay in their range, bool is true from one half on. The nearest integers are
+            exactly those of the image. Integers and bool have no gradient, and learning cameras cost them nothing.
 
         Raises:
-            ValueError: another shape or size. TypeError: complex images.
+            ValueError: another shape or size. TypeError: no tensor, or a complex one.
         """
+        sampled = self._checked(images, mode, padding_mode, fill)
+        learns = images.is_floating_point() and torch.is_grad_enabled()
+        if self._is_long() and not (in_graph(images) or (learns and self._learns())):
+            result = images.new_empty(self._count(images), images.shape[1], *self.target._size("Warp"))
+            for rows, part, _ in self._strips(images, None, *sampled):
+                result[:, :, rows] = part
+            return result
+        return render(images, self._sampling() if learns else self._kept(), *sampled)
+
+    def strips(
+        self,
+        images: Tensor,
+        *,
+        rows: int | None = None,
+        mode: Mode | None = None,
+        padding_mode: PaddingMode | None = None,
+        fill: Fill | None = None,
+    ) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Warp images by strips of the target, from top to bottom, for images so large that memory is short.
+
+        Each strip has its own part of the grid, which is not kept, and of images that are not float32 or float64 it
+        copies no more than a tile of it reads. No gradients. Pixels are those of `forward`, up to the rounding of
+        positions in float32, a thousandth of a pixel in an image 10,000 pixels wide.
+
+            result = torch.empty(3, *warp.target.image_size, dtype=torch.uint8)
+            for rows, part, valid in warp.strips(image[None]):
+                result[:, rows] = part[0]
+                progress(rows.stop / len(result[0]), filled=valid.sum())
+
+        `forward` does so by itself, on a CPU and without gradients, for grids of more than 32 million pixels.
+
+        Args:
+            images: as of `forward`.
+            rows: of a strip; by default those of two million pixels.
+            mode: as of `forward`.
+            padding_mode: as of `forward`.
+            fill: as of `forward`.
+
+        Yields:
+            the rows of the target, a slice; these rows of `forward`'s result (B, C, n, W'); and of `valid_mask`
+            (B or 1, 1, n, W').
+        """
+        if rows is not None and rows < 1:
+            raise ValueError(f"Warp: rows must be at least 1; got {rows}")
+        return self._strips(images, rows, *self._checked(images, mode, padding_mode, fill))
+
+    def _strips(
+        self, images: Tensor, count: int | None, mode: Mode, padding_mode: PaddingMode, fill: tuple[float, ...]
+    ) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        kept: dict[int, Pyramid] = {}
+        for rows in self._rows(count):
+            with torch.no_grad():
+                where = self._strip(rows)
+                part, valid = render(images, where, mode, padding_mode, fill, kept), self._on_image(where)
+            yield slice(rows.start, rows.stop), part, valid
+
+    def _checked(
+        self, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
+    ) -> tuple[Mode, PaddingMode, tuple[float, ...]]:
+        """The options of one call, if they and the images are as they should be."""
         if not isinstance(images, Tensor) or images.is_complex():
-            what = getattr(images, "dtype", type(images).__name__)
-            raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}")
+            what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
+            hint = ""
+            if type(images).__name__ == "ndarray":
+                hint = ". An array (H, W, 3) goes in as torch.from_numpy(array).permute(2, 0, 1)[None]"
+            raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}{hint}")
+        shape, expected = tuple(images.shape), self.source._size("Warp")
+        if images.ndim in (3, 4) and shape[-3:-1] == expected and shape[-2:] != expected:
+            to = "(2, 0, 1)[None]" if len(shape) == 3 else "(0, 3, 1, 2)"
+            raise ValueError(
+                f"Warp: images must be (B, C, H, W); got shape {shape}, with the channels last. "
+                f"It goes in as image.permute{to}"
+            )
         if images.ndim != 4:
             hint = "One image goes in as image[None], masks without channels as masks[:, None]"
-            raise ValueError(f"Warp: images must be (B, C, H, W); got shape {tuple(images.shape)}. {hint}")
-        size, expected = tuple(images.shape[-2:]), self.source.image_size
-        if size != expected:
+            raise ValueError(f"Warp: images must be (B, C, H, W); got shape {shape}. {hint}")
+        if shape[-2:] != expected:
             raise ValueError(
-                f"Warp: images are {size} (height, width), but the source camera's image_size is {expected}"
+                f"Warp: images are {shape[-2:]} (height, width), but the source camera's image_size is {expected}"
             )
-        mode = self.mode if mode is None else one_of(mode, MODES, "mode", "Warp")
-        padding_mode = (
-            self.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
+        cameras = math.prod(self.batch_shape)
+        if cameras != 1 and images.shape[0] not in (1, cameras):
+            raise ValueError(f"Warp: {images.shape[0]} images do not fit {cameras} cameras")
+        values = self.fill if fill is None else as_fill(fill, "Warp")
+        if len(values) not in (1, shape[1]):
+            raise ValueError(f"Warp: fill has {len(values)} values, but the images have {shape[1]} channels")
+        return (
+            self.mode if mode is None else one_of(mode, MODES, "mode", "Warp"),
+            self.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp"),
+            values,
         )
-        fill = self.fill if fill is None else as_fill(fill, "Warp")
-        grid, mapped, scale = self._sampling()
-        if grid.shape[0] == 1:
-            grid = grid.expand(images.shape[0], -1, -1, -1)
-        elif images.shape[0] == 1:
-            images = images.expand(grid.shape[0], -1, -1, -1)
-        elif images.shape[0] != grid.shape[0]:
-            raise ValueError(f"Warp: {images.shape[0]} images do not fit {grid.shape[0]} cameras")
-        dtype, minifies = images.dtype, scale is not None and mode != "nearest"
-        if minifies or any(fill):
-            images = widen(images)
-        if minifies:
-            # what lies beyond the rim is left out by coverage: at small levels the rim's pixels are wide
-            beyond = "border" if padding_mode == "zeros" else padding_mode
-            result = minify.sample_minified(images, grid, scale, mode, beyond)
-        else:
-            result = sample(images, grid, mode, padding_mode)
-        if any(fill) or padding_mode != "zeros" or minifies:
-            if len(fill) not in (1, result.shape[1]):
-                raise ValueError(f"Warp: fill has {len(fill)} values, but the images have {result.shape[1]} channels")
-            value = result.new_tensor(fill)[:, None, None]
-            if padding_mode == "zeros":
-                covered = coverage(images, grid, mode)
-                result = torch.where(covered != 0, result * covered, 0) if minifies else result
-                result = result + value * (1 - covered)
-            else:
-                result = torch.where(mapped.unsqueeze(1), result, value)
-        return narrow(result, dtype)
+
+    def _count(self, images: Tensor) -> int:
+        cameras = math.prod(self.batch_shape)
+        return images.shape[0] if cameras == 1 else cameras
 
     def grid(self) -> Tensor:
         """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
-        return self._sampling()[0].clone()
+        return self._sampling().grid.clone(memory_format=torch.contiguous_format)
 
     def valid_mask(self) -> Tensor:
         """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its image."""
-        grid, mapped, _ = self._sampling()
-        pixels = (grid.detach() + 1) * grid.new_tensor(self.source.image_size[::-1]) / 2 - 0.5
-        return (mapped & self.source.contains(pixels)).unsqueeze(1)
+        if self._is_long():
+            with torch.no_grad():
+                return torch.cat([self._on_image(self._strip(rows)) for rows in self._rows(None)], 2)
+        return self._on_image(self._kept())
 
-    def _sampling(self) -> tuple[Tensor, Tensor, Tensor | None]:
-        """The grid, where a ray was mapped at all, and with antialias the local scale."""
+    def _on_image(self, where: Sampling) -> Tensor:
+        grid = where.grid.detach()
+        pixels = (grid + 1) * grid.new_tensor(self.source._size("Warp")[::-1]) / 2 - 0.5
+        return (where.mapped & self.source.contains(pixels)).unsqueeze(1)
+
+    # -- where the images are sampled
+
+    def _sampling(self) -> Sampling:
+        """With a graph, where something learns, or else `_kept`."""
+        if self._pinned is None and torch.is_grad_enabled() and self._learns():
+            return self._with_scale(*tabulate(self.source, self.target, self.rotation))
+        return self._kept()
+
+    def _kept(self) -> Sampling:
+        """Without a graph, until something changes; or what is pinned."""
         if self._pinned is not None:
             return self._pinned
-        inputs = [t for t in self._inputs() if t is not None]
-        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            return self._with_scale(*self._positions(self.target.pixel_grid()))
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
         options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
-        return self._memo(inputs, options, lambda: self._with_scale(*self._tabulate()))
+        kept: Sampling = self._memo(self._inputs(), options, self._whole)
+        return kept
+
+    def _whole(self) -> Sampling:
+        if torch.compiler.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu:
+            return self._with_scale(*compiled.positions(self.source, self.target, self.rotation, self.tolerance))
+        return self._with_scale(*tabulate(self.source, self.target, self.rotation, self.tolerance))
+
+    def _strip(self, rows: range) -> Sampling:
+        """Of some rows of the target."""
+        around = rows
+        if self.antialias:  # the scale is that between neighbours
+            around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
+        where = self._with_scale(*tabulate(self.source, self.target, self.rotation, self.tolerance, around))
+        here = slice(rows.start - around.start, rows.stop - around.start)
+        return Sampling(*(t if t is None else t[:, here] for t in where))
+
+    def _rows(self, count: int | None) -> Iterator[range]:
+        height, width = self.target._size("Warp")
+        step = count or max(_STRIP // (max(math.prod(self.batch_shape), 1) * width), 1)
+        return (range(top, min(top + step, height)) for top in range(0, height, step))
+
+    def _is_long(self) -> bool:
+        """Whether the grid is not to be made at once, nor kept."""
+        long = math.prod((*self.batch_shape, *self.target._size("Warp"))) > _MOST_KEPT
+        tensors = self._inputs()
+        return (
+            long and self._pinned is None and not in_transform() and all(t.is_cpu and is_concrete(t) for t in tensors)
+        )
 
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
@@ -187,47 +318,16 @@ class Warp(GeometryModule):
             self._pinned = self._sampling()
         return self
 
-    def _with_scale(self, grid: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        size = self.source.image_size
-        return grid, mapped, minify.local_scale(grid.detach(), mapped, size) if self.antialias else None
+    def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
+        size = self.source._size("Warp")
+        return Sampling(grid, mapped, local_scale(grid.detach(), mapped, size) if self.antialias else None)
 
-    def _inputs(self) -> tuple[Tensor | None, ...]:
+    def _inputs(self) -> list[Tensor]:
         s, t = self.source, self.target
-        return s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation
+        return [p for p in (s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation) if p is not None]
 
-    def _tabulate(self) -> tuple[Tensor, Tensor]:
-        """`_positions` of all pixels."""
-        pixels = self.target.pixel_grid()
-        if torch.compiler.is_compiling() and self.tolerance and pixels.is_cpu:
-            return compiled.positions(self)
-        if in_transform() or not is_concrete(pixels):
-            return self._positions(pixels)
-        if self.tolerance and pixels.is_cpu:
-            sizes = self.target.image_size, self.source.image_size
-            found = on_lattice(self._positions, *sizes, self.tolerance, pixels)
-            if found is not None:
-                return found
-        return in_strips(self._positions, pixels, math.prod(self.batch_shape))
-
-    def _positions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `positions.Exact`."""
-        if pixels.ndim == 3:
-            pixels = pixels.expand(*self.target.batch_shape, *pixels.shape)
-        rays, has_ray = self.target.unproject(pixels)
-        if rays.ndim == 3:
-            rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-        rotation = None if self.rotation is None else self.rotation.mT
-        seen, mapped = self.source.project(turn(rotation, rays, "rays"))
-        mapped = mapped & has_ray
-        position = torch.stack(
-            [
-                (plane * (2 / size) + (1 / size - 1)).clamp(-_FAR, _FAR)
-                for plane, size in zip(seen.unbind(-1), self.source.image_size[::-1], strict=True)
-            ]
-        )
-        if not (may_look(mapped) and bool(mapped.all())):
-            position = torch.where(mapped, position, OUTSIDE)
-        return position.movedim(0, -1), mapped
+    def _learns(self) -> bool:
+        return any(t.requires_grad for t in self._inputs())
 
     # -- labels
 
@@ -285,11 +385,17 @@ class Warp(GeometryModule):
         return Warp(self.target, self.source, rotation, **self.options)
 
     @property
-    def options(self) -> dict:
+    def options(self) -> Options:
         """What another Warp takes to sample in the same way."""
-        return {name: getattr(self, name) for name in ("mode", "padding_mode", "fill", "antialias", "tolerance")}
+        return {
+            "mode": self.mode,
+            "padding_mode": self.padding_mode,
+            "fill": self.fill,
+            "antialias": self.antialias,
+            "tolerance": self.tolerance,
+        }
 
-    def __getstate__(self):
+    def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_pinned": None}
 
     def extra_repr(self) -> str:

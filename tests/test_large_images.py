@@ -1,0 +1,126 @@
+"""Laws of large images and narrow dtypes: strips, tiles and parts change nothing, and memory stays bounded."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.warp import sampling, warp
+
+SIZE = (90, 120)
+
+
+def pair(rotation=(30.0, 10.0, 25.0)):
+    """From a lens to a wide target that looks aside: part of it is off the image, part has no ray."""
+    source = ct.KannalaBrandt([60.0, 61, 58, 44], [0.02, -0.01, 0.004, -0.001], image_size=SIZE).requires_grad_(False)
+    target = ct.Equirectangular([22.0, 22, 49.5, 34.5], image_size=(70, 100)).requires_grad_(False)
+    return source, target, ct.augment.mount_rotation(*(torch.tensor(angle) for angle in rotation))
+
+
+def images(dtype, count=1):
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(256, (count, 3, *SIZE), generator=generator).to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.int32])
+@pytest.mark.parametrize("mode", ["nearest", "bilinear", "bicubic"])
+@pytest.mark.parametrize("padding_mode", ["zeros", "border", "reflection"])
+def test_tiles_of_a_large_image_change_nothing(dtype, mode, padding_mode, monkeypatch):
+    for options in ({}, {"fill": (9, 8, 7)}, {"antialias": True}):
+        one = ct.Warp(*pair(), mode=mode, padding_mode=padding_mode, **options)
+        given = images(dtype, 2)
+        expected = one(given.double())
+        if dtype == torch.uint8:
+            expected = expected.clamp(0, 255)
+        monkeypatch.setattr(sampling, "_LARGE", 100)
+        monkeypatch.setattr(sampling, "_TILE", 32)
+        result = one(given)
+        monkeypatch.undo()
+        assert result.dtype == dtype
+        difference = (result.double() - expected).abs()
+        # rounded are the positions, and integers; at a tie the nearest is another neighbour
+        rounding = 0.15 if dtype.is_floating_point else 0.51
+        assert (difference > rounding).double().mean() < (1e-3 if mode == "nearest" else 1e-5)
+
+
+@pytest.mark.parametrize("rows", [1, 7, 16, 1000, None])
+@pytest.mark.parametrize("antialias", [False, True])
+def test_strips_are_the_rows_of_the_whole(rows, antialias):
+    one = ct.Warp(*pair(), antialias=antialias, fill=3.0)
+    for given in (images(torch.uint8, 2), images(torch.float32)):
+        strips = list(one.strips(given, rows=rows))
+        assert [part.stop for part, _, _ in strips][-1] == 70
+        assert [part.start for part, _, _ in strips] == [0, *(part.stop for part, _, _ in strips)][:-1]
+        assert torch.equal(torch.cat([part for _, part, _ in strips], 2), one(given))
+        assert torch.equal(torch.cat([valid for _, _, valid in strips], 2), one.valid_mask())
+
+
+def test_strips_of_a_batch_of_cameras_and_of_one_image():
+    source, target, _ = pair()
+    turned = torch.stack([ct.augment.mount_rotation(*(torch.tensor(a) for a in (yaw, 0.0, 5.0))) for yaw in (0.0, 40)])
+    one = ct.Warp(source, target, turned)
+    strips = list(one.strips(images(torch.uint8), rows=20))
+    assert torch.equal(torch.cat([part for _, part, _ in strips], 2), one(images(torch.uint8)))
+    assert strips[0][2].shape == (2, 1, 20, 100)
+
+
+def test_long_grids_are_neither_made_at_once_nor_kept(monkeypatch):
+    one = ct.Warp(*pair(), fill=2.0)
+    given = images(torch.uint8)
+    expected, mask = one(given), one.valid_mask()
+    monkeypatch.setattr(warp, "_MOST_KEPT", 1000)
+    monkeypatch.setattr(warp, "_STRIP", 1000)
+    long = ct.Warp(*pair(), fill=2.0)
+    assert torch.equal(long(given), expected)
+    assert torch.equal(long.valid_mask(), mask)
+    assert long._memo._kept is None
+    differentiable = given.double().requires_grad_()
+    long(differentiable).sum().backward()
+    assert differentiable.grad.abs().sum() > 0
+
+
+def test_strips_have_no_graph_and_name_what_is_wrong():
+    source, target, _ = pair()
+    learning = ct.KannalaBrandt(source.intrinsics, source.distortion, image_size=SIZE)
+    learning.requires_grad_(True)
+    for _, part, _ in ct.Warp(learning, target).strips(images(torch.float32).requires_grad_(), rows=32):
+        assert part.grad_fn is None
+    with pytest.raises(ValueError, match="rows must be at least 1; got 0"):
+        ct.Warp(source, target).strips(images(torch.uint8), rows=0)
+    with pytest.raises(ValueError, match=r"\(B, C, H, W\)"):
+        ct.Warp(source, target).strips(images(torch.uint8)[0])
+
+
+_PEAK = """
+import resource, torch, camtorch as ct
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+size = (3000, 4000)
+camera = ct.BrownConrady([3000.0, 3000, 2000, 1500], [-0.3, 0.1, 0.001, 0.001, 0.0], image_size=size)
+small = ct.Dewarp(camera.resize(60, 80).requires_grad_(False), {options})
+small(torch.zeros(1, 3, 60, 80, dtype=torch.uint8))
+images = torch.zeros({count}, *size, 3, dtype=torch.uint8).permute(0, 3, 1, 2)
+warp = ct.Dewarp(camera.requires_grad_(False), {options})
+before = peak()
+{act}
+print(peak() - before)
+"""
+
+
+@pytest.mark.parametrize(
+    ("act", "options", "count", "bound"),
+    [
+        ("for _ in warp.strips(images, rows=64): pass", "tolerance=0.01", 1, 60),
+        ("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60),
+        # the result, the grid (96 MB, in float32), and what is made of one image
+        ("warp(images)", "fill=3, tolerance=0.01", 4, 4 * 36 + 96 + 150),
+        ("warp(images)", "antialias=True, tolerance=0.01", 4, 4 * 36 + 96 + 48 + 400),
+    ],
+)
+def test_memory_beyond_the_images(act, options, count, bound):
+    """In megabytes; a copy in float32 of the 36 MB of an image takes 144."""
+    script = _PEAK.format(act=act, options=options, count=count)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert float(done.stdout) < bound
