@@ -31,6 +31,8 @@ class RadialFactor:
     """That of the class in `FACTORS`."""
     parameters: tuple[Tensor, ...]
     """What the formula learns, in the order in which `vjp` gives the cotangents."""
+    fold: Tensor | None = None
+    """The radius at which the orientation is lost, a column, where the factor knows it; else it is looked for."""
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
@@ -201,28 +203,27 @@ class RadiusTable(RadialFactor):
     """
 
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
-        """nodes: ascending radii. values: r at the nodes, as many, two at least."""
+        """nodes: ascending radii. values: r at the nodes, as many, two at least.
+
+        fold: the node up to which r ascends.
+        """
         zero = torch.zeros_like(values[0])
         self.nodes, self.end = (zero, *nodes[:-1]), nodes[-1]
         nodes, values = (torch.stack(torch.broadcast_tensors(zero, *w), -1) for w in (nodes, values))
         steps = nodes.diff(dim=-1)
         secants = values.diff(dim=-1) / steps
+        # the filter sees to it that r ascends wherever the table does
+        ascends = (secants.detach() > 0).long().cumprod(-1).sum(-1, keepdim=True)
+        self.fold = nodes.detach().gather(-1, ascends).squeeze(-1)
         slopes = _slopes(steps, secants)
         before, after = slopes[..., :-1], slopes[..., 1:]
         squares = (3 * secants - 2 * before - after) / steps
         # of the first piece it is zero, unless the filter was at work; not rounding, which the axis divides by zero
         first = (squares * steps).abs() < 64 * torch.finfo(steps.dtype).eps * secants.abs()
-        start = nodes[..., :-1]
-        squares = torch.where(first & (start == 0), 0.0, squares)
+        squares = torch.where(first & (nodes[..., :-1] == 0), 0.0, squares)
         cubes = (before + after - 2 * secants) / (steps * steps)
-        # by powers of the radius itself: on the first piece the factor is a polynomial of t
-        cubics = (
-            values[..., :-1] - start * (before - start * (squares - start * cubes)),
-            before - start * (2 * squares - 3 * start * cubes),
-            squares - 3 * start * cubes,
-            cubes,
-        )
-        self.cubics = tuple(power.unbind(-1) for power in cubics)
+        # by powers of the distance from the node: those of the radius itself would cancel, the more the finer the table
+        self.cubics = tuple(power.unbind(-1) for power in (values[..., :-1], before, squares, cubes))
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
@@ -233,37 +234,39 @@ class RadiusTable(RadialFactor):
         return self.derivatives(t, 0)[0]
 
     def _at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The radius, whether it lies behind the end, where it is mirrored to, its piece."""
+        """The radius, whether it lies behind the end, its piece, how far from the piece's node it is mirrored to."""
         radius = root(t)
         behind = radius > self.end
         place = torch.where(behind, (2 * self.end - radius).clamp(min=0), radius)
-        return radius, behind, place, _piece(self.nodes[1:], place)
+        piece = _piece(self.nodes[1:], place)
+        return radius, behind, piece, place - _pick(self.nodes, piece)
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
         """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
-        radius, behind, place, piece = self._at(t)
+        radius, behind, piece, offset = self._at(t)
         zeroth, first, second, third = (_pick(power, piece) for power in self.cubics)
-        # before the end neither division nor root has a part in the derivatives of the outer terms
-        share, square = torch.where(behind, place / radius, 1.0), torch.where(behind, place * place, t)
-        factor = zeroth / radius + share * (first + place * second + square * third)
+        # on the first piece neither division nor root has a part in the derivatives of the outer terms
+        central = (piece == 0) & ~behind
+        share, square = torch.where(central, 1.0, offset / radius), torch.where(central, t, offset * offset)
+        factor = zeroth / radius + share * (first + offset * second + square * third)
         if not order:
             return (factor,)
         orientation = torch.where(behind, -1.0, 1.0)
-        by_radius = (orientation * (first + 2 * place * second + 3 * square * third) - factor) / radius
+        by_radius = (orientation * (first + 2 * offset * second + 3 * square * third) - factor) / radius
         slope = by_radius / (2 * radius)
         if order == 1:
             return factor, slope
-        twice = (2 * second + 6 * place * third - 2 * by_radius) / radius
+        twice = (2 * second + 6 * offset * third - 2 * by_radius) / radius
         return factor, slope, (twice - 2 * slope) / (4 * radius * radius)
 
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
-        radius, _, place, piece = self._at(t)
+        radius, _, piece, offset = self._at(t)
         weight, sums = weight / radius, []
         for _ in self.cubics:
             table = weight.new_zeros(*weight.shape[:-1], len(self.nodes)).scatter_add(-1, piece, weight)
             sums += table.split(1, -1)
-            weight = weight * place
+            weight = weight * offset
         return sums
 
 

@@ -72,6 +72,10 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
     most: the largest image that is a number to calculate with.
     """
 
+    known = radial.fold
+    if known is not None:
+        return known.clamp(max=end)
+
     def orientation(radius: Tensor) -> Tensor:
         found, image = radial.orientation(radius), radius * radial(radius * radius)
         return torch.where(image < most, found, -1.0)
