@@ -31,8 +31,6 @@ class RadialFactor:
     """That of the class in `FACTORS`."""
     parameters: tuple[Tensor, ...]
     """What the formula learns, in the order in which `vjp` gives the cotangents."""
-    fold: Tensor | None = None
-    """The radius at which the orientation is lost, a column, where the factor knows it; else it is looked for."""
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
@@ -52,6 +50,12 @@ class RadialFactor:
 
     def margin(self, t: Tensor) -> Tensor | None:
         """Positive where the factor is defined; None where it is so everywhere."""
+        return None
+
+    @property
+    def fold(self) -> Tensor | None:
+        """The radius at which the orientation is lost, in the shape of a parameter; None where it is to be looked for.
+        """
         return None
 
     def orientation(self, radius: Tensor) -> Tensor:
@@ -203,18 +207,13 @@ class RadiusTable(RadialFactor):
     """
 
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
-        """nodes: ascending radii. values: r at the nodes, as many, two at least.
-
-        fold: the node up to which r ascends.
-        """
+        """nodes: ascending radii. values: r at the nodes, as many, two at least."""
         zero = torch.zeros_like(values[0])
         self.nodes, self.end = (zero, *nodes[:-1]), nodes[-1]
         nodes, values = (torch.stack(torch.broadcast_tensors(zero, *w), -1) for w in (nodes, values))
         steps = nodes.diff(dim=-1)
         secants = values.diff(dim=-1) / steps
-        # the filter sees to it that r ascends wherever the table does
-        ascends = (secants.detach() > 0).long().cumprod(-1).sum(-1, keepdim=True)
-        self.fold = nodes.detach().gather(-1, ascends).squeeze(-1)
+        self._table = nodes, secants
         slopes = _slopes(steps, secants)
         before, after = slopes[..., :-1], slopes[..., 1:]
         squares = (3 * secants - 2 * before - after) / steps
@@ -229,6 +228,13 @@ class RadiusTable(RadialFactor):
     def parameters(self) -> tuple[Tensor, ...]:
         """The four coefficients of every piece, by powers."""
         return tuple(c for power in self.cubics for c in power)
+
+    @property
+    def fold(self) -> Tensor:
+        """The first node that r does not ascend from, or the last one."""
+        # the filter sees to it that r ascends wherever the table does
+        nodes, secants = self._table
+        return nodes.gather(-1, (secants > 0).long().cumprod(-1).sum(-1, keepdim=True)).squeeze(-1)
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]

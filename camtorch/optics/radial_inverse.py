@@ -1,4 +1,4 @@
-"""The inverse of a radial factor: where it folds, a table to start from, Newton's method, and bisection at last."""
+"""The inverse of a radial factor: where it folds, a table to start from, Newton's method, and a bracket at last."""
 
 from __future__ import annotations
 
@@ -72,9 +72,8 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
     most: the largest image that is a number to calculate with.
     """
 
-    known = radial.fold
-    if known is not None:
-        return known.clamp(max=end)
+    if radial.fold is not None:
+        return radial.fold.clamp(max=end)
 
     def orientation(radius: Tensor) -> Tensor:
         found, image = radial.orientation(radius), radius * radial(radius * radius)
@@ -188,6 +187,8 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
+        if count > _STEPS[r2.dtype]:  # what is settled stays, whatever else is in its batch
+            step = torch.where(settled > 0, 0.0, step)
         scale = scale + step
         settled = short(scale.dtype) * scale - step.abs()
         if count >= _STEPS[r2.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
@@ -195,16 +196,33 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
     return scale, settled
 
 
-def bisect(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
-    """The factor of `solve` of single points (M,), each with its own coefficients and its own fold."""
-    wanted = r2.sqrt()
-    low, high = torch.zeros_like(wanted), inner2.sqrt()
-    for _ in range(2 * -int(math.log2(torch.finfo(r2.dtype).eps))):
-        middle = (low + high) / 2
-        lower = middle * radial(middle * middle) < wanted
-        low, high = torch.where(lower, middle, low), torch.where(lower, high, middle)
-    # on the axis itself nothing is left open
-    return high / wanted.clamp(min=torch.finfo(r2.dtype).tiny)
+def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
+    """The factor of `solve` of single points (M,), each with its own coefficients and its own fold.
+
+    Steps of Cauchy's method, to the root of the local parabola: of third order, and at the fold too, where Newton's
+    method crawls. They stay in a bracket that every other step halves, so that no kink holds them up.
+    """
+    eps = torch.finfo(r2.dtype).eps
+    wanted, low, high = r2.sqrt(), torch.zeros_like(r2), inner2.sqrt().expand_as(r2)
+    rho = torch.minimum(wanted, high)
+    width, moves = high, torch.ones_like(rho, dtype=torch.bool)
+    for count in range(-4 * int(math.log2(eps))):
+        t = rho * rho
+        value, first, second = radial.derivatives(t, 2)
+        slope, bend = value + 2 * t * first, rho * (6 * first + 4 * t * second)
+        error = wanted - rho * value
+        low, high = torch.where(error > 0, rho, low), torch.where(error > 0, high, rho)
+        denominator = slope.abs() + (slope * slope + 2 * bend * error).clamp(min=0).sqrt()
+        ahead = rho + 2 * error / torch.where(denominator > 0, denominator, 1.0)
+        ahead = torch.minimum(torch.maximum(ahead, low), high)
+        moves = moves & ((ahead - rho).abs() > 2 * eps * rho)
+        if not bool(moves.any()):
+            break
+        if count % 2:
+            ahead = torch.where(high - low > width / 2, (low + high) / 2, ahead)
+            width = high - low
+        rho = torch.where(moves, ahead, rho)
+    return radial(rho * rho).reciprocal()
 
 
 class RadialInverse:
@@ -236,7 +254,7 @@ class RadialInverse:
     def __call__(self, r2: Tensor) -> Tensor:
         """The factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
         if self.of_points:
-            return bisect(self.radial, r2, self.inner2)
+            return bracketed(self.radial, r2, self.inner2)
         return _radial_scale(self.factor.name, self.k, self.end, r2.reshape(len(self.k), -1)).view_as(r2)
 
 
@@ -281,14 +299,14 @@ def _(info, in_dims, name, k, end):
 
 @torch.library.custom_op("camtorch::radial_scale", mutates_args=())
 def _radial_scale(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
-    """`solve` of coefficients (C, n) and squared radii (C, N), by bisection where Newton's method leaves it open."""
+    """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
     inner2, table = _kept_tables(name, k, end)
     scale, settled = solve(FACTORS[name](columns(k)), InverseTable(table), r2)
     camera, point = (~(settled > 0)).nonzero(as_tuple=True)
     if len(camera):
         # a single camera serves all points
         radial = FACTORS[name](k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT)
-        scale[camera, point] = bisect(radial, r2[camera, point], inner2[camera, 0])
+        scale[camera, point] = bracketed(radial, r2[camera, point], inner2[camera, 0])
     return scale
 
 

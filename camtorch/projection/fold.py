@@ -15,21 +15,21 @@ if TYPE_CHECKING:
     from camtorch.optics.radial import RadialFactor
 
 AZIMUTHS = 336  # no further apart than 1.4 degrees
-_RADII = 2048  # on one azimuth, which stands for all where the lens is radial
+_RADII = 2048  # to find the fold of the radial factor
 _SMOOTH, _BULGE = 0.02, 0.001
 _DIP = 65  # radii at which a dip between two nodes is looked at
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 
 
 class Azimuths:
-    """The lens of each camera on azimuths and radii of the chart's plane. Graph-free.
+    """The lens of each camera, one that is not radial, on azimuths and radii of the chart's plane. Graph-free.
 
     On each azimuth the orientation of the lens (positive where it is regular) is followed outwards. It is
     lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
     dips below zero between them. Up to there the orientation changes its sign once at the most, so that its
     value at the point itself tells exactly on which side of the fold the point lies.
 
-    A lens that is not radial mostly folds where its radial factor does: there its radii are dense.
+    Such a lens mostly folds where its radial factor does: there the radii are dense.
     """
 
     def __init__(self, chart: Chart, lens: Lens, like: Tensor):
@@ -37,12 +37,11 @@ class Azimuths:
         fine = chart.radii(_RADII, like)
         margin = lens.radial.margin(fine * fine) if lens.radial else None
         self.has_pole = None if margin is None else ~(margin > 0).all(-1)
-        self.count = 1 if lens.is_radial else AZIMUTHS
-        self.radii = fine if lens.is_radial else _around(lens.radial, chart, fine)
-        a, b = (c[:, None] * self.radii.unsqueeze(-2) for c in _directions(self.count, like))
+        self.radii = _around(lens.radial, chart, fine)
+        a, b = (c[:, None] * self.radii.unsqueeze(-2) for c in _directions(like))
         at = lens.at(a.flatten(-2), b.flatten(-2))
         x, y = at.value
-        shape = (self.count, self.radii.shape[-1])
+        shape = (AZIMUTHS, self.radii.shape[-1])
         lost = self._lost(lens, at.orientation.unflatten(-1, shape))
         self.limits = self._limits(lost)
         self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
@@ -51,7 +50,7 @@ class Azimuths:
         """(C, azimuths): `first_loss`, where dips between coarse nodes count only if a closer look finds them."""
         spared = torch.zeros_like(orientation, dtype=torch.bool)
         last = orientation.shape[-1] - 1
-        a, b = (c.unsqueeze(-1) for c in _directions(self.count, orientation))
+        a, b = (c.unsqueeze(-1) for c in _directions(orientation))
         steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
         while True:
             lost = first_loss(orientation, spared)
@@ -59,12 +58,9 @@ class Azimuths:
             assumed = (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
             if not bool(assumed.any()):
                 return lost
-            radius = _radius_at(self.radii.unsqueeze(-2), (node + steps).clamp(0, last).flatten(-2)).unflatten(
-                -1, (self.count, _DIP)
-            )
-            seen = lens.at((a * radius).flatten(-2), (b * radius).flatten(-2)).orientation.unflatten(
-                -1, (self.count, _DIP)
-            )
+            shape = (AZIMUTHS, _DIP)
+            radius = _radius_at(self.radii.unsqueeze(-2), (node + steps).clamp(0, last).flatten(-2)).unflatten(-1, shape)
+            seen = lens.at((a * radius).flatten(-2), (b * radius).flatten(-2)).orientation.unflatten(-1, shape)
             spared_now = assumed & (seen > 0).all(-1, keepdim=True)
             if not bool(spared_now.any()):
                 return lost
@@ -86,13 +82,12 @@ class Azimuths:
         # before a pole there is no end to it
         return furthest if self.has_pole is None else torch.where(self.has_pole, torch.inf, furthest)
 
-    def bracket(self, camera: Tensor, target: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The radii (M,) between which the lens of each point's camera reaches `target` on the azimuth of (a, b), and a
-        guess between them.
+    def start(self, camera: Tensor, target: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """The radius (M,) at which the lens of each point's camera nearly reaches `target` on the azimuth of (a, b).
 
         Looked for before the fold only: a target that is not reached ends up next to it.
         """
-        row = camera * self.count + azimuth(a, b, self.count, 0.5)
+        row = camera * AZIMUTHS + azimuth(a, b, 0.5)
         table = self.reach.flatten()
         size = self.radii.shape[-1]
         low = _last_not_above(table, row * size, size, target)
@@ -100,24 +95,24 @@ class Azimuths:
         # next to the fold only its inner side is safe to start from
         fraction = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
         radii, row = self.radii.flatten(), camera * size if self.radii.ndim > 1 else 0
-        lower, inner, upper = (radii[row + (low + i).clamp(max=size - 1)] for i in range(3))
-        return lower, lower + fraction.clamp(0, 1) * (inner - lower), upper
+        inner, outer = (radii[row + low + i] for i in range(2))
+        return inner + fraction.clamp(0, 1) * (outer - inner)
 
 
-def _directions(count: int, like: Tensor) -> tuple[Tensor, Tensor]:
+def _directions(like: Tensor) -> tuple[Tensor, Tensor]:
     """The unit vectors of the azimuths, in even steps along the rim of the diamond |a| + |b| = 1."""
-    turn = torch.arange(count, dtype=like.dtype, device=like.device) * (4 / count)
+    turn = torch.arange(AZIMUTHS, dtype=like.dtype, device=like.device) * (4 / AZIMUTHS)
     a, b = (turn - 2).abs() - 1, 1 - ((turn + 1).remainder(4) - 2).abs()
     length = torch.hypot(a, b)
     return a / length, b / length
 
 
-def azimuth(a: Tensor, b: Tensor, count: int = AZIMUTHS, offset: float = 0.0) -> Tensor:
+def azimuth(a: Tensor, b: Tensor, offset: float = 0.0) -> Tensor:
     """The index of the azimuth at or below that of the points; `offset` 0.5 gives the nearest one."""
     size = a.abs() + b.abs()
     across = b / torch.where(size > 0, size, 1.0)
     turn = torch.where(a < 0, 2 - across, across)
-    return (turn * (count / 4) + offset).floor().to(torch.int32).remainder(count)
+    return (turn * (AZIMUTHS / 4) + offset).floor().to(torch.int32).remainder(AZIMUTHS)
 
 
 def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch._tracing import may_look
 from camtorch.optics.charts import floor_of
-from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
+from camtorch.optics.radial_inverse import MOST_STEPS, bracketed, short, solve
 from camtorch.projection.domain import regular
 from camtorch.projection.fold import azimuth
 
@@ -22,7 +22,6 @@ Planes2 = tuple[Tensor, Tensor]
 # Steps of Newton's method that most points need, by whether they can be counted while they are made
 _STEPS = {torch.float32: 2, torch.float64: 3}
 
-_RADIAL_STEPS = 6  # of third order, from one interval of the table: 1e-2, 1e-6, 1e-18, with a reserve for wild lenses
 _START_ROUNDS = 6
 _CLOSE = 0.1
 _SLOWEST_TURN = 0.05
@@ -71,6 +70,8 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
         at = domain.lens.at(a, b)
         jacobian = at.jacobian
         da, db = newton_step(jacobian, u - at.value[0], v - at.value[1])
+        if count > _STEPS[u.dtype]:  # what is settled stays, whatever else is in its batch
+            da, db = torch.where(settled > 0, 0.0, da), torch.where(settled > 0, 0.0, db)
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
         settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
@@ -106,6 +107,8 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     camera: (M,) the index of each point's camera. Takes many steps, and finds what lies next to a fold as well.
     """
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
+    if domain.lens.is_radial:
+        return _Search(domain, camera)(u, v)
     (some,) = (torch.hypot(u, v) <= domain.azimuths.furthest()[camera]).nonzero(as_tuple=True)
     if len(some):
         a[some], b[some], found[some] = _Search(domain, camera[some])(u[some], v[some])
@@ -116,7 +119,7 @@ class _Search:
     """The lenses of single points (M,), and the inverse by bracketing and damped steps."""
 
     def __init__(self, domain: Domain, camera: Tensor):
-        self.domain, self.camera, self.azimuths = domain, camera, domain.azimuths
+        self.domain, self.camera = domain, camera
         self.chart, self.lens = domain.optics_of(camera)
 
     def __call__(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -151,25 +154,11 @@ class _Search:
         return inside | (before & (regular(self.lens, a, b) > 0))
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
-        """Steps of Cauchy's method inside a bracket.
-
-        They go to the root of the local parabola: of third order, and at the fold too, where Newton's method crawls.
-        """
-        target = (u * u + v * v).sqrt()
-        lower, rho, upper = self.azimuths.bracket(self.camera, target, u, v)
-        for _ in range(_RADIAL_STEPS):
-            t = rho * rho
-            value, first, second = self.lens.radial.derivatives(t, 2)
-            slope = value + 2 * t * first
-            bend = rho * (6 * first + 4 * t * second)
-            error = target - rho * value
-            denominator = slope.abs() + (slope * slope + 2 * bend * error).clamp(min=0).sqrt()
-            step = 2 * error / torch.where(denominator > 0, denominator, 1.0)
-            rho = torch.minimum(torch.maximum(rho + torch.where(slope < 0, -step, step), lower), upper)
+        """In a bracket up to the fold."""
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit
-        rho = torch.minimum(rho, self.domain.inner2[self.camera, 0].sqrt() * (1 - 32 * torch.finfo(u.dtype).eps))
-        scale = self.lens.radial(rho * rho)
-        return u / scale, v / scale
+        fold2 = self.domain.inner2[self.camera, 0] * (1 - 64 * torch.finfo(u.dtype).eps)
+        scale = bracketed(self.lens.radial, torch.addcmul(u * u, v, v), fold2)
+        return u * scale, v * scale
 
     def planar(self, u: Tensor, v: Tensor) -> Planes2:
         """Newton's method; the few that need many steps go on by themselves."""
@@ -217,15 +206,17 @@ class _Search:
         """
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
         a, b, best = torch.zeros_like(u), torch.zeros_like(v), target * target
+        close = torch.zeros_like(u, dtype=torch.bool)
         angle, step, last_off = wanted, torch.zeros_like(u), torch.zeros_like(u)
         for _ in range(_START_ROUNDS):
             c, s = torch.cos(angle), torch.sin(angle)
-            rho = self.azimuths.bracket(self.camera, target, c, s)[1]
+            rho = self.domain.azimuths.start(self.camera, target, c, s)
             x, y = self.lens(rho * c, rho * s)
             error = (u - x) ** 2 + (v - y) ** 2
-            better = error < best
+            better = (error < best) & ~close  # what is close stays, whatever else is in its batch
             a, b, best = (torch.where(better, n, o) for n, o in ((rho * c, a), (rho * s, b), (error, best)))
-            if bool((best <= _CLOSE**2 * target * target).all()):
+            close = best <= _CLOSE**2 * target * target
+            if bool(close.all()):
                 break
             off = torch.atan2(x * v - y * u, x * u + y * v)
             slope = torch.where(step != 0, (last_off - off) / torch.where(step != 0, step, 1.0), 1.0)
