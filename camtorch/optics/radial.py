@@ -184,13 +184,18 @@ class AnglePerRadius(RadialFactor):
         return angle_per_radius(t, self.ahead(t))
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """The factor and, for order 1, its derivative by t; at the centre finite, for what is multiplied by t."""
-        ahead, *slope = self.ahead.derivatives(t, order)
+        """The factor and its first `order` derivatives by t; at the centre finite, for what is multiplied by t."""
+        ahead, *bends = self.ahead.derivatives(t, order)
         factor = angle_per_radius(t, ahead, 1)
         if not order:
             return (factor,)
-        by_radius = torch.addcmul(ahead, t, slope[0], value=-2) / torch.addcmul(t, ahead, ahead)
-        return factor, (by_radius - factor) / (2 * t + torch.finfo(t.dtype).tiny ** 0.5)
+        square, twice = torch.addcmul(t, ahead, ahead), 2 * t + torch.finfo(t.dtype).tiny ** 0.5
+        by_radius = torch.addcmul(ahead, t, bends[0], value=-2) / square
+        slope = (by_radius - factor) / twice
+        if order == 1:
+            return factor, slope
+        by_radius = (-bends[0] - 2 * t * bends[1] - by_radius * (1 + 2 * ahead * bends[0])) / square
+        return factor, slope, (by_radius - 3 * slope) / twice
 
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
