@@ -54,8 +54,7 @@ class RadialFactor:
 
     @property
     def fold(self) -> Tensor | None:
-        """The radius at which the orientation is lost, in the shape of a parameter; None where it is to be looked for.
-        """
+        """The radius at which the orientation is lost, in the shape of a parameter; None if it is to be looked for."""
         return None
 
     def orientation(self, radius: Tensor) -> Tensor:

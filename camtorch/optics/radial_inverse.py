@@ -71,7 +71,6 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
     radii: (RADII,) ascending, at which it is followed from the centre outwards.
     most: the largest image that is a number to calculate with.
     """
-
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
 
@@ -182,17 +181,18 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
     Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
     positive where the last step was so short that the next one would be nothing.
     """
-    scale = table(r2)
+    scale, settled = table(r2), None
     for count in range(1, MOST_STEPS + 1):
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
-        if count > _STEPS[r2.dtype]:  # what is settled stays, whatever else is in its batch
+        if settled is not None:  # what is settled stays, whatever else is in its batch
             step = torch.where(settled > 0, 0.0, step)
         scale = scale + step
-        settled = short(scale.dtype) * scale - step.abs()
-        if count >= _STEPS[r2.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
-            break
+        if count >= _STEPS[r2.dtype]:
+            settled = short(scale.dtype) * scale - step.abs()
+            if not may_look(settled) or bool(settled.amin() > 0):
+                break
     return scale, settled
 
 

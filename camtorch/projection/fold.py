@@ -59,7 +59,8 @@ class Azimuths:
             if not bool(assumed.any()):
                 return lost
             shape = (AZIMUTHS, _DIP)
-            radius = _radius_at(self.radii.unsqueeze(-2), (node + steps).clamp(0, last).flatten(-2)).unflatten(-1, shape)
+            closer = (node + steps).clamp(0, last).flatten(-2)
+            radius = _radius_at(self.radii.unsqueeze(-2), closer).unflatten(-1, shape)
             seen = lens.at((a * radius).flatten(-2), (b * radius).flatten(-2)).orientation.unflatten(-1, shape)
             spared_now = assumed & (seen > 0).all(-1, keepdim=True)
             if not bool(spared_now.any()):

@@ -65,18 +65,19 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
         # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
-    short2 = short(u.dtype) ** 2
+    short2, settled = short(u.dtype) ** 2, None
     for count in range(1, MOST_STEPS + 1):
         at = domain.lens.at(a, b)
         jacobian = at.jacobian
         da, db = newton_step(jacobian, u - at.value[0], v - at.value[1])
-        if count > _STEPS[u.dtype]:  # what is settled stays, whatever else is in its batch
+        if settled is not None:  # what is settled stays, whatever else is in its batch
             da, db = torch.where(settled > 0, 0.0, da), torch.where(settled > 0, 0.0, db)
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
-        settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
-        if count >= _STEPS[u.dtype] and (not may_look(settled) or bool(settled.amin() > 0)):
-            break
+        if count >= _STEPS[u.dtype]:
+            settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
+            if not may_look(settled) or bool(settled.amin() > 0):
+                break
     # further out than images reach a determinant may overflow, and a step seem short
     inside = domain.inner2.clamp(max=domain.chart.usual_end(u.dtype) ** 2) - t
     solved = torch.minimum(torch.minimum(settled, inside), _reciprocal(jacobian).abs())
