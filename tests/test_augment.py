@@ -13,6 +13,9 @@ from cameras import KEYS, PAIRS, spread
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
 
+# wide lenses for narrow images, on purpose
+pytestmark = pytest.mark.filterwarnings("ignore:.*will show nothing")
+
 SIZE = (240, 320)
 
 
@@ -163,7 +166,7 @@ def sample(count=3, camera=None):
         return torch.rand(*shape, generator=generator)
 
     pose = torch.eye(4).repeat(count, 1, 1)
-    pose[:, :3, :3] = ct.Extrinsics(rand(count, 3), torch.zeros(3)).matrix()[:, :3, :3].detach()
+    pose[:, :3, :3] = ct.Extrinsics(rand(count, 3), torch.zeros(count, 3)).matrix()[:, :3, :3].detach()
     pose[:, :3, 3] = rand(count, 3) + torch.tensor([-0.5, -0.5, 1.0])
     return {
         "image": rand(count, 3, 60, 80),

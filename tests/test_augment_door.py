@@ -40,8 +40,28 @@ def test_options(options, text):
         RandomMount(**options)
 
 
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: RandomCamera(prest="dms130"), "RandomCamera: unknown keyword 'prest'; did you mean 'like'?"),
+        (lambda: RandomCamera(crops=0.9), "RandomCamera: unknown keyword 'crops'; did you mean 'crop'?"),
+        (lambda: RandomMount(rol=20), "RandomMount: unknown keyword 'rol'; did you mean 'roll'?"),
+        (lambda: RandomLens(distorsion=0.1), "RandomLens: unknown keyword 'distorsion'; did you mean 'distortion'?"),
+        (lambda: RandomLens(min_fill=0.9), "RandomLens: unknown keyword 'min_fill'; did you mean 'min_filled'?"),
+        (lambda: RandomLens(xyz=1), "RandomLens: unknown keyword 'xyz'; known are like, fov, focal, .*min_filled"),
+        (lambda: RandomMount(focal=(0.9, 1.1)), "RandomMount: there is no focal here; RandomCamera has it"),
+        (lambda: RandomLens(yaw=5), "RandomLens: there is no yaw here; RandomCamera has it"),
+    ],
+)
+def test_keywords_that_do_not_exist(make, text):
+    with pytest.raises(TypeError, match=text.replace("?", r"\?")):
+        make()
+
+
 def test_lenses(camera):
     with pytest.raises(ValueError, match=f"preset \\({', '.join(PRESETS)}\\) or a model .*; got 'dms13'"):
+        RandomCamera("dms13")
+    with pytest.raises(ValueError, match=r"got 'dms13'. Did you mean 'dms130'\?"):
         RandomCamera("dms13")
     with pytest.raises(ValueError, match="says nothing of the field of view; give fov="):
         RandomLens("kannala_brandt")

@@ -3,8 +3,8 @@
 `camtorch.augment.kornia`, `.torchvision` and `.numpy` are the same for those libraries' pipelines.
 """
 
-from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change
+from camtorch.augment.augmentation import Augmentation, Range
+from camtorch.augment.change import Change, camera_like
 from camtorch.augment.collate import collate
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.presets import PRESETS, Preset
@@ -22,6 +22,8 @@ __all__ = [
     "RandomCamera",
     "RandomLens",
     "RandomMount",
+    "Range",
+    "camera_like",
     "collate",
     "from_pitch_yaw",
     "mount_rotation",

@@ -1,29 +1,46 @@
-"""Sample in, sample out: what every augmentation does with the fields of a sample."""
+"""What all random augmentations are: ranges to draw from, and a change of cameras that moves a whole sample."""
 
 from __future__ import annotations
 
+import difflib
+import inspect
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import as_whole
-from camtorch._tracing import may_look
-from camtorch.augment.change import Change, Part, alone, expanded, joined, kind, rows_of
+from camtorch._tracing import is_concrete, may_look
+from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, kind, rows_of
+from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.warp.sampling import as_options
+from camtorch.warp.warp import Warp
+
+_FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
+_TRIES = 16
 
 
 @dataclass(frozen=True)
 class Range:
-    """Even chances between two numbers; `size` of them for each sample, or one."""
+    """Even chances between two numbers; `size` of them for each sample, or one.
+
+    Raises:
+        ValueError: NaN, infinity, or the wrong order.
+    """
 
     low: float
     high: float
     size: int | None = None
+
+    def __post_init__(self) -> None:
+        if not -math.inf < self.low <= self.high < math.inf:
+            raise ValueError(f"Range: low and high must be finite, with low <= high; got {self.low!r}, {self.high!r}")
 
     @property
     def middle(self) -> float:
@@ -35,7 +52,7 @@ class Range:
 
 
 def as_range(
-    value,
+    value: object,
     name: str,
     owner: str,
     *,
@@ -50,10 +67,10 @@ def as_range(
         TypeError: neither a number nor two. ValueError: NaN, the wrong order, or outside of [least, most].
     """
     try:
-        pair = (
-            tuple(map(float, value)) if isinstance(value, Iterable) else (around - float(value), around + float(value))
-        )
-        low, high = pair
+        if isinstance(value, Iterable):
+            low, high = map(float, value)
+        else:
+            low, high = around - float(value), around + float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise TypeError(f"{owner}: {name} must be a range (low, high) or a number; got {value!r}") from None
     if not (math.isfinite(low) and math.isfinite(high)):
@@ -73,14 +90,15 @@ def draw(
     The numbers come in the order in which kornia asks for them: first the gate, if there is a choice, then the ranges.
     """
     rows = min(count, 1) if same else count
-    like = {"generator": generator, "device": generator.device if generator is not None else "cpu"}
-    values = {
-        "apply": torch.rand(rows, **like) < p if 0 < p < 1 else torch.full((rows,), p >= 1, device=like["device"])
-    }
+    device = generator.device if generator is not None else torch.device("cpu")
+    if 0 < p < 1:
+        values = {"apply": torch.rand(rows, generator=generator, device=device) < p}
+    else:
+        values = {"apply": torch.full((rows,), p >= 1, device=device)}
     for name, interval in ranges.items():
         shape = (rows,) if interval.size is None else (rows, interval.size)
         # in float64, so that what is drawn is what every precision sees
-        share = torch.rand(shape, dtype=torch.float64, **like)
+        share = torch.rand(shape, generator=generator, dtype=torch.float64, device=device)
         values[name] = interval.low + (interval.high - interval.low) * share
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
 
@@ -110,15 +128,50 @@ class Augmentation(SampleTransform):
     Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere would not be exact:
     near things shift against far ones, which no warp of an image can do, so no augmentation does it.
 
-    Gradients go to images, labels and a camera that learns; what a lens is jittered by counts as given.
+    Gradients go to images, labels and a camera that learns; what a lens is jittered by counts as given, and so does
+    what it is zoomed by for `min_filled`.
+
+    **One's own augmentation** is a subclass that names the ranges it draws from, and writes `new_camera`: the camera
+    after the change, and how far it is turned. All fields, front ends, replays and options then come by themselves:
+
+        class Nearer(ct.augment.Augmentation):
+            def __init__(self, zoom=(1.0, 2.0), **options):
+                super().__init__({"zoom": ct.augment.Range(*zoom)}, **options)
+
+            def new_camera(self, source, values):
+                one = torch.ones_like(values["zoom"])
+                scale = torch.stack((values["zoom"], values["zoom"], one, one), -1)
+                intrinsics = source.intrinsics * scale
+                return ct.augment.camera_like(source, intrinsics, source.distortion, source.image_size), None
+
+    Args:
+        ranges: name -> `Range`, in the order in which they are drawn.
+        camera: of samples that do not bring one.
+        p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
+        fields: name -> kind, for fields of other names; "keep" leaves one as it is.
+        mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
+        mask_fill: the value of masks where nothing is seen.
+        valid_mask: whether `image_valid` (B, 1, H, W) comes out: where the image shows something.
+        min_filled: the part of every new image, from 0 to 1, that has to show something of the old one. As far as it
+            takes, the new camera zooms, and where four times are not enough it turns less far. This follows from the
+            camera and the draw, and so does a replay. A warning tells once if a source cannot fill so much. None
+            leaves images as they are drawn, and warns once where more than a third of them is going to be empty; so
+            does 0, without a word.
+
+    Raises:
+        ValueError: a p or a min_filled outside of [0, 1], an unknown kind of field or way to sample.
+        TypeError: an unknown keyword, or a camera that is none.
     """
 
     ranges: dict[str, Range]
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
+    other_words: ClassVar[Mapping[str, str]] = {}
+    """Words that people try as keywords -> the keyword, for the hint of an error."""
 
     def __init__(
         self,
+        ranges: Mapping[str, Range] | None = None,
         *,
         camera: Camera | None = None,
         p: float = 1.0,
@@ -131,15 +184,55 @@ class Augmentation(SampleTransform):
         valid_mask: bool = False,
         antialias: bool = False,
         tolerance: float = 0.001,
+        min_filled: float | None = None,
+        **unknown: object,
     ):
         super().__init__(camera, fields, mask_fill, valid_mask)
+        for name in unknown:
+            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
         if not 0 <= p <= 1:
             raise ValueError(f"{self._name}: p must be a probability in [0, 1]; got {p!r}")
+        if min_filled is not None and not 0 <= min_filled <= 1:
+            raise ValueError(f"{self._name}: min_filled must be a part in [0, 1], or None; got {min_filled!r}")
         self.p, self.same_on_batch = float(p), bool(same_on_batch)
         self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
-        self.ranges = {}
+        self.ranges = dict(ranges or {})
+        self.min_filled = None if min_filled is None else float(min_filled)
+        self._warned = False
         self.last: Change | None = None
         """The change of the last call: its `source`, `target` and `rotation`."""
+
+    @classmethod
+    def _meant(cls, word: str) -> str:
+        """The keyword that somebody may have meant."""
+        known = [
+            parameter.name
+            for owner in cls.__mro__
+            if "__init__" in vars(owner) and issubclass(owner, Augmentation)
+            for parameter in inspect.signature(vars(owner)["__init__"]).parameters.values()
+            if parameter.kind is not parameter.VAR_KEYWORD and parameter.name != "self"
+        ]
+        close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
+        return (
+            f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
+            if close
+            else f"; known are {', '.join(known)}"
+        )
+
+    # -- what a subclass writes
+
+    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+        """The camera after the change, with an image_size, and the rotation, `ray_after = R ray_before`, or None.
+
+        Args:
+            source: the camera before, with an image_size; without batch dims, or with those of the values.
+            values: what was drawn from each range, (*B,) or (*B, size), of the source's dtype and on its device. *B is
+                one dim, or none where one camera serves all samples.
+
+        Returns:
+            A camera without batch dims or of *B, made for example by `camera_like`, and (3, 3) or (*B, 3, 3).
+        """
+        raise NotImplementedError
 
     # -- drawing
 
@@ -214,7 +307,6 @@ class Augmentation(SampleTransform):
         return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
 
     def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
-        count = len(draw["apply"])
         values = {name: value for name, value in draw.items() if name != "apply"}
         batched = bool(source.batch_shape) or not _one_for_all(values)
         if not batched:  # one map serves the whole batch
@@ -222,11 +314,51 @@ class Augmentation(SampleTransform):
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         like = {"dtype": dtype, "device": source.intrinsics.device}
         values = {name: value.to(**like) for name, value in values.items()}
-        return self._planned(rows, source, values, torch.ones((count,) if batched else (), **like))
+        target, rotation = self.new_camera(source, values)
+        if self.min_filled:
+            factor, turned, found = enough(source, target, rotation, self.min_filled)
+            target, rotation = scaled(target, factor), None if rotation is None else turned
+            self._tell_of_too_few(found)
+        part = Part(rows, Warp(source, target, rotation, **self.options), source)
+        part.shades, part.light = self._seen_through(part.warp, values)
+        return part
 
-    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor], ones: Tensor) -> Part:
-        """The part of a batch with these cameras and drawn values, of the dtype, device and batch dims of `ones`."""
-        raise NotImplementedError
+    def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
+        """What the lens does to colours and light: `shades` and `light` of the part of a batch."""
+        return None, None
+
+    def _tell_of_too_few(self, found: Tensor) -> None:
+        """Warn, once, if what was found filled is less than `min_filled`."""
+        if self._warned or not is_concrete(found) or found.numel() == 0 or bool((found >= self.min_filled).all()):
+            return
+        self._warned = True
+        few = int((found < self.min_filled).sum())
+        warnings.warn(
+            f"{self._name}: min_filled={self.min_filled:g} is out of reach for {few} of {found.numel()} new images, of "
+            f"which down to {float(found.min()):.0%} shows something: the camera of the images does not see along the "
+            "axis of the new one",
+            stacklevel=2,
+        )
+
+    def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
+        """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
+        camera = camera if isinstance(camera, Camera) else camera[0]
+        if self.min_filled is not None or self._warned or self.p == 0 or not is_concrete(camera.intrinsics):
+            return
+        self._warned = True
+        values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
+        with torch.no_grad():
+            first = rows_of(frozen(camera, camera.image_size), torch.zeros(_TRIES, dtype=torch.long))
+            warp = self._part(None, first, values).warp
+            shares = filled(warp.source, warp.target, warp.rotation)
+        if shares.mean() < _FEW:
+            warnings.warn(
+                f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
+                f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "
+                "until that much of every image shows something; fov='source', in lenses, takes one as wide as the "
+                "images are; min_filled=0 says that it is meant so",
+                stacklevel=2,
+            )
 
     # -- applying
 
@@ -262,6 +394,8 @@ class Augmentation(SampleTransform):
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
             self.last = change
+            if count and any(found == "image" for found, _ in named.values()):
+                self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
     @without_graph_in_workers
@@ -286,13 +420,24 @@ class Augmentation(SampleTransform):
             raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
         return self._moved(sample, named, batched, change)
 
-    def __getstate__(self):
+    if TYPE_CHECKING:
+
+        def __call__(
+            self,
+            sample: Mapping[str, Any] | None = None,
+            *,
+            draw: Mapping[str, Tensor] | None = None,
+            generator: torch.Generator | None = None,
+            **fields: Any,
+        ) -> Sample: ...
+
+    def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "last": None}
 
     def extra_repr(self) -> str:
         """What is drawn from, and the options."""
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
-        options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options}
+        options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
 
 

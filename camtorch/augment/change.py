@@ -132,7 +132,10 @@ class Change:
         """`move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves."""
 
         def of(part: Part):
-            rows = value if part.rows is None else value[part.rows.to(value.device)]
+            if part.rows is not None:
+                rows = value[part.rows.to(value.device)]
+            else:  # what comes out is never what went in, but a copy
+                rows = value.clone() if part.warp is None else value
             return stay(part.camera, rows) if part.warp is None else move(part, rows)
 
         results = [of(part) for part in self.parts]
@@ -208,9 +211,11 @@ class Change:
 
         What has another form is read as rays, and written in its form again.
         """
-        return self.each(
-            rays, lambda part, rows: write(part.warp.transform_rays(read(rows))), lambda camera, rows: rows
-        )
+
+        def move(part: Part, rows: Tensor) -> Tensor:
+            return rows.clone() if part.warp.rotation is None else write(part.warp.transform_rays(read(rows)))
+
+        return self.each(rays, move, lambda camera, rows: rows)
 
     def depth(self, depth: Tensor) -> Tensor:
         """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known."""
@@ -278,6 +283,11 @@ def alone(camera: Camera) -> Camera:
     return singles(camera)[0] if tuple(camera.batch_shape) == (1,) else camera
 
 
+def copied(camera: Camera) -> Camera:
+    """A camera of the same numbers, whose tensors are its own."""
+    return camera_like(camera, camera.intrinsics.clone(), camera.distortion.clone(), camera.image_size)
+
+
 def rows_of(camera: Camera, index: Tensor) -> Camera:
     """The cameras of these rows; one without batch dims serves all of them."""
     if not camera.batch_shape:
@@ -290,7 +300,7 @@ def expanded(camera: Camera, count: int) -> Camera:
     """A batch of `count` rows."""
     if tuple(camera.batch_shape) == (count,):
         return camera
-    numbers = (t.expand(count, t.shape[-1]) for t in (camera.intrinsics, camera.distortion))
+    numbers = (t.expand(count, t.shape[-1]).clone() for t in (camera.intrinsics, camera.distortion))
     return camera_like(camera, *numbers, camera.image_size)
 
 

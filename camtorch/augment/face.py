@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size
 from camtorch._tracing import is_concrete
-from camtorch.augment.change import Change, Part, alone, camera_like
+from camtorch.augment.change import Change, Part, alone, camera_like, copied
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
@@ -140,9 +140,9 @@ class FaceNormalizer(SampleTransform):
         moved = self._moved(sample, named, batched, change)
         scale = self.distance / centre.norm(dim=-1)
         moved["scale"] = scale if batched else scale.squeeze(0)
-        moved["source_camera"] = camera
+        moved["source_camera"] = copied(camera)
         if "rotation" in sample:  # of augmentations before
-            moved["source_rotation"] = sample["rotation"]
+            moved["source_rotation"] = sample["rotation"].clone()
         return moved
 
     @without_graph_in_workers

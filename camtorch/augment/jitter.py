@@ -12,6 +12,7 @@ from camtorch._module import same
 from camtorch.augment.change import camera_like, frozen
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
+from camtorch.projection.rays import image_lattice
 from camtorch.warp.polygons import along_edges
 
 DRAWN = 16
@@ -104,7 +105,7 @@ def _kept(measure: Callable[[Camera], Tensor], camera: Camera, *inputs: Tensor) 
 
 def _sensitivity(camera: Camera) -> Tensor:
     """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner."""
-    pixels = _lattice(camera)
+    pixels = image_lattice(camera, _SIDE, _SIDE).flatten(0, 1)
     camera = camera_like(camera, camera.intrinsics.double(), camera.distortion.double(), camera.image_size)
     batch, count = camera.batch_shape, camera.distortion.shape[-1]
     rays, seen = camera.unproject(pixels.double().expand(*batch, *pixels.shape))
@@ -162,13 +163,3 @@ def _ends(camera: Camera) -> Tensor:
         last = (valid.long().cumprod(-1).sum(-1, keepdim=True) - 1).clamp(min=0)
         low, width = angle.expand(valid.shape).gather(-1, last), width / _ANGLES
     return pixels.gather(-2, last.unsqueeze(-1).expand(*last.shape, 2)).squeeze(-2)
-
-
-def _lattice(camera: Camera) -> Tensor:
-    """(81, 2): pixels over the whole image, its outer edges included."""
-    height, width = camera.image_size
-    like = {"dtype": torch.promote_types(camera.intrinsics.dtype, torch.float32), "device": camera.intrinsics.device}
-    v = torch.linspace(-0.5, height - 0.5, _SIDE, **like)
-    u = torch.linspace(-0.5, width - 0.5, _SIDE, **like)
-    v, u = torch.meshgrid(v, u, indexing="ij")
-    return torch.stack((u, v), -1).reshape(-1, 2)

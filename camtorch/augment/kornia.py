@@ -101,6 +101,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
                 f"{self._get_name()}: images are {size} (height, width), but the camera's image_size is "
                 f"{self.camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
             )
+        if count:
+            self.augmentation.tell_of_empty_images(self.camera)
         drawn = draw(self.augmentation.ranges, count, 1.0, self.same_on_batch, None)
         del drawn["apply"]
         drawn[_KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()

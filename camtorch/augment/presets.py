@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
@@ -28,7 +29,9 @@ class Preset:
         return frozen(model, self.image_size)
 
 
-PRESETS = {
+PresetName = Literal["webcam", "dms60", "dms90", "dms130", "surround190", "tumvi", "aria", "aria_rgb"]
+
+PRESETS: dict[str, Preset] = {
     "webcam": Preset(
         "brown_conrady",
         (480, 640),

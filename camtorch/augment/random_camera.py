@@ -1,22 +1,29 @@
-"""Random mounts, lenses, and cameras."""
+"""Random mounts, lenses and cameras: what they are drawn from, and the new camera that a draw makes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, ClassVar, Literal, cast
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, broadcast_shapes
+from camtorch._module import Memo
 from camtorch._tracing import is_concrete
 from camtorch.augment.augmentation import Augmentation, as_range
-from camtorch.augment.change import Part, camera_like, frozen
+from camtorch.augment.change import camera_like, frozen
+from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import DRAWN, jittered
-from camtorch.augment.presets import PRESETS
+from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera
 from camtorch.models import MODELS
+from camtorch.projection.rays import field_of_view
 from camtorch.rotations import mount_rotation
 from camtorch.warp.warp import Warp
+
+RangeLike = float | Sequence[float]
 
 
 class RandomCamera(Augmentation):
@@ -35,7 +42,9 @@ class RandomCamera(Augmentation):
         roll: degrees by which it then leans to its right, clockwise: what it sees turns counterclockwise.
         zoom: factor on the focal lengths.
         fov: horizontal field of view of the new camera in degrees, from one outer edge of the image to the other if
-            the axis is in the middle. None: that of the lens, whatever the size of the image.
+            the axis is in the middle. None: that of the lens, whatever the size of the image. "source": as much of
+            that as the images fill, all of the new image as long as nothing else is drawn: the focal lengths are
+            scaled up to that. A turn then still leaves a rim empty, which `min_filled` takes away.
         focal: factor on the focal lengths, for lenses made alike.
         centre: how far the principal point moves, as a part of the image's width and height.
         distortion: by what part of the distance from the centre to the corner all coefficients together may move
@@ -46,35 +55,40 @@ class RandomCamera(Augmentation):
         vignetting: the part of the light that is lost in the image's farthest corner; it grows with the square of
             the distance from the principal point.
         image_size: (height, width) to come out; the sample's by default. Fields of view are those in width.
-        p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
-        fields: name -> kind, for fields of other names; "keep" leaves one as it is.
-        mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
-        mask_fill: the value of masks where nothing is seen.
-        valid_mask: whether `image_valid` (B, 1, H, W) comes out: where the image shows something.
+        options: p, same_on_batch, camera, fields, mode, padding_mode, fill, antialias, tolerance, mask_fill, valid_mask
+            and min_filled; see `Augmentation`.
 
     Raises:
         ValueError: ranges in the wrong order or out of bounds, an unknown name (the text lists those there are).
+        TypeError: ranges that are none, an unknown keyword.
     """
+
+    other_words: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("preset", "model", "lens"), "like"),
+        **{"center": "centre", "size": "image_size"},
+    }
 
     def __init__(
         self,
-        like: Camera | str | None = None,
+        like: Camera | PresetName | str | None = None,
         *,
-        yaw=(-10.0, 10.0),
-        pitch=(-10.0, 10.0),
-        roll=(-10.0, 10.0),
-        zoom=(1.0, 1.0),
-        fov=None,
-        focal=(0.95, 1.05),
-        centre=(-0.02, 0.02),
-        distortion=(-0.02, 0.02),
-        crop=(0.9, 1.0),
-        chromatic=None,
-        vignetting=None,
+        yaw: RangeLike | None = (-10.0, 10.0),
+        pitch: RangeLike | None = (-10.0, 10.0),
+        roll: RangeLike | None = (-10.0, 10.0),
+        zoom: RangeLike | None = (1.0, 1.0),
+        fov: RangeLike | Literal["source"] | None = None,
+        focal: RangeLike | None = (0.95, 1.05),
+        centre: RangeLike | None = (-0.02, 0.02),
+        distortion: RangeLike | None = (-0.02, 0.02),
+        crop: RangeLike | None = (0.9, 1.0),
+        chromatic: RangeLike | None = None,
+        vignetting: RangeLike | None = None,
         image_size: tuple[int, int] | None = None,
-        **options,
+        **options: Any,
     ):
         super().__init__(**options)
+        self.fov = "source" if isinstance(fov, str) and fov == "source" else None
+        self._memo = Memo()
         self.image_size = as_image_size(image_size, self._name)
         self.like = _as_like(like, self._name)
         if self.like is not None and self.like.image_size is None and fov is None:
@@ -85,7 +99,7 @@ class RandomCamera(Augmentation):
             "pitch": (pitch, {"least": -180, "most": 180}),
             "roll": (roll, {"least": -180, "most": 180}),
             "zoom": (zoom, {"least": tiny, "most": huge, "around": 1}),
-            "fov": (_pair(fov), {"least": tiny, "most": 360}),
+            "fov": (None if self.fov else _pair(fov), {"least": tiny, "most": 360}),
             "focal": (focal, {"least": tiny, "most": huge, "around": 1}),
             "centre": (centre, {"least": -1, "most": 1, "size": 2}),
             "distortion": (distortion, {"least": -1, "most": 1, "size": DRAWN}),
@@ -96,37 +110,67 @@ class RandomCamera(Augmentation):
         }
         self.ranges = {n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None}
 
-    def _planned(self, rows: Tensor | None, source: Camera, values: Mapping[str, Tensor], ones: Tensor) -> Part:
-        target = self._target(source, values, ones)
-        rotation = mount_rotation(*(values[name] for name in ("yaw", "pitch", "roll"))) if "yaw" in values else None
-        warp = Warp(source, target, rotation, **self.options)
-        shades = None
-        if "chromatic" in values:
-            shades = tuple(
-                Warp(source, _scaled(target, 1 + values["chromatic"][..., i]), rotation, **self.options) for i in (0, 1)
-            )
-        light = _light(target, values["vignetting"]) if "vignetting" in values else None
-        return Part(rows, warp, source, shades, light)
+    def _without(self, options: Mapping[str, object], *names: str) -> dict[str, Any]:
+        """None for the ranges that a class does without.
 
-    def _target(self, source: Camera, values: Mapping[str, Tensor], ones: Tensor) -> Camera:
+        Raises:
+            TypeError: one of them is asked for.
+        """
+        for name in names:
+            if name in options:
+                raise TypeError(f"{type(self).__name__}: there is no {name} here; RandomCamera has it")
+        return dict.fromkeys(names)
+
+    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+        """The new camera and its turn; see `Augmentation.new_camera`."""
+        rotation = mount_rotation(*(values[name] for name in ("yaw", "pitch", "roll"))) if "yaw" in values else None
+        return self._target(source, values), rotation
+
+    def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
+        shades = light = None
+        if "chromatic" in values:
+            red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
+            shades = tuple(Warp(warp.source, target, warp.rotation, **self.options) for target in (red, blue))
+        if "vignetting" in values:
+            light = _light(warp.target, values["vignetting"])
+        return shades, light
+
+    def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
         base = source if self.like is None else self.like
-        size = self.image_size or source.image_size
-        base = camera_like(base, base.intrinsics.to(ones), base.distortion.to(ones), base.image_size)
-        fx, fy, cx, cy = _sized(base, size, values.get("fov")).unbind(-1)
-        factor = ones * values.get("focal", 1.0) * values.get("zoom", 1.0)
-        fx, fy = fx * factor, fy * factor
+        size = self.image_size or cast("tuple[int, int]", source.image_size)
+        dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
+        numbers = (t.to(source.intrinsics.device, dtype) for t in (base.intrinsics, base.distortion))
+        base = camera_like(base, *numbers, base.image_size)
+        intrinsics = usual = self._from_source(source, base, size) if self.fov == "source" else None
+        if intrinsics is None or usual is None:
+            middle = base.intrinsics.new_tensor(self.ranges["fov"].middle) if "fov" in values else None
+            intrinsics, usual = (_sized(base, size, fov) for fov in (values.get("fov"), middle))
+        fx, fy, cx, cy = intrinsics.unbind(-1)
+        for name in ("focal", "zoom"):
+            if name in values:
+                fx, fy = fx * values[name], fy * values[name]
         if "centre" in values:
             cx, cy = cx + values["centre"][..., 0] * size[1], cy + values["centre"][..., 1] * size[0]
         intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
         target = camera_like(base, intrinsics, base.distortion, size)
         if "distortion" in values and base.distortion.shape[-1]:
-            usual = ones.new_tensor(self.ranges["fov"].middle) if "fov" in values else None
-            nominal = _sized(base, size, usual)
-            step = jittered(frozen(target, size), values["distortion"], nominal) - base.distortion.detach()
+            step = jittered(frozen(target, size), values["distortion"], usual) - base.distortion.detach()
             target = camera_like(base, intrinsics, base.distortion + step, size)
         if "crop" in values:
             target = _cropped(target, values["crop"], values["place"])
         return target
+
+    def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
+        """(*B, 4): intrinsics of the lens at most as wide as its like and as images of the source fill all of."""
+
+        def narrowed() -> Tensor:
+            fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
+            whole = camera_like(base, _sized(base, size, fov), base.distortion, size)
+            return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
+
+        numbers = source.intrinsics, source.distortion, base.intrinsics, base.distortion
+        kept: Tensor = self._memo(numbers, (type(source), source.image_size, size), narrowed)
+        return kept
 
 
 class RandomMount(RandomCamera):
@@ -136,8 +180,16 @@ class RandomMount(RandomCamera):
     the homography K' R K^-1.
     """
 
-    def __init__(self, *, yaw=(-10.0, 10.0), pitch=(-10.0, 10.0), roll=(-10.0, 10.0), zoom=(1.0, 1.0), **options):
-        none = dict.fromkeys(("focal", "centre", "distortion", "crop"))
+    def __init__(
+        self,
+        *,
+        yaw: RangeLike | None = (-10.0, 10.0),
+        pitch: RangeLike | None = (-10.0, 10.0),
+        roll: RangeLike | None = (-10.0, 10.0),
+        zoom: RangeLike | None = (1.0, 1.0),
+        **options: Any,
+    ):
+        none = self._without(options, "focal", "centre", "distortion", "crop")
         super().__init__(yaw=yaw, pitch=pitch, roll=roll, zoom=zoom, **none, **options)
 
 
@@ -150,15 +202,15 @@ class RandomLens(RandomCamera):
 
     def __init__(
         self,
-        like: Camera | str | None = None,
+        like: Camera | PresetName | str | None = None,
         *,
-        fov=None,
-        focal=(0.9, 1.1),
-        centre=(-0.03, 0.03),
-        distortion=(-0.05, 0.05),
-        **options,
+        fov: RangeLike | Literal["source"] | None = None,
+        focal: RangeLike | None = (0.9, 1.1),
+        centre: RangeLike | None = (-0.03, 0.03),
+        distortion: RangeLike | None = (-0.05, 0.05),
+        **options: Any,
     ):
-        none = dict.fromkeys(("yaw", "pitch", "roll", "zoom", "crop"))
+        none = self._without(options, "yaw", "pitch", "roll", "zoom", "crop")
         super().__init__(like, fov=fov, focal=focal, centre=centre, distortion=distortion, **none, **options)
 
 
@@ -172,21 +224,16 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
     if isinstance(like, str) and like in MODELS:
         ideal = MODELS[like]([1.0, 1.0, 0.0, 0.0])
         return frozen(ideal, None)
+    close = get_close_matches(like, [*PRESETS, *MODELS], 1) if isinstance(like, str) else []
     raise ValueError(
         f"{owner}: like must be a Camera, a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
-        f"got {like!r}"
+        f"got {like!r}" + (f". Did you mean {close[0]!r}?" if close else "")
     )
 
 
-def _pair(value):
+def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
     """A single number of these means just that number."""
     return (value, value) if isinstance(value, (int, float)) else value
-
-
-def _scaled(camera: Camera, factor: Tensor) -> Camera:
-    """The camera with focal lengths times a factor (*B,)."""
-    scale = torch.stack((factor, factor, torch.ones_like(factor), torch.ones_like(factor)), -1)
-    return camera_like(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
 
 
 def _sized(base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:

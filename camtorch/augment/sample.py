@@ -5,17 +5,18 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch.augment.change import Change, alone, on_device, singles
+from camtorch.augment.change import Change, alone, copied, on_device, singles
 from camtorch.camera import Camera
 from camtorch.rotations import rotation_matrix, rotation_vector
 
-Sample = dict[str, object]
+Sample = dict[str, Any]
 
 
 # -- the kinds of fields
@@ -353,13 +354,14 @@ class SampleTransform(nn.Module):
         if self.valid_mask and any(found == "image" for found, _ in named.values()):
             before = change.valid_mask() if before is None else before & change.valid_mask()
         if before is not None:
-            put("image_valid", before)
+            put("image_valid", before.contiguous())
         if "rotation" not in named:
-            put("rotation", change.rotation)
+            put("rotation", change.rotation.clone())
         target = change.target
         if isinstance(target, Camera) and not batched:
             target = singles(target)[0]
-        moved["camera"] = target
+        # the change keeps cameras of its own, to go back by
+        moved["camera"] = copied(target) if isinstance(target, Camera) else [copied(one) for one in target]
         return moved
 
     @staticmethod

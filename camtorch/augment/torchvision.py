@@ -105,6 +105,7 @@ class Transform(v2.Transform):
                     f"{camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
                 )
         with torch.no_grad():
+            self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.change(camera, self.augmentation.draw(1))
             self.augmentation.last = change
             return {"change": change, "camera": singles(change.target)[0]}

@@ -1,0 +1,127 @@
+"""How much of a new image shows something of the old one, and the zoom and the turn with which enough of it does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.change import camera_like, frozen
+from camtorch.camera import Camera
+from camtorch.projection.ops import CLASSES
+from camtorch.rotations import rotation_matrix, rotation_vector
+from camtorch.warp.warp import Warp
+
+# points along a side; those on the rim, where images stay empty first, count as much as others: a careful estimate
+_SIDE = 33
+_CARE = 0.01  # what a lattice may miss by where a rim runs along its lines
+_ZOOM = 4.0  # at most, before the camera turns back
+_FAR_ZOOM = 1000.0  # of a camera that is not turned
+_TURNS = 1.0, 0.5, 0.25, 0.0
+_HALVINGS = 10
+
+
+def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
+    """(*B,): the part of the target's image that shows something of the source's, of a lattice of its pixels."""
+    height, width = target.image_size or (0, 0)
+    like = target.intrinsics
+    v, u = (torch.linspace(0, side - 1, _SIDE, dtype=like.dtype, device=like.device) for side in (height, width))
+    pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).flatten(0, 1)
+    back = Warp(target, source, None if rotation is None else rotation.mT)
+    return back.transform_points(pixels.expand(*(back.batch_shape or ()), -1, -1))[1].to(like.dtype).mean(-1)
+
+
+def scaled(camera: Camera, factor: Tensor) -> Camera:
+    """The camera with focal lengths times a factor (*B,)."""
+    one = torch.ones_like(factor)
+    scale = torch.stack((factor, factor, one, one), -1)
+    return camera_like(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
+
+
+def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The least that is to be done so that a `share` of the target's image shows something of the source's.
+
+    First the target zooms, up to four times. Where that is not enough it turns half as far from the source, a quarter
+    as far, or not at all.
+
+    Returns:
+        factor (*B,) on the target's focal lengths, at least 1; the rotation (*B, 3, 3); and the part (*B,) that is
+        filled then, which is below `share` where the source does not even see the target's axis. Graph-free.
+    """
+    share = min(share + _CARE, 1.0)
+    with torch.no_grad():
+        if rotation is None:
+            rotation = torch.eye(3, dtype=target.intrinsics.dtype, device=target.intrinsics.device)
+        if torch.compiler.is_compiling():
+            cameras = [
+                t for c in (source, target) for t in (c._model, c.intrinsics, c.distortion, list(c.image_size or ()))
+            ]
+            factor, rotation, found = _opaque_enough(*cameras, rotation, share)
+            return factor, rotation, found
+        return _enough(frozen(source, source.image_size), frozen(target, target.image_size), rotation, share)
+
+
+def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor]:
+    found = filled(source, target, rotation)
+    factor = torch.ones_like(found)
+    done = found >= share
+    drawn = turned = rotation.expand(*found.shape, 3, 3)
+    straight = bool((rotation == torch.eye(3, dtype=rotation.dtype, device=rotation.device)).all())
+    for part in _TURNS[-1:] if straight else _TURNS:
+        if bool(done.all()):
+            break
+        if part != 1:
+            turned = rotation_matrix(part * rotation_vector(drawn))
+        zoom = _least_zoom(source, target, turned, share, _ZOOM if part else _FAR_ZOOM)
+        now = filled(source, scaled(target, zoom), turned)
+        better = ~done & (now > found)
+        factor, found = torch.where(better, zoom, factor), torch.where(better, now, found)
+        rotation = torch.where(better[..., None, None], turned, rotation)
+        done = found >= share
+    return factor, rotation.expand(*found.shape, 3, 3), found
+
+
+def _least_zoom(source: Camera, target: Camera, rotation: Tensor, share: float, most: float) -> Tensor:
+    """(*B,): the least factor of at least 1, or `most`."""
+    batch = filled(source, target, rotation)
+    low, high = torch.ones_like(batch), torch.full_like(batch, most)
+    high = torch.where(batch >= share, low, high)
+    for _ in range(_HALVINGS):
+        middle = (low * high).sqrt()
+        is_enough = filled(source, scaled(target, middle), rotation) >= share
+        low, high = torch.where(is_enough, low, middle), torch.where(is_enough, middle, high)
+    return high
+
+
+@torch.library.custom_op("camtorch::enough", mutates_args=())
+def _opaque_enough(
+    source: str,
+    source_intrinsics: Tensor,
+    source_distortion: Tensor,
+    source_size: Sequence[int],
+    target: str,
+    target_intrinsics: Tensor,
+    target_distortion: Tensor,
+    target_size: Sequence[int],
+    rotation: Tensor,
+    share: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    cameras = [
+        frozen(
+            CLASSES[model](*(t.detach() for t in (intrinsics, distortion)[: 1 + bool(distortion.shape[-1])])),
+            tuple(size),
+        )
+        for model, intrinsics, distortion, size in (
+            (source, source_intrinsics, source_distortion, source_size),
+            (target, target_intrinsics, target_distortion, target_size),
+        )
+    ]
+    factor, turned, found = _enough(*cameras, rotation, share)
+    return factor.clone(), turned.clone(), found.clone()
+
+
+@_opaque_enough.register_fake
+def _(source, i, d, source_size, target, j, e, target_size, rotation, share):  # type: ignore[no-untyped-def]
+    batch = torch.broadcast_shapes(*(t.shape[:-1] for t in (i, d, j, e)), rotation.shape[:-2])
+    return j.new_empty(batch), rotation.new_empty(*batch, 3, 3), j.new_empty(batch)

@@ -1,0 +1,225 @@
+"""How much of new images shows something: a warning with the number, and two ways to have them full."""
+
+import copy
+import pickle
+import warnings
+
+import kornia.augmentation as K  # noqa: N812
+import pytest
+import torch
+
+import camtorch as ct
+import camtorch.augment.kornia
+from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
+
+SIZE = (120, 160)
+
+
+def pinhole(degrees=70.0):
+    focal = SIZE[1] / 2 / torch.tensor(degrees / 2).deg2rad().tan().item()
+    return ct.Pinhole([focal, focal, (SIZE[1] - 1) / 2, (SIZE[0] - 1) / 2], image_size=SIZE).requires_grad_(False)
+
+
+def shares(augmentation, count=24, seed=0, **fields):
+    """(count,): the part of each new image that shows something, of all of its pixels."""
+    draw = augmentation.draw(count, torch.Generator().manual_seed(seed))
+    change = augmentation.change(fields.get("camera"), draw)
+    return change.valid_mask().flatten(1).float().mean(1)
+
+
+# -- the warning
+
+
+def test_mostly_empty_images_are_told_once_with_the_number():
+    augmentation = RandomCamera("dms130", camera=pinhole())
+    empty = 1 - shares(RandomCamera("dms130", camera=pinhole(), min_filled=0), 200).mean()
+    assert empty > 0.6
+    state = torch.random.get_rng_state()
+    with pytest.warns(UserWarning, match=r"RandomCamera: of the new images (\d+)% will show nothing") as told:
+        augmentation(image=torch.rand(1, 3, *SIZE))
+    assert abs(int(str(told[0].message).split("%")[0].split()[-1]) - 100 * empty) < 4
+    torch.random.set_rng_state(state)
+    moved = augmentation(image=torch.ones(1, 3, *SIZE))  # warnings are errors here: it says so once
+    torch.random.set_rng_state(state)
+    # and the draws of it cost no random numbers
+    quiet = RandomCamera("dms130", camera=pinhole(), min_filled=0)(image=torch.ones(1, 3, *SIZE))
+    assert torch.equal(moved["image"], quiet["image"])
+
+
+@pytest.mark.parametrize(
+    "augmentation",
+    [
+        RandomCamera("webcam", camera=pinhole(90)),
+        RandomMount(camera=pinhole()),
+        RandomCamera("dms130", camera=pinhole(), min_filled=0.5),
+        RandomCamera("dms130", camera=pinhole(), p=0),
+    ],
+)
+def test_what_is_full_or_meant_so_is_not_told(augmentation):
+    augmentation(image=torch.rand(2, 3, *SIZE))
+
+
+def test_labels_alone_are_not_told():
+    RandomCamera("dms130", camera=pinhole())(keypoints=torch.rand(2, 5, 2) * 100)
+
+
+def test_front_ends_tell_it_too():
+    aug = ct.augment.kornia.RandomCamera(pinhole(), "dms130")
+    with pytest.warns(UserWarning, match="will show nothing"):
+        aug(torch.rand(2, 3, *SIZE))
+    aug(torch.rand(2, 3, *SIZE))
+
+
+# -- min_filled
+
+
+MAKERS = {
+    "camera": lambda **options: RandomCamera("dms130", **options),
+    "surround": lambda **options: RandomCamera("surround190", yaw=30, pitch=20, roll=180, **options),
+    "crop": lambda **options: RandomCamera("tumvi", crop=(0.3, 1.0), **options),
+    "mount": lambda **options: RandomMount(yaw=30, pitch=20, roll=45, **options),
+    "away": lambda **options: RandomMount(yaw=(60, 80), pitch=(-40, 40), **options),
+    "lens": lambda **options: RandomLens("kannala_brandt", fov=(120, 160), **options),
+    "own": lambda **options: RandomLens(focal=(0.4, 1.0), **options),
+}
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("name", MAKERS)
+def test_every_image_is_filled_as_asked(name, share):
+    make = MAKERS[name]
+    before = shares(make(camera=pinhole(), min_filled=0))
+    after = shares(make(camera=pinhole(), min_filled=share))
+    assert before.min() < share
+    assert after.min() > share - (0.02 if share == 1 else 0.0)
+    enough = before > min(share + 0.03, 1 - 1e-6)  # the estimate is careful
+    torch.testing.assert_close(after[enough], before[enough], atol=1e-3, rtol=0)
+
+
+def test_no_more_is_zoomed_than_needed():
+    """What is filled above the part that was asked for is what a coarse lattice cannot tell."""
+    for name in ("camera", "mount", "lens"):
+        before, after = (shares(MAKERS[name](camera=pinhole(), min_filled=m)) for m in (0, 0.8))
+        moved = before < 0.78
+        assert moved.any()
+        assert after[moved].max() < 0.88, name
+
+
+@pytest.mark.parametrize("name", ["camera", "away"])
+def test_a_batch_is_its_samples_and_replays_are_identical(name):
+    cameras = [pinhole(70), ct.KannalaBrandt([60.0, 60.0, 79.5, 59.5], [0.0] * 4, image_size=SIZE), pinhole(50)]
+    augmentation = MAKERS[name](min_filled=0.9)
+    draw = augmentation.draw(3, torch.Generator().manual_seed(0))
+    points = torch.rand(3, 6, 2) * torch.tensor([159.0, 119.0])
+    with torch.no_grad():
+        out = augmentation(keypoints=points, camera=cameras, draw=draw)
+        again = pickle.loads(pickle.dumps(copy.deepcopy(augmentation)))(keypoints=points, camera=cameras, draw=draw)
+        assert torch.equal(out["keypoints"], again["keypoints"])
+        back = augmentation.inverse(out)["keypoints"]
+        seen = out["keypoints_valid"]
+        torch.testing.assert_close(back[seen], points[seen], atol=2e-3, rtol=0)
+        for i, camera in enumerate(cameras):
+            one = {key: value[i : i + 1] for key, value in draw.items()}
+            alone = augmentation(keypoints=points[i], camera=camera, draw=one)
+            torch.testing.assert_close(alone["keypoints"], out["keypoints"][i], atol=1e-2, rtol=0)
+
+
+def test_kornia_replays_it_bit_by_bit():
+    aug = K.AugmentationSequential(
+        ct.augment.kornia.RandomCamera(pinhole(), "dms130", min_filled=0.9), data_keys=["input", "keypoints"]
+    )
+    data = torch.ones(4, 1, *SIZE), torch.rand(4, 5, 2) * 100
+    first, params = aug(*data), aug._params
+    aug(*data)
+    again = aug(*data, params=params)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert (first[0] > 0).flatten(1).float().mean(1).min() > 0.9
+
+
+@pytest.mark.slow
+def test_compiled_it_is_the_same():
+    augmentation = RandomCamera("dms130", camera=pinhole(), fov="source", min_filled=0.9)
+    draw = augmentation.draw(2, torch.Generator().manual_seed(0))
+    points = torch.rand(2, 5, 2) * 100
+
+    def run(points, draw):
+        return augmentation(keypoints=points, draw=draw)["keypoints"]
+
+    compiled = torch.compile(run, fullgraph=True, backend="eager")(points, draw)
+    torch.testing.assert_close(compiled, run(points, draw), atol=2e-3, rtol=1e-4)
+
+
+def test_gradients_pass_and_the_zoom_counts_as_given():
+    camera = ct.Pinhole([100.0, 100.0, 79.5, 59.5], image_size=SIZE)
+    out = RandomCamera("dms130", camera=camera, min_filled=0.9)(keypoints=torch.rand(2, 5, 2) * 50 + 40)
+    out["keypoints"][out["keypoints_valid"]].sum().backward()
+    assert torch.isfinite(camera.intrinsics.grad).all()
+    assert camera.intrinsics.grad.abs().sum() > 0
+
+
+def test_what_cannot_be_filled_is_said():
+    """The camera of a strip at the side of an image: its axis lies off the strip."""
+    strip = pinhole().crop(0, 0, 120, 40)
+    augmentation = RandomCamera("dms130", camera=strip, yaw=1, pitch=1, roll=1, min_filled=0.9)
+    with pytest.warns(UserWarning, match=r"min_filled=0.9 is out of reach for . of 4 new images.* does not see along"):
+        augmentation(image=torch.rand(4, 1, 120, 40))
+    augmentation(image=torch.rand(4, 1, 120, 40))
+    with pytest.raises(ValueError, match=r"RandomMount: min_filled must be a part in \[0, 1\], or None; got 90"):
+        RandomMount(min_filled=90)
+
+
+# -- fov="source"
+
+
+@pytest.mark.parametrize("like", [*PRESETS, "kannala_brandt", "pinhole"])
+@pytest.mark.parametrize("degrees", [50, 90])
+def test_as_much_of_a_lens_as_the_source_fills(like, degrees):
+    still = {"focal": None, "centre": None, "distortion": None, "fov": "source"}
+    augmentation = RandomLens(like, camera=pinhole(degrees), **still)
+    change = augmentation.change(None, augmentation.draw(1))
+    assert change.valid_mask().float().mean() > 0.995
+    narrower = change.target
+    if like in PRESETS:
+        whole = RandomLens(like, camera=pinhole(degrees), **{**still, "fov": None})
+        whole = whole.change(None, whole.draw(1)).target
+        assert torch.equal(narrower.distortion, whole.distortion)
+        ratio = narrower.intrinsics[..., :2] / whole.intrinsics[..., :2]
+        assert (ratio > 1 - 1e-6).all()
+        assert torch.allclose(ratio[..., 0], ratio[..., 1])
+        if ratio.max() > 1:  # a little wider, and something is missing
+            wider = ct.augment.camera_like(
+                narrower, narrower.intrinsics * torch.tensor([0.97, 0.97, 1, 1]), narrower.distortion, SIZE
+            )
+            assert not ct.Warp(augmentation.camera, wider).valid_mask().all()
+
+
+def test_a_source_that_is_wider_leaves_the_lens_as_it_is():
+    wide = ct.KannalaBrandt([45.0, 45.0, 79.5, 59.5], [0.0] * 4, image_size=SIZE).requires_grad_(False)
+    still = {"focal": None, "centre": None, "distortion": None}
+    targets = [
+        (one := RandomLens("dms60", camera=wide, fov=fov, **still)).change(None, one.draw(1)).target
+        for fov in ("source", None)
+    ]
+    assert torch.equal(targets[0].intrinsics, targets[1].intrinsics)
+
+
+def test_every_source_has_its_own_fov():
+    cameras = ct.augment.collate([pinhole(40), pinhole(80)]).requires_grad_(False)
+    augmentation = RandomCamera("dms130", fov="source", min_filled=0.95)
+    found = shares(augmentation, 2, camera=cameras)
+    assert found.min() > 0.95
+    focal = augmentation.change(cameras, augmentation.draw(2)).target.intrinsics[:, 0]
+    assert focal[0] > 1.5 * focal[1]
+
+
+def test_a_first_example_has_full_images():
+    augmentation = RandomCamera("dms130", fov="source", min_filled=0.95, yaw=15, pitch=10, roll=20, camera=pinhole())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        out = augmentation(image=torch.ones(16, 1, *SIZE))
+    assert (out["image"] > 0).flatten(1).float().mean(1).min() > 0.95
+
+
+def test_words_that_are_no_fov():
+    with pytest.raises(TypeError, match=r"fov must be a range \(low, high\) or a number; got 'sauce'"):
+        RandomCamera("dms130", fov="sauce")

@@ -1,0 +1,81 @@
+"""An augmentation of one's own: the example of `Augmentation`, as anybody would write it."""
+
+import inspect
+import pickle
+import textwrap
+
+import pytest
+import torch
+
+import camtorch as ct
+import camtorch.augment.kornia
+import camtorch.augment.numpy
+
+SIZE = (48, 64)
+
+
+def camera():
+    return ct.KannalaBrandt([40.0, 40.0, 31.5, 23.5], [0.02, 0.0, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
+
+
+def example():
+    """The class that the docstring shows."""
+    text = inspect.getdoc(ct.augment.Augmentation).split("by themselves:\n")[1].split("\nArgs:")[0]
+    assert len(text.strip().splitlines()) < 20
+    names = {"ct": ct, "torch": torch, "__name__": __name__}
+    exec(textwrap.dedent(text), names)
+    return names["Nearer"]
+
+
+class Upright(ct.augment.Augmentation):
+    """A camera that leans is set upright, and looks up or down."""
+
+    def __init__(self, lean: float, **options):
+        super().__init__({"pitch": ct.augment.Range(-20, 20)}, **options)
+        self.lean = lean
+
+    def new_camera(self, source, values):
+        zero = torch.zeros_like(values["pitch"])
+        return source, ct.augment.mount_rotation(zero, values["pitch"], zero + self.lean)
+
+
+def test_the_example_zooms_all_that_a_sample_holds():
+    nearer = example()(zoom=(2.0, 2.0), camera=camera(), valid_mask=True)
+    torch.manual_seed(0)
+    points = torch.tensor([[[31.5, 23.5], [36.5, 23.5], [60.0, 40.0]]])
+    out = nearer(image=torch.rand(1, 3, *SIZE), keypoints=points, gaze=torch.tensor([[0.0, 0.0, -1.0]]))
+    torch.testing.assert_close(out["keypoints"][0, :2], torch.tensor([[31.5, 23.5], [41.5, 23.5]]), atol=1e-3, rtol=0)
+    assert out["keypoints_valid"].tolist() == [[True, True, False]]
+    assert out["gaze"].tolist() == [[0.0, 0.0, -1.0]]
+    assert out["image_valid"].all()
+    torch.testing.assert_close(nearer.inverse(out)["keypoints"], points, atol=1e-3, rtol=0)
+    assert "zoom=(2, 2), p=1.0" in repr(nearer)
+
+
+def test_one_s_own_has_all_that_others_have():
+    upright = Upright(30.0, camera=camera(), p=0.5, min_filled=0.8)
+    draw = upright.draw(6, torch.Generator().manual_seed(0))
+    points = torch.rand(6, 4, 2) * 40
+    out = upright(image=torch.rand(6, 1, *SIZE), keypoints=points, draw=draw)
+    skipped = ~draw["apply"]
+    assert torch.equal(out["keypoints"][skipped], points[skipped])
+    again = pickle.loads(pickle.dumps(upright))(keypoints=points, draw=draw)
+    assert torch.equal(again["keypoints"], out["keypoints"])
+    turned = out["rotation"][~skipped]
+    assert (turned[:, 0, 0] < 0.99).all()
+    cameras = [camera(), ct.Pinhole([50.0, 50.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)] * 3
+    listed = upright(keypoints=points, camera=cameras, draw=draw)
+    assert [type(c) for c in listed["camera"]] == [type(c) for c in cameras]
+    moved = ct.augment.numpy.Transform(upright)(image=torch.rand(*SIZE).numpy())
+    assert moved["image"].shape == SIZE
+    aug = ct.augment.kornia.CameraAugmentation(upright)
+    assert aug(torch.rand(2, 1, *SIZE)).shape == (2, 1, *SIZE)
+
+
+def test_what_it_gets_wrong_is_told():
+    with pytest.raises(ValueError, match=r"Range: low and high must be finite, with low <= high; got 2, 1"):
+        ct.augment.Range(2, 1)
+    with pytest.raises(TypeError, match="Upright: unknown keyword 'leen'; did you mean 'lean'"):
+        Upright(3.0, leen=4.0)
+    with pytest.raises(NotImplementedError):
+        ct.augment.Augmentation(camera=camera())(keypoints=torch.zeros(1, 2))

@@ -1,0 +1,94 @@
+"""What an augmentation hands out belongs to the caller: editing it in place changes nothing else."""
+
+import copy
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.augment import FaceNormalizer, RandomCamera, RandomLens, RandomMount
+
+SIZE, COUNT = (24, 32), 3
+
+
+def camera(count=None):
+    numbers = torch.tensor([24.0, 24.0, 15.5, 11.5])
+    return ct.Pinhole(numbers if count is None else numbers.repeat(count, 1), image_size=SIZE).requires_grad_(False)
+
+
+def sample(own):
+    pose = torch.eye(4).repeat(COUNT, 1, 1)
+    pose[:, 2, 3] = 1.0
+    return {
+        "image": torch.rand(COUNT, 3, *SIZE),
+        "mask": torch.ones(COUNT, *SIZE),
+        "depth": torch.ones(COUNT, 1, *SIZE),
+        "keypoints": torch.rand(COUNT, 4, 2) * 20,
+        "keypoints_valid": torch.ones(COUNT, 4, dtype=torch.bool),
+        "boxes": torch.tensor([[[4.0, 4, 20, 16]]]).repeat(COUNT, 1, 1),
+        "gaze": torch.rand(COUNT, 3),
+        "pitch_yaw": torch.rand(COUNT, 2),
+        "points": torch.rand(COUNT, 5, 3),
+        "head_pose": pose,
+        "image_valid": torch.ones(COUNT, 1, *SIZE, dtype=torch.bool),
+        "camera": own,
+    }
+
+
+def tensors(values):
+    """Name -> tensor, of the fields and of their cameras."""
+    found = {}
+    for name, value in values.items():
+        for i, one in enumerate(value if isinstance(value, list) else [value]):
+            if isinstance(one, ct.Camera):
+                found |= {f"{name}{i}.intrinsics": one.intrinsics, f"{name}{i}.distortion": one.distortion}
+            elif isinstance(one, torch.Tensor):
+                found[f"{name}{i}"] = one
+    return found
+
+
+AUGMENTATIONS = {
+    "mount": RandomMount(valid_mask=True),
+    "lens": RandomLens("kannala_brandt", fov=60, valid_mask=True),
+    "one map": RandomCamera("webcam", same_on_batch=True, valid_mask=True, min_filled=0.9),
+    "nothing": RandomMount(p=0, valid_mask=True),
+    "some": RandomMount(p=0.5, valid_mask=True),
+    "still": RandomMount(yaw=0, pitch=0, roll=0, valid_mask=True),
+    "face": FaceNormalizer(focal=40, distance=1.0, image_size=SIZE, valid_mask=True),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "alone"),
+    [
+        (name, own, alone)
+        for name in AUGMENTATIONS
+        for own, alone in (("one", False), ("one", True), ("batch", False), ("list", False))
+        if (name, own) != ("face", "list")
+    ],
+)
+def test_everything_that_comes_out_can_be_edited_in_place(name, own, alone):
+    augmentation = AUGMENTATIONS[name]
+    cameras = {"one": camera(), "batch": camera(COUNT), "list": [camera() for _ in range(COUNT)]}[own]
+    given = sample(cameras)
+    if alone:
+        given = {k: v if k == "camera" else v[0] for k, v in given.items()}
+    before = copy.deepcopy(given)
+    torch.manual_seed(1)
+    out = augmentation(given)
+    label = {"keypoints": out["keypoints"].clone()}
+    back = {} if name == "face" else augmentation.inverse(label)
+    with torch.no_grad():
+        for field, tensor in tensors(out).items():
+            rest = {other: t.clone() for other, t in tensors(out).items() if other != field}
+            tensor.zero_()  # an expanded view refuses
+            if tensor.numel() > 1 and tensor.ndim and len(tensor) > 1:
+                tensor[0] = 1
+                assert not tensor[1:].any(), f"{field} is one row for all"
+            for other, was in rest.items():
+                assert torch.equal(tensors(out)[other], was), f"{other} moved with {field}"
+    for field, tensor in tensors(given).items():
+        if not field.startswith("source"):
+            assert torch.equal(tensor, tensors(before)[field]), f"{field} of the given sample"
+    if back:
+        assert torch.equal(augmentation.inverse(label)["keypoints"], back["keypoints"])
