@@ -27,7 +27,7 @@ from camtorch.augment.kornia import RandomCamera as KorniaRandomCamera
 
 ADAPTER, AFFINE = "camtorch in kornia", "kornia RandomAffine"
 BATCH, SIZE, QUICK_SIZE, LANDMARKS = 8, (480, 640), (120, 160), 68
-_ANGLES = {"yaw": 10, "pitch": 10, "roll": 10}
+_ANGLES = {"yaw": 10, "pitch": 10, "roll": 10, "min_filled": 0}
 _DEGREES = np.radians(10)
 
 
