@@ -43,10 +43,11 @@ def loads_or_says_why(path):
     return True
 
 
+@pytest.mark.parametrize("step", [23, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SAMPLES)
-def test_truncated_at_every_byte(name, tmp_path):
+def test_truncated_anywhere(name, step, tmp_path):
     whole = (FILES / name).read_bytes()
-    for length in range(len(whole)):
+    for length in {*range(0, len(whole), step), *range(max(0, len(whole) - 5), len(whole))}:
         loads_or_says_why(written(tmp_path / name, whole[:length]))
 
 

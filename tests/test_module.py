@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from cameras import KEYS, constants, fan, make, one, pixel_lattice, spread
+from cameras import DISTINCT, KEYS, RARE_ARE_SLOW, constants, fan, make, one, pixel_lattice, spread
 from torch import nn
 from torch.func import functional_call, jacfwd, jacrev, vmap
 
@@ -45,21 +45,16 @@ def parameters_of(module):
 
 # -- compile, export, transforms
 
-TRACED = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sphere", "division", "f_theta_backward"}
+
+distinct_models = pytest.mark.parametrize("key", RARE_ARE_SLOW)
 
 
-def backend(key, method):
-    """Down to aten for one model of each chart and lens: those long traces are the same for the others."""
-    short = key in TRACED or (key == "fisheye62" and method == "project")
-    return "aot_eager" if short else "eager"
-
-
-@every_model
+@distinct_models
 @both_directions
 def test_compile_without_graph_breaks(key, method):
     torch._dynamo.reset()
     module, values = module_and_input(key, method)
-    compiled = torch.compile(module, fullgraph=True, backend=backend(key, method))
+    compiled = torch.compile(module, fullgraph=True, backend="aot_eager" if key in DISTINCT else "eager")
     gradients = []
     for function in (compiled, module):
         leaf = values.clone().requires_grad_()
@@ -68,6 +63,7 @@ def test_compile_without_graph_breaks(key, method):
     assert_same(*gradients)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # inductor imports what still uses it
 def test_compile_to_machine_code():
     torch._dynamo.reset()
@@ -78,7 +74,7 @@ def test_compile_to_machine_code():
     assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
 
 
-@every_model
+@distinct_models
 @both_directions
 def test_export(key, method):
     module, values = module_and_input(key, method)
