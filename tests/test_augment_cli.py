@@ -76,8 +76,8 @@ def test_without_an_image_it_shows_the_driver(folder, capsys):
     assert "22 of 22 points" in lines[0]
     assert lines[-1].startswith("augment.png: ")
     image = pixels("augment.png")
-    # three columns of tiles of 4:3, the first image on two rows and columns
-    assert image.shape == (1271, 1340, 3)
+    # three columns of tiles of 4:3, the first image on two rows and columns, below two lines of where the lens is from
+    assert image.shape == (1295, 1340, 3)
     for colour in (POINT, BOX, GAZE):
         assert (image == colour).all(-1).sum() > 200
 

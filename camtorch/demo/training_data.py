@@ -92,7 +92,14 @@ def teacher(name: str, camera: Camera, like: Camera) -> Augment:
     """What makes of samples of `camera` those that a network for the lens `like` learns from."""
     if name == "camtorch":
         yaw, pitch, roll = ((a - b, a + b) for a, b in zip(PLANNED, WITHIN, strict=True))
-        options = {"focal": 0.02, "centre": 0.01, "distortion": None, "crop": None, "padding_mode": "border"}
+        options = {
+            "focal": 0.02,
+            "centre": 0.01,
+            "distortion": None,
+            "crop": None,
+            "padding_mode": "border",
+            "min_filled": 0,
+        }
         augment = RandomCamera(like, yaw=yaw, pitch=pitch, roll=roll, camera=camera, **options)
 
         def by_camera(p: Samples, generator: torch.Generator) -> Samples:
