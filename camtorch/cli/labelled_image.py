@@ -103,7 +103,14 @@ def augmented(
     scale = min(NEW_SIZE[1] / width, NEW_SIZE[0] / height)
     size = max(1, round(height * scale)), max(1, round(width * scale))
     new = RandomCamera(
-        like, camera=before.camera, image_size=size, antialias=True, fill=NOTHING, valid_mask=True, **ranges
+        like,
+        camera=before.camera,
+        image_size=size,
+        antialias=True,
+        fill=NOTHING,
+        valid_mask=True,
+        min_filled=0.0,  # the notes say how much is filled
+        **ranges,
     )
     labels = before.labels
     generator = torch.Generator().manual_seed(seed)
