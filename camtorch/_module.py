@@ -40,6 +40,14 @@ class GeometryModule(nn.Module):
                 parameter.requires_grad = False
         return self
 
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        super()._load_from_state_dict(*arguments)
+        # what has no values is in no state_dict, and follows what was assigned in the place of meta tensors
+        for name, buffer in self._buffers.items():
+            for parameter in self.parameters(recurse=False):
+                if buffer is not None and buffer.is_meta and buffer.numel() == 0:
+                    self._buffers[name] = torch.empty_like(buffer, device=parameter.device, dtype=parameter.dtype)
+
     def _apply(self, fn, recurse=True):
         # network.half() must not round a principal point to whole pixels
         def at_least_float32(tensor: Tensor) -> Tensor:

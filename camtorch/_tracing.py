@@ -18,15 +18,27 @@ def in_transform() -> bool:
 
 
 def in_graph(tensor: Tensor) -> bool:
-    """Whether derivatives, of either mode, or a transform pass through the tensor."""
-    return tensor.requires_grad or not is_concrete(tensor) or has_tangent(tensor)
+    """Whether derivatives, of either mode, or a transform pass through the tensor, or it is traced."""
+    return tensor.requires_grad or _is_traced(tensor) or has_tangent(tensor)
 
 
 def is_concrete(tensor: Tensor) -> bool:
-    """Whether the values may be looked at: not while a graph is traced, nor inside vmap, grad or jacfwd."""
-    return not (
-        torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor) or tensor.is_meta
-    )
+    """Whether the values may be looked at: not while a graph is traced, nor inside vmap, grad or jacfwd.
+
+    Nor are there any on the meta device or in a FakeTensorMode, where modules are made of shapes alone.
+    """
+    return not (_is_traced(tensor) or tensor.is_meta or _is_fake(tensor))
+
+
+def _is_traced(tensor: Tensor) -> bool:
+    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+
+
+def _is_fake(tensor: Tensor) -> bool:
+    if torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.FAKE) is not None:
+        return True
+    # not imported for its name alone: that takes a third of a second
+    return type(tensor) is not Tensor and type(tensor).__name__ == "FakeTensor"
 
 
 def may_look(tensor: Tensor) -> bool:

@@ -207,22 +207,22 @@ class Camera(BatchedModule):
             raise ValueError(f"{owner}: axis must be one of {AXES}; got {axis!r}")
         fov = torch.tensor(fov, dtype=torch.float64) if isinstance(fov, (int, float)) else fov
         degrees = as_real(fov, "fov", owner).detach().double()
-        if not bool(((degrees > 0) & (degrees <= 360)).all()):
+        if is_concrete(degrees) and not bool(((degrees > 0) & (degrees <= 360)).all()):
             raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
-        if bool((degrees <= 2 * math.pi).any()):
+        if is_concrete(degrees) and bool((degrees <= 2 * math.pi).any()):
             raise ValueError(
                 f"{owner}: fov is in degrees; {degrees.tolist()} seems to be radians, which math.degrees() converts. A "
                 "lens as narrow as that has a focal length of width / 2 / tan(fov / 2), which makes its intrinsics"
             )
         given = () if distortion is None else (as_real(distortion, "distortion", owner),)
-        plane = cls([1.0, 1.0, 0.0, 0.0], *(t.detach() for t in given)).double()
+        plane = cls(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
         degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
         focal, reached = focal_for(plane, degrees.deg2rad(), size, axis)
         centre = focal.new_tensor([(size[1] - 1) / 2, (size[0] - 1) / 2]).expand(*focal.shape, 2)
         intrinsics = torch.cat((focal[..., None], focal[..., None], centre), -1)
         intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
         made = cls(intrinsics, *given, image_size=size)
-        if not bool(reached.all()):
+        if is_concrete(reached) and not bool(reached.all()):
             widest = made.field_of_view[..., AXES.index(axis)].rad2deg().flatten().tolist()
             raise ValueError(
                 f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "

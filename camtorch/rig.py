@@ -8,6 +8,7 @@ from typing import TypeVar, cast
 from torch import nn
 
 from camtorch._module import BatchedModule
+from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 
@@ -219,11 +220,11 @@ class Rig(nn.Module):
 
 def _line(name: str, camera: Camera, extrinsics: Extrinsics | None) -> str:
     size = "" if camera.image_size is None else f" {camera.image_size[1]}x{camera.image_size[0]}"
+    numbers = where = ""
     if camera.batch_shape:
         numbers = f" batch_shape={tuple(camera.batch_shape)}"
-    else:
+    elif is_concrete(camera.intrinsics):
         numbers = " ({:.7g}, {:.7g}, {:.7g}, {:.7g})".format(*camera.intrinsics.tolist())
-    where = ""
-    if extrinsics is not None and not extrinsics.batch_shape:
+    if extrinsics is not None and not extrinsics.batch_shape and is_concrete(extrinsics.translation):
         where = " at ({:.4g}, {:.4g}, {:.4g})".format(*(extrinsics.position + 0.0).tolist())
     return f"  {name}: {type(camera).__name__}{size}{numbers}{where}"

@@ -98,7 +98,7 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     if rotation is not None:
         while rays.ndim - 2 < rotation.ndim - 2:
             rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-    plane, shown = model([1.0, 1.0, 0.0, 0.0]).to(**like).project(turn(rotation, rays, "rays"))
+    plane, shown = model(torch.tensor([1.0, 1.0, 0.0, 0.0], **like)).project(turn(rotation, rays, "rays"))
     shown = (shown & has_ray).unsqueeze(-1)
     limit = plane.new_tensor([widest, tallest]) / 2
     plane = torch.maximum(torch.minimum(plane, limit), -limit)
