@@ -4,12 +4,15 @@ import copy
 
 import pytest
 import torch
-from cameras import KEYS, fan
+from cameras import KEYS, fan, slow_unless
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import camtorch as ct
 
 every_model = pytest.mark.parametrize("key", KEYS)
+some_models = pytest.mark.parametrize(
+    ("key",), slow_unless(lambda case: case[0] in ("pinhole", "kannala_brandt", "fisheye624"), [(key,) for key in KEYS])
+)
 POINTS = fan(40, 4, 3).float()
 
 
@@ -78,7 +81,7 @@ def test_assigned_double_precision():
     assert camera.project(POINTS)[0].dtype == torch.float64
 
 
-@every_model
+@some_models
 @pytest.mark.parametrize("mode", [FakeTensorMode, lambda: torch.device("meta")], ids=["fake", "meta"])
 def test_shapes_without_values(key, mode):
     expected = results(build(key))
