@@ -4,14 +4,15 @@ import copy
 
 import pytest
 import torch
-from cameras import KEYS, fan, slow_unless
+from cameras import KEYS, fan
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import camtorch as ct
 
 every_model = pytest.mark.parametrize("key", KEYS)
+QUICK = ("pinhole", "kannala_brandt", "fisheye624")
 some_models = pytest.mark.parametrize(
-    ("key",), slow_unless(lambda case: case[0] in ("pinhole", "kannala_brandt", "fisheye624"), [(key,) for key in KEYS])
+    "key", [key if key in QUICK else pytest.param(key, marks=pytest.mark.slow) for key in KEYS]
 )
 POINTS = fan(40, 4, 3).float()
 
