@@ -16,7 +16,7 @@ INK, GREY, RIM, PAPER = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 24
 POINT, BOX, GAZE = (226, 29, 72), (255, 190, 40), (30, 100, 240)
 """The colours of marks."""
 WHITE = (255, 255, 255, 235)
-LARGE, MIDDLE, SMALL = 34, 20, 17
+LARGE, MIDDLE, SMALL = 34, 18, 16
 """Sizes of texts."""
 MARGIN = 20
 _SHARP = 3  # marks are drawn that many times as large, and reduced

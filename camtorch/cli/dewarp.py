@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from camtorch.cli.options import Commands
     from camtorch.warp.warp import Warp
 
-_STRIP_PIXELS = 1 << 21
+
+_LARGE = 1 << 24
+"""Pixels of an image from which on speed counts."""
 
 
 def add(commands: Commands) -> None:
@@ -60,6 +62,8 @@ def run(arguments: argparse.Namespace) -> None:
     image, orientation = images.read(arguments.image)
     rows, columns = image.shape[-2:]
     camera = cameras.read_camera_of(arguments.image, (rows, columns), arguments)
+    if rows * columns > _LARGE:
+        camera = camera.float()  # at twice the speed; positions are rounded to a thousandth of a pixel
     with torch.no_grad():
         warp = Dewarp(
             camera,
@@ -67,41 +71,31 @@ def run(arguments: argparse.Namespace) -> None:
             fov=None if fov is None else math.radians(fov),
             image_size=arguments.size,
         )
-        result, filled = _in_strips(warp, image)
+        result, filled = _warped(warp, image)
+        del image
         lattice = (camera.resize(64, 64).pixel_grid() + 0.5) * torch.tensor([columns / 64, rows / 64]) - 0.5
         shown = float(warp.transform_points(lattice)[1].double().mean())
     images.write(arguments.output, images.from_tensor(result), orientation=orientation)
     height, width = result.shape[-2:]
     fx, fy, cx, cy = warp.target.intrinsics.tolist()
+    degrees = math.degrees(float(warp.target.field_of_view[0]))
     print(
-        f"{arguments.output}: {camera.key} dewarped to {arguments.projection}, {_degrees(warp):.1f} degrees "
+        f"{arguments.output}: {camera.key} dewarped to {arguments.projection}, {degrees:.1f} degrees "
         f"wide, {width}x{height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; {100 * filled:.1f} % of it is "
         f"filled and shows {100 * shown:.0f} % of the photograph"
     )
 
 
-def _in_strips(warp: Warp, image: Tensor) -> tuple[Tensor, float]:
-    """The warped image and the filled part of it, computed in strips that bound the memory of large targets."""
+def _warped(warp: Warp, image: Tensor) -> tuple[Tensor, float]:
+    """The warped image, by strips, and the filled part of it."""
     import torch
 
-    from camtorch.warp.warp import Warp
-
-    height, width = warp.target._size("dewarp")
-    rows = max(1, _STRIP_PIXELS // width)
-    strips, filled = [], 0
-    show = progress("dewarping")
-    for top in range(0, height, rows):
-        strip = Warp(warp.source, warp.target.crop(top, 0, min(rows, height - top), width))
-        strips.append(strip(image[None])[0])
-        filled += int(strip.valid_mask().sum())
-        show(min(1.0, (top + rows) / height))
-    return torch.cat(strips, -2), filled / (height * width)
-
-
-def _degrees(warp: Warp) -> float:
-    """The horizontal field of view of a target, from outer edge to outer edge."""
-    fx, _, cx, _ = warp.target.intrinsics.tolist()
-    left, right = (cx + 0.5) / fx, (warp.target._size("dewarp")[1] - 0.5 - cx) / fx
-    if warp.target.key == "pinhole":
-        left, right = math.atan(left), math.atan(right)
-    return math.degrees(left + right)
+    height, width = warp.target.height, warp.target.width
+    # as image files have it, channels last: they need no copy
+    result = torch.empty(height, width, len(image), dtype=image.dtype).permute(2, 0, 1)
+    filled, show = 0, progress("dewarping")
+    for rows, part, valid in warp.strips(image[None]):
+        result[:, rows] = part[0]
+        filled += int(valid.sum())
+        show(rows.stop / height)
+    return result, filled / (height * width)

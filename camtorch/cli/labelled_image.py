@@ -13,7 +13,6 @@ from torch import Tensor
 from camtorch.augment import PRESETS, RandomCamera
 from camtorch.camera import Camera
 from camtorch.cli.labels import Labels
-from camtorch.projection.rays import field_of_view
 
 if TYPE_CHECKING:
     from camtorch.demo.example import Example
@@ -53,7 +52,7 @@ def rendered(example: Example) -> LabelledImage:
 def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str) -> LabelledImage:
     """An image, (C, H, W) as `images.read` has it; without labels, with a lattice of dots and a box."""
     if labels is None:
-        height, width = camera.image_size
+        height, width = camera.height, camera.width
         steps = [(torch.arange(n, dtype=torch.float64) + 0.5) * side / n - 0.5 for n, side in ((7, height), (9, width))]
         y, x = torch.meshgrid(*steps, indexing="ij")
         box = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]], dtype=torch.float64) - 0.5
@@ -74,7 +73,7 @@ def _in_colour(image: Tensor) -> Tensor:
 
 
 def _before(image: Tensor, camera: Camera, labels: Labels, title: str) -> LabelledImage:
-    height, width = camera.image_size
+    height, width = camera.height, camera.width
     x1, y1, x2, y2 = labels.boxes.unbind(-1)
     overlap = (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
     caption = [f"before: {title}", f"{camera.key}, {_degrees(camera):.0f}° wide"]
@@ -99,7 +98,7 @@ def augmented(
             and show the same.
         ranges: of `RandomCamera`.
     """
-    height, width = size or before.camera.image_size
+    height, width = size or (before.camera.height, before.camera.width)
     scale = min(NEW_SIZE[1] / width, NEW_SIZE[0] / height)
     size = max(1, round(height * scale)), max(1, round(width * scale))
     new = RandomCamera(
@@ -169,4 +168,4 @@ def presets() -> Iterator[str]:
 
 def _degrees(camera: Camera) -> float:
     """The horizontal field of view."""
-    return math.degrees(float(field_of_view(camera)[0]))
+    return math.degrees(float(camera.field_of_view[0]))

@@ -52,8 +52,8 @@ def run(arguments: argparse.Namespace) -> None:
         compared = difference(camera, other)
         print(f"against {against}: {compared}, over {100 * compared.part:.4g} % of the image")
     if output is not None:
-        height, width = camera.image_size
-        _draw(output, camera, other, f"{path.name}: {name if name != 'camera' else camera.key}, {width} x {height}")
+        which = name if name != "camera" else camera.key
+        _draw(output, camera, other, f"{path.name}: {which}, {camera.width} x {camera.height}")
         print(f"{output}: distortion, radius over angle{', difference' if other is not None else ''}")
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from camtorch.demo.walls import soft
 
-Planes = tuple[Tensor, Tensor, Tensor]
+Planes = tuple[Tensor, ...]
 
 LOOKS = (
     *("skin", "hair", "length", "parting", "shirt", "iris", "beard", "smile", "nose", "jaw", "width", "lids"),

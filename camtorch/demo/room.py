@@ -13,7 +13,7 @@ from torch import Tensor
 from camtorch.camera import Camera
 from camtorch.demo import walls
 
-Planes = tuple[Tensor, Tensor, Tensor]
+Planes = tuple[Tensor, ...]
 _CHUNK = 1 << 17
 
 # -- where the rays go

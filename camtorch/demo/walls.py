@@ -100,7 +100,7 @@ def _odd(a: Tensor, b: Tensor, origin: tuple[float, float], side: float) -> Tens
     return (torch.floor((a - origin[0]) / side) + torch.floor((b - origin[1]) / side)) % 2 == 1
 
 
-def soft(a: Tensor, low: float, high: float, width) -> Tensor:
+def soft(a: Tensor, low: float | Tensor, high: float | Tensor, width: float | Tensor) -> Tensor:
     """1 between low and high, 0 outside, blurred by `width`."""
     return torch.sigmoid((a - low) / width) * torch.sigmoid((high - a) / width)
 
