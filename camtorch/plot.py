@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,8 @@ from camtorch.projection.rays import angles_from_axis, followed, ideal, image_la
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from torch import Tensor
 
@@ -54,8 +57,8 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
     _shade_without_rays(ax, camera)
     both, lost = valid & covered, valid & ~covered
     if bool(lost.any()):
-        crosses = {"color": _GREY, "markersize": 4, "linestyle": "none", "label": "beyond the ideal lens"}
-        ax.plot(*pixels[lost].double().T.tolist(), marker="x", **crosses)
+        u, v = pixels[lost].double().T.tolist()
+        ax.plot(u, v, color=_GREY, marker="x", markersize=4, linestyle="none", label="beyond the ideal lens")
         ax.legend(loc="lower right", framealpha=0.8)
     longer = 1
     if bool(both.any()):
@@ -66,7 +69,12 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
             along, length, longer = 0 * along, 0 * length, 1
         arrows = ax.quiver(
             *[plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)],
-            **{"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0024, "headwidth": 4, "headlength": 5},
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            width=0.0024,
+            headwidth=4,
+            headlength=5,
             cmap=_without_palest("viridis_r"),
             zorder=3,
         )
@@ -95,7 +103,7 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
     Raises:
         ValueError: a batch, or not as many labels as cameras. ImportError: no matplotlib.
     """
-    cameras = [cameras] if not isinstance(cameras, (list, tuple)) else cameras
+    cameras = cameras if isinstance(cameras, Sequence) else [cameras]
     labels = labels or [camera.key for camera in cameras]
     if len(labels) != len(cameras):
         raise ValueError(f"{len(cameras)} cameras, and labels for {len(labels)}")
@@ -149,7 +157,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
         ValueError: a batch, no image size, or two different ones. ImportError: no matplotlib.
     """
     compared = differences.difference(a, b, remove_rotation=remove_rotation)
-    height, width = a.image_size
+    height, width = a._size("a difference")
     ax = _axes(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
     _frame(ax, height, width)
@@ -187,7 +195,7 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
 # -- what they share
 
 
-def _pyplot():
+def _pyplot() -> ModuleType:
     try:
         from matplotlib import pyplot
     except ImportError:
@@ -196,7 +204,10 @@ def _pyplot():
 
 
 def _axes(ax: Axes | None) -> Axes:
-    return _pyplot().subplots(layout="constrained")[1] if ax is None else ax
+    if ax is not None:
+        return ax
+    new: Axes = _pyplot().subplots(layout="constrained")[1]
+    return new
 
 
 def _single(camera: Camera) -> None:
@@ -218,7 +229,7 @@ def _frame(ax: Axes, height: int, width: int) -> None:
 
 
 def _shade_without_rays(ax: Axes, camera: Camera) -> None:
-    height, width = camera.image_size
+    height, width = camera._size("a plot")
     valid = camera.unproject(image_lattice(camera, 200, 200))[1]
     shade = np.ma.masked_array(np.ones((200, 200)), valid.numpy(force=True))
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
@@ -229,18 +240,18 @@ def _magnification(most: float) -> int:
     """1, 2, 5, 10, ... up to a number."""
     if not 1 < most < 1e9:
         return 1
-    power = 10 ** math.floor(math.log10(most))
+    power = int(10 ** math.floor(math.log10(most)))
     return power * max(n for n in (1, 2, 5) if n * power <= most)
 
 
-def _without_palest(name: str):
+def _without_palest(name: str) -> Colormap:
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(colormaps[name](np.linspace(0.15, 1, 256)))
 
 
-def _limit(mappable, values: Tensor) -> str:
+def _limit(mappable: ScalarMappable, values: Tensor) -> str:
     """Give what is coloured its range, without the few largest values if they are far from the others."""
     most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)
     cut = most > 4 * many > _FAINT

@@ -48,7 +48,7 @@ class Summary:
         rows.append(
             ("valid rays", f"up to {low:.1f} degrees from the axis" + (f", {high:.1f} in places" * (high > low + 0.1)))
         )
-        if self.fov is not None:
+        if self.fov is not None and self.seen is not None and self.corners is not None:
             wide, tall, across = (f"{math.degrees(angle):.1f}" for angle in self.fov)
             rows.append(("field of view", f"{wide} horizontal, {tall} vertical, {across} diagonal degrees"))
             rows.append(("has rays", f"{100 * self.seen:.4g} % of the image"))

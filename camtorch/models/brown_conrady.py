@@ -1,11 +1,13 @@
-"""The Brown-Conrady camera with OpenCV's rational, thin-prism and tilt terms."""
+"""The Brown-Conrady camera, OpenCV's: a pinhole with radial, tangential, thin-prism and tilt distortion."""
 
 import math
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Lens, Perspective, Planar, Polynomial, Rational, Tilt
+from camtorch.optics import Chart, Lens, Perspective, Planar, Polynomial, Rational, Tilt
 
 
 class BrownConrady(Camera):
@@ -35,15 +37,15 @@ class BrownConrady(Camera):
     odd_in_y = frozenset({"p1", "s3", "s4", "tau_x"})
 
     @classmethod
-    def names_of(cls, count):
+    def names_of(cls, count: int) -> tuple[str, ...] | None:
         return cls.distortion_names[:count] if count in cls.counts else None
 
     @classmethod
-    def counts_text(cls):
+    def counts_text(cls) -> str:
         return "n = 4, 5, 8, 12 or 14 (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]])"
 
     @classmethod
-    def fit_start(cls, names, angles, radii):
+    def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
         zeros = super().fit_start(names, angles, radii)
         if "k6" not in names:
             return zeros
@@ -68,12 +70,12 @@ class BrownConrady(Camera):
         return torch.cat((zeros, start))
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         k1, k2, p1, p2, *more = k
         numerator = [k1, k2, *more[:1]]
         radial = Rational(numerator, more[1:4]) if len(more) > 1 else Polynomial(numerator)
         # OpenCV numbers the decentering coefficients the other way round: p2 is the one along x
-        stages = [Planar(radial, tangential=(p2, p1), prism=more[4:8])]
+        stages: list[Planar | Tilt] = [Planar(radial, tangential=(p2, p1), prism=more[4:8])]
         if len(more) > 8:
             stages.append(Tilt(*more[8:]))
         return Perspective(), Lens(*stages)

@@ -1,7 +1,12 @@
-"""The cylindrical panorama."""
+"""The cylindrical panorama: longitude across, height y / hypot(x, z) down."""
 
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from camtorch._arguments import TensorLike
 from camtorch.camera import Camera
-from camtorch.optics import CylinderChart, Lens
+from camtorch.optics import Chart, CylinderChart, Lens
 
 
 class Cylindrical(Camera):
@@ -15,9 +20,9 @@ class Cylindrical(Camera):
 
     key = "cylindrical"
 
-    def __init__(self, intrinsics, *, image_size=None):
+    def __init__(self, intrinsics: TensorLike, *, image_size: tuple[int, int] | None = None) -> None:
         super().__init__(intrinsics, image_size=image_size)
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return CylinderChart(), Lens()

@@ -1,7 +1,11 @@
-"""The division camera."""
+"""The division camera: the pixel (a, b) of radius r sees along (a, b, 1 + lambda1 r^2 + lambda2 r^4 + ...)."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import AnglePerRadius, Inverted, Lens, OneDivision
+from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, OneDivision
 
 
 class Division(Camera):
@@ -28,13 +32,13 @@ class Division(Camera):
     fit_counts = (1, 2, 4)
 
     @classmethod
-    def names_of(cls, count):
+    def names_of(cls, count: int) -> tuple[str, ...] | None:
         return tuple(f"lambda{i}" for i in range(1, count + 1)) or None
 
     @classmethod
-    def counts_text(cls):
+    def counts_text(cls) -> str:
         return "n >= 1 (lambda1 lambda2 ...)"
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return (OneDivision(k[0]) if len(k) == 1 else Inverted(AnglePerRadius, k)), Lens()

@@ -1,7 +1,11 @@
-"""The double sphere camera."""
+"""The double sphere camera: (x, y) / (alpha d' + (1 - alpha) z'), z' = z + xi d."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Lens, Unified
+from camtorch.optics import Chart, Lens, Unified
 
 
 class DoubleSphere(Camera):
@@ -25,9 +29,9 @@ class DoubleSphere(Camera):
     defined_text = "xi > -1"
 
     @staticmethod
-    def defined(k):
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
         return k[0] + 1
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Unified(xi=k[0], alpha=k[1]), Lens()

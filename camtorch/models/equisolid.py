@@ -1,8 +1,12 @@
-"""The equisolid fisheye."""
+"""The equisolid fisheye: r = 2 sin(theta / 2), and a polynomial of it."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.models._polynomial import OddPolynomial
+from camtorch.optics import Chart, Lens, Planar, Polynomial
 from camtorch.optics import Equisolid as EquisolidChart
-from camtorch.optics import Lens, Planar, Polynomial
 
 
 class Equisolid(OddPolynomial):
@@ -18,5 +22,5 @@ class Equisolid(OddPolynomial):
     key = "equisolid"
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return EquisolidChart(), Lens(Planar(Polynomial(k)))

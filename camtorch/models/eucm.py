@@ -1,7 +1,11 @@
-"""The extended unified camera."""
+"""The extended unified camera (EUCM): (x, y) / (alpha sqrt(beta (x^2 + y^2) + z^2) + (1 - alpha) z)."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Lens, Unified
+from camtorch.optics import Chart, Lens, Unified
 
 
 class EUCM(Camera):
@@ -25,13 +29,13 @@ class EUCM(Camera):
     defined_text = "beta > 0"
 
     @classmethod
-    def ideal(cls, count):
+    def ideal(cls, count: int) -> tuple[float, ...]:
         return 0.0, 1.0
 
     @staticmethod
-    def defined(k):
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
         return k[1]
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Unified(alpha=k[0], beta=k[1]), Lens()

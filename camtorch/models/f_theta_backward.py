@@ -1,9 +1,13 @@
-"""The f-theta fisheye camera that is given from the pixel to the angle."""
+"""The f-theta fisheye camera from the pixel to the angle: theta = r (1 + k2 r + k3 r^2 + ...)."""
 
 from __future__ import annotations
 
-from camtorch.models.f_theta import FreePolynomial
-from camtorch.optics import Inverted, Lens, RadiusPolynomial
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from camtorch.models._polynomial import FreePolynomial
+from camtorch.optics import Chart, Inverted, Lens, RadiusPolynomial
 
 
 class FThetaBackward(FreePolynomial):
@@ -21,11 +25,11 @@ class FThetaBackward(FreePolynomial):
     key = "f_theta_backward"
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Inverted(RadiusPolynomial, k), Lens()
 
     @classmethod
-    def _scaled(cls, coefficients):
+    def _scaled(cls, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         focal = 1 / coefficients[..., :1]
         powers = range(2, coefficients.shape[-1] + 1)
         return focal, coefficients[..., 1:] * focal ** coefficients.new_tensor(list(powers))

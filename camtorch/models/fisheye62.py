@@ -1,7 +1,11 @@
-"""The Fisheye62 camera: radial and tangential terms of a fisheye."""
+"""Project Aria's Fisheye62: r = theta (1 + k0 theta^2 + ... + k5 theta^12), then tangential terms."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Equidistant, Lens, Planar, Polynomial
+from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
 
 class Fisheye62(Camera):
@@ -28,5 +32,5 @@ class Fisheye62(Camera):
     odd_in_y = frozenset({"p1"})
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Equidistant(), Lens(Planar(Polynomial(k[:6])), Planar(tangential=k[6:]))

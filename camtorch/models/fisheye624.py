@@ -1,7 +1,11 @@
-"""The Fisheye624 camera: radial, tangential and thin-prism terms of a fisheye."""
+"""Project Aria's Fisheye624: r = theta (1 + k0 theta^2 + ...), then tangential and thin-prism terms."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Equidistant, Lens, Planar, Polynomial
+from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
 
 class Fisheye624(Camera):
@@ -28,7 +32,7 @@ class Fisheye624(Camera):
     odd_in_y = frozenset({"p1", "s2", "s3"})
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Equidistant(), Lens(Planar(Polynomial(k[:6])), Planar(tangential=k[6:8], prism=k[8:]))
 
 

@@ -1,9 +1,12 @@
-"""The field-of-view camera."""
+"""The field-of-view camera (ATAN): r = atan(2 tan(omega / 2) rho / z) / omega."""
 
 import math
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Fov, Lens
+from camtorch.optics import Chart, Fov, Lens
 
 
 class FOV(Camera):
@@ -27,9 +30,9 @@ class FOV(Camera):
     defined_text = "-pi < omega < pi"
 
     @staticmethod
-    def defined(k):
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
         return math.pi - k[0].abs()
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Fov(k[0]), Lens()

@@ -1,15 +1,17 @@
-"""The Kannala-Brandt fisheye camera."""
+"""The Kannala-Brandt fisheye camera, OpenCV's: r = theta (1 + k1 theta^2 + k2 theta^4 + ...)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
-from camtorch._arguments import as_batch, as_real
+from camtorch._arguments import TensorLike, as_batch, as_real
 from camtorch._tracing import is_concrete
 from camtorch.models._polynomial import OddPolynomial
-from camtorch.optics import Equidistant, Lens, Planar, Polynomial
+from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -29,11 +31,13 @@ class KannalaBrandt(OddPolynomial):
     key = "kannala_brandt"
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Equidistant(), Lens(Planar(Polynomial(k)))
 
     @classmethod
-    def from_general(cls, intrinsics, coefficients, *, image_size=None) -> Self:
+    def from_general(
+        cls, intrinsics: TensorLike, coefficients: TensorLike, *, image_size: tuple[int, int] | None = None
+    ) -> Self:
         """From the paper's form r = k1 theta + k2 theta^3 + ..., which has no leading 1.
 
         Args:

@@ -1,7 +1,11 @@
-"""The unified camera with a radial-tangential lens."""
+"""The Mei camera, OpenCV's omnidir: (x, y) / (z + xi d), then radial and tangential distortion."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Lens, Planar, Polynomial, Unified
+from camtorch.optics import Chart, Lens, Planar, Polynomial, Unified
 
 
 class Mei(Camera):
@@ -31,11 +35,11 @@ class Mei(Camera):
     defined_text = "xi > -1"
 
     @staticmethod
-    def defined(k):
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
         return k[0] + 1
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         xi, k1, k2, p1, p2 = k
         # OpenCV numbers the decentering coefficients the other way round: p2 is the one along x
         return Unified(xi=xi), Lens(Planar(Polynomial((k1, k2)), tangential=(p2, p1)))

@@ -1,7 +1,11 @@
-"""The orthographic fisheye."""
+"""The orthographic fisheye: r = sin(theta), and a polynomial of it."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.models._polynomial import OddPolynomial
-from camtorch.optics import Lens, Planar, Polynomial, Unified
+from camtorch.optics import Chart, Lens, Planar, Polynomial, Unified
 
 
 class OrthographicFisheye(OddPolynomial):
@@ -18,5 +22,5 @@ class OrthographicFisheye(OddPolynomial):
     key = "orthographic_fisheye"
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Unified(alpha=1.0), Lens(Planar(Polynomial(k)))

@@ -1,7 +1,12 @@
-"""The pinhole camera."""
+"""The pinhole camera: u = fx x/z + cx, v = fy y/z + cy."""
 
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from camtorch._arguments import TensorLike
 from camtorch.camera import Camera
-from camtorch.optics import Lens, Perspective
+from camtorch.optics import Chart, Lens, Perspective
 
 
 class Pinhole(Camera):
@@ -12,9 +17,9 @@ class Pinhole(Camera):
 
     key = "pinhole"
 
-    def __init__(self, intrinsics, *, image_size=None):
+    def __init__(self, intrinsics: TensorLike, *, image_size: tuple[int, int] | None = None) -> None:
         super().__init__(intrinsics, image_size=image_size)
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Perspective(), Lens()

@@ -1,7 +1,11 @@
-"""The stereographic fisheye."""
+"""The stereographic fisheye: r = 2 tan(theta / 2), and a polynomial of it."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.models._polynomial import OddPolynomial
-from camtorch.optics import Lens, Planar, Polynomial, Unified
+from camtorch.optics import Chart, Lens, Planar, Polynomial, Unified
 
 
 class Stereographic(OddPolynomial):
@@ -17,5 +21,5 @@ class Stereographic(OddPolynomial):
     key = "stereographic"
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Unified(alpha=0.5), Lens(Planar(Polynomial(k)))

@@ -1,16 +1,18 @@
-"""The radially symmetric camera of a table, as lens vendors hand it out."""
+"""The camera whose r(theta) is a table, as lens vendors hand it out."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
-from camtorch._arguments import as_real
+from camtorch._arguments import TensorLike, as_real
 from camtorch.camera import Camera
-from camtorch.optics import EquidistantUpTo, Lens, Planar, RadiusTable
+from camtorch.optics import Chart, EquidistantUpTo, Lens, Planar, RadiusTable
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -39,32 +41,32 @@ class Tabulated(Camera):
     defined_text = "angles that ascend from above 0"
 
     @classmethod
-    def names_of(cls, count):
+    def names_of(cls, count: int) -> tuple[str, ...] | None:
         numbers = range(1, count // 2 + 1)
         even = count >= 4 and count % 2 == 0
         return (*(f"theta{i}" for i in numbers), *(f"r{i}" for i in numbers)) if even else None
 
     @classmethod
-    def counts_text(cls):
+    def counts_text(cls) -> str:
         return "n = 4, 6, 8, ... (theta1 theta2 ... r1 r2 ...)"
 
     @classmethod
-    def ideal(cls, count):
+    def ideal(cls, count: int) -> tuple[float, ...]:
         angles = tuple(2 * math.pi * i / count for i in range(1, count // 2 + 1))
         return angles + angles
 
     @staticmethod
-    def defined(k):
+    def defined(k: Sequence[Tensor]) -> Tensor | None:
         angles = torch.stack((torch.zeros_like(k[0]), *k[: len(k) // 2]), -1)
         return angles.diff(dim=-1).amin(-1)
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         angles, radii = [w.detach() for w in k[: len(k) // 2]], k[len(k) // 2 :]
         return EquidistantUpTo(angles[-1]), Lens(Planar(RadiusTable(angles, radii)))
 
     @classmethod
-    def fit_start(cls, names, angles, radii):
+    def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
         count = len(names) // 2
         # a ray at the last node itself would be lost to rounding
         nodes = angles[:, -1:] * (1 + 1e-9) * torch.arange(1, count + 1).to(angles) / count
@@ -75,7 +77,15 @@ class Tabulated(Camera):
         return torch.cat((nodes.clamp(max=math.pi), low + (place - before) * (high - low)), -1)[None]
 
     @classmethod
-    def from_table(cls, centre, angles, radii, *, pixels_per_unit: float = 1.0, image_size=None) -> Self:
+    def from_table(
+        cls,
+        centre: TensorLike,
+        angles: TensorLike,
+        radii: TensorLike,
+        *,
+        pixels_per_unit: float = 1.0,
+        image_size: tuple[int, int] | None = None,
+    ) -> Self:
         """From a table of angles and image heights, in any unit of length or in pixels.
 
         The focal length becomes the slope of the table at its beginning, so that r is nearly theta there.
@@ -91,9 +101,9 @@ class Tabulated(Camera):
             ValueError: the table has another shape, does not begin to ascend from the origin, or goes beyond half a
                 turn.
         """
-        centre, angles, radii = (
-            as_real(v, n, cls.__name__) for v, n in ((centre, "centre"), (angles, "angles"), (radii, "radii"))
-        )
+        centre = as_real(centre, "centre", cls.__name__)
+        angles = as_real(angles, "angles", cls.__name__)
+        radii = as_real(radii, "radii", cls.__name__)
         if centre.shape != (2,) or angles.ndim != 1 or angles.shape != radii.shape:
             shapes = [tuple(t.shape) for t in (centre, angles, radii)]
             raise ValueError(f"{cls.__name__}: centre must be (2,), angles and radii (N,); got shapes {shapes}")

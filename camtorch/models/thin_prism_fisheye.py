@@ -1,9 +1,12 @@
-"""COLMAP's fisheye with tangential and thin-prism terms."""
+"""COLMAP's thin-prism fisheye: theta (cos phi, sin phi) with radial, tangential and thin-prism terms."""
+
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Equidistant, Lens, Planar, Polynomial
+from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
 
 class ThinPrismFisheye(Camera):
@@ -29,7 +32,7 @@ class ThinPrismFisheye(Camera):
     odd_in_y = frozenset({"p1", "sy1"})
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         k1, k2, p1, p2, k3, k4, sx1, sy1 = k
         zero = torch.zeros_like(sx1)
         # as in OpenCV, p2 is the decentering coefficient along x

@@ -1,7 +1,11 @@
-"""The unified camera."""
+"""The unified camera (UCM): (x, y) / (alpha d + (1 - alpha) z), d the distance."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.optics import Lens, Unified
+from camtorch.optics import Chart, Lens, Unified
 
 
 class UCM(Camera):
@@ -26,5 +30,5 @@ class UCM(Camera):
     fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"alpha": 0.7})
 
     @staticmethod
-    def optics(k):
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
         return Unified(alpha=k[0]), Lens()

@@ -1,9 +1,11 @@
-"""The camera of the WoodScape data set."""
+"""The fisheye of the WoodScape data set: r = theta (1 + k2 theta + k3 theta^2 + k4 theta^3)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from camtorch._arguments import TensorLike
 from camtorch.models.f_theta import FTheta
 
 if TYPE_CHECKING:
@@ -25,15 +27,22 @@ class WoodScape(FTheta):
     fit_counts = ()
 
     @classmethod
-    def names_of(cls, count):
+    def names_of(cls, count: int) -> tuple[str, ...] | None:
         return cls.distortion_names if count == 3 else None
 
     @classmethod
-    def counts_text(cls):
+    def counts_text(cls) -> str:
         return "n = 3 (k2 k3 k4)"
 
     @classmethod
-    def from_woodscape(cls, coefficients, offset=(0.0, 0.0), *, image_size, aspect_ratio: float = 1.0) -> Self:
+    def from_woodscape(
+        cls,
+        coefficients: TensorLike,
+        offset: Sequence[float] = (0.0, 0.0),
+        *,
+        image_size: tuple[int, int],
+        aspect_ratio: float = 1.0,
+    ) -> Self:
         """From the numbers of a calibration file.
 
         Args:
