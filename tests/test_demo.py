@@ -14,6 +14,7 @@ def studies():
     return [dewarping.study(lens) for lens in chosen]
 
 
+@pytest.mark.slow
 def test_dewarped_is_what_the_target_would_have_seen(studies):
     for study in studies:
         assert study.warp.target.intrinsics[0] <= study.warp.source.intrinsics[0]
@@ -22,6 +23,7 @@ def test_dewarped_is_what_the_target_would_have_seen(studies):
         assert study.shift < 0.05
 
 
+@pytest.mark.slow
 def test_bent_edges_become_straight(studies):
     for study in studies:
         assert study.lines >= 5
@@ -29,6 +31,7 @@ def test_bent_edges_become_straight(studies):
         assert study.bend_after < 0.15
 
 
+@pytest.mark.slow
 def test_keypoints_move_with_the_image(studies):
     for study in studies:
         assert len(study.keypoints[0]) >= 20
@@ -50,6 +53,7 @@ def test_a_wrong_camera_would_be_noticed():
     assert bends[1] > 3 * bends[0]
 
 
+@pytest.mark.slow
 def test_all_lenses_one_image(tmp_path, monkeypatch, capsys):
     threads = torch.get_num_threads()
     whole = dewarping.run

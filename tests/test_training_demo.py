@@ -14,13 +14,13 @@ def seen() -> Samples:
     return training_data.photograph(training_data.cameras()[0], drivers)
 
 
-def lesson(name: str, seen: Samples, seed: int = 1) -> Samples:
+def learned_from(name: str, seen: Samples, seed: int = 1) -> Samples:
     torch.manual_seed(seed)
     return training_data.teacher(name, *training_data.cameras())(seen, torch.Generator().manual_seed(seed))
 
 
-def test_labels_of_lessons_are_where_their_cameras_see_them(seen):
-    for images in (seen, lesson("camtorch", seen)):
+def test_labels_learned_from_are_where_their_cameras_see_them(seen):
+    for images in (seen, learned_from("camtorch", seen)):
         pixels, valid = images.camera.project(images.points)
         assert bool(valid.all())
         assert (pixels - images.keypoints).abs().max() < 0.1
@@ -40,12 +40,12 @@ def test_both_augmentations_turn_and_scale_alike(seen):
     # else one of them would be at a disadvantage
     across = {}
     for name in ("camtorch", "affine"):
-        keypoints = torch.cat([lesson(name, seen, seed).keypoints for seed in range(8)])
+        keypoints = torch.cat([learned_from(name, seen, seed).keypoints for seed in range(8)])
         eyes = keypoints[:, 2:4].mean(1) - keypoints[:, :2].mean(1)
         before = seen.keypoints[:, 2:4].mean(1) - seen.keypoints[:, :2].mean(1)
         scale = eyes.norm(dim=-1) / before.norm(dim=-1).repeat(8)
         turn = torch.atan2(eyes[:, 1], eyes[:, 0]) - torch.atan2(before[:, 1], before[:, 0]).repeat(8)
-        points = torch.cat([lesson(name, seen, seed).points for seed in range(8)])
+        points = torch.cat([learned_from(name, seen, seed).points for seed in range(8)])
         across[name] = scale.mean(), torch.rad2deg(turn).mean(), keypoints.mean((0, 1)), points.mean((0, 1))
     (scale, turn, place, point), (flat_scale, flat_turn, flat_place, flat_point) = across.values()
     assert abs(scale / flat_scale - 1) < 0.15
@@ -54,6 +54,7 @@ def test_both_augmentations_turn_and_scale_alike(seen):
     assert (point - flat_point).norm() < 0.03
 
 
+@pytest.mark.slow
 def test_learning_lowers_the_loss(seen):
     torch.manual_seed(0)
     network = training.Network(seen.camera.image_size)
@@ -62,6 +63,7 @@ def test_learning_lowers_the_loss(seen):
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
 
 
+@pytest.mark.slow
 def test_a_small_run_by_the_command_line(tmp_path, monkeypatch, capsys):
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     kept = []

@@ -118,7 +118,7 @@ def _rays(corners: Tensor, across: float, down: float, turn: Tensor | None) -> T
 
 def _corners_of(camera: Camera) -> tuple[Tensor, Tensor]:
     """Rays (B or 1, H + 1, W + 1, 3) of the pixels' corners, and which pixels have them, (B or 1, 1, H, W)."""
-    height, width = camera.image_size
+    height, width = camera.height, camera.width
     grid = camera.crop(0, 0, height + 1, width + 1).pixel_grid() - 0.5
     corners, valid = camera.unproject(grid.expand(*camera.batch_shape, *grid.shape))
     corners, valid = corners.reshape(-1, height + 1, width + 1, 3), valid.reshape(-1, 1, height + 1, width + 1)
@@ -178,14 +178,14 @@ def render(
     while math.gcd(step, samples) > 1:
         step += 1
     shift = [0.5 / samples] * 2 if generator is None else torch.rand(2, generator=generator).tolist()
-    total = 0.0
+    total = torch.zeros(())
     # small images are seen several samples at a time: what costs is the number of calls
-    group = max(1, _CHUNK // (len(drivers) * camera.image_size[0] * camera.image_size[1]))
+    group = max(1, _CHUNK // (len(drivers) * camera.height * camera.width))
     for some in torch.arange(samples).split(group):
         places = [((i / samples + shift[0]) % 1, (i * step % samples / samples + shift[1]) % 1) for i in some.tolist()]
         rays = torch.cat([_rays(corners, *place, turn) for place in places], 1)
         total = total + _scan(rays, scene, dots, dot_radius)[0].unflatten(1, (len(places), -1)).sum(1)
-    image = (total / samples).unflatten(1, camera.image_size).permute(0, 3, 1, 2)
+    image = (total / samples).unflatten(1, (camera.height, camera.width)).permute(0, 3, 1, 2)
     return torch.where(valid, image, 0.0)
 
 

@@ -116,7 +116,7 @@ def corners(p: Planes) -> Tensor:
     """(N): what part of its light a point keeps, less close to several walls."""
     shade = torch.ones_like(p[0])
     for point, facing in WALLS:
-        gap = sum((c - a) * b for c, a, b in zip(p, point, facing, strict=True))
+        gap = torch.stack([(c - a) * b for c, a, b in zip(p, point, facing, strict=True)]).sum(0)
         shade = shade * (1 - 0.35 / (1 + (gap / 0.06).square()))
     return shade / 0.65
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from PIL import Image
 from torch import Tensor
 
-from camtorch._drawing import GREY, INK, MARGIN, MIDDLE, PAPER, POINT, Marks, Sheet, shown
+from camtorch._drawing import GREY, INK, MARGIN, MIDDLE, PAPER, POINT, Colour, Marks, Sheet, shown
 from camtorch.camera import Camera
 from camtorch.demo import room
 from camtorch.models import BrownConrady, Fisheye62, Fisheye624, KannalaBrandt, Pinhole
@@ -175,16 +175,21 @@ def drawing(studies: list[Study]) -> Image.Image:
         numbers = f"PSNR {s.psnr:.1f} dB     edges bent by {s.bend_before:.2f} px, now by {s.bend_after:.2f} px"
         sheet.text((columns[1], top + 13), numbers)
         off = (10 * (s.dewarped - s.direct).abs().mean(0) * s.valid).clamp(max=1)
-        difference = torch.lerp(*(torch.tensor(c)[:, None, None] / 255 for c in (PAPER, INK)), off)
-        for x, content, points in zip(columns, (s.source, s.dewarped, difference), (*s.keypoints, ()), strict=True):
+        difference = torch.lerp(_flat(PAPER), _flat(INK), off)
+        marked = (s.source, s.keypoints[0]), (s.dewarped, s.keypoints[1]), (difference, s.keypoints[0][:0])
+        for x, (content, points) in zip(columns, marked, strict=True):
             scale = height / content.shape[-2]
             image = shown(content, height, round(content.shape[-1] * scale))
             marks = Marks(image.width, height, scale)
-            for at in points:
+            for at in points.tolist():
                 marks.circle(at, 1.5, fill=POINT)
             marks.over(image)
             sheet.put(image, (x + (widest - image.width) // 2 * (x == columns[0]), top + band))
     return sheet.image
+
+
+def _flat(colour: Colour) -> Tensor:
+    return torch.tensor(colour)[:, None, None] / 255
 
 
 def _rotation(pitch: float, roll: float) -> Tensor:
@@ -247,7 +252,7 @@ def _edges(lines: Tensor, *views: tuple[Tensor, Camera, Tensor]) -> list[list[Te
             ahead, _ = camera.project((points + 1e-3 * (end - start)) @ rotation.T)
             along = F.normalize(ahead - pixels, dim=-1)
             normal = torch.stack((-along[:, 1], along[:, 0]), -1)
-            inner = camera.crop(8, 8, camera.image_size[0] - 16, camera.image_size[1] - 16).contains(pixels - 8)
+            inner = camera.crop(8, 8, camera.height - 16, camera.width - 16).contains(pixels - 8)
             offset, clear = _across(image, pixels, normal)
             use = use & valid & inner & clear
             places.append(pixels + offset[:, None] * normal)
@@ -266,9 +271,9 @@ def _bend(lines: list[Tensor]) -> float:
 
 def _shift(image: Tensor, truth: Tensor, valid: Tensor) -> float:
     """The length in px of the shift that explains best how an image differs from the truth, to first order."""
-    slopes = [(truth.roll(-1, axis) - truth.roll(1, axis)) / 2 for axis in (2, 1)]
+    along = [(truth.roll(-1, axis) - truth.roll(1, axis)) / 2 for axis in (2, 1)]
     inner = valid.clone()
     inner[[0, -1]], inner[:, [0, -1]] = False, False
-    slopes = torch.stack([slope[:, inner].flatten() for slope in slopes], -1)
+    slopes = torch.stack([slope[:, inner].flatten() for slope in along], -1)
     difference = (truth - image)[:, inner].flatten()
     return float(torch.linalg.solve(slopes.T @ slopes, slopes.T @ difference).norm())

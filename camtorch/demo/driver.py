@@ -66,7 +66,7 @@ def shape_of(looks: Tensor) -> Shape:
 
 def _egg(x: Tensor, y: Tensor, z: Tensor, centre, radii) -> Tensor:
     """The distance to an ellipsoid, exact on its surface and to first order."""
-    square = steep = 1e-12
+    square = steep = torch.full((), 1e-12)
     for place, middle, radius in zip((x, y, z), centre, radii, strict=True):
         # most middles are 0, and this is where the time goes
         place = place if isinstance(middle, (int, float)) and middle == 0 else place - middle
@@ -156,7 +156,8 @@ class Neck(NamedTuple):
 
 def body(p: Planes, neck: Neck) -> Tensor:
     """The distance to neck, trunk, limbs and what the hands hold."""
-    bare = torch.minimum(_limb(*p, (0.0, 0.03, 0.02), neck, (0.054, 0.049)), hands(p))
+    x, y, z = p
+    bare = torch.minimum(_limb(x, y, z, (0.0, 0.03, 0.02), neck, (0.054, 0.049)), hands(p))
     return 0.9 * torch.minimum(_join(torch.minimum(shirt(p), legs(p)), bare, 0.008), wheel(p))
 
 
@@ -203,7 +204,8 @@ def belt(x: Tensor, y: Tensor) -> Tensor:
 def march(distance: Callable, origin: Planes, ray: Planes, near: Tensor, far: Tensor, shape) -> Tensor:
     """Where rays first meet a surface between near and far, infinite where they do not; `shape` is a NamedTuple."""
     found = torch.full_like(near, torch.inf)
-    left, t, lines = torch.arange(len(near)), near, (*origin, *ray)
+    left, t = torch.arange(len(near)), near
+    lines: Planes = (*origin, *ray)
     # along a silhouette steps are short; few rays go there
     for _ in range(12):
         for _ in range(4):
@@ -215,7 +217,7 @@ def march(distance: Callable, origin: Planes, ray: Planes, near: Tensor, far: Te
         on = (~done & (t < far)).nonzero()[:, 0]
         if len(on) == 0:
             return found
-        left, t, far, gap, lines = left[on], t[on], far[on], gap[on], [w[on] for w in lines]
+        left, t, far, gap, lines = left[on], t[on], far[on], gap[on], tuple(w[on] for w in lines)
         shape = shape._make(w[on] for w in shape)
     close = gap < 2e-3
     found[left[close]] = t[close]

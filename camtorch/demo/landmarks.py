@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -15,19 +17,21 @@ LANDMARKS = (
     *("chin", "right_jaw", "left_jaw", "right_ear", "left_ear"),
 )
 """The order of `Drivers.landmarks`; right and left are the driver's."""
+Place = tuple[float | Tensor, ...]
 _ENDS = ((-1, 1), (-1, -1), (1, -1), (1, 1))  # side of the face, outer or inner end
 
 
-def _on_skin(places: list[tuple], s: Shape) -> Tensor:
+def _on_skin(places: Sequence[Place], s: Shape) -> Tensor:
     """(B, N, 3): where the skin is met from outside along the last axis named; that axis's value is the side (+-1)."""
     origin, ray = torch.zeros(2, 3, len(places), len(s.width), dtype=s.width.dtype)
-    for i, (*place, axis) in enumerate(places):
+    for i, (*place, last) in enumerate(places):
+        axis = int(last)
         for j, value in enumerate(place):
             origin[j, i] = value
         ray[axis, i], origin[axis, i] = -origin[axis, i], 0.25 * origin[axis, i]
     origin, ray = origin.flatten(1), ray.flatten(1)
     near = torch.zeros_like(origin[0])
-    shape = s._make(c.repeat(len(places)) for c in s)
+    shape = Shape._make(c.repeat(len(places)) for c in s)
     # half steps: along a fixed line the surface is to be met, not just come near to
     way = driver.march(lambda p, s: 0.6 * driver.skin(p, s), tuple(origin), tuple(ray), near, near + 1, shape)
     return (origin + way * ray).unflatten(1, (len(places), -1)).permute(2, 1, 0)
@@ -40,12 +44,12 @@ def face_points(s: Shape, gaze: Tensor) -> tuple[Tensor, Tensor]:
     top, _, bottom, _ = driver.lips(torch.zeros_like(w), s)
     eyes = [(i * w * (driver.EYE + j * driver.EYE_WIDTH), -0.05 * j * driver.EYE_WIDTH, -1, 2) for i, j in _ENDS]
     brows = [(i * w * driver.BROW[j > 0], ends[j > 0], -1, 2) for i, j in _ENDS]
-    nose = [(0.0, 0.0395 + s.nose, -1, 2), *((i * 0.0155 * w, 0.044 + s.nose, -1, 2) for i in (-1, 1))]
-    mouth = [(i * driver.MOUTH * w, driver.MOUTH_Y - s.smile, -1, 2) for i in (-1, 1)]
+    nose: list[Place] = [(0.0, 0.0395 + s.nose, -1, 2), *((i * 0.0155 * w, 0.044 + s.nose, -1, 2) for i in (-1, 1))]
+    mouth: list[Place] = [(i * driver.MOUTH * w, driver.MOUTH_Y - s.smile, -1, 2) for i in (-1, 1)]
     mouth += [(0.0, y, -1, 2) for y in (top, bottom)]
     chin = (0.0, 1, -0.004, 1)
     sides = [(i, y, z, 0) for y, z in ((0.07, 0.045), (0.012, 0.1)) for i in (-1, 1)]
-    outline = [(i, y, 0.03, 0) for y in (-0.045, 0.0, 0.035, 0.07) for i in (-1, 1)]
-    found = _on_skin([*eyes, *brows, *nose, *mouth, chin, *sides, *outline, (0.0, -0.062, -1, 2)], s)
+    rim = [(i, y, 0.03, 0) for y in (-0.045, 0.0, 0.035, 0.07) for i in (-1, 1)]
+    found = _on_skin([*eyes, *brows, *nose, *mouth, chin, *sides, *rim, (0.0, -0.062, -1, 2)], s)
     marks, outline = found[:, :20], torch.cat([found[:, 20:], found[:, [8, 15]]], 1)
     return torch.cat([marks[:, :4], driver.eyeballs(s) + driver.EYE_RADIUS * gaze[:, None], marks[:, 4:]], 1), outline

@@ -21,15 +21,13 @@ _CHUNK = 1 << 17
 
 def _slabs(origin: Planes, ray: Planes, box) -> tuple[Tensor, Tensor, Tensor]:
     """Distances at which rays enter and leave a box, and the axis of the face they enter through."""
-    near = far = axis = None
+    first = torch.zeros_like(ray[0])
+    near, far, axis = first - torch.inf, first + torch.inf, first.long()
     for i in range(3):
         a, b = (box[0][i] - origin[i]) / ray[i], (box[1][i] - origin[i]) / ray[i]
         low, high = torch.minimum(a, b), torch.maximum(a, b)
-        if near is None:
-            near, far, axis = low, high, torch.zeros_like(low, dtype=torch.long)
-        else:
-            axis = torch.where(low > near, i, axis)
-            near, far = torch.maximum(near, low), torch.minimum(far, high)
+        axis = torch.where(low > near, i, axis)
+        near, far = torch.maximum(near, low), torch.minimum(far, high)
     return near, far, axis
 
 
@@ -109,13 +107,13 @@ def _irradiance(point: Planes, normal: Tensor) -> Tensor:
     on_floor = walls.soft(y, 1.0, 2.0, 0.02)
     corner = corner * (1 - 0.6 * on_floor * walls.soft(x, -0.75, 0.75, 0.12) * walls.soft(z, 2.0, 2.9, 0.12))
     light = corner * (0.5 - 0.08 * normal[1]) * torch.tensor([[1.08], [1.0], [0.93]])
-    to = (-x, -0.3 - y, 4.3 - z)
+    to: Planes = (-x, -0.3 - y, 4.3 - z)
     square = sum(c * c for c in to) + 1e-6
     facing = sum(a * b for a, b in zip(to, normal, strict=True)).clamp(min=0) * to[2].clamp(min=0) / square
     light = light + 3.0 * facing / (square + 0.9) * torch.tensor([[1.0], [0.93], [0.84]]) * corner
     for lamp in walls.LAMPS:
-        to = [c - p for c, p in zip(lamp, point, strict=True)]
-        square = sum(c * c for c in to) + 1e-6
+        to = tuple(c - p for c, p in zip(lamp, point, strict=True))
+        square = torch.stack(to).square().sum(0) + 1e-6
         facing = sum(a * b for a, b in zip(to, normal, strict=True)).clamp(min=0) * square.rsqrt()
         light = light + 0.3 * facing / (square + 0.2) * torch.tensor([[1.0], [0.85], [0.62]]) * corner
     facing = sum(a * b for a, b in zip(walls.SUN, normal, strict=True))
@@ -165,7 +163,7 @@ def render(camera: Camera, rotation: Tensor | None = None, *, samples: int = 12)
         rotation: (3, 3), camera from walls.
         samples: rays per pixel, spread over it as a lattice; their mean is the pixel, as on a sensor.
     """
-    height, width = camera.image_size
+    height, width = camera.height, camera.width
     # Rays of the pixels' corners, interpolated within the pixel: off by 1 / (8 focal lengths) of a pixel, and
     # the lens is inverted once for all samples
     corners, valid = camera.unproject(camera.crop(0, 0, height + 1, width + 1).pixel_grid() - 0.5)

@@ -50,21 +50,20 @@ def see(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tensor
     classes = torch.full((len(rays),), CABIN)
 
     # the head, in its own frame
-    turned = tuple(torch.where(c.abs() < 1e-7, 1e-7, c) for c in _columns(turned))
-    near, far = slabs(_columns(scene.origin[row]), turned, *driver.HEAD_BOX)
+    head_ray = tuple(torch.where(c.abs() < 1e-7, 1e-7, c) for c in _columns(turned))
+    near, far = slabs(_columns(scene.origin[row]), head_ray, *driver.HEAD_BOX)
     best = torch.full_like(near, torch.inf)
     some = (near < far).nonzero()[:, 0]
-    o, r = _columns(scene.origin[row[some]]), tuple(c[some] for c in turned)
+    o, r = _columns(scene.origin[row[some]]), tuple(c[some] for c in head_ray)
     shape = Shape._make(c[row[some]] for c in scene.shape)
     best[some] = driver.march(driver.head, o, r, near[some], far[some], shape)
     on_head = best < torch.inf
 
     # the body, in its frame
     start = _columns(-scene.body[row])
-    near, far = (slabs(start, ray, *box) for box in driver.BODY_BOXES)
-    near, far = zip(near, far, strict=True)
-    near = torch.minimum(*(torch.where(a < b, a, torch.inf) for a, b in zip(near, far, strict=True)))
-    far = torch.maximum(*far)
+    boxes = [slabs(start, ray, *box) for box in driver.BODY_BOXES]
+    near = torch.stack([torch.where(a < b, a, torch.inf) for a, b in boxes]).amin(0)
+    far = torch.stack([b for _, b in boxes]).amax(0)
     some = ((near < far) & (near < best)).nonzero()[:, 0]
     o, r = tuple(c[some] for c in start), tuple(c[some] for c in ray)
     neck = Neck._make(c[row[some]] for c in scene.neck)
@@ -96,7 +95,7 @@ def see(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tensor
     on_body = on_body[seat[on_body] < 0]
 
     here = on_head.nonzero()[:, 0]
-    light[:, here], classes[here] = _see_head(ray, turned, best[here], here, row[here], scene)
+    light[:, here], classes[here] = _see_head(ray, head_ray, best[here], here, row[here], scene)
 
     k = row[on_body]
     p = tuple(best[on_body] * c[on_body] for c in ray)
@@ -141,7 +140,7 @@ def _see_head(ray: Planes, turned: Planes, t: Tensor, here: Tensor, k: Tensor, s
     normal = driver.normals(driver.head, p, shape)
     albedo, is_hair = paint.head(p, shape, scene.looks[k])
     # the hollow that a point looks out of: how much nearer the surface is than on a plane
-    hollow = 1.0
+    hollow = torch.ones_like(t)
     for step in (0.008, 0.025):
         out = tuple(a + step * b for a, b in zip(p, normal, strict=True))
         hollow = hollow * (0.5 + 0.5 * (driver.head(out, shape) / (0.9 * step)).clamp(0, 1))

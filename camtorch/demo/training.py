@@ -156,7 +156,7 @@ def run(
             say(f"rendering {2 * images} images to learn from and {tests} to be examined on")
             seen = photograph(camera, drivers, workers=workers)
             test, bound = (photograph(like, d, MOUNT, workers) for d in (others, drivers))
-            first = Network(camera.image_size)
+            first = Network((camera.height, camera.width))
 
             def study(name: str) -> Result:
                 # torch's own generator is RandomAffine's alone from here on

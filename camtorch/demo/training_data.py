@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -92,15 +93,19 @@ def teacher(name: str, camera: Camera, like: Camera) -> Augment:
     """What makes of samples of `camera` those that a network for the lens `like` learns from."""
     if name == "camtorch":
         yaw, pitch, roll = ((a - b, a + b) for a, b in zip(PLANNED, WITHIN, strict=True))
-        options = {
-            "focal": 0.02,
-            "centre": 0.01,
-            "distortion": None,
-            "crop": None,
-            "padding_mode": "border",
-            "min_filled": 0,
-        }
-        augment = RandomCamera(like, yaw=yaw, pitch=pitch, roll=roll, camera=camera, **options)
+        augment = RandomCamera(
+            like,
+            yaw=yaw,
+            pitch=pitch,
+            roll=roll,
+            focal=0.02,
+            centre=0.01,
+            distortion=None,
+            crop=None,
+            camera=camera,
+            padding_mode="border",
+            min_filled=0,
+        )
 
         def by_camera(p: Samples, generator: torch.Generator) -> Samples:
             new = augment(image=p.image, keypoints=p.keypoints, points=p.points, generator=generator)
@@ -118,17 +123,17 @@ def _by_affine(camera: Camera, like: Camera) -> Augment:
     """
     from kornia.augmentation import RandomAffine
 
-    height, width = camera.image_size
     focal = float(like.intrinsics[0])
-    shift = tuple(math.radians(angle) * focal / side for angle, side in zip(WITHIN, (width, height), strict=False))
+    shift = math.radians(WITHIN[0]) * focal / camera.width, math.radians(WITHIN[1]) * focal / camera.height
     scale = focal / float(camera.intrinsics[0])
-    roll = tuple(-PLANNED[2] + s * WITHIN[2] for s in (-1, 1))
+    roll = -PLANNED[2] - WITHIN[2], -PLANNED[2] + WITHIN[2]
     aim = _turn((*PLANNED[:2], 0.0)).float()
     augment = RandomAffine(roll, shift, (0.98 * scale, 1.02 * scale), p=1.0, padding_mode="border")
 
     def by_affine(p: Samples, generator: torch.Generator) -> Samples:
         image = augment(p.image)
-        linear, step = augment.transform_matrix[:, :2, :2], augment.transform_matrix[:, None, :2, 2]
+        matrix = cast(Tensor, augment.transform_matrix)
+        linear, step = matrix[:, :2, :2], matrix[:, None, :2, 2]
         keypoints = p.keypoints @ linear.mT + step
         turn = linear / torch.linalg.det(linear).sqrt()[:, None, None]
         points = p.points @ aim.T

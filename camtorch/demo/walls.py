@@ -69,7 +69,7 @@ def surface(kind: int, point: tuple[Tensor, ...], ray: tuple[Tensor, ...]) -> tu
         albedo = plain[kind].expand(3, len(x))
     elif kind == CHEQUERED:
         cells = [torch.floor((c - low - 1e-3) / 0.1) for c, low in zip(point, CUBE[0], strict=True)]
-        albedo = torch.where(sum(cells) % 2 == 1, _TERRACOTTA, _CREAM)
+        albedo = torch.where(torch.stack(cells).sum(0) % 2 == 1, _TERRACOTTA, _CREAM)
     elif kind in (LEFT_WALL, RIGHT_WALL):
         albedo = (_left_wall if kind == LEFT_WALL else _right_wall)(z, y)
     elif kind == REAR_WALL:
