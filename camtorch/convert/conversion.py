@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from camtorch._arguments import as_image_size, as_whole
 from camtorch.convert import views
-from camtorch.convert.least_squares import even_out, fit
+from camtorch.convert.least_squares import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
-from camtorch.convert.relations import carried, default_count
+from camtorch.convert.relations import carry_over, default_count
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -90,7 +90,7 @@ def convert(
     if counts[0] < 0 or model.names_of(counts[0]) is None:
         raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}; got count={count}")
 
-    def made(parameters: Tensor) -> CameraT:
+    def build(parameters: Tensor) -> CameraT:
         intrinsics, distortion = parameters[..., :4], parameters[..., 4:]
         # models without coefficients take no argument for them
         arguments = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
@@ -102,11 +102,13 @@ def convert(
     parts = []
     for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True):
         rays = reference(_with_numbers(source, *numbers), image_size, limit)
-        parts.append(_by_counts(_Task(rays, model, models, made, image_size, limit, float(tolerance)), counts))
+        parts.append(
+            _with_fewest_coefficients(_Task(rays, model, models, build, image_size, limit, float(tolerance)), counts)
+        )
     most = max(part.parameters.shape[-1] for part in parts)
     result = _Result(*map(torch.cat, zip(*(part.padded(most) for part in parts), strict=True)))
     return Conversion(
-        made(result.parameters.reshape(*batch, most)).freeze_like(source),
+        build(result.parameters.reshape(*batch, most)).freeze_like(source),
         rms=result.rms.reshape(batch),
         max_error=result.max_error.reshape(batch),
         max_angle=result.max_angle.reshape(batch),
@@ -131,7 +133,7 @@ class _Task(NamedTuple):
     source: Reference
     model: type[Camera]
     models: Mapping[str, type[Camera]]
-    made: Callable[[Tensor], Camera]
+    build: Callable[[Tensor], Camera]
     image_size: tuple[int, int] | None
     limit: float
     tolerance: float
@@ -172,7 +174,7 @@ class _Result(NamedTuple):
         return self._replace(parameters=parameters)
 
 
-def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
+def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
     """Each row with the first number of coefficients that keeps the tolerance; or, if none does, that is worth it."""
     result = _converted(task, counts[0])
     for count in counts[1:]:
@@ -181,47 +183,47 @@ def _by_counts(task: _Task, counts: tuple[int, ...]) -> _Result:
             break
         other = _converted(task.of(rows), count)
         enough = (_WORTH_IT * result.max_error[rows]).clamp(min=task.tolerance)
-        (good,) = ((other.max_error <= enough) & _as_far(other.max_angle, result.max_angle[rows])).nonzero(
+        (good,) = ((other.max_error <= enough) & _reaches_as_far(other.max_angle, result.max_angle[rows])).nonzero(
             as_tuple=True
         )
         result = result.replaced(rows[good], other.of(good))
     return result
 
 
-def _as_far(angle: Tensor, before: Tensor) -> Tensor:
+def _reaches_as_far(angle: Tensor, before: Tensor) -> Tensor:
     return angle >= before * (1 - 1e-9)  # measured on another batch, it is rounded otherwise
 
 
 def _converted(task: _Task, count: int) -> _Result:
-    source, model, made = task.source.camera, task.model, task.made
+    source, model, build = task.source.camera, task.model, task.build
     names = model.names_of(count) or ()
     slopes = views.focal_at_axis(source)
-    view = views.view(source, task.image_size, _FIT_SIDE, task.limit)
+    samples = views.sample(source, task.image_size, _FIT_SIDE, task.limit)
     starts = model.fit_start(names, *views.radii(source, slopes, task.source.reach))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
-    related = carried(source, source.distortion.nan_to_num(0.0, 0.0, 0.0), model, names, task.models)
-    if related is not None:
-        taken, exact = related[0], related[1] & usable & (source.intrinsics[:, :2] > 0).all(-1)
+    carried = carry_over(source, source.distortion.nan_to_num(0.0, 0.0, 0.0), model, names, task.models)
+    if carried is not None:
+        taken, exact = carried[0], carried[1] & usable & (source.intrinsics[:, :2] > 0).all(-1)
         starts = torch.cat((starts, taken[None]))
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
     rows = (~exact).nonzero()[:, 0]
     if len(rows):
-        parameters[rows] = fit(made(parameters), view.observations.of(rows), starts[:, rows], slopes[rows])
+        parameters[rows] = fit(build(parameters), samples.observations.of(rows), starts[:, rows], slopes[rows])
     result = _measured(task, parameters, exact)
     # no camera of the model has a largest error below the least root of the mean square
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
         these = task.of(rows)
-        observations = views.rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit).observations
-        evened = _measured(these, even_out(made(parameters), observations, parameters[rows]), exact[rows])
+        observations = views.sample_with_rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit).observations
+        minimax = _measured(these, refine_minimax(build(parameters), observations, parameters[rows]), exact[rows])
         (better,) = (
-            (evened.max_error < result.max_error[rows]) & _as_far(evened.max_angle, result.max_angle[rows])
+            (minimax.max_error < result.max_error[rows]) & _reaches_as_far(minimax.max_angle, result.max_angle[rows])
         ).nonzero(as_tuple=True)
-        result = result.replaced(rows[better], evened.of(better))
+        result = result.replaced(rows[better], minimax.of(better))
     return result
 
 
 def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
-    return _Result(parameters, *measure(task.made(parameters), parameters[:, 4:], exact, task.source), exact)
+    return _Result(parameters, *measure(task.build(parameters), parameters[:, 4:], exact, task.source), exact)

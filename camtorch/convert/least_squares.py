@@ -1,4 +1,4 @@
-"""Cameras fitted to pixels of rays, by Levenberg and Marquardt's method, each row of a batch for itself."""
+"""Cameras fitted to pixels of rays, by the Levenberg-Marquardt method, each row of a batch for itself."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FURTHEST = 20.0
 _MOST_STEPS = 60
 _ROUNDS = 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
-_EVENINGS, _EVENING_STEPS, _PATIENCE = 40, 2, 6
+_LAWSON_ROUNDS, _LAWSON_STEPS, _PATIENCE = 40, 2, 6
 _SETTLED = 1e-8  # the relative decrease of the cost that ends the search
 _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
 _LEAST_SLOPE = 1e-3  # of a lens at the axis, that a fit starts from
@@ -39,7 +39,7 @@ class Observations(NamedTuple):
         return Observations(*(t[rows] for t in self))
 
 
-class Seen(NamedTuple):
+class SensorPoints(NamedTuple):
     """Planes (C, N): points on the plane of the sensor, the centre where there is none, and whether there is one."""
 
     a: Tensor
@@ -47,7 +47,7 @@ class Seen(NamedTuple):
     covered: Tensor
 
 
-def see(camera: Camera, k: Tensor, rays: Tensor) -> Seen:
+def to_sensor(camera: Camera, k: Tensor, rays: Tensor) -> SensorPoints:
     """Rays through the chart and the lens of coefficients (C, n), whether or not they lie before a fold."""
     chart, lens = camera.optics(columns(k))
     x, y, z = rays.unbind(-1)
@@ -58,7 +58,7 @@ def see(camera: Camera, k: Tensor, rays: Tensor) -> Seen:
     if lens.stages:
         a, b = lens(a, b)
     covered = covered & torch.isfinite(a) & torch.isfinite(b)
-    return Seen(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
+    return SensorPoints(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
 
 
 def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
         within = observations._replace(weights=torch.zeros_like(observations.weights))
         for _ in range(_ROUNDS):
             # a chart may cover more once its coefficients fit what it covered before
-            weights = observations.weights * see(camera, parameters[:, 4:], observations.rays).covered
+            weights = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
             more = (weights != within.weights).any(-1) & ~found
             within = observations._replace(weights=weights)
             parameters = _refine(camera, within, parameters, low, high, more)
@@ -96,19 +96,19 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
     return torch.stack(results)[best, torch.arange(len(best), device=best.device)]
 
 
-def even_out(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
+def refine_minimax(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
     """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
 
-    Lawson's algorithm: least squares over and over, the weight of a square multiplied by its error each time, approach
+    Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time, approach
     what has the least largest error.
     """
     low, high = _bounds(camera, parameters)
-    covered = observations.weights * see(camera, parameters[:, 4:], observations.rays).covered
+    covered = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
     observations = observations._replace(weights=covered)
     best, weights = parameters, covered
     error = _distances(observations, camera, parameters)
     least, stale = error.amax(-1), torch.zeros_like(error[:, 0])
-    for _ in range(_EVENINGS):
+    for _ in range(_LAWSON_ROUNDS):
         going = stale < _PATIENCE
         if not bool(going.any()):
             break
@@ -116,7 +116,7 @@ def even_out(camera: Camera, observations: Observations, parameters: Tensor) -> 
         weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
         weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
         weighted = observations._replace(weights=weights)
-        parameters = _refine(camera, weighted, parameters, low, high, going, _EVENING_STEPS, _LEAST_DAMPING)
+        parameters = _refine(camera, weighted, parameters, low, high, going, _LAWSON_STEPS, _LEAST_DAMPING)
         error = _distances(observations, camera, parameters)
         better = going & (error.amax(-1) < least)
         best = torch.where(better[:, None], parameters, best)
@@ -128,7 +128,7 @@ def even_out(camera: Camera, observations: Observations, parameters: Tensor) -> 
 def _distances(observations: Observations, camera: Camera, parameters: Tensor) -> Tensor:
     """(C, N) pixels."""
     return torch.linalg.vector_norm(
-        _residuals(observations, parameters, see(camera, parameters[:, 4:], observations.rays)), dim=1
+        _residuals(observations, parameters, to_sensor(camera, parameters[:, 4:], observations.rays)), dim=1
     )
 
 
@@ -142,7 +142,7 @@ def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _residuals(observations: Observations, parameters: Tensor, seen: Seen) -> Tensor:
+def _residuals(observations: Observations, parameters: Tensor, seen: SensorPoints) -> Tensor:
     """(C, 2, N) pixels."""
     fx, fy, cx, cy = columns(parameters[:, :4])
     u, v = observations.pixels.unbind(-1)
@@ -151,7 +151,7 @@ def _residuals(observations: Observations, parameters: Tensor, seen: Seen) -> Te
 
 def _cost(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
     """(C,) the sum of squares; infinite where a ray that counts is not covered, or the coefficients make no camera."""
-    seen = see(camera, parameters[:, 4:], observations.rays)
+    seen = to_sensor(camera, parameters[:, 4:], observations.rays)
     lost = (~seen.covered & (observations.weights > 0)).any(-1)
     cost = _residuals(observations, parameters, seen).square().sum((1, 2))
     defined = camera.defined(parameters[:, 4:].unbind(-1))
@@ -163,7 +163,7 @@ def _cost(camera: Camera, observations: Observations, parameters: Tensor) -> Ten
 def _linearised(camera: Camera, observations: Observations, parameters: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
     """The residuals (C, 2 N), and their derivatives (C, F, 2 N) by the parameters of indices (F,), 0 to 3 first."""
     k = parameters[:, 4:]
-    seen = see(camera, k, observations.rays)
+    seen = to_sensor(camera, k, observations.rays)
     fx, fy, _, _ = columns(parameters[:, :4])
     zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
     derivatives = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
@@ -178,7 +178,7 @@ def _linearised(camera: Camera, observations: Observations, parameters: Tensor, 
 
 
 def _derivatives(camera: Camera, k: Tensor, rays: Tensor, directions: Tensor) -> Tensor:
-    """(C, D, 2, N): of `see` by the coefficients (C, n), along directions (D, n).
+    """(C, D, 2, N): of `to_sensor` by the coefficients (C, n), along directions (D, n).
 
     The directions are rows more: vmap over the derivatives of one would take Python's word for many operations.
     """
@@ -187,7 +187,7 @@ def _derivatives(camera: Camera, k: Tensor, rays: Tensor, directions: Tensor) ->
         # on its first use forward mode loads what calls the deprecated torch.jit.script
         warnings.simplefilter("ignore", DeprecationWarning)
         dual = forward_ad.make_dual(k.repeat_interleave(count, 0), directions.repeat(len(k), 1))
-        seen = see(camera, dual, rays.repeat_interleave(count, 0))
+        seen = to_sensor(camera, dual, rays.repeat_interleave(count, 0))
         tangents = [forward_ad.unpack_dual(plane).tangent for plane in seen[:2]]
     planes = [torch.zeros_like(seen.a) if t is None else t for t in tangents]
     return torch.stack(planes, 1).unflatten(0, (len(k), count))

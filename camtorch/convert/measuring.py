@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from camtorch.convert import views
-from camtorch.convert.least_squares import see
+from camtorch.convert.least_squares import to_sensor
 from camtorch.projection.rays import image_edges, ray_fan
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def reference(camera: Camera, image_size: tuple[int, int] | None, limit: float) 
     """The rays of cameras (C,); those count that are up to an angle from the axis."""
     lattice = views.lattice(camera, image_size, _SIDE, limit)
     rays = lattice.sampled(camera, lattice.nodes())
-    all_rays = rays if limit == math.pi else views.view(camera, image_size, _SIDE, math.pi)
+    all_rays = rays if limit == math.pi else views.sample(camera, image_size, _SIDE, math.pi)
     return Reference(camera, image_size, lattice, rays, all_rays)
 
 
@@ -72,7 +72,7 @@ def measure(target: Camera, k: Tensor, exact: Tensor, source: Reference) -> Meas
 
     def reached(rays: views.SampledRays) -> Tensor:
         # what was out of the reach of the fit is no part of its result
-        return see(target, k, rays.rays).covered | exact[:, None]
+        return to_sensor(target, k, rays.rays).covered | exact[:, None]
 
     rays = source.rays
     errors, mapped = compared(rays)

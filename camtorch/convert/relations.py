@@ -33,7 +33,7 @@ def default_count(model: Model, source: Camera, models: Models) -> int:
     return min((n for n, number in held.items() if number == max(held.values())), default=model.default_count)
 
 
-def carried(
+def carry_over(
     source: Camera, values: Tensor, model: Model, names: tuple[str, ...], models: Models
 ) -> tuple[Tensor, Tensor] | None:
     """The coefficients (C, n) of a camera as those of a related model, and whether nothing is lost: bool (C,).

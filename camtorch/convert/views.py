@@ -102,15 +102,15 @@ def lattice(camera: Camera, image_size: tuple[int, int] | None, side: int, limit
     return Lattice(low, high, side, True, limit)
 
 
-def view(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
+def sample(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
     """side^2 rays on the image, or in all directions, of which those count that the camera has up to an angle."""
     nodes = lattice(camera, image_size, side, limit)
     return nodes.sampled(camera, nodes.nodes())
 
 
-def rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
-    """`view`, and rays on circles around the axis, over which the errors of a radial lens change."""
-    whole = view(camera, image_size, side, limit)
+def sample_with_rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
+    """`sample`, and rays on circles around the axis, over which the errors of a radial lens change."""
+    whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
     rays = ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS).flatten(1, 2)
     pixels, valid = camera.project(rays)
