@@ -99,8 +99,8 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
 def refine_minimax(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
     """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
 
-    Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time, approach
-    what has the least largest error.
+    Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time,
+    approach what has the least largest error.
     """
     low, high = _bounds(camera, parameters)
     covered = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
