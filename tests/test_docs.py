@@ -1,0 +1,81 @@
+"""README and documentation: every Python block runs on its own, every command runs, every public name has a page."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import camtorch as ct
+from camtorch.cli.main import main
+
+ROOT = Path(__file__).parent.parent
+FILES = ROOT / "tests" / "files"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(language: str):
+    for page in PAGES:
+        for found in re.finditer(rf"^( *)```{language}\n(.*?)^ *```", page.read_text(), re.S | re.M):
+            line = page.read_text()[: found.start()].count("\n") + 2
+            code = re.sub(rf"^{found[1]}", "", found[2], flags=re.M)
+            yield pytest.param(page, line, code, id=f"{page.relative_to(ROOT)}:{line}")
+
+
+def commands():
+    for param in blocks("bash"):
+        page, line, code = param.values
+        lines = [text for text in code.splitlines() if text.startswith("camtorch ") and " demo " not in text]
+        if lines:
+            yield pytest.param(page, line, lines, id=param.id)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, with the files that the pages speak of."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(FILES / "opencv_fisheye.yml", "camera.yml")
+    shutil.copy(FILES / "kalibr_camchain.yaml", "camchain.yaml")
+    camera = ct.load("camera.yml").camera
+    height, width = camera.image_size
+    ct.save(camera, "other.yml", format="opencv")
+    Image.fromarray(np.full((height, width, 3), 128, np.uint8)).save("photo.jpg")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("page", "line", "code"), [*blocks("python")])
+def test_a_block_runs_by_itself(page, line, code, folder):
+    exec(compile("\n" * (line - 1) + code, str(page), "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize(("page", "line", "lines"), [*commands()])
+def test_a_command_runs(page, line, lines, folder, capsys):
+    for text in lines:
+        words = shlex.split(text, comments=True)[1:]
+        assert main(words) == 0, f"{page}:{line}: {text}\n{capsys.readouterr().err}"
+
+
+def test_every_public_name_has_a_place_in_the_reference():
+    reference = "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
+    missing = []
+    for name in ct.__all__:
+        value = getattr(ct, name)
+        if not isinstance(value, type) and not callable(value):
+            continue
+        if f".{value.__name__}\n" not in reference + "\n":
+            missing.append(name)
+    assert not missing
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = (ROOT / "mkdocs.yml").read_text()
+    pages = [str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")]
+    assert pages
+    assert [page for page in pages if f" {page}\n" not in navigation] == []
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 200
