@@ -155,13 +155,10 @@ def as_values(values, name: str, owner: str, device: torch.device | None = None)
     return values
 
 
-def as_rows(
+def as_points(
     values, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
-) -> tuple[Tensor, torch.Size, Callable[[Tensor], Tensor]]:
-    """Bring (*B, *N, size) into rows (C, N, size), one for each camera.
-
-    Returns the rows, in the dtype to compute in; the batch dims that C counts; and a function that gives results their
-    shape back: planes (C, N) become (*B, *N), and planes (count, C, N) become a view (*B, *N, count).
+) -> tuple[Tensor, torch.Size]:
+    """What users pass as (*B, *N, size), in the dtype to compute in and with the batch dims of `batch`; and *B.
 
     Raises:
         TypeError: not real numbers. ValueError: the shape does not fit `batch`.
@@ -177,19 +174,30 @@ def as_rows(
         lead = lead if lead == batch else broadcast_shapes(lead, batch)
     except ValueError:
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}") from None
-    rows = values.to(working_dtype(values, *parameters))
-    if rows.shape[: len(lead)] != lead:
-        rows = rows.expand(*lead, *rest, size)
-    rows = rows.reshape(math.prod(lead), math.prod(rest), size)
+    values = values.to(working_dtype(values, *parameters))
+    if values.shape[: len(lead)] != lead:
+        values = values.expand(*lead, *rest, size)
+    return values, lead
+
+
+def as_rows(
+    values, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
+) -> tuple[Tensor, torch.Size, Callable[[Tensor], Tensor]]:
+    """Bring (*B, *N, size) into rows (C, N, size), one for each camera; see `as_points`.
+
+    Returns the rows, in the dtype to compute in; the batch dims that C counts; and a function that gives results their
+    shape back: planes (count, C, N) become a view (*B, *N, count).
+    """
+    values, lead = as_points(values, name, size, batch, parameters, owner)
+    shape = values.shape[:-1]
 
     def restore(planes: Tensor) -> Tensor:
-        if planes.ndim == 2:
-            return planes.reshape((*lead, *rest))
-        return planes.reshape((len(planes), *lead, *rest)).movedim(0, -1)
+        return planes.reshape((len(planes), *shape)).movedim(0, -1)
 
-    return rows, lead, restore
+    return values.reshape(math.prod(lead), math.prod(shape[len(batch) :]), size), lead, restore
 
 
 def columns(parameters: Tensor) -> tuple[Tensor, ...]:
     """(*B, n) -> n tensors (*B, 1), or (1,), that broadcast against planes."""
-    return parameters.unsqueeze(-1).unbind(-2)
+    # what has no columns cannot be unbound once it was exported and loaded
+    return parameters.unsqueeze(-1).unbind(-2) if parameters.shape[-1] else ()

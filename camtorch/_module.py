@@ -138,6 +138,9 @@ class Memo:
     Nothing is kept while the values may not be looked at. Copies and pickles begin empty.
     """
 
+    result: Any = None
+    """What is kept, of whatever inputs."""
+
     def __init__(self):
         self._kept = None
 
@@ -146,16 +149,16 @@ class Memo:
         if not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
         if self._kept is not None:
-            kept_inputs, kept_options, result = self._kept
+            kept_inputs, kept_options = self._kept
             if options == kept_options and all(map(same, inputs, kept_inputs)):
-                return result
+                return self.result
         if in_transform():  # what a transform makes dies with it
             return compute()
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
             copies = [t.detach().clone() for t in inputs]
             result = compute()
-        self._kept = (copies, options, result)
+        self._kept, self.result = (copies, options), result
         return result
 
     def __getstate__(self):

@@ -9,29 +9,28 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from camtorch._arguments import (
     as_batch,
     as_image_size,
+    as_points,
     as_real,
-    as_rows,
     as_values,
     as_whole,
     broadcast_shapes,
-    columns,
 )
 from camtorch._module import BatchedModule, Memo
-from camtorch._tracing import has_tangent, in_transform, is_concrete, may_look
+from camtorch._tracing import has_tangent, is_concrete
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
-from camtorch.projection import formulas, ops
-from camtorch.projection.autograd import Cameras, Project, Unproject
-from camtorch.projection.domain import Domain
 from camtorch.projection.explanation import explain
-from camtorch.projection.ops import finish, positive, tables, to_planes, without_keeping
+from camtorch.projection.ops import register_camera
+from camtorch.projection.project import Project
 from camtorch.projection.rays import AXES, field_of_view, focal_for
-from camtorch.projection.solve import invert
+from camtorch.projection.rows import Cameras
+from camtorch.projection.unproject import Unproject
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -97,7 +96,7 @@ class Camera(BatchedModule):
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
-        cls._model = ops.register_camera(cls)
+        cls._model = register_camera(cls)
         if "key" in cls.__dict__:
             MODELS[cls.key] = cls
 
@@ -356,23 +355,7 @@ class Camera(BatchedModule):
             lies before the fold of the lens. Whether the pixel is on the image is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        rows, lead, restore = as_rows(points, "points", 3, self.batch_shape, self._tensors, type(self).__name__)
-        return self._map(Project, self._project_by_formulas, rows, lead, restore)
-
-    def _project_by_formulas(self, points: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
-        intrinsics, distortion, domain, usable = self._traced(points, intrinsics, distortion)
-
-        def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-            ray = formulas.normalise(domain.chart, x, y, z)
-            a, b, mask = formulas.see(ray, *self.optics(columns(distortion)), domain, order)
-            mask = formulas.both(mask, usable)
-            focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
-            pixels = focal_x * a + centre_x, focal_y * b + centre_y
-            pixels = torch.stack([formulas.replace(mask, w, formulas.INVALID_PIXEL) for w in pixels])
-            return pixels, torch.ones_like(pixels[0]) if mask is None else mask.expand_as(pixels[0])
-
-        pixels, mask = without_keeping(evaluate, *to_planes(points), intrinsics, distortion)
-        return pixels, positive(mask)
+        return self._map(Project, points, "points", 3)
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -384,92 +367,41 @@ class Camera(BatchedModule):
             rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
-        rows, lead, restore = as_rows(pixels, "pixels", 2, self.batch_shape, self._tensors, type(self).__name__)
-        return self._map(Unproject, self._unproject_by_formulas, rows, lead, restore)
-
-    def _unproject_by_formulas(self, pixels: Tensor, intrinsics: Tensor, distortion: Tensor, order: int = 2):
-        intrinsics, distortion, domain, usable = self._traced(pixels, intrinsics, distortion)
-        u, v = to_planes(pixels)
-        p, q, mask = formulas.to_target(u.detach(), v.detach(), columns(intrinsics.detach()))
-        mask = formulas.both(mask, usable)
-        p, q = formulas.replace(mask, p, 0.0), formulas.replace(mask, q, 0.0)
-        if domain.lens.stages:
-            found = finish(self._model, domain.k, p, q, invert(domain, p, q))
-            solved = formulas.to_mask(found.solved)
-            solution = formulas.clean(solved, found)
-        else:
-            solved = formulas.to_mask(domain.chart.on_plane(p, q))
-            solution = formulas.replace(solved, p, 0.0), formulas.replace(solved, q, 0.0)
-        mask = formulas.both(mask, solved)
-
-        def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
-            target = formulas.to_target(u, v, columns(intrinsics))
-            optics = self.optics(columns(distortion))
-            return torch.stack(formulas.rays_of(solution, target[:2], mask, *optics, order))
-
-        if torch.compiler.is_compiling() and not any(t.requires_grad for t in (pixels, intrinsics, distortion)):
-            order = 0
-        rays = without_keeping(evaluate, u, v, intrinsics, distortion)
-        return rays, positive(torch.ones_like(p) if mask is None else mask.expand_as(p))
+        return self._map(Unproject, pixels, "pixels", 2)
 
     # -- how both are evaluated
 
-    def _map(self, blockwise, by_formulas, rows: Tensor, lead: torch.Size, restore) -> tuple[Tensor, Tensor]:
-        """Rows (C, N, size) by blocks, or by formulas that are traced: compiled, or by a transform of torch.func."""
-        intrinsics, distortion = (_per_row(t, lead, rows) for t in self._tensors)
-        inputs = rows, intrinsics, distortion
-        if not in_transform() and all(is_concrete(t) and not has_tangent(t) for t in inputs):
-            keeps = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-            results = blockwise.apply(*inputs, self._cameras(intrinsics, distortion), by_formulas, keeps)
+    def _map(
+        self, direction: type[Project] | type[Unproject], values: Tensor, name: str, size: int
+    ) -> tuple[Tensor, Tensor]:
+        """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
+        batch, intrinsics, distortion = self.batch_shape, self.intrinsics, self.distortion
+        lead, dims = batch, len(batch)
+        fit = isinstance(values, Tensor) and values.dtype == intrinsics.dtype == distortion.dtype
+        if not fit or values.ndim <= dims or values.shape[-1] != size or values.shape[:dims] != batch:
+            values, lead = as_points(values, name, size, batch, self._tensors, type(self).__name__)
+        shape = values.shape[:-1]
+        rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
+        inputs = rows, _per_row(intrinsics, lead, rows), _per_row(distortion, lead, rows)
+        if _is_plain(inputs):
+            learns = rows.requires_grad or inputs[1].requires_grad or inputs[2].requires_grad
+            keeps = learns and torch.is_grad_enabled()
+            planes, valid = direction.apply(*inputs, self._cameras(*inputs[1:]), type(self), keeps)
         else:
             # what is compiled has no derivatives of derivatives
-            results = by_formulas(*inputs, order=1 if torch.compiler.is_compiling() else 2)
-        return tuple(restore(result) for result in results)
+            order = 1 if torch.compiler.is_compiling() else 2
+            known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
+            cameras = self._cameras(*inputs[1:]) if known else None
+            planes, valid = direction.traced(type(self), *inputs, cameras, order)
+        return planes.reshape((len(planes), *shape)).movedim(0, -1), valid.reshape(shape)
 
     def _cameras(self, intrinsics: Tensor, distortion: Tensor) -> Cameras:
         """The rows' cameras, kept until a value changes."""
-
-        def look() -> Cameras:
-            with torch.no_grad():
-                usable = self._usable(intrinsics, distortion)
-                ideal = (intrinsics, 1.0), (distortion, self._ideal(distortion))
-                values = [torch.where(usable, t.detach(), w).clone() for t, w in ideal]
-                mask = None if may_look(usable) and bool(usable.all()) else usable.to(intrinsics.dtype)
-                return Cameras(values[0], ops.domain_of(self._model, values[1], self.optics), mask)
-
-        return self._memo((intrinsics, distortion), (intrinsics.dtype, intrinsics.device), look)
-
-    def _traced(self, rows: Tensor, intrinsics: Tensor, distortion: Tensor):
-        """The parameters that can be used, their domain, and the mask of the usable cameras, while values are traced.
-
-        A camera that learning drove to NaN, to a focal length that is not positive or to coefficients without a
-        formula is replaced by an ideal one, and all its results are invalid.
-        """
-        if all(is_concrete(t) and not has_tangent(t) for t in (intrinsics, distortion)):
-            cameras = self._cameras(intrinsics, distortion)
-            domain, usable = cameras.domain, cameras.usable
-        else:
-            able = self._usable(intrinsics.detach(), distortion.detach())
-            usable = able.to(rows.dtype)
-            k = torch.where(able, distortion.detach(), self._ideal(distortion))
-            domain = Domain(self.optics, k)
-            if domain.lens.stages:
-                domain.with_tables(*tables(self._model, k))
-        if usable is not None:
-            ideal = (intrinsics, 1.0), (distortion, self._ideal(distortion))
-            intrinsics, distortion = (torch.where(usable > 0, t, w) for t, w in ideal)
-        return intrinsics, distortion, domain, usable
-
-    def _ideal(self, like: Tensor) -> float | Tensor:
-        ideal = self.ideal(like.shape[-1])
-        return torch.tensor(ideal, dtype=like.dtype, device=like.device) if any(ideal) else 0.0
-
-    def _usable(self, intrinsics: Tensor, distortion: Tensor) -> Tensor:
-        """Bool (C, 1): finite, with focal lengths that are positive, and coefficients for which the formula exists."""
-        finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
-        usable = finite & (intrinsics[..., :2] > 0).all(-1)
-        defined = self.defined(distortion.unbind(-1))
-        return (usable if defined is None else usable & (defined > 0)).unsqueeze(-1)
+        known = self._memo.result
+        if known is not None and known.are(intrinsics, distortion):
+            return known
+        inputs = intrinsics, distortion
+        return self._memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras.of(type(self), *inputs))
 
     @property
     def _tensors(self) -> tuple[Tensor, Tensor]:
@@ -682,6 +614,17 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     if not (isinstance(model, type) and issubclass(model, Camera) and hasattr(model, "key")):
         raise TypeError(f"{owner} takes a camera model, or its key in ct.MODELS; got {model!r}")
     return model
+
+
+def _is_plain(inputs: Sequence[Tensor]) -> bool:
+    """Whether nothing is traced and no transform is under way, of all that could be: asked once a call."""
+    if (
+        torch.compiler.is_compiling()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+    ):
+        return False
+    return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)
 
 
 def _per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

@@ -10,8 +10,8 @@ from torch.autograd import gradcheck
 
 import camtorch as ct
 from camtorch.optics.charts import Perspective
-from camtorch.projection import autograd, ops
-from camtorch.projection.solve import invert
+from camtorch.projection import ops, rows, unproject
+from camtorch.projection.unproject import invert
 from camtorch.warp import grid, sampling
 from camtorch.warp.grid import Sampling
 
@@ -53,7 +53,7 @@ def test_blocks_change_nothing(key, method, cameras, block, monkeypatch):
         values = torch.cat((pixel_lattice(camera, 9, 11), torch.tensor([[math.nan, 1], [1e9, 3]]).double()))
         values = values.expand(cameras, -1, -1)
     whole = everything(camera, method, values)
-    monkeypatch.setattr(autograd, "_BLOCK", block)
+    monkeypatch.setattr(rows, "_BLOCK", block)
     for result, expected in zip(everything(camera, method, values), whole, strict=True):
         torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
 
@@ -92,8 +92,8 @@ def test_bytes_kept_for_backward(key, method, limit):
     assert not kept
 
 
-def nothing_solved(domain, u, v):
-    return invert(domain, u, v)._replace(solved=-torch.ones_like(u))
+def nothing_solved(domain, u, v, looks):
+    return invert(domain, u, v, looks)._replace(solved=-torch.ones_like(u))
 
 
 @pytest.mark.parametrize("key", [key for key in KEYS if one(key).distortion_names])
@@ -102,13 +102,13 @@ def test_search_alone_agrees_with_newton(key, monkeypatch):
     camera = one(key)
     pixels = pixel_lattice(camera)
     expected = everything(camera, "unproject", pixels)
-    monkeypatch.setattr(autograd, "invert", nothing_solved)
+    monkeypatch.setattr(unproject, "invert", nothing_solved)
     for result, reference in zip(everything(camera, "unproject", pixels), expected, strict=True):
         torch.testing.assert_close(result, reference, rtol=1e-9, atol=1e-11)
 
 
 def test_gradcheck_over_several_blocks(monkeypatch):
-    monkeypatch.setattr(autograd, "_BLOCK", 4)
+    monkeypatch.setattr(rows, "_BLOCK", 4)
     camera = spread("fisheye624")
     leaves = [t.detach().clone().requires_grad_() for t in (camera.intrinsics, camera.distortion)]
     points = (fan(60, 3, 3) * 1.7).requires_grad_()

@@ -178,7 +178,11 @@ class Equidistant(Chart):
         return True
 
     def scale(self, x, y, z, order=2):
-        return angle_per_radius(torch.addcmul(x * x, y, y), z, order)
+        rho2 = torch.addcmul(x * x, y, y)
+        if order > 1:
+            return angle_per_radius(rho2, z)
+        rho = (rho2 + floor_of(z.dtype)).sqrt()
+        return torch.atan2(rho, z) / rho
 
     def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
         rho2 = torch.addcmul(x * x, y, y)
@@ -193,14 +197,22 @@ class Equidistant(Chart):
 
     def to_ray(self, a, b, order=2):
         theta2 = torch.addcmul(a * a, b, b)
-        sinc = sinc_root(theta2, order)
-        return a * sinc, b * sinc, cos_root(theta2, order)
+        sinc, cos = self._turned(theta2, order)
+        return a * sinc, b * sinc, cos
 
     def to_ray_vjp(self, a, b, gx, gy, gz, want_parameters):
         theta2 = torch.addcmul(a * a, b, b)
-        sinc, cos = sinc_root(theta2, 1), cos_root(theta2, 1)
+        sinc, cos = self._turned(theta2, 1)
         along = torch.addcmul(gx * a, gy, b) * (cos - sinc) / (theta2 + floor_of(a.dtype)) - gz * sinc
         return (torch.addcmul(gx * sinc, a, along), torch.addcmul(gy * sinc, b, along)), []
+
+    @staticmethod
+    def _turned(theta2: Tensor, order: int) -> Planes2:
+        """sin(theta) / theta and cos(theta)."""
+        if order > 1:
+            return sinc_root(theta2), cos_root(theta2)
+        theta = (theta2 + floor_of(theta2.dtype)).sqrt()
+        return torch.sin(theta) / theta, torch.cos(theta)
 
     def end(self, dtype):
         return math.pi

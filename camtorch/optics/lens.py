@@ -17,6 +17,7 @@ from torch import Tensor
 from camtorch.optics.radial import RadialFactor, total
 
 Planes2 = tuple[Tensor, Tensor]
+Planes3 = tuple[Tensor, Tensor, Tensor]
 Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
 
 
@@ -24,6 +25,18 @@ def _orientation(jacobian: Jacobian) -> Tensor:
     ua, ub, va, vb = jacobian
     # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
     return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
+
+
+def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes3:
+    """The step (da, db) that a regular Jacobian sends to (du, dv), and 1 / its determinant.
+
+    Where it is singular some finite step; the reciprocal is 0 there, and for what is out of the floating-point range.
+    """
+    ua, ub, va, vb = jacobian
+    determinant = torch.addcmul(ua * vb, ub, va, value=-1)
+    reciprocal = (determinant + torch.finfo(du.dtype).tiny ** 0.5 / determinant).reciprocal()
+    da, db = torch.addcmul(vb * du, ub, dv, value=-1), torch.addcmul(ua * dv, va, du, value=-1)
+    return da * reciprocal, db * reciprocal, reciprocal
 
 
 @dataclass
@@ -115,7 +128,8 @@ class PlanarAt:
             ua = vb = torch.ones_like(t)
             ub = va = torch.zeros_like(t)
         if stage.tangential:
-            px, py = (2 * p for p in stage.tangential)
+            px, py = stage.tangential
+            px, py = 2 * px, 2 * py
             # the gradient of (p . m) t: its Jacobian is symmetric
             ua = torch.addcmul(ua + self.twice_dot, a, 2 * px)
             vb = torch.addcmul(vb + self.twice_dot, b, 2 * py)
@@ -222,7 +236,7 @@ class TiltAt:
         r00, r01, _, r10, r11, _, r20, r21, r22 = self.stage.parameters
         ua, ub = r22 * r00 - self.u * r20, r22 * r01 - self.u * r21
         va, vb = r22 * r10 - self.v * r20, r22 * r11 - self.v * r21
-        return tuple(w * self.reciprocal for w in (ua, ub, va, vb))
+        return ua * self.reciprocal, ub * self.reciprocal, va * self.reciprocal, vb * self.reciprocal
 
     @property
     def orientation(self) -> Tensor:
@@ -249,16 +263,10 @@ class Lens:
 
     def __init__(self, *stages: Planar | Tilt):
         self.stages = stages
-
-    @property
-    def is_radial(self) -> bool:
+        self.is_radial = len(stages) == 1 and stages[0].is_radial
         """Whether the lens is a single radial factor: then its inverse is a matter of one variable."""
-        return len(self.stages) == 1 and self.stages[0].is_radial
-
-    @property
-    def radial(self) -> RadialFactor | None:
+        self.radial: RadialFactor | None = getattr(stages[0], "radial", None) if stages else None
         """The radial factor of the first stage, if it has one."""
-        return getattr(self.stages[0], "radial", None)
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:

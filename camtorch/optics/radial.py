@@ -88,10 +88,12 @@ class Polynomial(RadialFactor):
             # two columns in one operation would leave the vectorised loop
             is_plane = isinstance(c, Tensor) and taylor[0] is not self.parameters[-1]
             taylor[0] = torch.addcmul(c, taylor[0], t) if is_plane else taylor[0] * t + c
-        return tuple(
-            torch.zeros_like(t) if isinstance(x, float) else x if i < 2 else math.factorial(i) * x
-            for i, x in enumerate(taylor)
-        )
+        for i, x in enumerate(taylor):
+            if isinstance(x, float):
+                taylor[i] = torch.zeros_like(t)
+            elif i > 1:
+                taylor[i] = math.factorial(i) * x
+        return tuple(taylor)
 
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""

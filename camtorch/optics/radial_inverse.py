@@ -168,18 +168,19 @@ class InverseTable:
         if len(self.values) > 1:
             node = node + torch.arange(len(self.values), device=r2.device, dtype=torch.int32).unsqueeze(-1) * _NODES
         node = node.flatten()
-        value, step = (w.flatten().index_select(0, node).view(r2.shape) for w in (self.values, self.steps))
-        return torch.addcmul(value, fraction, step)
+        value, step = self.values.flatten().index_select(0, node), self.steps.flatten().index_select(0, node)
+        return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
 
 
 # -- the solution
 
 
-def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:
+def solve(radial: RadialFactor, table: InverseTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
     """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
 
     Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
-    positive where the last step was so short that the next one would be nothing.
+    positive where the last step was so short that the next one would be nothing. looks: whether the steps may stop
+    where that is so everywhere.
     """
     scale, settled = table(r2), None
     for count in range(1, MOST_STEPS + 1):
@@ -191,7 +192,7 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
         scale = scale + step
         if count >= _STEPS[r2.dtype]:
             settled = short(scale.dtype) * scale - step.abs()
-            if not may_look(settled) or bool(settled.amin() > 0):
+            if not looks or bool(settled.amin() > 0):
                 break
     return scale, settled
 
@@ -301,7 +302,7 @@ def _(info, in_dims, name, k, end):
 def _radial_scale(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
     inner2, table = _kept_tables(name, k, end)
-    scale, settled = solve(FACTORS[name](columns(k)), InverseTable(table), r2)
+    scale, settled = solve(FACTORS[name](columns(k)), InverseTable(table), r2, may_look(r2))
     camera, point = (~(settled > 0)).nonzero(as_tuple=True)
     if len(camera):
         # a single camera serves all points

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch._tracing import may_look
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import AZIMUTHS, Azimuths, azimuth
 
@@ -66,7 +65,10 @@ class Domain:
 
     def with_tables(self, inner2: Tensor, limits2: Tensor, table: Tensor) -> Domain:
         """The same domain with tables that were made elsewhere."""
-        self.__dict__.update(inner2=inner2, limits2=limits2, table=table)
+        # set, not cached: a compiler cannot follow the lock of a cached property
+        usual2 = inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+        inverse = InverseTable(table) if self.lens.radial else None
+        self.__dict__.update(inner2=inner2, usual2=usual2, limits2=limits2, inverse=inverse)
         return self
 
     @cached_property
@@ -107,15 +109,20 @@ class Domain:
         chart, lens = self.optics(columns(k))
         return tabulate(lens.radial, self._fold, chart.usual_end(self.k.dtype)).to(self.k.dtype)
 
-    @property
+    @cached_property
     def inverse(self) -> InverseTable | None:
         """That of the radial factor of the first stage, if it has one."""
         return InverseTable(self.table) if self.lens.radial else None
 
+    @cached_property
+    def usual2(self) -> Tensor:
+        """(C, 1): `inner2`, but no further out than images reach."""
+        return self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+
     def margin(self, a: Tensor, b: Tensor, t: Tensor) -> Tensor:
         """Positive for the plane points (C, N) in the domain; t = a^2 + b^2."""
         inside = self.inner2 - t
-        if self.lens.is_radial or (may_look(inside) and bool(inside.amin() > 0)):
+        if self.lens.is_radial:
             return inside
         row = torch.arange(len(self.k), device=t.device, dtype=torch.int32).unsqueeze(-1) * AZIMUTHS
         index = row + azimuth(a, b)

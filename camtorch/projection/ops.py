@@ -18,7 +18,7 @@ from camtorch._tracing import register
 from camtorch.optics.radial_inverse import table_width
 from camtorch.projection.domain import Domain, Optics
 from camtorch.projection.fold import AZIMUTHS
-from camtorch.projection.solve import Found, search
+from camtorch.projection.solve import search
 
 Result = TypeVar("Result")
 
@@ -178,15 +178,6 @@ def positive(mask: Tensor) -> Tensor:
     """The mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
     compiled = torch.compiler.is_compiling() and mask.device.type == "cpu"
     return _positive(mask.detach()) if compiled else mask > 0
-
-
-def finish(model: str, k: Tensor, u: Tensor, v: Tensor, found: Found) -> Found:
-    """What was found, and what `search` finds of the rest."""
-    if torch.compiler.is_compiling():
-        search_in_place(model, k, u, v, *found)
-        return found
-    a, b, solved = search_open(model, k, u, v, *found)
-    return Found(a, b, solved, found.possible)
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:

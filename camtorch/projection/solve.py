@@ -1,105 +1,27 @@
-"""The inverse of a lens: graph-free, for all points at once, and by another way for the few that this leaves open."""
+"""The inverse of a lens for the few points that a table and a few steps leave open: brackets and damped steps."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from camtorch._tracing import may_look
-from camtorch.optics.charts import floor_of
-from camtorch.optics.radial_inverse import MOST_STEPS, bracketed, short, solve
+from camtorch.optics.lens import newton_step
+from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
 from camtorch.projection.fold import azimuth
 
 if TYPE_CHECKING:
-    from camtorch.optics.lens import Jacobian, Lens
     from camtorch.projection.domain import Domain
 
 Planes2 = tuple[Tensor, Tensor]
-
-# Steps of Newton's method that most points need, by whether they can be counted while they are made
-_STEPS = {torch.float32: 2, torch.float64: 3}
 
 _START_ROUNDS = 6
 _CLOSE = 0.1
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
 _FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
-
-
-class Found(NamedTuple):
-    """Planes (C, N): a point of the chart's plane, positive where it is the solution, positive where one may exist."""
-
-    a: Tensor
-    b: Tensor
-    solved: Tensor
-    possible: Tensor
-
-
-def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    """The point that the lens sends to (u, v), from a table and a few steps of Newton's method.
-
-    What is solved is the solution in the domain, to rounding: the last step was so short that the next one would be
-    nothing. What is not, and yet possible, is left to `search`.
-    """
-    return (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v)
-
-
-def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    r2 = torch.addcmul(u * u, v, v)
-    eps = torch.finfo(u.dtype).eps
-    possible = domain.inverse.most2 * (1 + 8 * eps) - r2
-    r2 = torch.minimum(r2, domain.inverse.most2)
-    scale, settled = solve(domain.lens.radial, domain.inverse, r2)
-    # a ray's rounding must not carry it across the fold
-    inside = domain.inner2 * (1 - 32 * eps) - r2 * scale * scale
-    return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
-
-
-def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    """Newton's method in the plane, from the inverse of the radial factor."""
-    a, b = domain.lens.start(u, v)
-    if domain.inverse is not None:
-        # a stage may have sent a pixel far off the image out of the floating-point range
-        scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
-        a, b = a * scale, b * scale
-    short2, settled = short(u.dtype) ** 2, None
-    for count in range(1, MOST_STEPS + 1):
-        at = domain.lens.at(a, b)
-        jacobian = at.jacobian
-        da, db = newton_step(jacobian, u - at.value[0], v - at.value[1])
-        if settled is not None:  # what is settled stays, whatever else is in its batch
-            da, db = torch.where(settled > 0, 0.0, da), torch.where(settled > 0, 0.0, db)
-        a, b = a + da, b + db
-        t = torch.addcmul(a * a, b, b)
-        if count >= _STEPS[u.dtype]:
-            settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
-            if not may_look(settled) or bool(settled.amin() > 0):
-                break
-    # further out than images reach a determinant may overflow, and a step seem short
-    inside = domain.inner2.clamp(max=domain.chart.usual_end(u.dtype) ** 2) - t
-    solved = torch.minimum(torch.minimum(settled, inside), _reciprocal(jacobian).abs())
-    return Found(a, b, solved, torch.ones_like(a))
-
-
-def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes2:
-    """The step that a regular Jacobian sends to (du, dv); some finite one where it is singular."""
-    ua, ub, va, vb = jacobian
-    reciprocal = _reciprocal(jacobian)
-    da, db = torch.addcmul(vb * du, ub, dv, value=-1), torch.addcmul(ua * dv, va, du, value=-1)
-    return da * reciprocal, db * reciprocal
-
-
-def _reciprocal(jacobian: Jacobian) -> Tensor:
-    """1 / determinant; 0 for 0, and for what is out of the floating-point range."""
-    ua, ub, va, vb = jacobian
-    determinant = torch.addcmul(ua * vb, ub, va, value=-1)
-    return (determinant + floor_of(determinant.dtype) / determinant).reciprocal()
-
-
-# -- the points that are left open
 
 
 def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -131,7 +53,7 @@ class _Search:
         stretch = torch.maximum(jacobian[0].abs() + jacobian[1].abs(), jacobian[2].abs() + jacobian[3].abs())
         stretch = stretch * torch.maximum(a.abs(), b.abs())
         for _ in range(2):  # what rounding left
-            da, db = newton_step(jacobian, u - x, v - y)
+            da, db, _ = newton_step(jacobian, u - x, v - y)
             a, b = torch.where(valid, a + da, 0.0), torch.where(valid, b + db, 0.0)
             x, y = self.lens(a, b)
         # next to a fold the polished solution may lie on its other side: what counts is where its ray is seen
@@ -187,7 +109,7 @@ class _Search:
             active = (torch.maximum(miss[0].abs(), miss[1].abs()) > enough) & (length > _GIVE_UP)
             if step_number == steps or not bool(active.any()):
                 break
-            step = newton_step(jacobian, *miss)
+            step = newton_step(jacobian, *miss)[:2]
             trial = a + length * step[0], b + length * step[1]
             at = self.lens.at(*trial)
             trial_value, trial_jacobian = at.value, at.jacobian
@@ -229,20 +151,3 @@ class _Search:
 def rounding(u: Tensor, v: Tensor, stretch: Tensor | float = 0.0) -> Tensor:
     """How far from (u, v) rounding may leave a lens that `stretch`es the rounding of its solution by so much."""
     return 32 * torch.finfo(u.dtype).eps * (1 + torch.maximum(u.abs(), v.abs()) + stretch)
-
-
-def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
-    """Give a graph-free solution of lens(solution) = target its derivatives, exact up to the order of `steps`.
-
-    Steps of the chord method x <- x - J^-1 (f(x) - y) with the constant Jacobian of the solution. If parameters and
-    target move by d, the solution is off by O(d^2) after one step and by O(d^3) after two: its Taylor series agrees
-    with that of the implicit function up to that order. The Jacobian itself never enters the graph.
-    """
-    a, b = solution
-    with torch.no_grad():
-        jacobian = [w.detach() for w in lens.at(a, b).jacobian]
-    for _ in range(steps):
-        x, y = lens(a, b)
-        da, db = newton_step(jacobian, target[0] - x, target[1] - y)
-        a, b = a + da, b + db
-    return a, b

@@ -1,0 +1,312 @@
+"""Pixels to rays: the inverse of the lens and what makes a pixel invalid, block by block or recorded in a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from camtorch._arguments import columns
+from camtorch.optics.lens import newton_step
+from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
+from camtorch.projection.ops import positive, search_in_place, search_open, to_planes, without_keeping
+from camtorch.projection.rows import (
+    Block,
+    Cameras,
+    Sums,
+    Traced,
+    blocks,
+    both,
+    by_formulas,
+    planes_of,
+    replace,
+    to_mask,
+)
+from camtorch.projection.solve import search
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+    from camtorch.optics.lens import Lens
+    from camtorch.projection.domain import Domain
+
+Planes2 = tuple[Tensor, Tensor]
+Planes3 = tuple[Tensor, Tensor, Tensor]
+
+# Steps of Newton's method that most points need, by whether they can be counted while they are made
+_STEPS = {torch.float32: 2, torch.float64: 3}
+
+
+class Found(NamedTuple):
+    """Planes (C, N): a point of the chart's plane, positive where it is the solution, positive where one may exist."""
+
+    a: Tensor
+    b: Tensor
+    solved: Tensor
+    possible: Tensor
+
+
+def invert(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+    """The point that the lens sends to (u, v), from a table and a few steps of Newton's method.
+
+    What is solved is the solution in the domain, to rounding: the last step was so short that the next one would be
+    nothing. What is not, and yet possible, is left to `search`.
+    """
+    return (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v, looks)
+
+
+def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+    r2 = torch.addcmul(u * u, v, v)
+    eps, table = torch.finfo(u.dtype).eps, domain.inverse
+    possible = table.most2 * (1 + 8 * eps) - r2
+    r2 = torch.minimum(r2, table.most2)
+    scale, settled = solve(domain.lens.radial, table, r2, looks)
+    # a ray's rounding must not carry it across the fold
+    inside = domain.inner2 * (1 - 32 * eps) - r2 * scale * scale
+    return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
+
+
+def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+    """Newton's method in the plane, from the inverse of the radial factor."""
+    a, b = domain.lens.start(u, v)
+    if domain.inverse is not None:
+        # a stage may have sent a pixel far off the image out of the floating-point range
+        scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
+        a, b = a * scale, b * scale
+    short2, settled = short(u.dtype) ** 2, None
+    for count in range(1, MOST_STEPS + 1):
+        at = domain.lens.at(a, b)
+        x, y = at.value
+        da, db, reciprocal = newton_step(at.jacobian, u - x, v - y)
+        if settled is not None:  # what is settled stays, whatever else is in its batch
+            da, db = torch.where(settled > 0, 0.0, da), torch.where(settled > 0, 0.0, db)
+        a, b = a + da, b + db
+        t = torch.addcmul(a * a, b, b)
+        if count >= _STEPS[u.dtype]:
+            settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
+            if not looks or bool(settled.amin() > 0):
+                break
+    # further out than images reach a determinant may overflow, and a step seem short
+    solved = torch.minimum(torch.minimum(settled, domain.usual2 - t), reciprocal.abs())
+    return Found(a, b, solved, torch.ones_like(a))
+
+
+def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
+    """Give a graph-free solution of lens(solution) = target its derivatives, exact up to the order of `steps`.
+
+    Steps of the chord method x <- x - J^-1 (f(x) - y) with the constant Jacobian of the solution. If parameters and
+    target move by d, the solution is off by O(d^2) after one step and by O(d^3) after two: its Taylor series agrees
+    with that of the implicit function up to that order. The Jacobian itself never enters the graph.
+    """
+    a, b = solution
+    with torch.no_grad():
+        jacobian = tuple([w.detach() for w in lens.at(a, b).jacobian])
+    for _ in range(steps):
+        x, y = lens(a, b)
+        da, db, _ = newton_step(jacobian, target[0] - x, target[1] - y)
+        a, b = a + da, b + db
+    return a, b
+
+
+class Target(NamedTuple):
+    """Pixels as points (p, q) of the sensor in focal lengths; the centre where `mask` is 0, None where it is all 1."""
+
+    p: Tensor
+    q: Tensor
+    mask: Tensor | None
+
+
+def to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...], looks: bool = False) -> Target:
+    """Invalid: pixels that are no numbers, or so large that a square overflows."""
+    focal_x, focal_y, centre_x, centre_y = intrinsics
+    p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
+    far = torch.maximum(p.detach().abs(), q.detach().abs())
+    limit = torch.finfo(far.dtype).max ** 0.25
+    if looks and float(far.amax()) < limit:
+        return Target(p, q, None)
+    mask = (far < limit).to(far.dtype)
+    p, q = ((torch.where(mask > 0, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
+    return Target(p, q, mask)
+
+
+class Solution(NamedTuple):
+    """The point of the chart's plane of each pixel, the centre where it is invalid; what of that was found how."""
+
+    a: Tensor
+    b: Tensor
+    mask: Tensor | None
+    target: Target
+    open: Tensor | None  # bool: where a point may exist that only `search` finds
+
+
+def solutions(
+    u: Tensor,
+    v: Tensor,
+    intrinsics: tuple[Tensor, ...],
+    domain: Domain,
+    usable: Tensor | None,
+    finish: Callable[[Planes2, Found], Found] | None = None,
+    looks: bool = False,
+) -> Solution:
+    """Where pixels, planes (C, N), come from: graph-free, with all that makes a pixel invalid.
+
+    Args:
+        u: pixels.
+        v: likewise.
+        intrinsics: columns.
+        domain: of the lens.
+        usable: the mask of the cameras whose parameters make a camera.
+        finish: adds to what was found at p, q what a search finds; by default that is left open.
+        looks: whether a look at the values may find a shorter way.
+    """
+    p, q, known = to_target(u, v, intrinsics, looks)
+    known = known if usable is None else both(known, usable)
+    if known is not None:
+        p, q = replace(known, p, 0.0, looks), replace(known, q, 0.0, looks)
+    target, left = Target(p, q, known), None
+    if domain.lens.stages:
+        found = invert(domain, p, q, looks)
+        if finish is not None:
+            found = finish((p, q), found)
+        solved = to_mask(found.solved, looks)
+        a, b = found.a, found.b
+        if solved is not None:
+            left = (found.possible > 0) & ~(solved > 0)
+            if looks:  # a product has no use for what ran away
+                a, b = a.nan_to_num(0.0, 0.0, 0.0), b.nan_to_num(0.0, 0.0, 0.0)
+    else:
+        solved, a, b = to_mask(domain.chart.on_plane(p, q), looks), p, q
+    if solved is None:
+        return Solution(a, b, known, target, left)
+    a, b = replace(solved, a, 0.0, looks), replace(solved, b, 0.0, looks)
+    return Solution(a, b, both(known, solved), target, left)
+
+
+class Unproject(Function):
+    """Rows of pixels (C, N, 2), intrinsics (C, 4), distortion (C, n) -> rays (3, C, N), valid (C, N).
+
+    Block by block, without a graph: temporaries stay in the cache, and backward computes again what is not dear.
+    """
+
+    @staticmethod
+    def traced(
+        model: type[Camera],
+        pixels: Tensor,
+        intrinsics: Tensor,
+        distortion: Tensor,
+        cameras: Cameras | None,
+        order: int = 2,
+    ) -> tuple[Tensor, Tensor]:
+        """The same, recorded in a graph or by a transform. cameras: if values may be looked at."""
+        usual = Traced.of(model, intrinsics, distortion, cameras)
+        u, v = to_planes(pixels)
+
+        def finish(target: Planes2, found: Found) -> Found:
+            if torch.compiler.is_compiling():
+                search_in_place(model._model, usual.domain.k, *target, *found)
+                return found
+            return Found(*search_open(model._model, usual.domain.k, *target, *found), found.possible)
+
+        columns_now = columns(usual.intrinsics.detach())
+        a, b, mask, _, _ = solutions(u.detach(), v.detach(), columns_now, usual.domain, usual.usable, finish)
+
+        def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
+            chart, lens = model.optics(columns(distortion))
+            p, q, _ = to_target(u, v, columns(intrinsics))
+            p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
+            here = (p, q) if not lens.stages else attach(lens, (a, b), (p, q), order) if order else (a, b)
+            rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
+            return torch.stack([replace(mask, w, axis) for w, axis in rays])
+
+        if torch.compiler.is_compiling() and not any(t.requires_grad for t in (pixels, intrinsics, distortion)):
+            order = 0
+        rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
+        return rays, positive(torch.ones_like(a) if mask is None else mask.expand_as(a))
+
+    @staticmethod
+    def forward(ctx, pixels, intrinsics, distortion, cameras: Cameras, model: type[Camera], keeps: bool):
+        """keeps: whether there will be a backward."""
+        shape, looks = pixels.shape[:2], cameras.looks
+        rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
+        valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
+        left_open: list[tuple[Tensor, ...]] = []
+        for block in blocks(cameras, pixels):
+            here, domain = block.here, block.domain
+            u, v = planes_of(pixels[here])
+            a, b, mask, target, left = solutions(u, v, block.intrinsics, domain, block.usable, None, looks)
+            made = domain.chart.to_ray(a, b, 1)
+            for plane, w, axis in zip(rays, made, (0.0, 0.0, 1.0), strict=True):
+                plane[here] = replace(mask, w, axis, looks)
+            if solution is not None:
+                solution[0][here], solution[1][here] = a, b
+            if mask is not None:
+                valid[here] = mask > 0
+            if left is not None:
+                left_open += _places(block, target, left)
+        if left_open:
+            _search(cameras, left_open, rays, solution, valid)
+        if keeps:
+            # a copy: what is handed out belongs to the caller
+            ctx.save_for_backward(pixels, intrinsics, distortion, valid.clone(), solution)
+            ctx.cameras, ctx.model = cameras, model
+        ctx.mark_non_differentiable(valid)
+        ctx.set_materialize_grads(False)
+        return rays, valid
+
+    @staticmethod
+    def backward(ctx, by_rays, _):
+        """The cotangents of pixels and parameters; with a graph if that is asked for."""
+        if by_rays is None:
+            return (None,) * 6
+        *inputs, valid, solution = ctx.saved_tensors
+        wanted, cameras = ctx.needs_input_grad, ctx.cameras
+        if torch.is_grad_enabled():
+            again = by_formulas(lambda *t: Unproject.traced(ctx.model, *t, cameras), inputs, wanted, by_rays)
+            return *again, None, None, None
+        sums = Sums(cameras, wanted, inputs[0])
+        by_pixels = torch.empty_like(inputs[0]) if wanted[0] else None
+        for block in blocks(cameras, inputs[0]):
+            here, chart = block.here, block.domain.chart
+            a, b = solution[0][here], solution[1][here]
+            gx, gy, gz = (by_rays[i][here] for i in range(3))
+            if not bool(valid[here].all()):
+                # what comes back of an invalid pixel need not be finite
+                gx, gy, gz = (torch.where(valid[here], g, 0.0) for g in (gx, gy, gz))
+            (ga, gb), by_optics = chart.to_ray_vjp(a, b, gx, gy, gz, sums.wants_distortion)
+            at = block.domain.lens.at(a, b)
+            if at.stages:
+                ua, ub, va, vb = at.jacobian
+                ga, gb, _ = newton_step((ua, va, ub, vb), ga, gb)
+                if sums.wants_distortion:
+                    by_optics = by_optics + at.vjp(-ga, -gb)[1]
+            sums.add_optics(block, by_optics)
+            focal_x, focal_y, _, _ = block.intrinsics
+            ga, gb = ga / focal_x, gb / focal_y
+            sums.add_intrinsics(block, -ga, -gb, *at.value)
+            if by_pixels is not None:
+                by_pixels[here][..., 0], by_pixels[here][..., 1] = ga, gb
+        return by_pixels, *sums.result(), None, None, None
+
+
+def _places(block: Block, target: Target, left: Tensor) -> Iterable[tuple[Tensor, ...]]:
+    """Camera, point, p and q of what is left open in a block, if anything is."""
+    camera, point = left.nonzero(as_tuple=True)
+    if len(camera):
+        yield camera + block.cameras.start, point + block.points.start, target.p[left], target.q[left]
+
+
+def _search(
+    cameras: Cameras, left_open: list[tuple[Tensor, ...]], rays: Tensor, solution: Tensor | None, valid: Tensor
+) -> None:
+    """Write what a search finds of what the blocks left open."""
+    camera, point, p, q = (torch.cat(parts) for parts in zip(*left_open, strict=True))
+    a, b, found = search(cameras.domain, camera, p, q)
+    camera, point, a, b = camera[found], point[found], a[found], b[found]
+    chart, _ = cameras.domain.optics_of(camera)
+    for plane, w in zip(rays, chart.to_ray(a, b, 1), strict=True):
+        plane[camera, point] = w
+    if solution is not None:
+        solution[0][camera, point], solution[1][camera, point] = a, b
+    valid[camera, point] = True
