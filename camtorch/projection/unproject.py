@@ -232,6 +232,7 @@ class Unproject(Function):
         rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
         left_open: list[tuple[Tensor, ...]] = []
+        all_valid = True
         for block in blocks(cameras, pixels):
             here, domain = block.here, block.domain
             u, v = planes_of(pixels[here])
@@ -242,14 +243,14 @@ class Unproject(Function):
             if solution is not None:
                 solution[0][here], solution[1][here] = a, b
             if mask is not None:
-                valid[here] = mask > 0
+                valid[here], all_valid = mask > 0, False
             if left is not None:
                 left_open += _places(block, target, left)
         if left_open:
             _search(cameras, left_open, rays, solution, valid)
         if keeps:
             # a copy: what is handed out belongs to the caller
-            ctx.save_for_backward(pixels, intrinsics, distortion, valid.clone(), solution)
+            ctx.save_for_backward(pixels, intrinsics, distortion, None if all_valid else valid.clone(), solution)
             ctx.cameras, ctx.model = cameras, model
         ctx.mark_non_differentiable(valid)
         ctx.set_materialize_grads(False)
@@ -271,7 +272,7 @@ class Unproject(Function):
             here, chart = block.here, block.domain.chart
             a, b = solution[0][here], solution[1][here]
             gx, gy, gz = (by_rays[i][here] for i in range(3))
-            if not bool(valid[here].all()):
+            if valid is not None and not bool(valid[here].all()):
                 # what comes back of an invalid pixel need not be finite
                 gx, gy, gz = (torch.where(valid[here], g, 0.0) for g in (gx, gy, gz))
             (ga, gb), by_optics = chart.to_ray_vjp(a, b, gx, gy, gz, sums.wants_distortion)

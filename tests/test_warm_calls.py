@@ -1,0 +1,45 @@
+"""How many files and functions a warm call leads its reader through."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from cameras import one
+
+import camtorch as ct
+
+MOST = {"project": (6, 30), "unproject": (7, 35)}  # files, functions
+ROOT = Path(ct.__file__).parent
+
+
+def entered(function, *arguments):
+    """The (file, name) of every function of camtorch that a call enters."""
+    seen = set()
+
+    def note(frame, event, _):
+        if event == "call" and ROOT in (path := Path(frame.f_code.co_filename)).parents:
+            seen.add((path.relative_to(ROOT).as_posix(), frame.f_code.co_name))
+
+    sys.setprofile(note)
+    try:
+        function(*arguments)
+    finally:
+        sys.setprofile(None)
+    return seen
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("method", MOST)
+@pytest.mark.parametrize("key", ["kannala_brandt", "brown_conrady", "fisheye624"])
+def test_a_warm_call_is_a_short_way(key, method, dtype):
+    camera = one(key).to(dtype).requires_grad_(False)
+    values = torch.cat((torch.rand(1000, 2, dtype=dtype) - 0.5, torch.ones(1000, 1, dtype=dtype)), -1)
+    if method == "unproject":
+        values = camera.project(values)[0].contiguous()
+    call = getattr(camera, method)
+    assert call(values)[1].all()
+    seen = entered(call, values)
+    files, functions = MOST[method]
+    assert len({path for path, _ in seen}) <= files, sorted(seen)
+    assert len(seen) <= functions, sorted(seen)
