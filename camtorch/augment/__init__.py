@@ -1,6 +1,6 @@
 """Augmentations that move image, masks, landmarks, boxes, gaze and head pose together, by changing the camera.
 
-`camtorch.augment.kornia`, `.torchvision` and `.numpy` are the same for those libraries' pipelines.
+`camtorch.augment.kornia`, `.torchvision`, `.albumentations` and `.numpy` are the same for those libraries' pipelines.
 """
 
 from camtorch.augment.augmentation import Augmentation, Range

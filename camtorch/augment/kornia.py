@@ -45,8 +45,9 @@ class CameraAugmentation(GeometricAugmentationBase2D):
     Convention:
         - pixel coordinates are ``(x, y)`` at integer pixel centres, as in all of kornia and camtorch.
           ``align_corners`` means nothing; ``resample`` and ``padding_mode`` can be overridden by a call.
-        - keypoints keep their count and order. One without a place in the new image becomes ``(-1, -1)``;
-          ``aug.change(params).points(keypoints)`` says in addition which ones lie on it.
+        - keypoints keep their count and order. ``keypoints_valid`` (B, N), an attribute, is which of those last moved
+          lie on their new image. One without a place there becomes ``(-1, -1)``, and stays that, not valid, in
+          whatever augmentations of camtorch follow.
         - boxes become those that enclose their moved outlines, which are curved; they are not clipped. A box with no
           part of its outline on the new image is invalid, which kornia exports as zeros.
         - masks take the nearest value, the augmentation's `mask_fill` where nothing is seen, and never the colours and
@@ -84,6 +85,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         if size != camera.image_size:
             self.flags["size"] = size
         self._kind = _kind(camera)
+        self.keypoints_valid: Tensor | None = None
+        """(B, N) bool: which of the keypoints that were moved last lie on their image."""
         # lists of masks come row by row between other labels of the batch
         self._memos = Memo(), Memo()
 
@@ -163,9 +166,11 @@ class CameraAugmentation(GeometricAugmentationBase2D):
 
     def apply_transform_keypoint(self, input, params, flags, transform=None, *, back=False):
         rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
-        moved, _ = self._move(params, rows, lambda change, pixels: change.points(pixels), back)
+        moved, valid = self._move(params, rows, lambda change, pixels: change.points(pixels), back)
+        lost = (rows == -1).all(-1)
         result = input.clone()
-        result._data = moved.reshape(input.shape)
+        result._data = torch.where(lost.unsqueeze(-1), -1.0, moved).reshape(input.shape)
+        self.keypoints_valid = (valid & ~lost).reshape(input.shape[:-1])
         return result
 
     def apply_transform_box(self, input, params, flags, transform=None, *, back=False):

@@ -40,7 +40,8 @@ class Transform:
     Whatever is no field is passed on as it is. All arrays come out with the layout and the dtype that they came in
     with, but coordinates of whole numbers come out in float32. Beside them come `keypoints_valid` (N,), `bboxes_valid`
     (M,) and so on, bool, the new `camera`, and `rotation` (3, 3). Nothing is ever dropped or sorted: what left the
-    image has a False there. There is no `bbox_params` or `keypoint_params`.
+    image has a False there. Pipelines of albumentations, with their `bbox_params` and `keypoint_params`, take the
+    `Transform` of `camtorch.augment.albumentations`.
 
     Numbers are drawn from torch's generator, `torch.manual_seed`, which DataLoader seeds differently in each of its
     workers, and not from numpy's. The same seed draws the same in every front end. Nothing is differentiated.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -43,12 +43,17 @@ class Transform(v2.Transform):
       of a sample without any of these.
     * `Mask` (..., H, W), by the nearest value.
     * `KeyPoints` (..., 2), for torchvision as for camtorch in pixels whose centres are whole numbers. One that has no
-      place on the new camera becomes (-1, -1); `last.points` also tells which lie on the image.
+      place on the new camera becomes (-1, -1), and stays that in whatever transforms of camtorch follow.
     * `BoundingBoxes` of every format without rotation, whose coordinates are torchvision's, between pixel edges. The
       new ones enclose all of what the old ones did, with whole numbers too, and are not clamped:
       `v2.ClampBoundingBoxes` and `v2.SanitizeBoundingBoxes` follow where wanted. One that has no place on the new
       camera becomes (-1, -1, -1, -1) in XYXY, which has no area.
     * A `Camera` in the sample is the sample's camera, and comes out as that of the new image.
+
+    `valid=True` gives all `KeyPoints` and `BoundingBoxes` that are values of dicts a flag for each point or box beside
+    them: `target["keypoints_valid"]`, a plain bool tensor, for `target["keypoints"]`. It says that the point, or a part
+    of the box, lies on the new image, and was valid before if the dict said so. Order and count stay, so a DataLoader
+    collates them as it does the points.
 
     Formats and dtypes stay; canvas_size becomes that of the new camera. All else stays as it is, also
     3D labels in plain tensors: `last.rotation` (1, 3, 3), or `last.rays`, turns them. Gradients
@@ -57,6 +62,7 @@ class Transform(v2.Transform):
     Args:
         augmentation: what to do.
         camera: of samples that hold none; by default the augmentation's.
+        valid: whether points and boxes in dicts get flags.
 
     Raises:
         TypeError: it is no augmentation; a camera that is none.
@@ -66,14 +72,23 @@ class Transform(v2.Transform):
 
     _transformed_types = (torch.Tensor, PIL.Image.Image, Camera)
 
-    def __init__(self, augmentation: Augmentation, camera: Camera | None = None):
+    def __init__(self, augmentation: Augmentation, camera: Camera | None = None, *, valid: bool = False):
         super().__init__()
         if not isinstance(augmentation, Augmentation):
             raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
         if camera is not None and not isinstance(camera, Camera):
             raise TypeError(f"{_OWNER}: camera must be a Camera; got {type(camera).__name__}")
         self.augmentation = augmentation
-        self.camera = camera
+        self.camera, self.valid = camera, bool(valid)
+        self._flags: list[tuple[Tensor, Tensor]] = []
+
+    def forward(self, *inputs: Any) -> Any:
+        """Move a sample, of one input or several."""
+        outputs = super().forward(*inputs)
+        if self.valid:
+            _put(outputs, self._flags)
+        self._flags = []
+        return outputs
 
     @property
     def last(self) -> Change | None:
@@ -107,8 +122,9 @@ class Transform(v2.Transform):
         with torch.no_grad():
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.change(camera, self.augmentation.draw(1))
-            self.augmentation.last = change
-            return {"change": change, "camera": singles(change.target)[0]}
+            self.augmentation.last, self._flags = change, []
+            (camera,) = singles(cast(Camera, change.target))
+            return {"change": change, "camera": camera}
 
     def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
         """Move one input of a sample by the `params` of `make_params`."""
@@ -119,21 +135,39 @@ class Transform(v2.Transform):
     def _moved(self, inpt: Any, change: Change, camera: Camera) -> Any:
         if isinstance(inpt, Camera):
             return camera
+        plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
+        if isinstance(inpt, (*_KEYPOINTS, tv_tensors.BoundingBoxes)):
+            of_boxes = isinstance(inpt, tv_tensors.BoundingBoxes)
+            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else _points(change, plain)
+            if change.parts[0].warp is None:
+                moved = plain
+            result = tv_tensors.wrap(moved, like=inpt, canvas_size=camera.image_size)
+            self._flags.append((result, valid))
+            return result
         if change.parts[0].warp is None:
             return inpt
         if isinstance(inpt, PIL.Image.Image):
             return _pil(change, inpt)
-        plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
         if isinstance(inpt, tv_tensors.Mask):
             return tv_tensors.wrap(_labels(change, plain, self.augmentation.mask_fill), like=inpt)
-        if isinstance(inpt, _KEYPOINTS):
-            return tv_tensors.wrap(_points(change, plain), like=inpt, canvas_size=camera.image_size)
-        if isinstance(inpt, tv_tensors.BoundingBoxes):
-            boxes = _boxes(change, plain, inpt.format.value)
-            return tv_tensors.wrap(boxes, like=inpt, canvas_size=camera.image_size)
         if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
             return tv_tensors.wrap(_images(change, plain), like=inpt)
         return inpt if isinstance(inpt, tv_tensors.TVTensor) else _images(change, plain)
+
+
+def _put(outputs: Any, flags: list[tuple[Tensor, Tensor]]) -> None:
+    """Put flags beside their tensors into the dicts of a nest."""
+    if isinstance(outputs, (list, tuple)):
+        for item in outputs:
+            _put(item, flags)
+    if not isinstance(outputs, dict):
+        return
+    for name, value in list(outputs.items()):
+        _put(value, flags)
+        for tensor, valid in flags:
+            if value is tensor:
+                before = outputs.get(f"{name}_valid")
+                outputs[f"{name}_valid"] = valid if before is None else valid & (torch.as_tensor(before) != 0)
 
 
 def _size(inpt: Any) -> tuple[int, int] | None:
@@ -171,14 +205,16 @@ def _labels(change: Change, masks: Tensor, fill: float) -> Tensor:
     return moved.reshape(*masks.shape[:-2], *moved.shape[-2:])
 
 
-def _points(change: Change, points: Tensor) -> Tensor:
-    """Pixels (..., 2)."""
-    moved = change.points(_wide(points).reshape(1, math.prod(points.shape[:-1]), 2))[0].reshape(points.shape)
-    return (moved if points.is_floating_point() else moved.round()).to(points.dtype)
+def _points(change: Change, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (..., 2), and valid (...)."""
+    lost = (points == -1).all(-1)
+    moved, valid = (t[0] for t in change.points(_wide(points).reshape(1, math.prod(points.shape[:-1]), 2)))
+    moved = torch.where(lost.unsqueeze(-1), -1.0, moved.reshape(points.shape))
+    return (moved if points.is_floating_point() else moved.round()).to(points.dtype), valid.reshape(lost.shape) & ~lost
 
 
-def _boxes(change: Change, boxes: Tensor, form: str) -> Tensor:
-    """Boxes (M, 4) between pixel edges, of one of torchvision's formats."""
+def _boxes(change: Change, boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
+    """Boxes (M, 4) between pixel edges, of one of torchvision's formats, and valid (M,)."""
     one, two = _wide(boxes).chunk(2, -1)
     if form == "XYXY":
         low, high = one, two
@@ -193,16 +229,17 @@ def _boxes(change: Change, boxes: Tensor, form: str) -> Tensor:
     whole = not boxes.is_floating_point()
     if whole:  # as torchvision reads them
         low, high = low.trunc(), high.trunc()
-    moved = change.boxes((torch.cat((low, high), -1) - 0.5)[None])[0][0]
-    lost = (moved == -1).all(-1, keepdim=True)
-    low, high = torch.where(lost, moved, moved + 0.5).chunk(2, -1)
+    given = torch.cat((low, high), -1)
+    moved, valid = (t[0] for t in change.boxes((given - 0.5)[None]))
+    lost = ((moved == -1) | (given == -1).all(-1, keepdim=True)).all(-1, keepdim=True)
+    low, high = torch.where(lost, -1.0, moved + 0.5).chunk(2, -1)
     if whole:
         # rounding errors are no reason for another pixel
         low, high = (low + 1e-3).floor(), (high - 1e-3).ceil()
         if form == "CXCYWH":  # whose centres are whole numbers too
             high = high + (high - low) % 2
     pairs = {"XYXY": (low, high), "XYWH": (low, high - low), "CXCYWH": ((low + high) / 2, high - low)}
-    return torch.cat(pairs[form], -1).to(boxes.dtype)
+    return torch.cat(pairs[form], -1).to(boxes.dtype), valid & ~lost.squeeze(-1)
 
 
 def _wide(values: Tensor) -> Tensor:

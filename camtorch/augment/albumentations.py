@@ -1,0 +1,169 @@
+"""Augmentations as a transform of albumentations, for the pipelines of `A.Compose`.
+
+    transform = camtorch.augment.albumentations.Transform(camtorch.augment.RandomMount(yaw=20), camera)
+    pipeline = A.Compose([transform, A.GaussNoise()], bbox_params=..., keypoint_params=...)
+
+The module is imported by name: `import camtorch.augment.albumentations`. Without pipelines of albumentations, the
+`Transform` of `camtorch.augment.numpy` takes the same arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import albumentations as A  # noqa: N812 (everybody's name for it)
+import numpy as np
+import torch
+from albumentations.core.type_definitions import Targets
+from torch import Tensor
+
+from camtorch.augment.augmentation import Augmentation, draw
+from camtorch.augment.change import Change, copied, singles
+from camtorch.augment.numpy import as_array, as_tensor
+from camtorch.augment.sample import moves
+from camtorch.camera import Camera
+
+_OWNER = "albumentations.Transform"
+_KINDS = (
+    "gaze",
+    "directions",
+    "points",
+    "pitch_yaw",
+    "head_pose",
+    "pose",
+    "rvec",
+    "tvec",
+    "rotation",
+    "depth",
+    "distance",
+)
+
+
+class Transform(A.DualTransform):
+    """An augmentation among those of albumentations: image, masks, boxes and keypoints of a sample move by one draw.
+
+    Under their own names, `gaze`, `directions`, `points`, `pitch_yaw`, `head_pose`, `rvec`, `tvec`, `depth` and
+    `distance` move as well; see `Augmentation`. A `camera` in the sample is that of its images, and every sample comes
+    out with the new `camera`, from which the next transform of camtorch goes on. What albumentations itself does
+    in between to where pixels lie, as a crop or a flip, no camera knows of.
+
+    Keypoints and boxes are given and filtered as `keypoint_params` and `bbox_params` of the pipeline say. That is
+    where their validity goes: a keypoint without a place on the new camera becomes (-1, -1), off the image, and
+    `remove_invisible=True` takes it away with its labels; `False` keeps it there. A lost box has no area. Angles and
+    sizes of keypoints stay as they are.
+
+    Numbers are drawn by the generator of the pipeline, `A.Compose(..., seed=...)`, and replayed by `A.ReplayCompose`.
+    Nothing is differentiated, and volumes are not taken.
+
+    Args:
+        augmentation: what to do.
+        camera: of samples that hold none; by default the augmentation's.
+        p: how likely a sample is augmented; by default as the augmentation says.
+
+    Raises:
+        TypeError: it is no augmentation; a camera that is none.
+        ValueError: no camera, one with batch dims, images that are not of the camera's image_size.
+    """
+
+    _targets = (Targets.IMAGE, Targets.MASK, Targets.BBOXES, Targets.KEYPOINTS)
+
+    def __init__(self, augmentation: Augmentation, camera: Camera | None = None, p: float | None = None):
+        if not isinstance(augmentation, Augmentation):
+            raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
+        if camera is not None and not isinstance(camera, Camera):
+            raise TypeError(f"{_OWNER}: camera must be a Camera; got {type(camera).__name__}")
+        super().__init__(p=augmentation.p if p is None else p)
+        self.augmentation, self.camera = augmentation, camera
+
+    @property
+    def targets(self) -> dict[str, Callable[..., Any]]:
+        """What moves, by name, and the method that moves it."""
+        moved = {name: getattr(self, f"apply_to_{name}") for name in ("images", "mask", "masks", "bboxes", "keypoints")}
+        others = {name: self._mover(name) for name in _KINDS}
+        return {"image": self.apply, **moved, **others, "camera": self.apply_to_camera}
+
+    @property
+    def last(self) -> Change | None:
+        """The change of the last sample that it was applied to: its `source`, `target` and `rotation`."""
+        return self.augmentation.last
+
+    def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> dict[str, Any]:
+        """Transform a sample of keyword arguments; see the class."""
+        result: dict[str, Any] = super().__call__(*args, force_apply=force_apply, **data)
+        result.setdefault("camera", self._source(data))
+        return result
+
+    def get_params(self) -> dict[str, Any]:
+        """A draw, of plain numbers."""
+        generator = torch.Generator().manual_seed(self.py_random.getrandbits(63))
+        drawn = draw(self.augmentation.ranges, 1, 1.0, False, generator)
+        return {"draw": {name: value.tolist() for name, value in drawn.items()}}
+
+    def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
+        """Move what a sample holds by the draw in `params`."""
+        camera = self._source(data)
+        drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
+        with torch.no_grad():
+            self.augmentation.tell_of_empty_images(camera)
+            change = self.augmentation.last = self.augmentation.change(camera, drawn)
+            moved: dict[str, Any] = super().apply_with_params({**params, "change": change}, *args, **data)
+            return {**moved, "camera": self.apply_to_camera(camera, change)}
+
+    def _source(self, data: Mapping[str, Any]) -> Camera:
+        camera = data.get("camera", self.augmentation.camera if self.camera is None else self.camera)
+        if not isinstance(camera, Camera):
+            raise ValueError(
+                f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation; got {camera!r}"
+            )
+        if camera.image_size is None or camera.batch_shape:
+            raise ValueError(
+                f"{_OWNER}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} "
+                f"and batch dims {tuple(camera.batch_shape)}"
+            )
+        for name in ("image", "mask"):
+            size = np.shape(data[name])[:2] if data.get(name) is not None else camera.image_size
+            if size != camera.image_size:
+                raise ValueError(
+                    f"{_OWNER}: {name} is {size} (height, width), but the camera's image_size is {camera.image_size}. "
+                    "camera.resize, .crop and .pad give the camera of an edited image"
+                )
+        return camera
+
+    # -- what moves
+
+    def apply(self, img: np.ndarray, change: Change, **params: Any) -> np.ndarray:
+        """An image (H, W, C) or (H, W)."""
+        return as_array(change.images(as_tensor("image", img))[0], img)
+
+    def apply_to_mask(self, mask: np.ndarray, change: Change, **params: Any) -> np.ndarray:
+        """A mask likewise, by the nearest value."""
+        return as_array(change.labels(as_tensor("mask", mask), self.augmentation.mask_fill)[0], mask)
+
+    def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
+        """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
+        moved, _ = change.points(torch.as_tensor(keypoints[:, :2])[None])
+        return np.concatenate((moved[0].numpy(), keypoints[:, 2:]), 1)
+
+    def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
+        """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""
+        before, after = (
+            torch.tensor([[*size[::-1], *size[::-1]]], dtype=torch.float64)
+            for size in (change.parts[0].camera.image_size, self.apply_to_camera(None, change).image_size)
+        )
+        corners = torch.as_tensor(bboxes[:, :4], dtype=torch.float64) * before - 0.5
+        moved, seen = change.boxes(corners[None])
+        moved = torch.where(seen[0, :, None], (moved[0] + 0.5) / after, 0.0)
+        return np.concatenate((moved.numpy().astype(bboxes.dtype), bboxes[:, 4:]), 1)
+
+    def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
+        """The camera of the new image."""
+        return copied(singles(change.target)[0])
+
+    def _mover(self, kind: str) -> Callable[..., np.ndarray]:
+        def move(value: np.ndarray, change: Change, **params: Any) -> np.ndarray:
+            tensor = torch.as_tensor(np.asarray(value))[None]
+            moved: Tensor = moves(kind, tensor)(change, tensor, {})
+            return moved[0].numpy()
+
+        return move

@@ -1,0 +1,113 @@
+"""The augmentations in albumentations' pipelines: the same as for arrays, in its conventions."""
+
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+
+A = pytest.importorskip("albumentations", reason="albumentations is not installed")
+
+import camtorch.augment.albumentations  # noqa: E402
+import camtorch.augment.numpy  # noqa: E402
+
+SIZE = (48, 64)
+
+
+def camera():
+    return ct.KannalaBrandt([36.0, 36.0, 31.0, 23.0], [0.01, -0.02, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
+
+
+def transform(**options):
+    return ct.augment.albumentations.Transform(ct.augment.RandomCamera(yaw=8, pitch=8, roll=15, **options), camera())
+
+
+def compose(*transforms, seed=3, **options):
+    boxes = A.BboxParams(format="pascal_voc", label_fields=["names"])
+    points = A.KeypointParams(format="xy", remove_invisible=False)
+    return A.Compose(list(transforms), bbox_params=boxes, keypoint_params=points, seed=seed, **options)
+
+
+def sample():
+    rng = np.random.default_rng(0)
+    mask = np.zeros(SIZE, np.uint8)
+    mask[15:33, 20:42] = 7
+    return {
+        "image": rng.integers(0, 256, (*SIZE, 3), dtype=np.uint8),
+        "mask": mask,
+        "bboxes": np.array([[20.0, 15, 42, 33]]),
+        "names": ["face"],
+        "keypoints": np.array([[30.0, 20.0], [40.0, 30.0], [500.0, 20.0]]),
+        "gaze": np.array([0.1, -0.2, -0.9]),
+    }
+
+
+def test_a_pipeline_moves_a_sample_as_arrays_are_moved():
+    one = transform()
+    out = compose(one)(**sample())
+    drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in one.params["draw"].items()}
+    plain = sample()
+    boxes = plain.pop("bboxes") - 0.5
+    want = ct.augment.numpy.Transform(one.augmentation)(**plain, bboxes=boxes, camera=camera(), draw=drawn)
+    np.testing.assert_array_equal(out["image"], want["image"])
+    np.testing.assert_array_equal(out["mask"], want["mask"])
+    np.testing.assert_allclose(out["gaze"], want["gaze"], atol=1e-6)
+    np.testing.assert_allclose(out["keypoints"], want["keypoints"], atol=1e-3)
+    inside = np.clip(want["bboxes"] + 0.5, 0, [64, 48, 64, 48])
+    np.testing.assert_allclose(out["bboxes"], inside, atol=1e-3)
+    torch.testing.assert_close(out["camera"].intrinsics, want["camera"].intrinsics)
+    rows, columns = np.nonzero(out["mask"])
+    extent = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    assert np.abs(np.array(extent) - out["bboxes"][0]).max() < 1.5
+
+
+def test_seeds_and_replays():
+    first, again, other = (compose(transform(), seed=seed)(**sample())["image"] for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+    replay = A.ReplayCompose([transform(), A.HorizontalFlip(p=0.5)], keypoint_params=A.KeypointParams(format="xy"))
+    plain = {"image": sample()["image"], "keypoints": sample()["keypoints"][:2]}
+    once = replay(**plain)
+    twice = A.ReplayCompose.replay(once["replay"], **plain)
+    np.testing.assert_array_equal(once["image"], twice["image"])
+
+
+def test_what_has_no_place_is_where_its_params_look():
+    wide = ct.KannalaBrandt([18.0, 18.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
+    mount = ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150), pitch=0, roll=0, min_filled=0)
+    one = ct.augment.albumentations.Transform(mount, wide)
+    out = compose(one)(**sample())
+    assert out["keypoints"].tolist() == [[-1, -1]] * 3
+    assert (len(out["bboxes"]), out["names"]) == (0, [])
+    away = A.Compose([one], keypoint_params=A.KeypointParams(format="xy", remove_invisible=True))
+    assert len(away(image=sample()["image"], keypoints=sample()["keypoints"][:2])["keypoints"]) == 0
+
+
+def test_p_and_chains_of_cameras():
+    never = compose(transform(p=0))(**sample())
+    np.testing.assert_array_equal(never["image"], sample()["image"])
+    assert torch.equal(never["camera"].intrinsics, camera().intrinsics)
+    first, second = transform(), transform(image_size=(24, 32))
+    out = compose(first, A.RandomBrightnessContrast(p=1), second)(**sample())
+    assert out["image"].shape == (24, 32, 3)
+    assert out["camera"].image_size == (24, 32)
+    assert torch.equal(second.last.source.intrinsics, first.last.target.intrinsics)
+
+
+def test_further_targets_and_lists():
+    pipeline = A.Compose([transform()], additional_targets={"infrared": "image", "parts": "mask"}, seed=1)
+    image, mask = sample()["image"], sample()["mask"]
+    out = pipeline(image=image, infrared=image, mask=mask, parts=mask, masks=[mask, mask], images=np.stack([image] * 2))
+    np.testing.assert_array_equal(out["image"], out["infrared"])
+    np.testing.assert_array_equal(out["mask"], out["parts"])
+    np.testing.assert_array_equal(out["masks"][1], out["mask"])
+    np.testing.assert_array_equal(out["images"][1], out["image"])
+
+
+def test_what_is_wrong_is_told():
+    with pytest.raises(TypeError, match="augmentation must be an Augmentation; got str"):
+        ct.augment.albumentations.Transform("mount")
+    with pytest.raises(ValueError, match="no camera; give one here, in the sample, or to the augmentation"):
+        A.Compose([ct.augment.albumentations.Transform(ct.augment.RandomMount())])(image=sample()["image"])
+    with pytest.raises(ValueError, match=r"image is \(47, 64\) \(height, width\), but the camera's image_size is"):
+        A.Compose([transform()])(image=sample()["image"][1:])

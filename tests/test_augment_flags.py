@@ -1,0 +1,125 @@
+"""Which labels are still on the image, where each framework's users look for it."""
+
+import copy
+import importlib
+import pickle
+
+import kornia.augmentation as K  # noqa: N812
+import pytest
+import torch
+from torch.utils.data import DataLoader
+from torchvision_stand_in import torchvision_of
+
+import camtorch as ct
+import camtorch.augment.kornia
+
+SIZE = (48, 64)
+POINTS = torch.tensor([[31.5, 23.5], [2.0, 2.0], [30.0, 20.0], [-30.0, 5.0]])
+
+
+def fisheye():
+    """Of a wide view; a narrow camera sees the middle of it alone."""
+    return ct.KannalaBrandt([22.0, 22.0, 31.5, 23.5], [0.0] * 4, image_size=SIZE).requires_grad_(False)
+
+
+def narrow(**options):
+    none = dict.fromkeys(("focal", "centre", "crop"))
+    return ct.augment.RandomCamera("pinhole", fov=60, yaw=0, pitch=0, roll=0, min_filled=0, **none, **options)
+
+
+# -- kornia
+
+
+def test_kornia_has_the_flags_of_the_keypoints_it_moved():
+    aug = ct.augment.kornia.CameraAugmentation(narrow(), fisheye())
+    assert aug.keypoints_valid is None
+    seq = K.AugmentationSequential(aug, data_keys=["input", "keypoints"])
+    _, moved = seq(torch.rand(2, 1, *SIZE), POINTS.expand(2, -1, -1))
+    assert aug.keypoints_valid.tolist() == [[True, False, True, False]] * 2
+    assert torch.equal(aug.keypoints_valid, aug.last.points(POINTS.expand(2, -1, -1))[1])
+    assert moved.shape == (2, 4, 2)
+    skipped = ct.augment.kornia.CameraAugmentation(narrow(), fisheye(), p=0.0)
+    K.AugmentationSequential(skipped, data_keys=["input", "keypoints"])(torch.rand(1, 1, *SIZE), POINTS[None])
+    assert skipped.keypoints_valid.tolist() == [[True, True, True, False]]  # where they are
+    for again in (copy.deepcopy(aug), pickle.loads(pickle.dumps(aug))):
+        assert torch.equal(again.keypoints_valid, aug.keypoints_valid)
+
+
+def test_what_one_augmentation_lost_the_next_ones_do_not_find():
+    turned = ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150), pitch=0, roll=0, min_filled=0, distortion=None)
+    pinhole = ct.Pinhole([55.0, 55.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
+    rolled = ct.augment.RandomMount(yaw=0, pitch=0, roll=(180, 180))
+    seq = K.AugmentationSequential(
+        ct.augment.kornia.CameraAugmentation(turned, fisheye()),
+        ct.augment.kornia.CameraAugmentation(rolled, pinhole.crop(-2, -2, *SIZE)),
+        data_keys=["input", "keypoints"],
+    )
+    _, moved = seq(torch.rand(1, 1, *SIZE), POINTS[None, :1])
+    assert not seq[0].keypoints_valid.any()
+    assert moved.tolist() == [[[-1, -1]]]
+    assert not seq[1].keypoints_valid.any()
+
+
+# -- torchvision
+
+
+@pytest.fixture(params=["stand-in", "real"])
+def vision(request, monkeypatch):
+    with torchvision_of(request.param, monkeypatch) as tv_tensors:
+        yield importlib.import_module("camtorch.augment.torchvision"), tv_tensors
+
+
+def sample(tv):
+    boxes = torch.tensor([[25.0, 18, 38, 29], [0, 0, 4, 4]])
+    target = {
+        "keypoints": tv.KeyPoints(POINTS.clone(), canvas_size=SIZE),
+        "boxes": tv.BoundingBoxes(boxes, format=tv.BoundingBoxFormat.XYXY, canvas_size=SIZE),
+        "labels": torch.tensor([3, 4]),
+    }
+    return tv.Image(torch.rand(3, *SIZE)), target
+
+
+def test_torchvision_puts_flags_beside_their_points(vision):
+    front_end, tv = vision
+    transform = front_end.Transform(narrow(), fisheye(), valid=True)
+    _, target = transform(*sample(tv))
+    assert list(target) == ["keypoints", "boxes", "labels", "keypoints_valid", "boxes_valid"]
+    assert target["keypoints_valid"].tolist() == [True, False, True, False]
+    assert target["boxes_valid"].tolist() == [True, False]
+    assert type(target["keypoints_valid"]) is torch.Tensor
+    assert target["labels"].tolist() == [3, 4]
+    # without being asked, nothing is added
+    _, plain = front_end.Transform(narrow(), fisheye())(*sample(tv))
+    assert list(plain) == ["keypoints", "boxes", "labels"]
+
+
+def test_torchvision_s_flags_go_on_through_chains(vision):
+    front_end, tv = vision
+    image, target = sample(tv)
+    target["keypoints_valid"] = torch.tensor([0, 1, 2, 2])  # COCO's, of somebody who sees less
+    _, target = front_end.Transform(narrow(), fisheye(), valid=True)(image, target)
+    assert target["keypoints_valid"].tolist() == [False, False, True, False]
+    skipped = front_end.Transform(narrow(p=0), fisheye(), valid=True)(*sample(tv))[1]
+    assert skipped["keypoints_valid"].tolist() == [True, True, True, False]
+    turned = ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150), pitch=0, roll=0, min_filled=0)
+    pinhole = ct.Pinhole([55.0, 55.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
+    rolled = ct.augment.RandomMount(yaw=0, pitch=0, roll=(180, 180))
+    first = front_end.Transform(turned, fisheye(), valid=True)
+    second = front_end.Transform(rolled, pinhole.crop(-2, -2, *SIZE), valid=True)
+    _, lost = second(*first(*sample(tv)))
+    assert lost["keypoints"].as_subclass(torch.Tensor)[0].tolist() == [-1, -1]
+    assert lost["boxes"].as_subclass(torch.Tensor)[0].tolist() == [-1, -1, -1, -1]
+    assert not lost["keypoints_valid"].any()
+    assert not lost["boxes_valid"].any()
+
+
+def test_torchvision_s_flags_survive_a_loader(vision):
+    front_end, tv = vision
+    transform = front_end.Transform(narrow(), fisheye(), valid=True)
+    targets = [transform(*sample(tv))[1] for _ in range(4)]
+    plain = [
+        {k: v.as_subclass(torch.Tensor) if isinstance(v, tv.TVTensor) else v for k, v in t.items()} for t in targets
+    ]
+    for batch in DataLoader(plain, batch_size=2):
+        assert batch["keypoints"].shape == (2, 4, 2)
+        assert batch["keypoints_valid"].tolist() == [[True, False, True, False]] * 2
