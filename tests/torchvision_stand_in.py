@@ -4,6 +4,7 @@ import contextlib
 import enum
 import functools
 import importlib
+import re
 import sys
 import types
 
@@ -68,13 +69,28 @@ def stand_in():
     return {module.__name__: module for module in (torchvision, transforms, v2, tv_tensors)}
 
 
+DECLARED = torch.library.Library("torchvision", "FRAGMENT")
+
+
 @functools.cache
 def why_not():
-    try:
-        importlib.import_module("torchvision.transforms.v2")
-    except Exception as error:
-        return f"torchvision cannot be imported: {type(error).__name__}: {error}"
-    return None
+    """Why the real torchvision cannot be had; its transforms and tv_tensors can even where its binary does not load.
+
+    Then the import stops at operators that the binary would have made; none of them is called here.
+    """
+    for _ in range(20):
+        try:
+            importlib.import_module("torchvision.transforms.v2")
+        except Exception as error:
+            missing = re.match(r"operator torchvision::(\w+) does not exist", str(error))
+            if not missing:
+                return f"torchvision cannot be imported: {type(error).__name__}: {error}"
+            DECLARED.define(f"{missing[1]}(Tensor _) -> Tensor")
+            for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+                del sys.modules[name]
+        else:
+            return None
+    return "torchvision wants ever more operators"
 
 
 @contextlib.contextmanager
