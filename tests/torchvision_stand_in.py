@@ -72,25 +72,27 @@ def stand_in():
 DECLARED = torch.library.Library("torchvision", "FRAGMENT")
 
 
+def import_error():
+    try:
+        importlib.import_module("torchvision.transforms.v2")
+    except Exception as error:
+        return error
+    return None
+
+
 @functools.cache
 def why_not():
     """Why the real torchvision cannot be had; its transforms and tv_tensors can even where its binary does not load.
 
     Then the import stops at operators that the binary would have made; none of them is called here.
     """
-    for _ in range(20):
-        try:
-            importlib.import_module("torchvision.transforms.v2")
-        except Exception as error:
-            missing = re.match(r"operator torchvision::(\w+) does not exist", str(error))
-            if not missing:
-                return f"torchvision cannot be imported: {type(error).__name__}: {error}"
-            DECLARED.define(f"{missing[1]}(Tensor _) -> Tensor")
-            for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
-                del sys.modules[name]
-        else:
-            return None
-    return "torchvision wants ever more operators"
+    error = import_error()
+    while missing := re.match(r"operator torchvision::(\w+) does not exist", str(error)):
+        DECLARED.define(f"{missing[1]}(Tensor _) -> Tensor")
+        for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+            del sys.modules[name]
+        error = import_error()
+    return error and f"torchvision cannot be imported: {type(error).__name__}: {error}"
 
 
 @contextlib.contextmanager
