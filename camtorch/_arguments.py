@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import torch
 from torch import Tensor, nn
 
-from camtorch._tracing import is_concrete
+from camtorch._tracing import in_graph, is_concrete
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -42,9 +42,17 @@ def as_real(value, name: str, owner: str) -> Tensor:
         raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
     if not value.is_floating_point():
         value = value.to(torch.get_default_dtype())
-    if is_concrete(value) and not bool(torch.isfinite(value).all()):
+    if is_concrete(value) and not is_predicted(value) and not bool(torch.isfinite(value).all()):
         raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
     return value
+
+
+def is_predicted(value: Tensor) -> bool:
+    """Whether a network may have made these rows of a batch: of them some may be bad, and the others shall live.
+
+    A tensor with batch dims, in a graph or, as predictions are at inference, where none is recorded.
+    """
+    return value.ndim > 1 and not isinstance(value, nn.Parameter) and (in_graph(value) or not torch.is_grad_enabled())
 
 
 def as_vectors(value, name: str, owner: str) -> Tensor:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._tracing import has_tangent, in_graph, in_transform, is_concrete
 
@@ -120,7 +121,8 @@ class BatchedModule(GeometryModule):
 
     def with_tensors(self, **tensors: Tensor) -> Self:
         """This module with other tensors, whose values are not checked; each is kept or registered as by `hold`."""
-        made = type(self).__new__(type(self))
+        model = type_before_parametrizations(self)
+        made = model.__new__(model)
         nn.Module.__init__(made)
         for name, value in self.__dict__.items():
             if name not in made.__dict__:

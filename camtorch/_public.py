@@ -29,6 +29,7 @@ from camtorch.models import (
     ThinPrismFisheye,
     WoodScape,
 )
+from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
@@ -58,10 +59,12 @@ __all__ = [
     "Mei",
     "OrthographicFisheye",
     "Pinhole",
+    "PositiveFocal",
     "Rig",
     "Stereographic",
     "Tabulated",
     "ThinPrismFisheye",
+    "TiedFocal",
     "Warp",
     "WoodScape",
     "augment",

@@ -19,6 +19,7 @@ from camtorch._arguments import (
     as_values,
     as_whole,
     broadcast_shapes,
+    is_predicted,
 )
 from camtorch._module import BatchedModule, Memo
 from camtorch._tracing import has_tangent, is_concrete
@@ -61,9 +62,12 @@ class Camera(BatchedModule):
     and a tensor that requires grad are kept as they are, so that gradients reach the network that predicted
     them, and a lens shared by a batch stays one.
 
+    Bad values, which are NaN or infinite, focal lengths that are not positive, or coefficients for which the formula
+    does not exist, are refused where a person gives them. In a batch that a network predicted, a tensor in a graph or
+    under `torch.no_grad`, the rows with bad values are cameras without a valid point, and the others live.
+
     Raises:
-        ValueError: a wrong shape or number of coefficients, NaN or infinite values, coefficients for which the
-            formula does not exist, a focal length or an image size that is not positive.
+        ValueError: a wrong shape or number of coefficients, bad values, an image size that is not positive.
         TypeError: parameters that are not numbers, an image size that is not two integers.
     """
 
@@ -110,7 +114,7 @@ class Camera(BatchedModule):
             raise ValueError(
                 f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
             )
-        if is_concrete(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
+        if _is_given(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
             raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
         if distortion is None:
             ideal = intrinsics.new_tensor(self.ideal(self.default_count))
@@ -126,7 +130,7 @@ class Camera(BatchedModule):
                 + hint
             )
         defined = self.defined(distortion.unbind(-1))
-        if defined is not None and is_concrete(distortion) and not bool((defined > 0).all()):
+        if defined is not None and _is_given(distortion) and not bool((defined > 0).all()):
             raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
@@ -625,6 +629,11 @@ def _is_plain(inputs: Sequence[Tensor]) -> bool:
     ):
         return False
     return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)
+
+
+def _is_given(values: Tensor) -> bool:
+    """Whether the values may be looked at, and bad ones are refused."""
+    return is_concrete(values) and not is_predicted(values)
 
 
 def _per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

@@ -93,6 +93,11 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
     def __contains__(self, name: object) -> bool:
         return name in self._places
 
+    def row(self, name: str) -> int | None:
+        """The row of `batch` that has this name, or None for a module of its own."""
+        place = self._places[name]
+        return None if isinstance(place, str) else place
+
     # a module is itself and nothing else, as the sets that nn.Module keeps of them want it
     __eq__ = object.__eq__
     __hash__ = object.__hash__

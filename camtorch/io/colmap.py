@@ -11,7 +11,7 @@ import re
 import struct
 
 from camtorch.camera import Camera
-from camtorch.io import colmap_images
+from camtorch.io import colmap_images, poses
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import decoded
 from camtorch.io.protocol import Names
@@ -66,14 +66,14 @@ def read(path: str, content: bytes) -> Rig:
         if lost is not None:
             Record(beside, None, "file").fail(f"missing; an interrupted save left {lost}: rename it, or delete it")
         return Rig(cameras)
-    extrinsics, images = {}, {}
-    for image in colmap_images.read(beside):
-        if image.name in extrinsics:
-            image.record.fail(f"a second image is called {image.name!r:.60}")
-        if image.camera not in cameras:
-            image.record.fail(f"its camera {image.camera} is not in {os.path.basename(path)}")
-        extrinsics[image.name], images[image.name] = image.extrinsics, image.camera
-    return Rig(cameras, extrinsics, images=images)
+    images = colmap_images.read(beside)
+    if unknown := set(images.cameras) - cameras.keys():
+        row = next(row for row, camera in enumerate(images.cameras) if camera in unknown)
+        images.record(row).fail(f"its camera {images.cameras[row]} is not in {os.path.basename(path)}")
+    if not images.names:
+        return Rig(cameras)
+    batch = poses.from_quaternions(images.record, images.values)
+    return Rig(cameras, (images.names, batch), images=dict(zip(images.names, images.cameras, strict=True)))
 
 
 def _images_beside(path: str) -> str | None:
@@ -93,8 +93,8 @@ def _from_text(path: str, content: bytes) -> dict[str, Camera]:
         words = record.value
         if len(words) < 4:
             record.fail("less than an id, a model, a width and a height")
-        identity, name, width, height, *values = record
-        identity = str(identity.whole(0, _LARGEST_ID, "camera id"))
+        first, name, width, height, *values = record
+        identity = str(first.whole(0, _LARGEST_ID, "camera id"))
         if identity in cameras:
             record.fail(f"a second camera has the id {identity}")
         if name.value not in _MODELS:

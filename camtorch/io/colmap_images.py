@@ -2,111 +2,153 @@
 
 from __future__ import annotations
 
-import math
 import os
 import struct
-from collections.abc import Iterator
+from array import array
 from typing import BinaryIO, NamedTuple
 
-from camtorch.extrinsics import Extrinsics
+import numpy as np
+
 from camtorch.io import poses
-from camtorch.io.parsing import check_ordinary
+from camtorch.io.parsing import MOST_COMMENTS, check_ordinary
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 
 _HEAD = struct.Struct("<I7dI")
 _POINT = 24  # x, y and the id of a 3D point
-_MOST_IMAGES = 200_000  # a pose takes some 5 kB
+_MOST_IMAGES = 1 << 18  # each takes some 400 bytes
 _LONGEST_NAME = 4096
 _LONGEST_LINE = 1 << 26
+_LARGEST_ID = (1 << 32) - 2
 
 
-class Image(NamedTuple):
-    """An image of a file: its name, the id of its camera, its pose, whether it has points; and its place."""
+class Images(NamedTuple):
+    """The images of a file.
 
-    name: str
-    camera: str
-    extrinsics: Extrinsics
+    names and cameras: of each image, the latter by their ids.
+    values: (N, 7), unit quaternions w, x, y, z and translations.
+    has_points: whether any of them has points.
+    unit, places: what numbers the place of an image in the file, and those numbers.
+    """
+
+    path: str
+    names: list[str]
+    cameras: list[str]
+    values: np.ndarray
     has_points: bool
-    record: Record
+    unit: str
+    places: array[int]
+
+    def record(self, row: int) -> Record:
+        """The place of an image."""
+        return Record(self.path, None, f"{self.unit} {self.places[row]}")
 
 
-def read(path) -> Iterator[Image]:
+def read(path: str) -> Images:
     """The images of an images.txt or images.bin.
 
     Raises:
-        CameraFileError: it is none.
+        CameraFileError: it is none, or two images have one name.
     """
     check_ordinary(path)
-    with open(path, "rb") as file:
-        images = (_from_bytes if os.fspath(path).endswith(".bin") else _from_text)(path, file)
-        for i, image in enumerate(images):
-            if i >= _MOST_IMAGES:
-                image.record.fail(f"more than {_MOST_IMAGES} images")
-            yield image
+    with open(path, "rb", buffering=1 << 16) as file:
+        images = (_from_bytes if path.endswith(".bin") else _from_text)(path, file)
+    if len(set(images.names)) < len(images.names):
+        seen: set[str] = set()
+        for row, name in enumerate(images.names):
+            if name in seen:
+                images.record(row).fail(f"a second image is called {name!r:.60}")
+            seen.add(name)
+    finite = np.isfinite(images.values).all(1)
+    if not finite.all():
+        row = int(finite.argmin())
+        images.record(row).fail(f"a pose that is no finite number: {images.values[row].tolist()}")
+    return images
 
 
-def _from_text(path, file: BinaryIO) -> Iterator[Image]:
-    i = 0
+def _from_text(path: str, file: BinaryIO) -> Images:
+    names: list[str] = []
+    cameras: list[str] = []
+    identities: dict[bytes, str] = {}
+    values, places = array("d"), array("q")
+    line_number = passed = 0
+    has_points = False
     while line := file.readline(_LONGEST_LINE):
-        i += 1
-        record = Record(path, None, f"line {i}")
-        try:
-            words = line.decode().split(maxsplit=9)
-        except UnicodeDecodeError:
-            record.fail("not text")
-        if not words or words[0].startswith("#"):
+        line_number += 1
+        words = line.split(None, 9)
+        if not words or words[0].startswith(b"#"):
+            passed += 1
+            if passed > MOST_COMMENTS:
+                Record(path, None, f"line {line_number}").fail("too many lines without an image")
             continue
+        record = Record(path, None, f"line {line_number}")
         if len(words) < 10:
+            _text(record, line)
             record.fail("less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME")
-        camera = str(Record(path, words[8], record.place).whole(0, (1 << 32) - 2, "camera id"))
-        values = [Record(path, word, record.place).number() for word in words[1:8]]
-        # the next line holds the points, be it empty
-        points = file.readline(_LONGEST_LINE)
-        i += 1
-        yield _image(record, words[9].strip(), camera, values, bool(points.strip()))
-
-
-def _from_bytes(path, file: BinaryIO) -> Iterator[Image]:
-    size = os.fstat(file.fileno()).st_size
-
-    def take(length: int) -> bytes:
-        record = Record(path, None, f"byte {file.tell()}")
-        content = file.read(length)
-        if len(content) < length:
-            record.fail(f"the file ends here, {length - len(content)} bytes too early")
-        return content
-
-    (count,) = struct.unpack("<Q", take(8))
-    if count > size // (_HEAD.size + 9):
-        Record(path, None, "byte 0").fail(f"{count} images, for which the file is too small")
-    for _ in range(count):
-        record = Record(path, None, f"byte {file.tell()}")
-        _, *values, camera = _HEAD.unpack(take(_HEAD.size))
-        if not all(map(math.isfinite, values)):
-            record.fail(f"a pose that is not finite: {values}")
-        name = bytearray()
-        while (byte := take(1)) != b"\0":
-            name += byte
-            if len(name) > _LONGEST_NAME:
-                record.fail("the name of the image has no end")
+        if len(names) >= _MOST_IMAGES:
+            record.fail(f"more than {_MOST_IMAGES} images")
         try:
-            text = name.decode()
-        except UnicodeDecodeError:
-            record.fail("the name of the image is no text")
-        (points,) = struct.unpack("<Q", take(8))
-        if points * _POINT > size - file.tell():
+            values.extend(map(float, words[1:8]))
+        except ValueError:
+            for word in words[1:8]:
+                Record(path, _text(record, word), record.place).number()
+        if words[8] not in identities:
+            identity = Record(path, _text(record, words[8]), record.place).whole(0, _LARGEST_ID, "camera id")
+            identities[words[8]] = str(identity)
+        cameras.append(identities[words[8]])
+        name = words[9].strip()
+        if len(name) > _LONGEST_NAME:
+            record.fail("the name of the image has no end")
+        names.append(_text(record, name))
+        places.append(line_number)
+        points = file.readline(_LONGEST_LINE)  # of the image; the line may be empty
+        line_number += 1
+        has_points = has_points or not (points.isspace() or not points)
+    return Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, "line", places)
+
+
+def _text(record: Record, content: bytes) -> str:
+    try:
+        return content.decode()
+    except UnicodeDecodeError:
+        record.fail("not text")
+
+
+def _from_bytes(path: str, file: BinaryIO) -> Images:
+    size = os.fstat(file.fileno()).st_size
+    names: list[str] = []
+    cameras: list[str] = []
+    values, places = array("d"), array("q")
+    has_points = False
+    position = 8
+    (count,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
+    if size < 8 or count > (size - 8) // (_HEAD.size + 9):
+        Record(path, None, "byte 0").fail(f"{count} images, for which the file is too small")
+    if count > _MOST_IMAGES:
+        Record(path, None, "byte 0").fail(f"{count} images; more than {_MOST_IMAGES} are not read")
+    for _ in range(count):
+        record = Record(path, None, f"byte {position}")
+        file.seek(position)
+        block = file.read(_HEAD.size + _LONGEST_NAME + 9)
+        end = block.find(b"\0", _HEAD.size)
+        if end + 9 > len(block) or (end < 0 and len(block) < _HEAD.size + _LONGEST_NAME):
+            record.fail("the file ends within this image")
+        if end < 0 or end - _HEAD.size > _LONGEST_NAME:
+            record.fail("the name of the image has no end")
+        _, *pose, camera = _HEAD.unpack_from(block)
+        (points,) = struct.unpack_from("<Q", block, end + 1)
+        places.append(position)
+        position += end + 9 + points * _POINT
+        if position > size:
             record.fail(f"{points} points, for which the file is too small")
-        file.seek(points * _POINT, os.SEEK_CUR)
-        yield _image(record, text, str(camera), values, points > 0)
-    if file.tell() < size:
-        Record(path, None, f"byte {file.tell()}").fail(f"{size - file.tell()} bytes after the last image")
-
-
-def _image(record: Record, name: str, camera: str, values: list[float], has_points: bool) -> Image:
-    extrinsics = poses.from_quaternion(record, values[:4], values[4:])
-    return Image(name, camera, extrinsics, has_points, record)
+        values.extend(pose)
+        cameras.append(str(camera))
+        names.append(_text(record, block[_HEAD.size : end]))
+        has_points = has_points or points > 0
+    if position < size:
+        Record(path, None, f"byte {position}").fail(f"{size - position} bytes after the last image")
+    return Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, "byte", places)
 
 
 # -- writing
@@ -119,20 +161,17 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
         CameraFileError: the file that is there has points, which would be lost.
     """
     entries = []
-    for name, extrinsics in rig.extrinsics.items():
-        lossy.pose(name, extrinsics)
+    for name, values in poses.quaternions(rig, lossy).items():
         if not name or "\0" in name or (not binary and (name.split() != [name])):
             lossy.fail(
                 repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
             )
-        quaternion, translation = poses.to_quaternion(extrinsics)
-        entries.append((name, identities[rig.images.get(name, name)], [*quaternion, *translation]))
+        entries.append((name, identities[rig.images.get(name, name)], values))
     if os.path.exists(path):
-        there = list(read(path))
-        kept = [(i.name, int(i.camera), [v for vs in poses.to_quaternion(i.extrinsics) for v in vs]) for i in there]
-        if kept == entries:
+        there = read(path)
+        if entries == list(zip(there.names, map(int, there.cameras), there.values.tolist(), strict=True)):
             return None
-        if any(image.has_points for image in there):
+        if there.has_points:
             Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
     folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
     for name in ("rigs", "frames"):

@@ -59,10 +59,8 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         raise CameraFileError(path, "content", f"cannot be read: {type(error).__name__}: {error}") from None
     if not rig.cameras:
         raise CameraFileError(path, "cameras", "none")
-    for module in (*rig.cameras.values(), *rig.extrinsics.values()):
-        module.requires_grad_(False)
     rig.format = format
-    return rig
+    return rig.requires_grad_(False)
 
 
 def _path(path: Any, owner: str) -> str:

@@ -22,7 +22,7 @@ _DEEPEST = 100
 _MOST_DIRECTIVES = 100  # libyaml compares each with all
 _MOST_VALUES = 1 << 17
 _BYTES_PER_VALUE = 8  # of larger files: a value takes some 60 bytes of memory
-_MOST_COMMENTS = 10_000
+MOST_COMMENTS = 10_000
 _START = 1 << 16  # of a text, where its kind shows
 
 # how files begin that people pass by mistake
@@ -169,7 +169,7 @@ def _from_literal(path, text: str) -> Any:
             expected = "separator" if closing else "end"
         elif kind == "comment":
             comments += 1
-            if comments > _MOST_COMMENTS:
+            if comments > MOST_COMMENTS:
                 tree.fail("too many comments")
         elif kind == "end":
             break

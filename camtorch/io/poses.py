@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
 import torch
 
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.record import Record
+from camtorch.io.writing import Lossy
+from camtorch.rig import Rig
 
 Vector = Sequence[float]
 Matrix = Sequence[Sequence[float]]
@@ -28,7 +32,7 @@ def pose(record: Record, rotation: Vector, translation: Vector) -> Extrinsics:
     return Extrinsics(*(torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation)))
 
 
-def keep(extrinsics: Extrinsics, kind: str, values, *others: Extrinsics) -> Extrinsics:
+def keep(extrinsics: Extrinsics, kind: str, values: Any, *others: Extrinsics) -> Extrinsics:
     """Remember how a file wrote the pose, so that unless it changes it is written again to the last bit.
 
     Args:
@@ -37,13 +41,16 @@ def keep(extrinsics: Extrinsics, kind: str, values, *others: Extrinsics) -> Extr
         values: what stood in the file.
         others: the poses that the values depend on as well.
     """
-    extrinsics._as_written = (kind, values, [numbers(e) for e in (extrinsics, *others)])
+    vars(extrinsics)[_KEPT] = kind, values, [numbers(e) for e in (extrinsics, *others)]
     return extrinsics
 
 
-def written(extrinsics: Extrinsics, kind: str, *others: Extrinsics):
+_KEPT = "_as_written"
+
+
+def written(extrinsics: Extrinsics, kind: str, *others: Extrinsics) -> Any:
     """What a file said of this pose, or None: it did not, or since then the pose has changed."""
-    was_kind, values, poses = getattr(extrinsics, "_as_written", (None, None, None))
+    was_kind, values, poses = vars(extrinsics).get(_KEPT, (None, None, None))
     return values if was_kind == kind and poses == [numbers(e) for e in (extrinsics, *others)] else None
 
 
@@ -55,6 +62,56 @@ def numbers(extrinsics: Extrinsics) -> tuple[list[float], list[float]]:
 def is_identity(extrinsics: Extrinsics | None) -> bool:
     """Whether the pose does nothing, to the last bit."""
     return extrinsics is None or not any(v for vector in numbers(extrinsics) for v in vector)
+
+
+# -- the poses of many images, which are the rows of a batch
+
+
+def from_quaternions(record: Callable[[int], Record], values: np.ndarray) -> Extrinsics:
+    """A batch of finite (N, 7), quaternions w, x, y, z and translations; `record` gives the place of a row."""
+    w, xyz, translation = values[:, 0], values[:, 1:4], values[:, 4:]
+    norm = np.sqrt((values[:, :4] ** 2).sum(1))
+    if (wrong := ~(np.abs(norm - 1) < _ORTHOGONAL)).any():
+        row = int(wrong.argmax())
+        record(row).fail(f"a quaternion of length {norm[row]:.6g}, which is no rotation")
+    if (wrong := (np.abs(translation) > _FARTHEST).any(1)).any():
+        record(int(wrong.argmax())).fail(f"a number beyond {_FARTHEST:g}")
+    largest = np.abs(xyz).max(1).clip(np.finfo(float).tiny)
+    sine = largest * np.sqrt(((xyz / largest[:, None]) ** 2).sum(1))
+    with np.errstate(invalid="ignore"):
+        # near the identity 2 atan2(s, w) / s -> 2 / w
+        scale = np.where(sine > 1e-150, 2 * np.arctan2(sine, np.abs(w)) / sine, 2 / np.abs(w))
+    rotation = xyz * np.copysign(scale, w)[:, None]
+    batch = Extrinsics(torch.from_numpy(rotation)[..., None], torch.from_numpy(translation.copy()))
+    vars(batch)[_KEPT] = "quaternions", values, np.concatenate((rotation, translation), 1)
+    return batch
+
+
+def quaternions(rig: Rig, lossy: Lossy) -> dict[str, list[float]]:
+    """The quaternion w, x, y, z and translation, seven numbers, of each pose of a rig; those of a file as it had them.
+
+    Raises:
+        CameraFileError: batches, or numbers that are not finite.
+    """
+    rows: list[list[float]] = []
+    if (batch := rig.extrinsics.batch) is not None:
+        tensors = (t.detach().double().cpu().expand(len(batch), 3).numpy() for t in (batch.rotation, batch.translation))
+        now = np.concatenate(list(tensors), 1)
+        _, values, then = vars(batch).get(_KEPT, (None, np.zeros((len(now), 7)), np.full_like(now, np.nan)))
+        rows = values.tolist()
+        for changed in map(int, np.nonzero((now != then).any(1))[0]):
+            rotation, translation = lossy.pose(f"row {changed}", batch[changed])
+            rows[changed] = [*quaternion_of_vector(rotation), *translation]
+    found = {}
+    for name in rig.extrinsics:
+        row = rig.extrinsics.row(name)
+        if row is None:
+            lossy.pose(name, rig.extrinsics[name])
+            quaternion, translation = to_quaternion(rig.extrinsics[name])
+            found[name] = [*quaternion, *translation]
+        else:
+            found[name] = rows[row]
+    return found
 
 
 # -- quaternions, as w, x, y, z

@@ -86,7 +86,7 @@ def ideal(camera: CameraT) -> CameraT:
     slopes = slopes_at_axis(camera.optics, camera.distortion.detach()[None])[0]
     # that a chart or a table has a slope of its own is no distortion; rounding is no slope
     slopes = torch.where((slopes - 1).abs() > 1e-9, slopes, 1.0)
-    return type(camera)(torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), values, image_size=camera.image_size)
+    return camera.with_tensors(intrinsics=torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), distortion=values)
 
 
 def followed(camera: Camera, angles: Tensor, azimuths: int) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,39 @@
+"""Parametrizations of a camera's intrinsics, for `torch.nn.utils.parametrize`: positive, and tied to each other."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class PositiveFocal(nn.Module):
+    """Focal lengths that no step of an optimizer makes negative: their logarithms learn, fx and fy each.
+
+        torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", ct.PositiveFocal())
+
+    An optimizer's step of 0.01 is one percent of a focal length; the principal point learns as it is, in pixels.
+    """
+
+    def forward(self, unconstrained: Tensor) -> Tensor:
+        """(*B, 4) log fx, log fy, cx, cy -> (*B, 4) intrinsics."""
+        return torch.cat((unconstrained[..., :2].exp(), unconstrained[..., 2:]), -1)
+
+    def right_inverse(self, intrinsics: Tensor) -> Tensor:
+        """What the intrinsics (*B, 4) are made of."""
+        return torch.cat((intrinsics[..., :2].log(), intrinsics[..., 2:]), -1)
+
+
+class TiedFocal(nn.Module):
+    """Square pixels, fx = fy: one focal length learns, as its logarithm; see `PositiveFocal`.
+
+    A camera whose focal lengths differ gets their geometric mean.
+    """
+
+    def forward(self, unconstrained: Tensor) -> Tensor:
+        """(*B, 3) log f, cx, cy -> (*B, 4) intrinsics."""
+        focal = unconstrained[..., :1].exp()
+        return torch.cat((focal, focal, unconstrained[..., 1:]), -1)
+
+    def right_inverse(self, intrinsics: Tensor) -> Tensor:
+        """What intrinsics (*B, 4) of square pixels are made of."""
+        return torch.cat((intrinsics[..., :2].log().mean(-1, keepdim=True), intrinsics[..., 2:]), -1)

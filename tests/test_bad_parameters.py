@@ -1,0 +1,122 @@
+"""Parameters that learning or a network made unusable: the others live, and what happened is said."""
+
+import copy
+
+import pytest
+import torch
+from cameras import KEYS, fan, make, one, spread
+from torch.nn.utils import parametrize
+
+import camtorch as ct
+
+every_model = pytest.mark.parametrize("key", KEYS)
+POINTS = fan(40, 4, 3)
+
+
+def predicted(key):
+    """Intrinsics of a batch as a network makes them, of which some rows are no camera's; and which are."""
+    camera = spread(key)
+    leaf = camera.intrinsics.detach().repeat(5, 1).requires_grad_()
+    bad = torch.full((5, 4), torch.inf, dtype=torch.float64)
+    bad[1, 0], bad[3, 1], bad[4, 2] = -300.0, 0.0, torch.nan
+    good = bad.eq(torch.inf).all(-1)
+    return leaf, torch.where(bad == torch.inf, leaf, bad), camera.distortion.detach(), good
+
+
+@every_model
+@pytest.mark.parametrize("graph", [True, False])
+def test_bad_rows_of_a_predicted_batch_are_invalid_and_the_others_live(key, graph):
+    with torch.set_grad_enabled(graph):
+        leaf, intrinsics, distortion, good = predicted(key)
+        camera = make(key, intrinsics, distortion, image_size=(480, 640))
+        pixels, valid = camera.project(POINTS.expand(5, -1, 3))
+        rays, has_ray = camera.unproject(torch.full((5, 3, 2), 250.0, dtype=torch.float64))
+    reference = make(key, intrinsics.detach()[0], distortion)
+    assert torch.equal(valid, reference.project(POINTS)[1] & good[:, None])
+    assert torch.equal(pixels[2], reference.project(POINTS)[0])
+    assert torch.equal(has_ray[:, 0], good)
+    assert [c.project(POINTS)[1].any().item() for c in camera] == good.tolist()
+    if graph:
+        (pixels.sum() + rays.sum()).backward()
+        assert leaf.grad.isfinite().all()
+        assert torch.equal(leaf.grad.any(-1), good)
+
+
+@every_model
+def test_an_undefined_row_of_predicted_coefficients(key):
+    model = ct.MODELS[key]
+    if model.defined_text == "":
+        pytest.skip("its formula always exists")
+    good = spread(key)
+    distortion = good.distortion.detach().repeat(2, 1)
+    distortion[1, {"eucm": 1}.get(key, 0)] = -1e3
+    camera = model(good.intrinsics.detach(), distortion.requires_grad_())
+    assert camera.project(POINTS.expand(2, -1, 3))[1].any(-1).tolist() == [True, False]
+    with pytest.raises(ValueError, match=f"{model.__name__}: the formula needs"):
+        model(good.intrinsics.detach(), distortion.detach())
+
+
+def test_bad_poses_of_a_predicted_batch():
+    rotation = torch.zeros(2, 3, requires_grad=True) * torch.tensor([[1.0], [torch.nan]])
+    pixels, valid = ct.Pinhole([300.0, 300.0, 0.0, 0.0])(ct.Extrinsics(rotation, torch.ones(2, 3))(torch.ones(2, 1, 3)))
+    assert valid.tolist() == [[True], [False]]
+    assert pixels.isfinite().all()
+
+
+# -- parametrizations
+
+PARAMETRIZATIONS = pytest.mark.parametrize("parametrization", [ct.PositiveFocal, ct.TiedFocal])
+
+
+def tied(key, **options):
+    camera = one(key)
+    intrinsics = camera.intrinsics.detach().clone()
+    intrinsics[..., 1] = intrinsics[..., 0]
+    return make(key, intrinsics, camera.distortion.detach(), image_size=camera.image_size)
+
+
+@every_model
+@PARAMETRIZATIONS
+def test_parametrized_cameras_are_the_same_and_copied(key, parametrization):
+    plain, camera = tied(key), tied(key)
+    parametrize.register_parametrization(camera, "intrinsics", parametrization())
+    fresh = tied(key)
+    parametrize.register_parametrization(fresh, "intrinsics", parametrization())
+    with torch.no_grad():
+        fresh.parametrizations.intrinsics.original.mul_(0.9)
+    fresh.load_state_dict(camera.state_dict())
+    for other in (camera, copy.deepcopy(camera), fresh):
+        for mine, expected in zip(other.project(POINTS), plain.project(POINTS), strict=True):
+            torch.testing.assert_close(mine, expected, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(other.unproject(plain.intrinsics.detach()[2:])[0].detach()[2].item(), 1.0)
+    torch.testing.assert_close(camera.hflip().hflip().project(POINTS)[0], plain.project(POINTS)[0])
+    assert camera.hflip().intrinsics.requires_grad
+    assert isinstance(camera, ct.MODELS[key])
+    assert type(camera.hflip()) is ct.MODELS[key]
+    assert ct.MODELS[key] is type(plain)
+    parametrize.remove_parametrizations(camera, "intrinsics")
+    torch.testing.assert_close(camera.project(POINTS)[0], plain.project(POINTS)[0])
+
+
+@PARAMETRIZATIONS
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_training_never_leaves_the_positive(parametrization, batch):
+    camera = ct.KannalaBrandt(torch.tensor([4.0, 4.0, 320.0, 240.0]).expand(*batch, 4), [0.01, 0.0, 0.0, 0.0])
+    parametrize.register_parametrization(camera, "intrinsics", parametrization())
+    optimizer = torch.optim.SGD(camera.parameters(), lr=1e-4)
+    for _ in range(50):
+        optimizer.zero_grad()
+        pixels, valid = camera(POINTS.float().expand(*batch, -1, 3))
+        assert valid.all()
+        (pixels - 320).square().sum().backward()  # it would have them negative
+        optimizer.step()
+    fx, fy = camera.fx.detach(), camera.fy.detach()
+    assert (fx > 0).all()
+    assert (fx < 3.9).all()
+    assert torch.equal(fx, fy) == (parametrization is ct.TiedFocal)
+
+
+def test_tied_focal_lengths_are_the_geometric_mean():
+    camera = ct.Pinhole([100.0, 400.0, 3.0, 4.0])
+    parametrize.register_parametrization(camera, "intrinsics", ct.TiedFocal())
+    torch.testing.assert_close(camera.intrinsics.detach(), torch.tensor([200.0, 200.0, 3.0, 4.0]))
