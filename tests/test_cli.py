@@ -182,7 +182,10 @@ def test_a_link_to_nothing_is_there_already(folder, capsys):
     [
         (None, None),
         ("kannala_brandt", None),
-        ("brown_conrady", "camera.yml: fisheye_model: says that the model is kannala_brandt, not brown_conrady"),
+        (
+            "brown_conrady",
+            "fisheye_model: says that the model is kannala_brandt; do not name brown_conrady",
+        ),
     ],
 )
 def test_the_model_of_the_file_is_not_overruled(folder, capsys, model, text):

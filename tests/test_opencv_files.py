@@ -311,7 +311,7 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory, intrinsics, distort
 def test_a_file_that_states_its_model_is_not_overruled(path, text, stated, other):
     written(path, f"K: {K}\n{text}")
     assert opencv.read(path, stated).key == opencv.read(path).key == stated
-    with pytest.raises(CameraFileError, match=f"says that the model is .*, not {other}; leave that out, or correct"):
+    with pytest.raises(CameraFileError, match=f"says that the model is .*; do not name {other}, or correct"):
         opencv.read(path, other)
 
 

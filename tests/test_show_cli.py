@@ -107,9 +107,13 @@ def test_show_draws_an_image(folder, capsys):
         (["convert", "camera.yml", "bad.yml/o.yml"], "bad.yml is no folder"),
         (["convert", "camera.yml", "a\0b.yml"], "is no name of a file"),
         (["convert", "a\0b.yml", "o.yml"], "is no name of a file"),
+        (["show", "camera.yml", "--against", FILES / "opencv_camera.yml"], "is for 1280x800, but camera.yml for 96x64"),
         (["show", "batch.json"], "batch.json: camera is a batch of (2,) cameras; single ones are shown"),
         (["show", "camera.yml", "--against", "batch.json"], "batch.json: camera is a batch of (2,) cameras; here one"),
-        (["show", "camera.yml", "--from-model", "pinhole"], "says that the model is kannala_brandt, not pinhole"),
+        (
+            ["show", "camera.yml", "--from-model", "pinhole"],
+            "the model is kannala_brandt; do not name pinhole",
+        ),
         (
             ["show", FILES / "kalibr_camchain.yaml", "--from-model", "pinhole"],
             "a file of kalibr, which says the models",

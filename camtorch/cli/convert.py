@@ -35,14 +35,14 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
+    from camtorch.cli import targets
     from camtorch.cli.cameras import read_rig
-    from camtorch.cli.images import check_path
     from camtorch.io import formats
     from camtorch.rig import Rig
 
     path = arguments.output
     if not path.is_dir():  # some formats are folders
-        check_path(path, force=arguments.force, inputs=(arguments.input,))
+        targets.check(path, force=arguments.force, inputs=(arguments.input,))
     angle = arguments.max_angle
     if angle is not None and not 0 < angle <= 180:
         raise ValueError(f"--max-angle must be above 0 and at most 180 degrees; got {angle:g}")
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, rig.extrinsics, images=rig.images, format=stays)
     for name in formats.rendered(changed, path, arguments.format):
-        check_path(Path(name), force=arguments.force, inputs=(arguments.input,))
+        targets.check(Path(name), force=arguments.force, inputs=(arguments.input,))
     path.parent.mkdir(parents=True, exist_ok=True)
     formats.save(changed, path, arguments.format)
     print("\n".join(notes))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from camtorch.cli import targets
 from camtorch.cli.terminal import note
 from camtorch.io.writing import replacing
 
@@ -102,34 +102,13 @@ def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = (
         inputs: what is read, which it may not overwrite in any case.
 
     Raises:
-        ImageFileError: see `check_path`; an unknown file type, or one that stores other sizes.
+        ValueError: see `targets.check`; an unknown file type, or one that stores other sizes.
     """
-    check_path(path, force=force, inputs=inputs)
+    targets.check(path, force=force, inputs=inputs)
     kind = Image.registered_extensions().get(path.suffix.lower())
     if kind not in Image.SAVE or kind in _OTHER_SIZES:
         why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"
         raise ImageFileError(f"{path}: {path.suffix or 'no suffix'}: {why}; try .png")
-
-
-def check_path(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """As `check_target`, for files of any type.
-
-    Raises:
-        ImageFileError: the file is one of the inputs, also by a link; it exists and `force` is not given; there is no
-            folder to write to, nor one to make it in.
-    """
-    if path.is_dir():
-        raise ImageFileError(f"{path}: is a folder; name a file in it")
-    for given in inputs:
-        if given is not None and path.exists() and given.exists() and path.samefile(given):
-            raise ImageFileError(f"{path}: would overwrite {given}, which is read; name another file")
-    if os.path.lexists(path) and not force:
-        raise ImageFileError(f"{path}: exists already; --force overwrites it")
-    folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
-    if not folder.is_dir():
-        raise ImageFileError(f"{path}: {folder} is no folder")
-    if not os.access(folder, os.W_OK):
-        raise ImageFileError(f"{path}: the folder {folder} cannot be written to")
 
 
 def from_tensor(image: Tensor) -> Image.Image:

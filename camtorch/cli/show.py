@@ -44,6 +44,9 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"{path} states no image size; --size says which")
     if against is not None:
         other = read_other(against, arguments.name)
+        if other.image_size not in (None, camera.image_size):
+            sizes = f"{other.width}x{other.height}, but {path} for {camera.width}x{camera.height}"
+            raise ValueError(f"{against} is for {sizes}: cameras of one image are compared")
     for name, camera in cameras.items():
         if camera.batch_shape:
             raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; single ones are shown")

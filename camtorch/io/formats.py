@@ -166,4 +166,6 @@ def _format_of(rig: Rig, path: str) -> str:
     if meant:
         return patterns[max(meant, key=len)]
     may = f"it may be {', '.join(formats)}" if formats else f"known are {', '.join(sorted(FORMATS))}"
-    raise ValueError(f"{path}: the name does not say the format; {may}. Say which, as in format={'kalibr'!r}")
+    raise ValueError(
+        f"{path}: the name does not say the format; {may}. Say which, as in format='kalibr' or --format kalibr"
+    )

@@ -134,7 +134,7 @@ class _File:
             distortion = [*(self.numbers(xi_key) if isinstance(xi.value, (dict, list)) else [xi.number()]), *distortion]
         fitting, place = (("mei",), xi_key) if xi_key else self.fitting()
         if place is not None and model is not None and model not in fitting:
-            self.fail(place, f"says that the model is {fitting[0]}, not {model}; leave that out, or correct the file")
+            self.fail(place, f"says that the model is {fitting[0]}; do not name {model}, or correct the file")
         kind = MODELS[model or ("mei" if xi_key else self.model(distortion, place))]
         arguments = [torch.tensor([fx, fy, cx, cy], dtype=torch.float64)]
         if distortion:
