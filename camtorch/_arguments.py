@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +19,14 @@ TensorLike: TypeAlias = "Tensor | ArrayLike"
 """What parameters and points are made of: a tensor, an array, or lists of numbers."""
 
 
-def as_real(value, name: str, owner: str) -> Tensor:
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Numbers: TypeAlias = "Tensor | ArrayLike"
+"""What users pass as numbers: a tensor, an array, a list."""
+
+
+def as_real(value: Numbers, name: str, owner: str) -> Tensor:
     """A floating-point tensor of finite numbers: the tensor itself, or made of an array, a list, or a list of arrays.
 
     Lists and integers take torch's default dtype, arrays and tensors keep theirs.
@@ -32,8 +39,10 @@ def as_real(value, name: str, owner: str) -> Tensor:
         if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
             raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
         try:
-            stacked = isinstance(value, (list, tuple)) and all(getattr(v, "ndim", 0) for v in value) and len(value)
-            value = torch.stack([torch.as_tensor(v) for v in value]) if stacked else torch.as_tensor(value)
+            if isinstance(value, (list, tuple)) and value and all(getattr(v, "ndim", 0) for v in value):
+                value = torch.stack([torch.as_tensor(v) for v in value])
+            else:
+                value = torch.as_tensor(value)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(
                 f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
@@ -55,7 +64,7 @@ def is_predicted(value: Tensor) -> bool:
     return value.ndim > 1 and not isinstance(value, nn.Parameter) and (in_graph(value) or not torch.is_grad_enabled())
 
 
-def as_vectors(value, name: str, owner: str) -> Tensor:
+def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
     """(*B, 3) vectors, as a tensor of finite numbers: OpenCV's columns (*B, 3, 1) and its array (1, 3) are vectors too.
 
     A tensor (1, 3) is a batch of one.
@@ -77,7 +86,7 @@ def as_vectors(value, name: str, owner: str) -> Tensor:
     return flat
 
 
-def as_image_size(value, owner: str) -> tuple[int, int] | None:
+def as_image_size(value: Any, owner: str) -> tuple[int, int] | None:
     """(height, width) as two positive ints, or None.
 
     Raises:
@@ -96,7 +105,7 @@ def as_image_size(value, owner: str) -> tuple[int, int] | None:
     return height, width
 
 
-def as_whole(value, name: str, owner: str) -> int:
+def as_whole(value: Any, name: str, owner: str) -> int:
     """A whole number of pixels.
 
     Raises:
@@ -147,7 +156,7 @@ def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
     return dtype
 
 
-def as_values(values, name: str, owner: str, device: torch.device | None = None) -> Tensor:
+def as_values(values: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
     """A tensor of real numbers, NaN and infinity among them, of what is one or can be made one.
 
     Raises:
@@ -164,7 +173,7 @@ def as_values(values, name: str, owner: str, device: torch.device | None = None)
 
 
 def as_points(
-    values, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
+    values: Numbers, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size]:
     """What users pass as (*B, *N, size), in the dtype to compute in and with the batch dims of `batch`; and *B.
 
@@ -189,7 +198,7 @@ def as_points(
 
 
 def as_rows(
-    values, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
+    values: Numbers, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size, Callable[[Tensor], Tensor]]:
     """Bring (*B, *N, size) into rows (C, N, size), one for each camera; see `as_points`.
 

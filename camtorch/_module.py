@@ -49,7 +49,7 @@ class GeometryModule(nn.Module):
                 if buffer is not None and buffer.is_meta and buffer.numel() == 0:
                     self._buffers[name] = torch.empty_like(buffer, device=parameter.device, dtype=parameter.dtype)
 
-    def _apply(self, fn, recurse=True):
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # network.half() must not round a principal point to whole pixels
         def at_least_float32(tensor: Tensor) -> Tensor:
             moved = fn(tensor)
@@ -59,7 +59,7 @@ class GeometryModule(nn.Module):
 
         return super()._apply(at_least_float32, recurse)
 
-    def __getstate__(self):
+    def __getstate__(self) -> dict[str, Any]:
         # a tensor of a graph cannot be copied with its graph: the copy is a leaf
         state = self.__dict__.copy()
         state["_buffers"] = {
@@ -121,7 +121,7 @@ class BatchedModule(GeometryModule):
 
     def with_tensors(self, **tensors: Tensor) -> Self:
         """This module with other tensors, whose values are not checked; each is kept or registered as by `hold`."""
-        model = type_before_parametrizations(self)
+        model: type[Self] = type_before_parametrizations(self)
         made = model.__new__(model)
         nn.Module.__init__(made)
         for name, value in self.__dict__.items():
@@ -143,8 +143,8 @@ class Memo:
     result: Any = None
     """What is kept, of whatever inputs."""
 
-    def __init__(self):
-        self._kept = None
+    def __init__(self) -> None:
+        self._kept: tuple[Any, ...] | None = None
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple, compute: Callable[[], object]):
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_batch, as_real, as_rows, as_vectors, broadcast_shapes, columns
+from camtorch._arguments import Numbers, as_batch, as_real, as_rows, as_vectors, broadcast_shapes, columns
 from camtorch._module import BatchedModule
 from camtorch._tracing import is_concrete
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
@@ -37,7 +39,7 @@ class Extrinsics(BatchedModule):
     rotation: Tensor
     translation: Tensor
 
-    def __init__(self, rotation, translation):
+    def __init__(self, rotation: Numbers, translation: Numbers):
         super().__init__()
         translation = as_vectors(translation, "translation", "Extrinsics")
         if isinstance(rotation, (list, tuple)):
@@ -72,7 +74,7 @@ class Extrinsics(BatchedModule):
         return torch.cat((top, bottom), -2)
 
     @classmethod
-    def from_matrix(cls, matrix, translation=None) -> Extrinsics:
+    def from_matrix(cls, matrix: Numbers | tuple[Numbers, Numbers], translation: Numbers | None = None) -> Extrinsics:
         """From matrices.
 
         Args:
@@ -83,10 +85,9 @@ class Extrinsics(BatchedModule):
         Raises:
             ValueError: another shape, a last row that is not (0, 0, 0, 1), an R that is not a rotation.
         """
-        if translation is None and _is_pair(matrix):
-            matrix, translation = matrix
+        given, translation = _pair(matrix) if translation is None else (matrix, translation)
         if translation is not None:
-            rotation = as_real(matrix, "rotation", "Extrinsics")
+            rotation = as_real(given, "rotation", "Extrinsics")
             if rotation.shape[-2:] != (3, 3):
                 raise ValueError(
                     "Extrinsics: beside a translation the rotation must be (*B, 3, 3) matrices; got shape "
@@ -95,7 +96,7 @@ class Extrinsics(BatchedModule):
             check_rotation(rotation, "rotation", "Extrinsics")
             translation = as_vectors(translation, "translation", "Extrinsics")
             return cls(rotation_vector(rotation).unsqueeze(-1), translation)
-        matrix = as_real(matrix, "matrix", "Extrinsics")
+        matrix = as_real(given, "matrix", "Extrinsics")
         if matrix.shape[-2:] not in ((4, 4), (3, 4)):
             hint = ". A rotation goes with its translation: from_matrix(R, t)" if matrix.shape[-2:] == (3, 3) else ""
             raise ValueError(
@@ -161,12 +162,12 @@ def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
     return False
 
 
-def _is_pair(matrix) -> bool:
-    """Whether it is (R, t), and not a list of two matrices."""
+def _pair(matrix: Any) -> tuple[Any, Any]:
+    """(R, t) of such a pair, or what else it is, a list of two matrices too, and None."""
     if not isinstance(matrix, (list, tuple)) or len(matrix) != 2:
-        return False
+        return matrix, None
     try:
         shapes = [tuple(v.shape) if isinstance(v, Tensor) else np.shape(v) for v in matrix]
     except ValueError:  # a list that is no array
-        return False
-    return shapes[0][-2:] == (3, 3) and shapes[0] != shapes[1]
+        return matrix, None
+    return (matrix[0], matrix[1]) if shapes[0][-2:] == (3, 3) and shapes[0] != shapes[1] else (matrix, None)

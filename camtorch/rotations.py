@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_real, as_rows
+from camtorch._arguments import Numbers, as_real, as_rows
 from camtorch._tracing import in_graph, is_concrete
 from camtorch.optics.special import cosc_root, sinc_root
 
@@ -23,7 +23,8 @@ def rotation_matrix(rotation: Tensor) -> Tensor:
     xy, yz, zx = c * x * y, c * y * z, c * z * x
     x, y, z = s * x, s * y, s * z
     rows = (1 - c * (yy + zz), xy - z, zx + y, xy + z, 1 - c * (zz + xx), yz - x, zx - y, yz + x, 1 - c * (xx + yy))
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    matrix: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return matrix
 
 
 def rotation_vector(matrix: Tensor) -> Tensor:
@@ -66,7 +67,7 @@ def _rotation_error(values: Tensor) -> Tensor:
     return (values @ values.mT - torch.eye(3, dtype=values.dtype, device=values.device)).abs().amax((-1, -2))
 
 
-def as_rotation(rotation, owner: str) -> Tensor | None:
+def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
     """A checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
     if rotation is None:
         return None
@@ -100,7 +101,8 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     zero, one = torch.zeros_like(a), torch.ones_like(a)
 
     def matrix(*entries: Tensor) -> Tensor:
-        return torch.stack(entries, -1).unflatten(-1, (3, 3))
+        made: Tensor = torch.stack(entries, -1).unflatten(-1, (3, 3))
+        return made
 
     turn = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
     look = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
