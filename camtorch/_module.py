@@ -146,7 +146,7 @@ class Memo:
     def __init__(self) -> None:
         self._kept: tuple[Any, ...] | None = None
 
-    def __call__(self, inputs: Sequence[Tensor], options: tuple, compute: Callable[[], object]):
+    def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
         if not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
@@ -163,7 +163,7 @@ class Memo:
         self._kept, self.result = (copies, options), result
         return result
 
-    def __getstate__(self):
+    def __getstate__(self) -> dict[str, Any]:
         return {"_kept": None}
 
 

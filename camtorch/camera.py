@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import difflib
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
+from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
+    Numbers,
     as_batch,
     as_image_size,
     as_points,
@@ -26,7 +29,7 @@ from camtorch._tracing import has_tangent, is_concrete
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
-from camtorch.projection.explanation import explain
+from camtorch.projection.explanation import explain, unusable
 from camtorch.projection.ops import register_camera
 from camtorch.projection.project import Project
 from camtorch.projection.rays import AXES, field_of_view, focal_for
@@ -98,13 +101,19 @@ class Camera(BatchedModule):
     """Ascending numbers of coefficients of which a fit takes the least one that is good enough; none: the default
     one. Where there are several, further coefficients that are zero change nothing."""
 
-    def __init_subclass__(cls, **kwargs):
+    def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        if cls.__module__ == parametrize.__name__:  # the class of one parametrized camera is no model of its own
+            return
         cls._model = register_camera(cls)
         if "key" in cls.__dict__:
             MODELS[cls.key] = cls
 
-    def __init__(self, intrinsics, distortion=None, *, image_size: tuple[int, int] | None = None):
+    _model: ClassVar[str]
+
+    def __init__(
+        self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: tuple[int, int] | None = None
+    ):
         super().__init__()
         owner = type(self).__name__
         intrinsics = as_real(intrinsics, "intrinsics", owner)
@@ -134,12 +143,19 @@ class Camera(BatchedModule):
             raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
-        self._memo = Memo()
+        self._memo, self._warned = Memo(), is_predicted(intrinsics) or is_predicted(distortion)
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, len(names)))
 
     @classmethod
-    def from_matrix(cls, K, distortion=None, *, image_size=None, ignore_skew: bool = False) -> Self:  # noqa: N803
+    def from_matrix(
+        cls,
+        K: Numbers,  # noqa: N803
+        distortion: Numbers | None = None,
+        *,
+        image_size: tuple[int, int] | None = None,
+        ignore_skew: bool = False,
+    ) -> Self:
         """A camera from its matrix, as OpenCV's calibrations give it.
 
         Args:
@@ -181,11 +197,11 @@ class Camera(BatchedModule):
     @classmethod
     def from_fov(
         cls,
-        fov: float | Tensor,
+        fov: Numbers,
         *,
         image_size: tuple[int, int],
         axis: Literal["horizontal", "vertical", "diagonal"] = "horizontal",
-        distortion: Tensor | Sequence[float] | None = None,
+        distortion: Numbers | None = None,
     ) -> Self:
         """A camera of a field of view given in DEGREES, for images that nothing more is known of.
 
@@ -258,7 +274,8 @@ class Camera(BatchedModule):
         """The (*B, 3, 3) camera matrix."""
         fx, fy, cx, cy = self.intrinsics.expand(*self.batch_shape, 4).unbind(-1)
         zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-        return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+        matrix: Tensor = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+        return matrix
 
     @property
     def fx(self) -> Tensor:
@@ -339,7 +356,7 @@ class Camera(BatchedModule):
             (S, C, n): S alternatives, of which the one that ends best is kept.
         """
         ideal = dict(zip(names, cls.ideal(len(names)), strict=True))
-        starts = [[(ideal | values)[name] for name in names] for values in cls.fit_starts]
+        starts = [[{**ideal, **values}[name] for name in names] for values in cls.fit_starts]
         return radii.new_tensor(starts).view(len(starts), 1, len(names)).expand(-1, len(radii), -1)
 
     # -- both directions
@@ -401,11 +418,30 @@ class Camera(BatchedModule):
 
     def _cameras(self, intrinsics: Tensor, distortion: Tensor) -> Cameras:
         """The rows' cameras, kept until a value changes."""
-        known = self._memo.result
+        known: Cameras | None = self._memo.result
         if known is not None and known.are(intrinsics, distortion):
             return known
         inputs = intrinsics, distortion
-        return self._memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras.of(type(self), *inputs))
+        options = intrinsics.dtype, intrinsics.device
+        cameras: Cameras = self._memo(inputs, options, lambda: Cameras.of(type(self), *inputs))
+        if cameras.usable is not None and not self._warned:
+            self._warn_of_unusable(cameras, cameras.usable)
+        return cameras
+
+    def _warn_of_unusable(self, cameras: Cameras, usable: Tensor) -> None:
+        """Say once that learning drove Parameters of this module to where no camera is, and no gradient leads back."""
+        bad = (usable <= 0).flatten().nonzero()
+        found = unusable(self, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
+        if found is not None and isinstance(getattr(self, found[0]), nn.Parameter):
+            self._warned = True
+            where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
+            warnings.warn(
+                f"{type(self).__name__}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
+                "and its gradients zero from here on. A smaller learning rate keeps it from there; focal lengths stay "
+                'positive after torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", '
+                "camtorch.PositiveFocal())",
+                stacklevel=2,
+            )
 
     @property
     def _tensors(self) -> tuple[Tensor, Tensor]:
@@ -425,8 +461,9 @@ class Camera(BatchedModule):
     def pixel_grid(self) -> Tensor:
         """(H, W, 2): the centre of every pixel."""
         height, width = self._size("pixel_grid")
-        like = {"dtype": torch.promote_types(self.intrinsics.dtype, torch.float32), "device": self.intrinsics.device}
-        v, u = torch.meshgrid(torch.arange(height, **like), torch.arange(width, **like), indexing="ij")
+        like = self.intrinsics.new_empty(0, dtype=torch.promote_types(self.intrinsics.dtype, torch.float32))
+        rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (height, width))
+        v, u = torch.meshgrid(rows, columns, indexing="ij")
         return torch.stack((u, v), -1)
 
     def _size(self, what: str) -> tuple[int, int]:
@@ -496,7 +533,14 @@ class Camera(BatchedModule):
         """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
         return self._edited(mirror="y", size=self._size("vflip"))
 
-    def _edited(self, *, size, shift=(0, 0), scale=(1.0, 1.0), mirror: str = "") -> Self:
+    def _edited(
+        self,
+        *,
+        size: tuple[int, int],
+        shift: tuple[int, int] = (0, 0),
+        scale: tuple[float, float] = (1.0, 1.0),
+        mirror: str = "",
+    ) -> Self:
         fx, fy, cx, cy = self.intrinsics.unbind(-1)
         cx, cy = (cx + 0.5) * scale[0] - 0.5 + shift[0], (cy + 0.5) * scale[1] - 0.5 + shift[1]
         odd: frozenset[str] = frozenset()

@@ -85,6 +85,7 @@ class Extrinsics(BatchedModule):
         Raises:
             ValueError: another shape, a last row that is not (0, 0, 0, 1), an R that is not a rotation.
         """
+        given: Any = matrix
         given, translation = _pair(matrix) if translation is None else (matrix, translation)
         if translation is not None:
             rotation = as_real(given, "rotation", "Extrinsics")

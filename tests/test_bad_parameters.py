@@ -120,3 +120,37 @@ def test_tied_focal_lengths_are_the_geometric_mean():
     camera = ct.Pinhole([100.0, 400.0, 3.0, 4.0])
     parametrize.register_parametrization(camera, "intrinsics", ct.TiedFocal())
     torch.testing.assert_close(camera.intrinsics.detach(), torch.tensor([200.0, 200.0, 3.0, 4.0]))
+
+
+# -- what learning broke is said
+
+
+@every_model
+def test_a_step_to_a_negative_focal_length_is_said_once(key):
+    camera = spread(key)
+    with torch.no_grad():
+        camera.intrinsics[0] = -3.0
+    says = rf"{type(camera).__name__}: intrinsics became unusable: fx = -3 is not positive.*PositiveFocal"
+    with pytest.warns(UserWarning, match=says):
+        assert not camera.project(POINTS)[1].any()
+    with torch.no_grad():
+        camera.intrinsics[0] = -4.0
+    assert not camera.project(POINTS)[1].any()  # a warning would be an error here
+    assert not camera.unproject(POINTS[:, :2])[1].any()
+
+
+def test_which_camera_of_a_batch_and_what_of_it():
+    camera = ct.Mei(torch.tensor([[300.0, 300.0, 319.5, 239.5]] * 4), torch.zeros(4, 5))
+    with torch.no_grad():
+        camera.distortion[2, 0] = -1.5
+    with pytest.warns(UserWarning, match=r"Mei: distortion of camera 2 in the batch became unusable: .* xi > -1"):
+        assert camera.unproject(torch.ones(4, 1, 2))[1].tolist() == [[True], [True], [False], [True]]
+
+
+def test_training_into_the_negative_warns():
+    camera = ct.Pinhole([4.0, 4.0, 320.0, 240.0])
+    optimizer = torch.optim.SGD(camera.parameters(), lr=1.0)
+    camera(POINTS.float())[0].sub(320).square().sum().backward()
+    optimizer.step()
+    with pytest.warns(UserWarning, match="Pinhole: intrinsics became unusable"):
+        camera(POINTS.float())

@@ -236,7 +236,8 @@ def test_reasons_in_batches_and_of_cameras_that_learning_broke():
         camera.intrinsics[1, 0] = -3.0
         camera.intrinsics[2, 3] = math.nan
         camera.distortion[3, 0] = -1.5
-    lines = camera.explain(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]).expand(4, 2, 3))
+    with pytest.warns(UserWarning, match="camera 1 in the batch became unusable"):
+        lines = camera.explain(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]).expand(4, 2, 3))
     assert lines[0] == "valid"
     assert lines[1].startswith("the chart does not cover it")
     assert lines[2:4] == ["the camera itself is unusable: fx = -3 is not positive"] * 2

@@ -37,27 +37,32 @@ def explain(camera: Camera, points: Tensor) -> list[str]:
         if good:
             lines.append("valid")
         else:
-            single = camera.with_tensors(intrinsics=intrinsics[i // each], distortion=distortion[i // each])
-            lines.append(_unusable(single) or _reason(single, points[i]))
+            row = {"intrinsics": intrinsics[i // each], "distortion": distortion[i // each]}
+            found = unusable(camera, **row)
+            lines.append(f"the camera itself is unusable: {found[1]}" if found else _reason(camera, row, points[i]))
     return lines
 
 
-def _unusable(camera: Camera) -> str:
-    """Why a single camera has no pixels at all, or nothing."""
-    names = ("fx", "fy", "cx", "cy", *camera.distortion_names)
-    for name, value in zip(names, [*camera.intrinsics.tolist(), *camera.distortion.tolist()], strict=True):
-        if not math.isfinite(value):
-            return f"the camera itself is unusable: {name} = {value}"
-        if name in ("fx", "fy") and value <= 0:
-            return f"the camera itself is unusable: {name} = {value:.6g} is not positive"
-    defined = camera.defined(camera.distortion.unbind(-1))
-    if defined is not None and not bool((defined > 0).all()):
-        return f"the camera itself is unusable: the formula needs {camera.defined_text}"
-    return ""
+def unusable(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> tuple[str, str] | None:
+    """Why a camera of this model and these values, (4,) and (n,), has no pixels at all: the tensor, and what it has."""
+    for tensor, names, values in (
+        ("intrinsics", ("fx", "fy", "cx", "cy"), intrinsics.tolist()),
+        ("distortion", camera.distortion_names, distortion.tolist()),
+    ):
+        for name, value in zip(names, values, strict=True):
+            if not math.isfinite(value):
+                return tensor, f"{name} = {value}"
+            if name in ("fx", "fy") and value <= 0:
+                return tensor, f"{name} = {value:.6g} is not positive"
+    defined = camera.defined(distortion.unbind(-1)) if camera.distortion_names else None
+    if defined is not None and not bool(defined > 0):
+        return "distortion", f"the formula needs {camera.defined_text}"
+    return None
 
 
-def _reason(camera: Camera, point: Tensor) -> str:
-    """Why a single usable camera has no pixel for a point (3,)."""
+def _reason(camera: Camera, row: dict[str, Tensor], point: Tensor) -> str:
+    """Why a camera of this model with a row of usable values has no pixel for a point (3,)."""
+    camera = camera.with_tensors(**row)
     shown = ", ".join(f"{value:.6g}" for value in point.tolist())
     if not bool(torch.isfinite(point).all()):
         return f"not finite: ({shown})"
