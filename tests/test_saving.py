@@ -102,6 +102,37 @@ def test_batches_float32_and_images_in_our_own_file(tmp_path):
     assert_same(ct.load(path), again)
 
 
+@pytest.mark.parametrize("key", ["rotation", "translation"])
+@pytest.mark.parametrize("shape", [(), (2,)])
+def test_extrinsics_beyond_all_numbers_are_refused(key, shape, tmp_path):
+    vectors = {"rotation": torch.zeros(*shape, 3).tolist(), "translation": torch.zeros(*shape, 3).tolist()}
+    content = {"camtorch": 1, "cameras": {"a": {"model": "pinhole", "intrinsics": [500, 500, 320, 240]}}}
+    (tmp_path / "own.json").write_text(json.dumps(content | {"extrinsics": {"a": vectors}}))
+    assert ct.load(tmp_path / "own.json").extrinsics["a"].batch_shape == shape
+    vectors[key] = torch.full((*shape, 3), 1e200, dtype=torch.float64).tolist()
+    (tmp_path / "own.json").write_text(json.dumps(content | {"extrinsics": {"a": vectors}}))
+    with pytest.raises(ct.CameraFileError, match=rf"own.json: extrinsics.a.{key}: a number beyond 1e\+100"):
+        ct.load(tmp_path / "own.json")
+
+
+def test_poses_of_many_images_are_one_batch_in_every_format(tmp_path):
+    names = [f"{i}.jpg" for i in range(50)]
+    batch = ct.Extrinsics(torch.rand(50, 3, 1, dtype=torch.float64), torch.rand(50, 3, 1, dtype=torch.float64))
+    rig = ct.Rig({"1": camera("pinhole")}, (names, batch), images=dict.fromkeys(names, "1"))
+    for path in ("cameras.txt", "cameras.bin", "transforms.json", "own.json"):
+        ct.save(rig, tmp_path / path)
+        found = ct.load(tmp_path / path)
+        assert list(found.extrinsics) == names
+        assert torch.allclose(found.extrinsics.batch.matrix(), batch.matrix(), rtol=0, atol=1e-14)
+        ct.save(found, tmp_path / path)
+        assert_same(ct.load(tmp_path / path), found)
+        with torch.no_grad():
+            found.extrinsics.batch.translation[7] += 1
+        ct.save(found, tmp_path / path)
+        moved = ct.load(tmp_path / path).extrinsics.batch.matrix() - found.extrinsics.batch.matrix()
+        assert moved.abs().max() < 1e-14
+
+
 @settings(max_examples=40)
 @given(core=st.tuples(*[st.floats(1, 1e4)] * 4), distortion=st.lists(st.floats(-1, 1), min_size=4, max_size=4))
 def test_numbers_come_back_to_the_last_bit(tmp_path_factory, core, distortion):

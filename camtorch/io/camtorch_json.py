@@ -11,6 +11,7 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
+from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, as_json
@@ -32,7 +33,8 @@ def parse(record: Record) -> Rig:
     record["camtorch"].whole(1, _VERSION, f"version that this camtorch reads, which is up to {_VERSION}")
     record["cameras"].few(len(record["cameras"].keys()))
     cameras = {name: _camera(record["cameras"][name]) for name in record["cameras"].keys()}  # noqa: SIM118
-    extrinsics, images = {}, {}
+    extrinsics: dict[str, tuple[Tensor, Tensor]] = {}
+    images: dict[str, str] = {}
     for name in record["extrinsics"].keys() if "extrinsics" in record else ():
         entry = record["extrinsics"][name]
         if "camera" in entry:
@@ -41,11 +43,13 @@ def parse(record: Record) -> Rig:
             entry.fail(f"of the camera {images.get(name, name)!r:.60}, which is not in the file")
         rotation, translation = _tensor(entry["rotation"], 3), _tensor(entry["translation"], 3)
         _same_batch(entry, rotation, translation)
-        try:
-            extrinsics[name] = Extrinsics(rotation[..., None], translation)  # columns, which are no matrices
-        except ValueError as error:
-            entry.fail(error)
-    return Rig(cameras, extrinsics, images=images)
+        for key, values in (("rotation", rotation), ("translation", translation)):
+            poses.check_near(entry[key], values.flatten().tolist())
+        extrinsics[name] = rotation[..., None], translation  # columns are no matrices
+    if extrinsics and extrinsics.keys() == images.keys() and all(t.ndim == 1 for _, t in extrinsics.values()):
+        batch = Extrinsics(*map(torch.stack, zip(*extrinsics.values(), strict=True)))
+        return Rig(cameras, (list(extrinsics), batch), images=images)
+    return Rig(cameras, {name: Extrinsics(*vectors) for name, vectors in extrinsics.items()}, images=images)
 
 
 def _camera(record: Record) -> Camera:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
@@ -53,7 +55,9 @@ def matches(keys: dict) -> bool:
 
 def parse(record: Record) -> Rig:
     """The camera of all frames, called "camera", or one for each frame; and the poses of the frames."""
-    cameras, extrinsics, images = {}, {}, {}
+    cameras: dict[str, Camera] = {}
+    names: dict[str, str | None] = {}  # of the images, and of the camera that they share
+    found = []
     frames = list(record["frames"]) if "frames" in record else []
     own = [any(key in frame for key in _OF_A_CAMERA) for frame in frames]
     record.few(sum(own))
@@ -61,15 +65,17 @@ def parse(record: Record) -> Rig:
         cameras["camera"] = _camera(record)
     for frame, has_own in zip(frames, own, strict=True):
         name = frame["file_path"].text()
-        if name in extrinsics or name in cameras:
+        if name in names or name in cameras:
             frame["file_path"].fail(f"a second frame is called {name!r:.60}")
         if has_own:
             cameras[name] = _camera(record, frame)
-        else:
-            images[name] = "camera"
-        rows = frame["transform_matrix"]
-        extrinsics[name] = _pose(rows)
-    return Rig(cameras, extrinsics, images=images)
+        names[name] = None if has_own else "camera"
+        found.append(_pose(frame["transform_matrix"]))
+    if not found:
+        return Rig(cameras)
+    rotation, translation, rows = map(np.array, zip(*found, strict=True))
+    batch = poses.batch(rotation, translation, "nerfstudio", rows)
+    return Rig(cameras, (list(names), batch), images={name: camera for name, camera in names.items() if camera})
 
 
 def _camera(record: Record, frame: Record | None = None) -> Camera:
@@ -139,17 +145,17 @@ def _distortion(record: Record, key: str) -> tuple[str, list[float]]:
     return key, [there.get(name, 0.0) for name in names]
 
 
-def _pose(record: Record) -> Extrinsics:
-    rows = record.rows(4 if len(record) == 4 else 3, 4)
-    if rows[3:] and rows[3] != [0, 0, 0, 1]:
-        record.fail("the last row is not 0 0 0 1")
+def _pose(record: Record) -> tuple[list[float], list[float], list[list[float]]]:
+    """Rotation vector, translation, and the 4 x 4 matrix that the file has."""
+    rows = poses.rows_of(record)
     position = [row[3] for row in rows[:3]]
     # world from our camera: the columns of y and z turned round
     turned = [[row[0], -row[1], -row[2]] for row in rows[:3]]
     rotation = [0.0 - v for v in poses.vector_of_matrix(record, turned)]
-    poses.pose(record, rotation, position)
+    poses.check_near(record, position)
     translation = [0.0 - v for v in poses.turn(poses.transposed(turned), position)]
-    return poses.keep(poses.pose(record, rotation, translation), "nerfstudio", rows)
+    poses.check_near(record, translation)
+    return rotation, translation, rows
 
 
 def panorama(size: tuple[int, int]) -> list[float]:
@@ -173,10 +179,11 @@ def render(rig: Rig, path) -> str:
     if shared:
         whole.update(next(iter(written.values())))
     whole["frames"] = []
+    kept = poses.written_rows(rig, "nerfstudio")
     for name, extrinsics in rig.extrinsics.items():
         own = {} if shared else written[rig.images.get(name, name)]
         lossy.pose(name, extrinsics)
-        whole["frames"].append({"file_path": name, **own, "transform_matrix": _rows(extrinsics)})
+        whole["frames"].append({"file_path": name, **own, "transform_matrix": kept.get(name) or _rows(extrinsics)})
     return as_json(whole)
 
 
@@ -203,9 +210,6 @@ def _entries(lossy: Lossy, name: str, camera: Camera) -> dict:
 
 
 def _rows(extrinsics: Extrinsics) -> list[list[float]]:
-    kept = poses.written(extrinsics, "nerfstudio")
-    if kept is not None:
-        return kept
     rotation, position = poses.inverse(*poses.numbers(extrinsics))
     turned = [[row[0], -row[1], -row[2]] for row in poses.matrix_of_vector(rotation)]
     return poses.as_rows(turned, position)

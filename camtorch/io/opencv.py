@@ -183,7 +183,7 @@ class _File:
         if key is None:
             return list(MODELS), None
         flag = self.record[key].value
-        if not isinstance(flag, (str, bool)):
+        if not isinstance(flag, (str, float, bool)):
             self.fail(key, "is neither true nor false")
         no = str(flag).strip().lower() in ("", "0", "0.", "0.0", "false", "no", "off", "n")
         return ("brown_conrady", "pinhole") if no else ("kannala_brandt",), key

@@ -21,7 +21,8 @@ _LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
 _MOST_DIRECTIVES = 100  # libyaml compares each with all
 _MOST_VALUES = 1 << 17
-_BYTES_PER_VALUE = 8  # of larger files: a value takes some 60 bytes of memory
+_MOST_JSON_UNITS = 1 << 20
+_BYTES_PER_VALUE = 4  # where there are more
 MOST_COMMENTS = 10_000
 _START = 1 << 16  # of a text, where its kind shows
 
@@ -74,7 +75,7 @@ def decoded(path, content: bytes) -> str:
 
 
 def read_mapping(path) -> dict[str, Any]:
-    """The keys of a file. Values are text, lists and mappings: numbers stay text until someone asks.
+    """The keys of a file. Values are text, lists and mappings: numbers stay text until someone asks, but for JSON's.
 
     Raises:
         CameraFileError: nothing known, a key twice, tags other than `!!opencv-matrix`, no mapping, too large.
@@ -110,12 +111,14 @@ def _from_text(path, content: bytes) -> Any:
 
 
 def _from_json(path, text: str) -> Any:
-    # in units of what a number takes in memory
-    size = text.count(",") + 2 * text.count("[") + 4 * text.count("{")
-    if size > max(_MOST_VALUES, len(text) // _BYTES_PER_VALUE):
+    # in units of 32 bytes, what a number takes in memory
+    size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
+    if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_VALUE):
         raise CameraFileError(path, "content", "too many values")
+    # floats at once: no text is made of a number, and integers of any length are no work
+    options: dict[str, Any] = {"parse_int": float, "parse_constant": float}
     try:
-        return json.loads(text, object_pairs_hook=_unique, parse_int=str, parse_float=str, parse_constant=str)
+        return json.loads(text, object_pairs_hook=_unique, **options)
     except json.JSONDecodeError as error:
         raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
     except ValueError as error:

@@ -27,9 +27,14 @@ def pose(record: Record, rotation: Vector, translation: Vector) -> Extrinsics:
     Raises:
         CameraFileError: numbers too large to compute with.
     """
-    if any(abs(value) > _FARTHEST for value in (*rotation, *translation)):
-        record.fail(f"a number beyond {_FARTHEST:g}")
+    check_near(record, (*rotation, *translation))
     return Extrinsics(*(torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation)))
+
+
+def check_near(record: Record, values: Vector) -> None:
+    """Refuse numbers too large to compute with."""
+    if any(abs(value) > _FARTHEST for value in values):
+        record.fail(f"a number beyond {_FARTHEST:g}")
 
 
 def keep(extrinsics: Extrinsics, kind: str, values: Any, *others: Extrinsics) -> Extrinsics:
@@ -45,7 +50,7 @@ def keep(extrinsics: Extrinsics, kind: str, values: Any, *others: Extrinsics) ->
     return extrinsics
 
 
-_KEPT = "_as_written"
+_KEPT, _KEPT_ROWS = "_as_written", "_rows_as_written"
 
 
 def written(extrinsics: Extrinsics, kind: str, *others: Extrinsics) -> Any:
@@ -70,7 +75,8 @@ def is_identity(extrinsics: Extrinsics | None) -> bool:
 def from_quaternions(record: Callable[[int], Record], values: np.ndarray) -> Extrinsics:
     """A batch of finite (N, 7), quaternions w, x, y, z and translations; `record` gives the place of a row."""
     w, xyz, translation = values[:, 0], values[:, 1:4], values[:, 4:]
-    norm = np.sqrt((values[:, :4] ** 2).sum(1))
+    with np.errstate(over="ignore"):
+        norm = np.sqrt((values[:, :4] ** 2).sum(1))
     if (wrong := ~(np.abs(norm - 1) < _ORTHOGONAL)).any():
         row = int(wrong.argmax())
         record(row).fail(f"a quaternion of length {norm[row]:.6g}, which is no rotation")
@@ -78,13 +84,34 @@ def from_quaternions(record: Callable[[int], Record], values: np.ndarray) -> Ext
         record(int(wrong.argmax())).fail(f"a number beyond {_FARTHEST:g}")
     largest = np.abs(xyz).max(1).clip(np.finfo(float).tiny)
     sine = largest * np.sqrt(((xyz / largest[:, None]) ** 2).sum(1))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         # near the identity 2 atan2(s, w) / s -> 2 / w
         scale = np.where(sine > 1e-150, 2 * np.arctan2(sine, np.abs(w)) / sine, 2 / np.abs(w))
     rotation = xyz * np.copysign(scale, w)[:, None]
-    batch = Extrinsics(torch.from_numpy(rotation)[..., None], torch.from_numpy(translation.copy()))
-    vars(batch)[_KEPT] = "quaternions", values, np.concatenate((rotation, translation), 1)
-    return batch
+    return batch(rotation, translation, "quaternion", values)
+
+
+def batch(rotation: np.ndarray, translation: np.ndarray, kind: str, values: np.ndarray) -> Extrinsics:
+    """The batch of (N, 3) rotation vectors and translations, with what a file wrote of each, for `written_rows`."""
+    poses = Extrinsics(*(torch.tensor(v, dtype=torch.float64)[..., None] for v in (rotation, translation)))
+    vars(poses)[_KEPT_ROWS] = kind, values, _both(poses)
+    return poses
+
+
+def written_rows(rig: Rig, kind: str) -> dict[str, Any]:
+    """What a file said of the images that are rows of the rig's batch of poses, where they have not changed since."""
+    poses = rig.extrinsics.batch
+    was_kind, values, then = (None, None, None) if poses is None else vars(poses).get(_KEPT_ROWS, (None, None, None))
+    if poses is None or was_kind != kind or len(values) != len(poses):
+        return {}
+    rows, same = values.tolist(), (_both(poses) == then).all(1)
+    places = ((name, rig.extrinsics.row(name)) for name in rig.extrinsics)
+    return {name: rows[row] for name, row in places if row is not None and same[row]}
+
+
+def _both(poses: Extrinsics) -> np.ndarray:
+    vectors = (t.detach().double().cpu().expand(len(poses), 3) for t in (poses.rotation, poses.translation))
+    return torch.cat(list(vectors), 1).numpy()
 
 
 def quaternions(rig: Rig, lossy: Lossy) -> dict[str, list[float]]:
@@ -93,24 +120,14 @@ def quaternions(rig: Rig, lossy: Lossy) -> dict[str, list[float]]:
     Raises:
         CameraFileError: batches, or numbers that are not finite.
     """
-    rows: list[list[float]] = []
-    if (batch := rig.extrinsics.batch) is not None:
-        tensors = (t.detach().double().cpu().expand(len(batch), 3).numpy() for t in (batch.rotation, batch.translation))
-        now = np.concatenate(list(tensors), 1)
-        _, values, then = vars(batch).get(_KEPT, (None, np.zeros((len(now), 7)), np.full_like(now, np.nan)))
-        rows = values.tolist()
-        for changed in map(int, np.nonzero((now != then).any(1))[0]):
-            rotation, translation = lossy.pose(f"row {changed}", batch[changed])
-            rows[changed] = [*quaternion_of_vector(rotation), *translation]
-    found = {}
+    found, kept = {}, written_rows(rig, "quaternion")
     for name in rig.extrinsics:
-        row = rig.extrinsics.row(name)
-        if row is None:
+        values = kept.get(name)
+        if values is None:
             lossy.pose(name, rig.extrinsics[name])
             quaternion, translation = to_quaternion(rig.extrinsics[name])
-            found[name] = [*quaternion, *translation]
-        else:
-            found[name] = rows[row]
+            values = [*quaternion, *translation]
+        found[name] = values
     return found
 
 
@@ -213,11 +230,17 @@ def compose(second: Extrinsics, first: Extrinsics) -> tuple[list[list[float]], l
 # -- as records
 
 
-def from_rows(record: Record, undo: bool = False) -> Extrinsics:
-    """A 4 x 4 or 3 x 4 matrix as a pose, or as the pose that undoes it."""
+def rows_of(record: Record) -> list[list[float]]:
+    """A 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
     rows = record.rows(4 if len(record) == 4 else 3, 4)
     if rows[3:] and rows[3] != [0, 0, 0, 1]:
         record.fail("the last row is not 0 0 0 1")
+    return [*rows[:3], [0.0, 0.0, 0.0, 1.0]]
+
+
+def from_rows(record: Record, undo: bool = False) -> Extrinsics:
+    """A 4 x 4 or 3 x 4 matrix as a pose, or as the pose that undoes it."""
+    rows = rows_of(record)
     rotation, translation = vector_of_matrix(record, [row[:3] for row in rows[:3]]), [row[3] for row in rows[:3]]
     if undo:
         pose(record, rotation, translation)
@@ -232,7 +255,7 @@ def to_rows(extrinsics: Extrinsics, undo: bool = False) -> list[list[float]]:
     if rows is None:
         rotation, translation = inverse(*numbers(extrinsics)) if undo else numbers(extrinsics)
         rows = as_rows(matrix_of_vector(rotation), translation)
-    return rows if len(rows) == 4 else [*rows, [0.0, 0.0, 0.0, 1.0]]
+    return rows
 
 
 def as_rows(matrix: Matrix, translation: Vector) -> list[list[float]]:

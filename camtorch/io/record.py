@@ -19,7 +19,7 @@ _LONGEST_NUMBER = 400  # no double needs as many characters
 
 
 class Record:
-    """A value of a file: text, True, False, None, a list or a mapping. Numbers are text until someone asks.
+    """A value of a file: text, a float, True, False, None, a list or a mapping. Text may be a number.
 
     Args:
         path: the file.
@@ -86,11 +86,14 @@ class Record:
     def number(self) -> float:
         """A finite number."""
         number = math.nan
-        if isinstance(self.value, str) and len(self.value) <= _LONGEST_NUMBER:
+        if isinstance(self.value, float):
+            number = self.value
+        elif isinstance(self.value, str) and len(self.value) <= _LONGEST_NUMBER:
             with contextlib.suppress(ValueError):
                 number = float(self.value)
         if not math.isfinite(number):
-            self.fail(f"{self.value!r:.60} is no finite number" if isinstance(self.value, str) else "is no number")
+            written = isinstance(self.value, (str, float))
+            self.fail(f"{self.value!r:.60} is no finite number" if written else "is no number")
         return number
 
     def whole(self, low: int, high: int, what: str) -> int:
