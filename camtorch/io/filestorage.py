@@ -68,7 +68,7 @@ def as_xml(values: dict[str, Value]) -> str:
 
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
 _DEEPEST = 100
-_MOST_VALUES = 1 << 18
+_MOST_VALUES = 1 << 17
 _MOST_ATTRIBUTES = 1 << 14
 
 

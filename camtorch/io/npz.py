@@ -31,13 +31,14 @@ def parse_archive(path, content: bytes) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for entry in archive.infolist():
-                name, ending = entry.filename[:-4], entry.filename[-4:]
-                if ending != ".npy":
-                    raise ValueError("not an archive of numpy.savez, whose files end in .npy")
+                name = entry.filename.removesuffix(".npy")
+                if name == entry.filename:
+                    raise ValueError("the files of numpy.savez end in .npy")
                 with archive.open(entry) as file:
                     keys[name] = _values(file.read(_LARGEST_ARRAY + 1))
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
-        raise CameraFileError(path, f"{name!r:.60}".strip("'"), f"no array of NumPy's: {error}") from None
+        place = name if name.isprintable() and len(name) <= 60 else f"{name!r:.60}"
+        raise CameraFileError(path, place, f"no array of NumPy's: {error}") from None
     return keys
 
 

@@ -1,4 +1,4 @@
-"""OpenCV's camera files: what `cv2.FileStorage` writes as YAML, JSON or XML, of one camera or of a stereo pair."""
+"""OpenCV's cameras or stereo pairs: YAML, JSON or XML of `cv2.FileStorage`, and archives of `numpy.savez`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NAMES = Names("opencv", "OpenCV", (".yml", ".yaml", ".json", ".xml"), ("*.xml",)
 
 # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
 _NAMES = r"\d*|left|right"
-_MATRIX = re.compile(rf"(?:K|M|(?i:camera_?matrix|intrinsic_?matrix))_?({_NAMES})")
+_MATRIX = re.compile(rf"(?:K|M|(?i:mtx|camera_?matrix|intrinsic_?matrix))_?({_NAMES})")
 _DISTORTION = re.compile(
     rf"(?:[Dd]|(?i:dist(?:ortion)?(?:_?coef(?:f|fs|s|ficients?)?(?:_?mat)?|_?param(?:s|eters)?)?))_?({_NAMES})"
 )
@@ -47,7 +47,7 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
     """The camera of an OpenCV YAML, JSON or XML file, in float64 and frozen.
 
     Args:
-        path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`) and, where it has them,
+        path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`, `mtx`) and, where it has them,
             distortion coefficients (`distortion_coefficients`, `distCoeffs`, `D`), `image_width` and `image_height`.
         model: a key of `camtorch.MODELS`, for a file that leaves it open. If left out: without coefficients a pinhole,
             with a true `fisheye_model` a Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning
