@@ -19,7 +19,7 @@ from albumentations.core.type_definitions import Targets
 from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation, draw
-from camtorch.augment.change import Change, copied, singles
+from camtorch.augment.change import Change, copied, singles, size_of
 from camtorch.augment.numpy import as_array, as_tensor
 from camtorch.augment.sample import moves
 from camtorch.camera import Camera
@@ -142,14 +142,15 @@ class Transform(A.DualTransform):
 
     def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
-        moved, _ = change.points(torch.as_tensor(keypoints[:, :2])[None])
-        return np.concatenate((moved[0].numpy(), keypoints[:, 2:]), 1)
+        moved = change.points(torch.as_tensor(keypoints[:, :2])[None])[0][0].numpy()
+        lost = (keypoints[:, :2] == -1).all(1, keepdims=True)
+        return np.concatenate((np.where(lost, -1, moved), keypoints[:, 2:]), 1)
 
     def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""
         before, after = (
             torch.tensor([[*size[::-1], *size[::-1]]], dtype=torch.float64)
-            for size in (change.parts[0].camera.image_size, self.apply_to_camera(None, change).image_size)
+            for size in map(size_of, (change.parts[0].camera, self.apply_to_camera(None, change)))
         )
         corners = torch.as_tensor(bboxes[:, :4], dtype=torch.float64) * before - 0.5
         moved, seen = change.boxes(corners[None])
@@ -158,7 +159,8 @@ class Transform(A.DualTransform):
 
     def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
         """The camera of the new image."""
-        return copied(singles(change.target)[0])
+        target = change.target
+        return copied(singles(target)[0] if isinstance(target, Camera) else target[0])
 
     def _mover(self, kind: str) -> Callable[..., np.ndarray]:
         def move(value: np.ndarray, change: Change, **params: Any) -> np.ndarray:

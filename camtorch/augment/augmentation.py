@@ -15,7 +15,7 @@ from torch import Tensor
 
 from camtorch._arguments import as_whole
 from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, kind, rows_of
+from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, kind, rows_of, size_of
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
@@ -258,34 +258,36 @@ class Augmentation(SampleTransform):
         draw = self._checked_draw(draw)
         applied = draw["apply"]
         count = len(applied)
-        listed = isinstance(camera, (list, tuple))
-        camera = camera if listed else alone(camera)
-        before = {one.image_size for one in (camera if listed else [camera])}
+        cameras = [alone(camera)] if isinstance(camera, Camera) else list(camera)
+        listed, (first, *_) = not isinstance(camera, Camera), cameras
+        before = {one.image_size for one in cameras}
         if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
             raise ValueError(
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
             )
         if listed:
-            groups: dict[tuple, list[int]] = {}
-            for i, one in enumerate(camera):
+            groups: dict[tuple[object, ...], list[int]] = {}
+            for i, one in enumerate(cameras):
                 groups.setdefault((*kind(one), bool(applied[i])), []).append(i)
-            members = [(torch.tensor(rows), joined([expanded(camera[i], 1) for i in rows])) for rows in groups.values()]
+            members = [
+                (torch.tensor(rows), joined([expanded(cameras[i], 1) for i in rows])) for rows in groups.values()
+            ]
         elif not (may_look(applied) or count == 0):
             # traced: all rows move, and a gate chooses
-            return Change(count, [self._part(None, camera, draw)], gate=None if self.p == 1 else applied)
+            return Change(count, [self._part(None, first, draw)], gate=None if self.p == 1 else applied)
         elif bool(applied.all()):
-            return Change(count, [self._part(None, camera, draw)])
+            return Change(count, [self._part(None, first, draw)])
         else:
-            members = [((applied == value).nonzero()[:, 0], camera) for value in (True, False)]
-            members = [(rows, rows_of(camera, rows)) for rows, camera in members if len(rows)]
+            both = [(applied == value).nonzero()[:, 0] for value in (True, False)]
+            members = [(rows, rows_of(first, rows)) for rows in both if len(rows)]
         parts = []
         for rows, source in members:
             if applied[rows[0]]:
                 parts.append(self._part(rows, source, {name: value[rows] for name, value in draw.items()}))
             else:
                 parts.append(Part(rows, None, source))
-        sizes = {(part.warp.target if part.warp else part.camera).image_size for part in parts}
+        sizes = {size_of(part.warp.target if part.warp else part.camera) for part in parts}
         if len(sizes) > 1 and len(before) == 1:
             text = f"samples of one batch would come out in the sizes {sorted(sizes)}; with p < 1 the size must stay"
             raise ValueError(f"{self._name}: {text}")
@@ -307,34 +309,39 @@ class Augmentation(SampleTransform):
         return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
 
     def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+        values = self._values(source, draw)
+        target, rotation = self.new_camera(source, values)
+        if self.min_filled:
+            factor, turned, found = enough(source, target, rotation, self.min_filled)
+            target, rotation = scaled(target, factor), None if rotation is None else turned
+            self._tell_of_too_few(found, self.min_filled)
+        warp = self._warp(source, target, rotation)
+        return Part(rows, warp, source, *self._seen_through(warp, values))
+
+    def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """What `new_camera` is given."""
         values = {name: value for name, value in draw.items() if name != "apply"}
         batched = bool(source.batch_shape) or not _one_for_all(values)
         if not batched:  # one map serves the whole batch
             values = {name: value[0] for name, value in values.items()}
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
-        like = {"dtype": dtype, "device": source.intrinsics.device}
-        values = {name: value.to(**like) for name, value in values.items()}
-        target, rotation = self.new_camera(source, values)
-        if self.min_filled:
-            factor, turned, found = enough(source, target, rotation, self.min_filled)
-            target, rotation = scaled(target, factor), None if rotation is None else turned
-            self._tell_of_too_few(found)
-        part = Part(rows, Warp(source, target, rotation, **self.options), source)
-        part.shades, part.light = self._seen_through(part.warp, values)
-        return part
+        return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
+
+    def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
+        return Warp(source, target, rotation, **self.options)
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         """What the lens does to colours and light: `shades` and `light` of the part of a batch."""
         return None, None
 
-    def _tell_of_too_few(self, found: Tensor) -> None:
-        """Warn, once, if what was found filled is less than `min_filled`."""
-        if self._warned or not is_concrete(found) or found.numel() == 0 or bool((found >= self.min_filled).all()):
+    def _tell_of_too_few(self, found: Tensor, share: float) -> None:
+        """Warn, once, if less than a share of some images was found filled."""
+        few = int((found < share).sum()) if is_concrete(found) else 0
+        if self._warned or not few:
             return
         self._warned = True
-        few = int((found < self.min_filled).sum())
         warnings.warn(
-            f"{self._name}: min_filled={self.min_filled:g} is out of reach for {few} of {found.numel()} new images, of "
+            f"{self._name}: min_filled={share:g} is out of reach for {few} of {found.numel()} new images, of "
             f"which down to {float(found.min()):.0%} shows something: the camera of the images does not see along the "
             "axis of the new one",
             stacklevel=2,
@@ -349,8 +356,7 @@ class Augmentation(SampleTransform):
         values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
             first = rows_of(frozen(camera, camera.image_size), torch.zeros(_TRIES, dtype=torch.long))
-            warp = self._part(None, first, values).warp
-            shares = filled(warp.source, warp.target, warp.rotation)
+            shares = filled(first, *self.new_camera(first, self._values(first, values)))
         if shares.mean() < _FEW:
             warnings.warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
@@ -365,11 +371,11 @@ class Augmentation(SampleTransform):
     @without_graph_in_workers
     def forward(
         self,
-        sample: Mapping[str, object] | None = None,
+        sample: Mapping[str, Any] | None = None,
         *,
         draw: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
-        **fields,
+        **fields: Any,
     ) -> Sample:
         """Augment a sample, a dict, or keyword arguments, or both.
 
@@ -401,20 +407,21 @@ class Augmentation(SampleTransform):
     @without_graph_in_workers
     def inverse(
         self,
-        sample: Mapping[str, object] | None = None,
+        sample: Mapping[str, Any] | None = None,
         *,
         draw: Mapping[str, Tensor] | None = None,
         camera: Camera | Sequence[Camera] | None = None,
-        **fields,
+        **fields: Any,
     ) -> Sample:
         """Move a sample back: by the last call's change, or by that of a `draw` and the `camera` before it.
 
         What left the image stays lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
         """
         sample = self._given(sample, fields)
-        if draw is None and self.last is None:
+        change = self.last if draw is None else self.change(camera, draw)
+        if change is None:
             raise ValueError(f"{self._name}: nothing to invert; call it first, or give draw= and camera=")
-        change = (self.last if draw is None else self.change(camera, draw)).inverse()
+        change = change.inverse()
         named, batched, count, _ = self._batch({**sample, "camera": change.source})
         if count != change.count:
             raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from camtorch._tracing import in_graph
 from camtorch.camera import Camera
 from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
-from camtorch.warp.sampling import narrow, widen
+from camtorch.warp.sampling import Mode, narrow, widen
 from camtorch.warp.warp import Warp
 
 
@@ -47,7 +48,7 @@ class Part:
             return Warp(camera, rows_of(warp.target, index), rotation, **warp.options)
 
         light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
-        shades = None if self.shades is None else tuple(map(of, self.shades))
+        shades = None if self.shades is None else (of(self.shades[0]), of(self.shades[1]))
         return Part(None, of(self.warp), camera, shades, light)
 
 
@@ -63,9 +64,9 @@ class Change:
 
     def __init__(self, count: int, parts: Sequence[Part], *, listed: bool = False, gate: Tensor | None = None):
         self.count, self.parts, self.listed, self.gate = count, list(parts), listed, gate
-        rows = [part.rows for part in self.parts]
+        rows = [part.rows for part in self.parts if part.rows is not None]
         self._inverse: Change | None = None
-        self._order = None if len(rows) == 1 and rows[0] is None else torch.cat(rows).argsort()
+        self._order = torch.cat(rows).argsort() if rows else None
 
     @property
     def source(self) -> Camera | list[Camera]:
@@ -78,9 +79,10 @@ class Change:
         after = [part.camera if part.warp is None else part.warp.target for part in self.parts]
         if self.gate is not None:
             source, target = (expanded(c, self.count) for c in (self.parts[0].camera, after[0]))
-            pairs = [(getattr(target, n), getattr(source, n)) for n in ("intrinsics", "distortion")]
-            numbers = [torch.where(self.gate.to(t.device).unsqueeze(-1), t, s) for t, s in pairs]
-            return camera_like(target, *numbers, target.image_size)
+            moves = self.gate.to(target.intrinsics.device).unsqueeze(-1)
+            intrinsics = torch.where(moves, target.intrinsics, source.intrinsics)
+            distortion = torch.where(moves, target.distortion, source.distortion)
+            return camera_like(target, intrinsics, distortion, target.image_size)
         return self._cameras(after)
 
     def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
@@ -97,8 +99,8 @@ class Change:
 
         def turned(part: Part, n: int) -> Tensor:
             eye = torch.eye(3, dtype=part.camera.intrinsics.dtype, device=part.camera.intrinsics.device)
-            none = part.warp is None or part.warp.rotation is None
-            return (eye if none else part.warp.rotation).expand(n, 3, 3)
+            turned = None if part.warp is None else part.warp.rotation
+            return (eye if turned is None else turned).expand(n, 3, 3)
 
         parts = [turned(part, self.count if part.rows is None else len(part.rows)) for part in self.parts]
         rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
@@ -128,62 +130,68 @@ class Change:
         self._inverse = Change(self.count, parts, listed=self.listed, gate=self.gate)
         return self._inverse
 
-    def each(self, value: Tensor, move: Callable, stay: Callable):
-        """`move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves."""
+    def each(
+        self, value: Tensor, move: Callable[[Part, Warp, Tensor], Any], stay: Callable[[Camera, Tensor], Any]
+    ) -> Any:
+        """`move(part, warp, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves.
 
-        def of(part: Part):
+        Both give a tensor, or a pair of tensors.
+        """
+
+        def of(part: Part) -> Any:
             if part.rows is not None:
                 rows = value[part.rows.to(value.device)]
             else:  # what comes out is never what went in, but a copy
                 rows = value.clone() if part.warp is None else value
-            return stay(part.camera, rows) if part.warp is None else move(part, rows)
+            return stay(part.camera, rows) if part.warp is None else move(part, part.warp, rows)
 
         results = [of(part) for part in self.parts]
-        if self.gate is not None:
-            moved, kept = results[0], stay(self.parts[0].camera, value)
-            return _both(lambda pair: _gated(self.gate, *pair), moved, kept)
-        if self._order is None:
+        gate, order = self.gate, self._order
+        if gate is not None:
+            return _both(lambda pair: _gated(gate, *pair), results[0], stay(self.parts[0].camera, value))
+        if order is None:
             return results[0]
-        return _both(lambda pieces: torch.cat(pieces)[self._order.to(pieces[0].device)], *results)
+        return _both(lambda pieces: torch.cat(pieces)[order.to(pieces[0].device)], *results)
 
     # -- what moves
 
-    def images(self, images: Tensor, **options) -> Tensor:
+    def images(self, images: Tensor, **options: Any) -> Tensor:
         """Images (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
 
-        def move(part: Part, rows: Tensor) -> Tensor:
+        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
             if part.shades is not None and rows.shape[1] == 3:
-                warps = part.shades[0], part.warp, part.shades[1]
-                fills = [{"fill": value} for value in part.warp.fill] if len(part.warp.fill) == 3 else [{}] * 3
-                triples = enumerate(zip(warps, fills, strict=True))
-                moved = torch.cat([warp.pin()(rows[:, i : i + 1], **fill, **options) for i, (warp, fill) in triples], 1)
+                red, blue = part.shades
+                fills = warp.fill if len(warp.fill) == 3 else [None] * 3
+                colours = enumerate(zip((red, warp, blue), fills, strict=True))
+                moved = torch.cat([w.pin()(rows[:, i : i + 1], fill=fill, **options) for i, (w, fill) in colours], 1)
             else:
-                moved = part.warp.pin()(rows, **options)
+                moved = warp.pin()(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
 
         return self.each(images, move, lambda camera, rows: rows)
 
-    def labels(self, masks: Tensor, fill: float = 0.0, mode: str = "nearest") -> Tensor:
+    def labels(self, masks: Tensor, fill: float = 0.0, mode: Mode = "nearest") -> Tensor:
         """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
 
-        def move(part: Part, rows: Tensor) -> Tensor:
-            return part.warp.pin()(rows, mode=mode, padding_mode="zeros", fill=fill)
+        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+            return warp.pin()(rows, mode=mode, padding_mode="zeros", fill=fill)
 
         return self.each(masks, move, lambda camera, rows: rows)
 
     def valid_mask(self) -> Tensor:
         """(count, 1, H', W') bool: where the images show something."""
-        size = self.parts[0].camera.image_size
-        everywhere = torch.ones(self.count, 1, *size, dtype=torch.bool, device=self.parts[0].camera.intrinsics.device)
+        camera = self.parts[0].camera
+        height, width = size_of(camera)
+        everywhere = torch.ones(self.count, 1, height, width, dtype=torch.bool, device=camera.intrinsics.device)
         return self.each(
             everywhere,
-            lambda part, rows: part.warp.pin().valid_mask().expand(len(rows), -1, -1, -1),
+            lambda part, warp, rows: warp.pin().valid_mask().expand(len(rows), -1, -1, -1),
             lambda camera, rows: rows,
         )
 
     def points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (count, *N, 2), and valid (count, *N): on the image."""
-        return self.each(pixels, lambda part, rows: part.warp.transform_points(rows), _where_they_are)
+        return self.each(pixels, lambda part, warp, rows: warp.transform_points(rows), _where_they_are)
 
     def boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
@@ -192,13 +200,13 @@ class Change:
             on_image = camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
             return rows, on_image & torch.isfinite(rows).all(-1)
 
-        return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
+        return self.each(boxes, lambda part, warp, rows: warp.transform_boxes(rows), stay)
 
     def quadrilaterals(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """Quadrilaterals (count, *N, 4, 2): the corners of the boxes that enclose them, and valid (count, *N)."""
 
-        def move(part: Part, rows: Tensor) -> tuple[Tensor, Tensor]:
-            enclosing, valid = part.warp.enclose(rows)
+        def move(part: Part, warp: Warp, rows: Tensor) -> tuple[Tensor, Tensor]:
+            enclosing, valid = warp.enclose(rows)
             return corners_of(enclosing), valid
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -206,25 +214,27 @@ class Change:
 
         return self.each(corners, move, stay)
 
-    def rays(self, rays: Tensor, read: Callable = _same, write: Callable = _same) -> Tensor:
+    def rays(
+        self, rays: Tensor, read: Callable[[Tensor], Tensor] = _same, write: Callable[[Tensor], Tensor] = _same
+    ) -> Tensor:
         """Directions and points (count, *N, 3) of the camera frame: they turn, their lengths stay.
 
         What has another form is read as rays, and written in its form again.
         """
 
-        def move(part: Part, rows: Tensor) -> Tensor:
-            return rows.clone() if part.warp.rotation is None else write(part.warp.transform_rays(read(rows)))
+        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+            return rows.clone() if warp.rotation is None else write(warp.transform_rays(read(rows)))
 
         return self.each(rays, move, lambda camera, rows: rows)
 
     def depth(self, depth: Tensor) -> Tensor:
         """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known."""
 
-        def move(part: Part, rows: Tensor) -> Tensor:
+        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
             wide = widen(rows)
-            before, after = (_forward(camera, wide) for camera in (part.warp.source, part.warp.target))
+            before, after = (_forward(camera, wide) for camera in (warp.source, warp.target))
             distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
-            moved = part.warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
+            moved = warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
             return narrow(moved, rows.dtype)
 
         return self.each(depth, move, lambda camera, rows: rows)
@@ -245,7 +255,7 @@ def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
     return torch.where(gate.to(moved.device).reshape(-1, *[1] * (moved.ndim - 1)), moved, kept.to(moved.dtype))
 
 
-def _both(function: Callable, *results):
+def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Any) -> Any:
     """`function` of the results, or of the first and of the second ones where each is a pair."""
     if isinstance(results[0], tuple):
         return tuple(function(pieces) for pieces in zip(*results, strict=True))
@@ -261,19 +271,32 @@ def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_si
     return type(camera)(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
 
 
+def numbers_by(camera: Camera, change: Callable[[Tensor], Tensor]) -> Camera:
+    """The camera with its intrinsics and its distortion changed, each by the same function."""
+    return camera_like(camera, change(camera.intrinsics), change(camera.distortion), camera.image_size)
+
+
 def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same numbers that does not learn."""
     return camera_like(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
 
 
+def copied(camera: Camera) -> Camera:
+    """A camera of the same numbers, whose tensors are its own."""
+    return numbers_by(camera, torch.clone)
+
+
 def on_device(camera: Camera, device: torch.device) -> Camera:
     """The camera where the images are."""
-    if camera.intrinsics.device == device:
-        return camera
-    return camera_like(camera, camera.intrinsics.to(device), camera.distortion.to(device), camera.image_size)
+    return camera if camera.intrinsics.device == device else numbers_by(camera, lambda t: t.to(device))
 
 
-def kind(camera: Camera) -> tuple:
+def size_of(camera: Camera) -> tuple[int, int]:
+    """The image_size of a camera that has one."""
+    return cast("tuple[int, int]", camera.image_size)
+
+
+def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
     """What cameras must have in common to be rows of one batch."""
     return type(camera), camera.distortion.shape[-1], camera.image_size
 
@@ -283,38 +306,34 @@ def alone(camera: Camera) -> Camera:
     return singles(camera)[0] if tuple(camera.batch_shape) == (1,) else camera
 
 
-def copied(camera: Camera) -> Camera:
-    """A camera of the same numbers, whose tensors are its own."""
-    return camera_like(camera, camera.intrinsics.clone(), camera.distortion.clone(), camera.image_size)
-
-
 def rows_of(camera: Camera, index: Tensor) -> Camera:
     """The cameras of these rows; one without batch dims serves all of them."""
-    if not camera.batch_shape:
-        return camera
-    numbers = (t.expand(*camera.batch_shape, -1)[index] for t in (camera.intrinsics, camera.distortion))
-    return camera_like(camera, *numbers, camera.image_size)
+    batch = camera.batch_shape
+    return numbers_by(camera, lambda t: t.expand(*batch, t.shape[-1])[index]) if batch else camera
 
 
 def expanded(camera: Camera, count: int) -> Camera:
     """A batch of `count` rows."""
     if tuple(camera.batch_shape) == (count,):
         return camera
-    numbers = (t.expand(count, t.shape[-1]).clone() for t in (camera.intrinsics, camera.distortion))
-    return camera_like(camera, *numbers, camera.image_size)
+    return numbers_by(camera, lambda t: t.expand(count, t.shape[-1]).clone())
 
 
 def singles(camera: Camera) -> list[Camera]:
     """The cameras of a batch, one by one."""
-    numbers = [t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)]
-    return [camera_like(camera, *(t[i] for t in numbers), camera.image_size) for i in range(camera.batch_shape[0])]
+    intrinsics, distortion = (
+        t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)
+    )
+    rows = range(camera.batch_shape[0])
+    return [camera_like(camera, intrinsics[i], distortion[i], camera.image_size) for i in rows]
 
 
 def joined(cameras: Sequence[Camera], order: Tensor | None = None) -> Camera:
     """One batch of cameras of one kind that have a batch dim each, in another order if wanted."""
-    numbers = []
-    for name in ("intrinsics", "distortion"):
-        tensors = [getattr(c, name).expand(*c.batch_shape, -1) for c in cameras]
-        number = torch.cat(tensors)
-        numbers.append(number if order is None else number[order])
-    return camera_like(cameras[0], *numbers, cameras[0].image_size)
+
+    def together(tensors: list[Tensor]) -> Tensor:
+        whole = torch.cat([t.expand(*c.batch_shape, t.shape[-1]) for t, c in zip(tensors, cameras, strict=True)])
+        return whole if order is None else whole[order]
+
+    intrinsics, distortion = together([c.intrinsics for c in cameras]), together([c.distortion for c in cameras])
+    return camera_like(cameras[0], intrinsics, distortion, cameras[0].image_size)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -59,7 +60,7 @@ class FaceNormalizer(SampleTransform):
         axis: tuple[float, float] | None = None,
         mode: str = "bilinear",
         padding_mode: str = "zeros",
-        fill=0.0,
+        fill: float | Sequence[float] = 0.0,
         antialias: bool = False,
         tolerance: float = 0.001,
         fields: Mapping[str, str] | None = None,
@@ -71,8 +72,10 @@ class FaceNormalizer(SampleTransform):
             if not 0 < value < float("inf"):
                 raise ValueError(f"{self._name}: {name} must be positive; got {value!r}")
         self.focal, self.distance = float(focal), float(distance)
-        self.image_size = as_image_size(image_size, self._name)
-        height, width = self.image_size
+        size = as_image_size(image_size, self._name)
+        if size is None:
+            raise TypeError(f"{self._name}: image_size must be two integers (height, width); got None")
+        height, width = self.image_size = size
         self.axis = (width / 2, height / 2) if axis is None else tuple(map(float, axis))
         self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
 
@@ -87,13 +90,10 @@ class FaceNormalizer(SampleTransform):
         Raises:
             ValueError: a face in the camera, or seen along the head's x axis.
         """
-        like = {
-            "dtype": torch.promote_types(camera.intrinsics.dtype, torch.float32),
-            "device": camera.intrinsics.device,
-        }
+        device, dtype = camera.intrinsics.device, torch.promote_types(camera.intrinsics.dtype, torch.float32)
         check_rotation(head_rotation, "the head's rotation", self._name)
         camera = alone(camera)
-        centre, across = face_centre.to(**like), head_rotation[..., 0].to(**like)
+        centre, across = face_centre.to(device, dtype), head_rotation[..., 0].to(device, dtype)
         distance = centre.norm(dim=-1, keepdim=True)
         forward = centre / distance
         down = torch.linalg.cross(forward, across)
@@ -115,7 +115,7 @@ class FaceNormalizer(SampleTransform):
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
     @without_graph_in_workers
-    def forward(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
+    def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Normalise a sample, a dict or keyword arguments.
 
         Raises:
@@ -146,7 +146,7 @@ class FaceNormalizer(SampleTransform):
         return moved
 
     @without_graph_in_workers
-    def inverse(self, sample: Mapping[str, object] | None = None, **fields) -> Sample:
+    def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Move what was predicted on a normalised sample back to the frame and the image of its source camera.
 
         The sample has `camera`, `rotation` and `source_camera` as they came out (and `source_rotation`, after other
@@ -167,6 +167,10 @@ class FaceNormalizer(SampleTransform):
         if before is not None:
             moved["rotation"] = moved.pop("source_rotation")
         return moved
+
+    if TYPE_CHECKING:
+
+        def __call__(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample: ...
 
     def extra_repr(self) -> str:
         """The virtual camera, and the options."""

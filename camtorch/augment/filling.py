@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import camera_like, frozen
+from camtorch.augment.change import camera_like, frozen, size_of
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
 from camtorch.rotations import rotation_matrix, rotation_vector
@@ -24,7 +24,7 @@ _HALVINGS = 10
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
     """(*B,): the part of the target's image that shows something of the source's, of a lattice of its pixels."""
-    height, width = target.image_size or (0, 0)
+    height, width = size_of(target)
     like = target.intrinsics
     v, u = (torch.linspace(0, side - 1, _SIDE, dtype=like.dtype, device=like.device) for side in (height, width))
     pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).flatten(0, 1)
@@ -54,10 +54,11 @@ def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float
         if rotation is None:
             rotation = torch.eye(3, dtype=target.intrinsics.dtype, device=target.intrinsics.device)
         if torch.compiler.is_compiling():
-            cameras = [
-                t for c in (source, target) for t in (c._model, c.intrinsics, c.distortion, list(c.image_size or ()))
-            ]
-            factor, rotation, found = _opaque_enough(*cameras, rotation, share)
+            numbers = (
+                (camera._model, camera.intrinsics, camera.distortion, list(size_of(camera)))
+                for camera in (source, target)
+            )
+            factor, rotation, found = _opaque_enough(*next(numbers), *next(numbers), rotation, share)
             return factor, rotation, found
         return _enough(frozen(source, source.image_size), frozen(target, target.image_size), rotation, share)
 
@@ -107,21 +108,31 @@ def _opaque_enough(
     rotation: Tensor,
     share: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    cameras = [
-        frozen(
-            CLASSES[model](*(t.detach() for t in (intrinsics, distortion)[: 1 + bool(distortion.shape[-1])])),
-            tuple(size),
-        )
-        for model, intrinsics, distortion, size in (
-            (source, source_intrinsics, source_distortion, source_size),
-            (target, target_intrinsics, target_distortion, target_size),
-        )
-    ]
-    factor, turned, found = _enough(*cameras, rotation, share)
+    before = _from_numbers(source, source_intrinsics, source_distortion, source_size)
+    after = _from_numbers(target, target_intrinsics, target_distortion, target_size)
+    factor, turned, found = _enough(before, after, rotation, share)
     return factor.clone(), turned.clone(), found.clone()
 
 
 @_opaque_enough.register_fake
-def _(source, i, d, source_size, target, j, e, target_size, rotation, share):  # type: ignore[no-untyped-def]
-    batch = torch.broadcast_shapes(*(t.shape[:-1] for t in (i, d, j, e)), rotation.shape[:-2])
-    return j.new_empty(batch), rotation.new_empty(*batch, 3, 3), j.new_empty(batch)
+def _(
+    source: str,
+    source_intrinsics: Tensor,
+    source_distortion: Tensor,
+    source_size: Sequence[int],
+    target: str,
+    target_intrinsics: Tensor,
+    target_distortion: Tensor,
+    target_size: Sequence[int],
+    rotation: Tensor,
+    share: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
+    batch = torch.broadcast_shapes(*(t.shape[:-1] for t in numbers), rotation.shape[:-2])
+    like = target_intrinsics
+    return like.new_empty(batch), rotation.new_empty(*batch, 3, 3), like.new_empty(batch)
+
+
+def _from_numbers(model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int]) -> Camera:
+    numbers = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
+    return frozen(CLASSES[model](*(t.detach() for t in numbers)), (size[0], size[1]))

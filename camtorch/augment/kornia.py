@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias, cast
 
 import torch
 from kornia.augmentation import GeometricAugmentationBase2D
 from kornia.augmentation.container.params import ParamItem
 from kornia.augmentation.utils import _transform_output_shape
 from kornia.constants import Resample, SamplePadding
+from kornia.geometry.boxes import Boxes
+from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
 from camtorch._module import Memo
@@ -20,11 +23,14 @@ from camtorch.augment import random_camera
 from camtorch.augment.augmentation import Augmentation, draw
 from camtorch.augment.change import Change, camera_like
 from camtorch.augment.collate import collate_cameras
+from camtorch.augment.presets import PresetName
 from camtorch.camera import Camera
-from camtorch.warp.sampling import narrow, widen
+from camtorch.warp.sampling import Mode, narrow, widen
 
 __all__ = ["CameraAugmentation", "RandomCamera", "RandomLens", "RandomMount", "with_cameras"]
 
+Params: TypeAlias = dict[str, Tensor]
+Flags: TypeAlias = dict[str, Any]
 _KIND = "source_kind"
 _NUMBERS = "source_intrinsics", "source_distortion"
 
@@ -61,7 +67,16 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         - params are tensors, drawn on the CPU wherever the module is. A replay is bit-identical.
     """
 
-    def __init__(self, augmentation, camera=None, *, p=None, p_batch=1.0, same_on_batch=None, keepdim=False):
+    def __init__(
+        self,
+        augmentation: Augmentation,
+        camera: Camera | None = None,
+        *,
+        p: float | None = None,
+        p_batch: float = 1.0,
+        same_on_batch: bool | None = None,
+        keepdim: bool = False,
+    ):
         name = type(self).__name__
         if not isinstance(augmentation, Augmentation):
             raise TypeError(f"{name}: augmentation must be one of camtorch.augment; got {type(augmentation).__name__}")
@@ -101,7 +116,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         count, size = batch_shape[0], tuple(batch_shape[-2:])
         if size != self.camera.image_size:
             raise ValueError(
-                f"{self._get_name()}: images are {size} (height, width), but the camera's image_size is "
+                f"{type(self).__name__}: images are {size} (height, width), but the camera's image_size is "
                 f"{self.camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
             )
         if count:
@@ -113,12 +128,12 @@ class CameraAugmentation(GeometricAugmentationBase2D):
             drawn["output_size"] = torch.tensor(self.flags["size"]).expand(count, -1).contiguous()
         return drawn
 
-    def change(self, params: Mapping[str, Tensor] | None = None, device: torch.device | None = None) -> Change:
+    def change(self, params: Params | None = None, device: torch.device | None = None) -> Change:
         """What params, by default the last, do to a batch: `source`, `target`, `rotation`, `points(...)` and so on."""
         params = self._params if params is None else params
         missing = [name for name in ("batch_prob", *self.augmentation.ranges) if name not in params]
         if missing:
-            raise ValueError(f"{self._get_name()}: the params lack {', '.join(missing)}; call it first")
+            raise ValueError(f"{type(self).__name__}: the params lack {', '.join(missing)}; call it first")
         values = {"apply": self._gate(params), **{name: params[name] for name in self.augmentation.ranges}}
         camera = self._source(params, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
@@ -126,28 +141,29 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self.augmentation.change(camera, values)
         memo = self._memos[len(values["apply"]) == 1]
-        return memo(inputs, (str(self.augmentation.options),), lambda: self.augmentation.change(camera, values))
+        kept: Change = memo(inputs, (str(self.augmentation.options),), lambda: self.augmentation.change(camera, values))
+        return kept
 
     @property
     def last(self) -> Change | None:
         """The change of the last call."""
         return self.change() if self._params else None
 
-    def _source(self, params: Mapping[str, Tensor], device: torch.device | None) -> Camera:
+    def _source(self, params: Params, device: torch.device | None) -> Camera:
         own = self.camera.intrinsics, self.camera.distortion
         device = own[0].device if device is None else device
-        numbers = [params.get(name, value).to(device) for name, value in zip(_NUMBERS, own, strict=True)]
-        same = numbers[0] is own[0] and numbers[1] is own[1]
-        return self.camera if same else camera_like(self.camera, *numbers, self.camera.image_size)
+        intrinsics, distortion = (params.get(n, value).to(device) for n, value in zip(_NUMBERS, own, strict=True))
+        same = intrinsics is own[0] and distortion is own[1]
+        return self.camera if same else camera_like(self.camera, intrinsics, distortion, self.camera.image_size)
 
     # -- moving
 
-    def _move(self, params: Mapping[str, Tensor], value: Tensor, move: Callable, back: bool = False):
+    def _move(self, params: Params, value: Tensor, move: Callable[[Change, Tensor], Any], back: bool = False) -> Any:
         """`move(change, value)`, in the dtype of the value; positions in half precision would be off by pixels."""
         with torch.autocast(value.device.type, enabled=False):
             change = self.change(params, value.device)
             if len(value) != change.count:
-                raise ValueError(f"{self._get_name()}: params for {change.count} samples, here are {len(value)}")
+                raise ValueError(f"{type(self).__name__}: params for {change.count} samples, here are {len(value)}")
             moved = move(change.inverse() if back else change, value)
         moved, valid = moved if isinstance(moved, tuple) else (moved, None)
         moved = narrow(moved, value.dtype)
@@ -155,16 +171,24 @@ class CameraAugmentation(GeometricAugmentationBase2D):
             moved = self._blend_by_prob(moved, value, self._gate(params))
         return moved if valid is None else (moved, valid)
 
-    def apply_transform(self, input, params, flags, transform=None, *, back=False):
+    def apply_transform(
+        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
+    ) -> Tensor:
         options = {"mode": Resample.get(flags["resample"]).name.lower()}
         options["padding_mode"] = SamplePadding.get(flags["padding_mode"]).name.lower()
-        return self._move(params, input, lambda change, images: change.images(images, **options), back)
+        moved: Tensor = self._move(params, input, lambda change, images: change.images(images, **options), back)
+        return moved
 
-    def apply_transform_mask(self, input, params, flags, transform=None, *, back=False):
-        fill, mode = self.augmentation.mask_fill, Resample.get(flags["resample"]).name.lower()
-        return self._move(params, input, lambda change, masks: change.labels(masks, fill, mode), back)
+    def apply_transform_mask(
+        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
+    ) -> Tensor:
+        fill, mode = self.augmentation.mask_fill, cast("Mode", Resample.get(flags["resample"]).name.lower())
+        moved: Tensor = self._move(params, input, lambda change, masks: change.labels(masks, fill, mode), back)
+        return moved
 
-    def apply_transform_keypoint(self, input, params, flags, transform=None, *, back=False):
+    def apply_transform_keypoint(
+        self, input: Keypoints, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
+    ) -> Keypoints:
         rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
         moved, valid = self._move(params, rows, lambda change, pixels: change.points(pixels), back)
         lost = (rows == -1).all(-1)
@@ -173,7 +197,9 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         self.keypoints_valid = (valid & ~lost).reshape(input.shape[:-1])
         return result
 
-    def apply_transform_box(self, input, params, flags, transform=None, *, back=False):
+    def apply_transform_box(
+        self, input: Boxes, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
+    ) -> Boxes:
         rows = input.data if input.data.ndim == 4 else input.data.unsqueeze(0)
         moved, seen = self._move(params, rows, lambda change, corners: change.quadrilaterals(widen(corners)), back)
         result = input.clone()
@@ -181,30 +207,38 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         result._valid = input._valid & seen.reshape(input._valid.shape)
         return result
 
-    def inverse_inputs(self, input, params, flags, transform=None, **kwargs):
+    def inverse_inputs(
+        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
+    ) -> Tensor:
         return self.apply_transform(self.transform_tensor(input), params, {**flags, **kwargs}, back=True)
 
-    def inverse_masks(self, input, params, flags, transform=None, **kwargs):
+    def inverse_masks(
+        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
+    ) -> Tensor:
         shape = params["forward_input_shape"]
         flags = {**flags, "resample": Resample.NEAREST, **kwargs}
         rows = self.transform_tensor(input, shape=shape, match_channel=False)
         moved = self.apply_transform_mask(rows, params, flags, back=True)
         return _transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved
 
-    def inverse_keypoints(self, input, params, flags, transform=None, **kwargs):
+    def inverse_keypoints(
+        self, input: Keypoints, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
+    ) -> Keypoints:
         return self.apply_transform_keypoint(input, params, flags, back=True)
 
-    def inverse_boxes(self, input, params, flags, transform=None, **kwargs):
+    def inverse_boxes(
+        self, input: Boxes, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
+    ) -> Boxes:
         return self.apply_transform_box(input, params, flags, back=True)
 
-    def compute_transformation(self, input, params, flags):
+    def compute_transformation(self, input: Tensor, params: Params, flags: Flags) -> Tensor:
         """(B, 3, 3) of NaN: there is no matrix, and an identity would be silently wrong."""
         return torch.full((input.shape[0], 3, 3), torch.nan, device=input.device, dtype=input.dtype)
 
-    def compute_inverse_transformation(self, transform):
+    def compute_inverse_transformation(self, transform: Tensor) -> Tensor:
         return transform
 
-    def __getstate__(self):
+    def __getstate__(self) -> dict[str, Any]:
         # a tensor of a graph can be neither copied nor pickled
         kept = {k: v.detach() if isinstance(v, Tensor) else v for k, v in self._params.items()}
         return {**self.__dict__, "_params": kept}
@@ -215,11 +249,20 @@ class CameraAugmentation(GeometricAugmentationBase2D):
 
 
 class _Random(CameraAugmentation):
-    _wraps: type[Augmentation]
+    _wraps: Callable[..., Augmentation]
 
-    def __init__(self, camera, *like, p=1.0, p_batch=1.0, same_on_batch=False, keepdim=False, **options):
-        gates = {"p": p, "p_batch": p_batch, "same_on_batch": same_on_batch}
-        super().__init__(self._wraps(*like, **options), camera, **gates, keepdim=keepdim)
+    def __init__(
+        self,
+        camera: Camera,
+        *like: Camera | PresetName | str,
+        p: float = 1.0,
+        p_batch: float = 1.0,
+        same_on_batch: bool = False,
+        keepdim: bool = False,
+        **options: Any,
+    ):
+        own = self._wraps(*like, **options)
+        super().__init__(own, camera, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
 
 
 class RandomMount(_Random):
@@ -255,7 +298,7 @@ class RandomCamera(_Random):
     _wraps = random_camera.RandomCamera
 
 
-def with_cameras(params, cameras: Camera | Sequence[Camera]):
+def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
     """Params for images whose cameras differ in their numbers: of one augmentation, or the list of a container.
 
     `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_cameras(params, cameras))`.
@@ -272,10 +315,10 @@ def with_cameras(params, cameras: Camera | Sequence[Camera]):
         cameras = collate_cameras(cameras)
     if not isinstance(cameras, Camera):
         raise TypeError("with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size")
-    found: list[dict] = []
+    found: list[Params] = []
 
-    def changed(params):
-        if isinstance(params, Mapping):
+    def changed(params: Any) -> Any:
+        if isinstance(params, dict):
             found.extend([params] if _KIND in params else [])
             return {**params, **_numbers(params, cameras)} if _KIND in params else params
         return [p._replace(data=changed(p.data)) if isinstance(p, ParamItem) and p.data else p for p in params]
@@ -286,7 +329,7 @@ def with_cameras(params, cameras: Camera | Sequence[Camera]):
     return result
 
 
-def _numbers(params: Mapping[str, Tensor], cameras: Camera) -> dict[str, Tensor]:
+def _numbers(params: Params, cameras: Camera) -> dict[str, Tensor]:
     kinds, kind, batch = params[_KIND], _kind(cameras), tuple(cameras.batch_shape)
     if len(kinds) and kinds[0].tolist() != kind:
         need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
@@ -296,8 +339,8 @@ def _numbers(params: Mapping[str, Tensor], cameras: Camera) -> dict[str, Tensor]
         raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
     frames = count // clips if batch == (clips,) and clips else 1
     numbers = (t.expand(*(batch or (1,)), -1) for t in (cameras.intrinsics, cameras.distortion))
-    numbers = [t.repeat_interleave(frames, 0).expand(count, -1) for t in numbers]
-    return dict(zip(_NUMBERS, numbers, strict=True))
+    rows = (t.repeat_interleave(frames, 0).expand(count, -1) for t in numbers)
+    return dict(zip(_NUMBERS, rows, strict=True))
 
 
 def _kind(camera: Camera) -> list[int]:

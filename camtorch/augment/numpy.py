@@ -9,6 +9,7 @@ The module is imported by name: `import camtorch.augment.numpy`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, check, kind_of
 from camtorch.camera import Camera
 
+Array: TypeAlias = "np.ndarray[Any, Any]"
+Restore = Callable[[list[Tensor], tuple[int, int]], Any]
 _OWNER = "numpy.Transform"
 _SEEN = "image_valid"
 
@@ -62,11 +65,11 @@ class Transform:
 
     def __call__(
         self,
-        sample: Mapping[str, object] | None = None,
+        sample: Mapping[str, Any] | None = None,
         *,
         draw: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
-        **fields,
+        **fields: Any,
     ) -> Sample:
         """Augment a sample, keyword arguments, or a dict, or both.
 
@@ -88,11 +91,11 @@ class Transform:
 
     def inverse(
         self,
-        sample: Mapping[str, object] | None = None,
+        sample: Mapping[str, Any] | None = None,
         *,
         draw: Mapping[str, Tensor] | None = None,
         camera: Camera | None = None,
-        **fields,
+        **fields: Any,
     ) -> Sample:
         """Move a sample back, see `Augmentation.inverse`: by the last call's change, or by `draw` and its `camera`."""
         options = {} if draw is None else {"draw": draw, "camera": camera}
@@ -108,13 +111,16 @@ class Transform:
     def __repr__(self) -> str:
         return f"Transform({self.augmentation!r})"
 
-    def _moved(self, move: Callable, sample: Mapping | None, fields: Mapping, options: Mapping) -> Sample:
+    def _moved(
+        self, move: Callable[..., Sample], sample: Mapping[str, Any] | None, fields: Sample, options: Mapping[str, Any]
+    ) -> Sample:
         if sample is not None and not isinstance(sample, Mapping):
             raise TypeError(
                 f"{_OWNER}: the fields go in by name, as in transform(image=...); got {type(sample).__name__}"
             )
         sample = {**(sample or {}), **fields}
-        inside, entries = {}, {}
+        inside: Sample = {}
+        entries: dict[str, tuple[dict[str, Tensor], Restore | None]] = {}
         for name, value in sample.items():
             tensors, restore = entries[name] = self._entry(name, value, sample)
             inside.update({name: value} if restore is None else tensors)
@@ -134,7 +140,7 @@ class Transform:
             result[name] = value[0] if name == _SEEN else value
         return result
 
-    def _entry(self, name: str, value, sample: Mapping) -> tuple[dict[str, Tensor], Callable | None]:
+    def _entry(self, name: str, value: Any, sample: Mapping[str, Any]) -> tuple[dict[str, Tensor], Restore | None]:
         """A field as the augmentation takes it, tensors with a batch dim of one, and how it gets its layout back.
 
         The latter is a function of what became of the tensors, and of the new image_size; None for what is passed on.
@@ -162,7 +168,7 @@ class Transform:
         # names that begin with their kind are known to the augmentation
         tensors = {f"{kind}_{name}[{i}]": as_tensor(f"{name}[{i}]", one, size) for i, one in enumerate(value)}
 
-        def restore(moved: list[Tensor], size: tuple[int, int]):
+        def restore(moved: list[Tensor], size: tuple[int, int]) -> Any:
             arrays = [as_array(image, one) for image, one in zip(moved, value, strict=True)]
             if many:
                 return arrays
@@ -171,7 +177,7 @@ class Transform:
         return tensors, restore
 
 
-def _numbers(value, kind: str):
+def _numbers(value: Any, kind: str) -> Any:
     """Coordinates of floating point; a list of numbers is taken for an array."""
     if isinstance(value, (list, tuple)):
         try:
@@ -183,9 +189,10 @@ def _numbers(value, kind: str):
     return value.astype(np.float32) if isinstance(value, np.ndarray) and value.dtype.kind in "iub" else value
 
 
-def as_tensor(name: str, value, size: tuple[int, int] | None = None) -> Tensor:
+def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> Tensor:
     """(1, C, H, W) of an array (H, W, C) or (H, W), which should be of that size."""
-    shape = _checked(name, value).shape
+    array = _checked(name, value)
+    shape = array.shape
     if len(shape) not in (2, 3):
         raise ValueError(f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}")
     if size == shape[1:] and size != shape[:2]:
@@ -193,24 +200,24 @@ def as_tensor(name: str, value, size: tuple[int, int] | None = None) -> Tensor:
             f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}, which has its channels first: "
             "np.moveaxis(image, 0, -1) puts them last"
         )
-    return _tensor(np.moveaxis(value, -1, 0) if len(shape) == 3 else value[None])[None]
+    return _tensor(np.moveaxis(array, -1, 0) if len(shape) == 3 else array[None])[None]
 
 
-def as_array(image: Tensor, like: np.ndarray) -> np.ndarray:
+def as_array(image: Tensor, like: Array) -> Array:
     """An image (C, H, W) in the layout and the dtype of an array."""
     array = image.detach().cpu().numpy()
     array = np.ascontiguousarray(np.moveaxis(array, 0, -1)) if like.ndim == 3 else array[0]
     return array.astype(like.dtype, copy=False)
 
 
-def _checked(name: str, value) -> np.ndarray:
+def _checked(name: str, value: object) -> Array:
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
         what = f"dtype {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
         raise TypeError(f"{_OWNER}: {name} must be a numpy array of real numbers; got {what}")
     return value
 
 
-def _tensor(array: np.ndarray) -> Tensor:
+def _tensor(array: Array) -> Tensor:
     # torch takes neither other byte orders nor negative strides, nor long doubles, and warns of read-only arrays
     dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64
     array = np.ascontiguousarray(array, dtype)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._module import Memo, same
 from camtorch._tracing import is_concrete
 from camtorch.augment.augmentation import Augmentation, as_range
-from camtorch.augment.change import camera_like, frozen
+from camtorch.augment.change import camera_like, frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera
@@ -107,7 +107,7 @@ class RandomCamera(Augmentation):
         if self.like is not None and self.like.image_size is None and fov is None:
             raise ValueError(f"{self._name}: like={like!r} says nothing of the field of view; give fov=(low, high)")
         tiny, huge = 1e-3, 1e3
-        limits = {
+        limits: dict[str, tuple[object, dict[str, Any]]] = {
             "yaw": (yaw, {"least": -180, "most": 180}),
             "pitch": (pitch, {"least": -180, "most": 180}),
             "roll": (roll, {"least": -180, "most": 180}),
@@ -143,17 +143,16 @@ class RandomCamera(Augmentation):
         shades = light = None
         if "chromatic" in values:
             red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
-            shades = tuple(Warp(warp.source, target, warp.rotation, **self.options) for target in (red, blue))
+            shades = self._warp(warp.source, red, warp.rotation), self._warp(warp.source, blue, warp.rotation)
         if "vignetting" in values:
             light = _light(warp.target, values["vignetting"])
         return shades, light
 
     def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
         base = source if self.like is None else self.like
-        size = self.image_size or cast("tuple[int, int]", source.image_size)
+        size = self.image_size or size_of(source)
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
-        numbers = (t.to(source.intrinsics.device, dtype) for t in (base.intrinsics, base.distortion))
-        base = camera_like(base, *numbers, base.image_size)
+        base = numbers_by(base, lambda t: t.to(source.intrinsics.device, dtype))
         intrinsics = usual = self._from_source(source, base, size) if self.fov == "source" else None
         if intrinsics is None or usual is None:
             middle = base.intrinsics.new_tensor(self.ranges["fov"].middle) if "fov" in values else None
@@ -281,7 +280,7 @@ def _plane_width(base: Camera, fov: Tensor) -> Tensor:
 
 def _cropped(camera: Camera, share: Tensor, place: Tensor) -> Camera:
     """The camera of a part of the image, `share` (*B,) of each side at `place` (*B, 2), enlarged to the full size."""
-    height, width = camera.image_size
+    height, width = size_of(camera)
     fx, fy, cx, cy = camera.intrinsics.unbind(-1)
     left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
     cx, cy = (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
@@ -290,7 +289,7 @@ def _cropped(camera: Camera, share: Tensor, place: Tensor) -> Camera:
 
 def _light(camera: Camera, loss: Tensor) -> Tensor:
     """(B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance."""
-    height, width = camera.image_size
+    height, width = size_of(camera)
     cx, cy = camera.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
     grid = camera.pixel_grid()
     square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
@@ -318,7 +317,8 @@ def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     with torch.no_grad():
         if torch.compiler.is_compiling():
             numbers = camera.intrinsics, camera.distortion
-            return _opaque_jittered(camera._model, *numbers, list(camera.image_size), amounts, nominal)
+            coefficients: Tensor = _opaque_jittered(camera._model, *numbers, list(size_of(camera)), amounts, nominal)
+            return coefficients
         return _jittered(camera, amounts, nominal)
 
 
@@ -339,8 +339,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     left = torch.ones(step.shape[:-1], dtype=torch.bool, device=step.device)
     for part in (sign / 2**halving for halving in range(_HALVINGS) for sign in (1, -1)):
         candidate, defined = _defined(camera, base + part * step, base)
-        numbers = (t.expand(*step.shape[:-1], -1) for t in (camera.intrinsics, candidate))
-        lens = camera_like(camera, *numbers, camera.image_size)
+        lens = camera_like(camera, camera.intrinsics.expand(*step.shape[:-1], 4), candidate, camera.image_size)
         seen = lens.unproject(rim.expand(*lens.batch_shape, *rim.shape[-2:]))[1]
         invertible = (seen | unseen).all(-1) & defined
         result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
@@ -354,17 +353,19 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
 def _opaque_jittered(
     model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
 ) -> Tensor:
-    camera = frozen(CLASSES[model](intrinsics.detach(), distortion.detach()), tuple(size))
+    camera = frozen(CLASSES[model](intrinsics.detach(), distortion.detach()), (size[0], size[1]))
     return _jittered(camera, amounts, nominal).clone()
 
 
 @_opaque_jittered.register_fake
-def _(model, intrinsics, distortion, size, amounts, nominal):
+def _(
+    model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
+) -> Tensor:
     return amounts.new_empty(*amounts.shape[:-1], distortion.shape[-1])
 
 
 _KEPT = 8
-_known: list[tuple[tuple, tuple[Tensor, ...], Tensor]] = []
+_known: list[tuple[tuple[object, ...], tuple[Tensor, ...], Tensor]] = []
 
 
 def _kept(measure: Callable[[Camera], Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
@@ -382,7 +383,7 @@ def _kept(measure: Callable[[Camera], Tensor], camera: Camera, *inputs: Tensor) 
 def _sensitivity(camera: Camera) -> Tensor:
     """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner."""
     pixels = image_lattice(camera, _SIDE, _SIDE).flatten(0, 1)
-    camera = camera_like(camera, camera.intrinsics.double(), camera.distortion.double(), camera.image_size)
+    camera = numbers_by(camera, torch.Tensor.double)
     batch, count = camera.batch_shape, camera.distortion.shape[-1]
     rays, seen = camera.unproject(pixels.double().expand(*batch, *pixels.shape))
     rays = rays.unsqueeze(-3).expand(*batch, count, *pixels.shape[:-1], 3)
@@ -396,7 +397,7 @@ def _sensitivity(camera: Camera) -> Tensor:
     (before, valid), (after, also) = ends
     moved = (after - before).norm(dim=-1) / (2 * _STEP)
     most = torch.where(valid & also & seen.unsqueeze(-2), moved, 0.0).amax(-1)
-    height, width = camera.image_size
+    height, width = size_of(camera)
     corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
     return torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
 
@@ -414,7 +415,7 @@ def _rim(camera: Camera) -> Tensor:
 
     What is mapped has no holes: a lens that is invertible on the outline is so inside.
     """
-    height, width = camera.image_size
+    height, width = size_of(camera)
     corners = camera.intrinsics.new_tensor([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
     edges = along_edges(corners, _EDGE_SAMPLES)
     ends = _kept(_ends, camera, camera.distortion)
@@ -429,7 +430,7 @@ def _ends(camera: Camera) -> Tensor:
     plane = camera_like(camera, ones, camera.distortion.detach().double(), None)
     azimuth = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1, None]
     share = torch.linspace(0, 1, _ANGLES + 1, dtype=torch.float64, device=ones.device)
-    low, width = 0.0, math.pi
+    low, width = share.new_zeros(()), math.pi
     for _ in range(2):  # the second time between the last angle that is mapped and the first that is not
         angle = low + width * share
         rays = torch.stack(

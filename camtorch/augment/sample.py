@@ -17,12 +17,18 @@ from camtorch.camera import Camera
 from camtorch.rotations import rotation_matrix, rotation_vector
 
 Sample = dict[str, Any]
+"""Name -> value; see `Augmentation`."""
+Named = dict[str, tuple[str, Any]]
+"""Name -> (kind, tensor or list of tensors)."""
 
 
 # -- the kinds of fields
 
 KEEP = "keep"
 IMAGES = ("image", "mask", "depth", "distance")
+
+
+Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
 
 
 @dataclass(frozen=True)
@@ -37,49 +43,49 @@ class Field:
     """What its last dim may be; empty: anything."""
     shape: str
     """In words, of a batch."""
-    move: Callable
+    move: Move
     """(change, batch, options) -> batch, or (batch, valid)."""
     decides: bool = False
     """Whether its number of dims tells a batch from a single sample."""
 
 
-def _image(change: Change, images: Tensor, options: Mapping) -> Tensor:
+def _image(change: Change, images: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.images(images)
 
 
-def _mask(change: Change, masks: Tensor, options: Mapping) -> Tensor:
+def _mask(change: Change, masks: Tensor, options: Mapping[str, float]) -> Tensor:
     flat = masks.ndim == 3
     moved = change.labels(masks.unsqueeze(1) if flat else masks, options["mask_fill"])
     return moved.squeeze(1) if flat else moved
 
 
-def _depth(change: Change, depth: Tensor, options: Mapping) -> Tensor:
+def _depth(change: Change, depth: Tensor, options: Mapping[str, float]) -> Tensor:
     flat = depth.ndim == 3
     moved = change.depth(depth.unsqueeze(1) if flat else depth)
     return moved.squeeze(1) if flat else moved
 
 
-def _distance(change: Change, distance: Tensor, options: Mapping) -> Tensor:
+def _distance(change: Change, distance: Tensor, options: Mapping[str, float]) -> Tensor:
     return _mask(change, distance, {"mask_fill": 0.0})
 
 
-def _pixels(change: Change, pixels: Tensor, options: Mapping) -> tuple[Tensor, Tensor]:
+def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
     return change.points(pixels)
 
 
-def _boxes(change: Change, boxes: Tensor, options: Mapping) -> tuple[Tensor, Tensor]:
+def _boxes(change: Change, boxes: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
     return change.boxes(boxes)
 
 
-def _rays(change: Change, rays: Tensor, options: Mapping) -> Tensor:
+def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.rays(rays)
 
 
-def _pitch_yaw(change: Change, angles: Tensor, options: Mapping) -> Tensor:
+def _pitch_yaw(change: Change, angles: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.rays(angles, from_pitch_yaw, to_pitch_yaw)
 
 
-def _pose(change: Change, pose: Tensor, options: Mapping) -> Tensor:
+def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
     top = change.rays(pose[..., :3, :], _columns, _columns)
     return torch.cat((top, pose[..., 3:, :].to(top)), -2)
 
@@ -88,11 +94,11 @@ def _columns(matrix: Tensor) -> Tensor:
     return matrix.mT
 
 
-def _rotation_vector(change: Change, rvec: Tensor, options: Mapping) -> Tensor:
+def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.rays(rvec, lambda r: rotation_matrix(r).mT, lambda columns: rotation_vector(columns.mT))
 
 
-def _rotation(change: Change, rotation: Tensor, options: Mapping) -> Tensor:
+def _rotation(change: Change, rotation: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.rays(rotation, _columns, _columns)
 
 
@@ -122,7 +128,7 @@ _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "poi
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
 
-def kind_of(name: str, value, own: Mapping[str, str], owner: str) -> str | None:
+def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str | None:
     """The key in `KINDS` of a field, or None if it stays as it is.
 
     Raises:
@@ -145,7 +151,7 @@ def kind_of(name: str, value, own: Mapping[str, str], owner: str) -> str | None:
     return base
 
 
-def _holds_reals(value) -> bool:
+def _holds_reals(value: object) -> bool:
     """Whether there are real numbers in it that might be geometry; a number alone is none."""
     if isinstance(value, Mapping):
         return any(map(_holds_reals, value.values()))
@@ -156,12 +162,12 @@ def _holds_reals(value) -> bool:
     return isinstance(value, Tensor) and value.ndim > 0 and value.is_floating_point()
 
 
-def moves(kind: str, value: Tensor) -> Callable:
+def moves(kind: str, value: Tensor) -> Move:
     """How values of a kind move."""
     return _rays if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
 
 
-def as_tensor(value, name: str, kind: str, owner: str) -> Tensor:
+def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
     """The value of a field as a tensor.
 
     Raises:
@@ -195,7 +201,7 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
         raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
 
 
-def is_batch(named: Mapping[str, tuple[str, object]], camera) -> bool:
+def is_batch(named: Named, camera: object) -> bool:
     """Whether a sample of name -> (kind, value) is a batch of samples.
 
     The field that decides is the first of: an image, pixels, boxes; else cameras with a batch dim, and else any
@@ -254,9 +260,9 @@ class SampleTransform(nn.Module):
             raise TypeError(f"{self._name} takes a dict of fields, or keywords, as in image=...; got {got}")
         return {**(sample or {}), **fields}
 
-    def _sorted(self, sample: Sample) -> dict[str, tuple[str, object]]:
-        """Name -> (kind, value) of the fields that move."""
-        named = {}
+    def _sorted(self, sample: Sample) -> Named:
+        """The fields that move."""
+        named: Named = {}
         for name, value in sample.items():
             if name in OWN or value is None:
                 continue
@@ -267,7 +273,7 @@ class SampleTransform(nn.Module):
                 named[name] = (found, value)
         return named
 
-    def _batch(self, sample: Sample) -> tuple[dict, bool, int, Camera | list[Camera]]:
+    def _batch(self, sample: Sample) -> tuple[Named, bool, int, Camera | list[Camera]]:
         """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras."""
         camera = sample.get("camera")
         camera = self.camera if camera is None else camera
@@ -277,21 +283,20 @@ class SampleTransform(nn.Module):
         if not named:
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
         batched = is_batch(named, camera)
-        count = None
+        counts: dict[str, int] = {}
         for name, (found, value) in named.items():
             if isinstance(value, (list, tuple)):
                 items = [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
                 for i, item in enumerate(items):
                     check(found, f"{name}[{i}]", item, False, self._name)
-                value, n = items, len(items)
+                value = items
             else:
                 check(found, name, value, batched, self._name)
                 value = value if batched else value.unsqueeze(0)
-                n = len(value)
-            named[name] = (found, value)
-            if count is not None and n != count:
-                raise ValueError(f"{self._name}: {name} is of {n} samples, other fields are of {count}")
-            count = n
+            named[name], counts[name] = (found, value), len(value)
+            count = next(iter(counts.values()))
+            if counts[name] != count:
+                raise ValueError(f"{self._name}: {name} is of {counts[name]} samples, other fields are of {count}")
         self._check_cameras(camera, count, named)
         values = [v for _, value in named.values() for v in (value if isinstance(value, list) else [value])]
         device = values[0].device if values else torch.device("cpu")
@@ -299,7 +304,7 @@ class SampleTransform(nn.Module):
         camera = [on_device(one, device) for one in camera] if many else on_device(alone(camera), device)
         return named, batched, count, camera
 
-    def _check_cameras(self, camera, count: int, named: Mapping) -> None:
+    def _check_cameras(self, camera: object, count: int, named: Named) -> None:
         cameras = list(camera) if isinstance(camera, (list, tuple)) else [camera]
         if not cameras:
             raise ValueError(f"{self._name}: an empty list of cameras; no samples have one camera, too")
@@ -325,25 +330,26 @@ class SampleTransform(nn.Module):
                             f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
                         )
 
-    def _moved(self, sample: Sample, named: Mapping, batched: bool, change: Change) -> Sample:
+    def _moved(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
         """The sample after a change; `named` holds its fields as a batch."""
         moved = dict(sample)
         options = {"mask_fill": self.mask_fill}
 
-        def put(name: str, value) -> None:
+        def put(name: str, value: Tensor | list[Tensor]) -> None:
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
 
         for name, (found, value) in named.items():
             if isinstance(value, list):
-                results = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
-                result, valid = ([r[j] for r in results] for j in (0, 1))
-                put(name, [r.squeeze(0) for r in result])
-                valid = None if not valid or valid[0] is None else [v.squeeze(0) for v in valid]
+                pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
+                put(name, [result.squeeze(0) for result, _ in pairs])
+                flags = [valid.squeeze(0) for _, valid in pairs if valid is not None]
+                if flags:
+                    self._put_valid(put, sample, f"{name}_valid", flags, batched)
             else:
                 result, valid = self._one(change, found, value, options)
                 put(name, result)
-            if valid is not None:
-                self._put_valid(put, sample, f"{name}_valid", valid, batched)
+                if valid is not None:
+                    self._put_valid(put, sample, f"{name}_valid", valid, batched)
         before = sample.get("image_valid")
         if before is not None:
             before = torch.as_tensor(before) != 0
@@ -365,19 +371,21 @@ class SampleTransform(nn.Module):
         return moved
 
     @staticmethod
-    def _one(change: Change, found: str, value: Tensor, options: Mapping) -> tuple[Tensor, Tensor | None]:
+    def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
         result = moves(found, value)(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
         return result.to(value.dtype) if value.is_floating_point() else result, valid
 
-    def _put_valid(self, put: Callable, sample: Sample, name: str, valid, batched: bool) -> None:
+    def _put_valid(
+        self, put: Callable[[str, Any], None], sample: Sample, name: str, valid: Tensor | list[Tensor], batched: bool
+    ) -> None:
         """Put the validity of a field, which stays invalid where it was; any number but zero is valid, as in COCO."""
-        before = sample.get(name)
-        if before is not None:
+        given = sample.get(name)
+        if given is not None:
             many = isinstance(valid, list)
-            before = [torch.as_tensor(b) != 0 for b in (before if many else [before])]
-            now = valid if many else [valid if batched else valid.squeeze(0)]
+            before = [torch.as_tensor(b) != 0 for b in (given if many else [given])]
+            now = valid if isinstance(valid, list) else [valid if batched else valid.squeeze(0)]
             if [b.shape for b in before] != [v.shape for v in now]:
                 shapes = ", ".join(str(tuple(v.shape)) for v in now)
                 raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")

@@ -33,10 +33,10 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
 
 _OWNER = "torchvision.Transform"
 # since torchvision 0.23
-_KEYPOINTS = (tv_tensors.KeyPoints,) if hasattr(tv_tensors, "KeyPoints") else ()
+_PLACES: Any = (tv_tensors.BoundingBoxes, *([tv_tensors.KeyPoints] if hasattr(tv_tensors, "KeyPoints") else []))
 
 
-class Transform(v2.Transform):
+class Transform(v2.Transform):  # type: ignore[misc]
     """A transform of v2: one draw for all that a sample holds, a dict or any other nest.
 
     * `Image` (..., C, H, W), `Video` (..., T, C, H, W), PIL images, and by v2's rule the first plain tensor
@@ -136,7 +136,7 @@ class Transform(v2.Transform):
         if isinstance(inpt, Camera):
             return camera
         plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
-        if isinstance(inpt, (*_KEYPOINTS, tv_tensors.BoundingBoxes)):
+        if isinstance(inpt, _PLACES):
             of_boxes = isinstance(inpt, tv_tensors.BoundingBoxes)
             moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else _points(change, plain)
             if change.parts[0].warp is None:
@@ -174,7 +174,7 @@ def _size(inpt: Any) -> tuple[int, int] | None:
     """(height, width) of the image that an input is, or lies on."""
     if isinstance(inpt, PIL.Image.Image):
         return inpt.size[::-1]
-    if isinstance(inpt, (*_KEYPOINTS, tv_tensors.BoundingBoxes)):
+    if isinstance(inpt, _PLACES):
         return tuple(inpt.canvas_size)
     if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video, tv_tensors.Mask)):
         return tuple(inpt.shape[-2:])
