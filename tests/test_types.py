@@ -17,6 +17,7 @@ import torch
 
 import camtorch as ct
 
+images = torch.rand(1, 3, 480, 640)
 camera = ct.KannalaBrandt([300.0, 300, 320, 240], torch.zeros(4), image_size=(480, 640))
 assert_type(camera, ct.KannalaBrandt)
 assert_type(camera.crop(0, 0, 100, 100), ct.KannalaBrandt)
@@ -25,6 +26,8 @@ assert_type(camera.convert(ct.Fisheye624), ct.Conversion[ct.Fisheye624])
 assert_type(camera.convert(ct.Fisheye624, max_angle=1.0).camera, ct.Fisheye624)
 assert_type(camera.convert("fisheye624").camera, ct.Camera)
 assert_type(camera.convert(ct.Pinhole).rms, torch.Tensor)
+assert_type(ct.Dewarp(camera, projection="cylindrical")(images), torch.Tensor)
+assert_type(ct.Warp(camera, camera).inverse()(images, mode="nearest"), torch.Tensor)
 """
 
 
@@ -47,7 +50,9 @@ def test_what_users_get_has_types(tmp_path):
 def test_a_wrong_use_is_found(tmp_path):
     other = "other: ct.Pinhole = camera.convert(ct.Fisheye624).camera\n"
     text = 'camera.convert(ct.Fisheye624, count="many")\n'
-    found = checked(tmp_path, USE + other + text)
+    projection = 'ct.Dewarp(camera, projection="flat")\n'
+    found = checked(tmp_path, USE + other + text + projection)
     assert 'expression has type "Fisheye624", variable has type "Pinhole"' in found
     assert 'No overload variant of "convert"' in found
-    assert "Found 2 errors" in found
+    assert 'to "Dewarp" has incompatible type' in found
+    assert "Found 3 errors" in found

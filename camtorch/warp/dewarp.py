@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -10,12 +11,16 @@ from torch import Tensor, nn
 from camtorch._arguments import as_image_size
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
+from camtorch.projection.rays import image_lattice
 from camtorch.rotations import as_rotation, turn
+from camtorch.warp.sampling import Fill, Mode, PaddingMode
 from camtorch.warp.warp import Warp, as_sized
+
+Projection = Literal["perspective", "cylindrical", "equirectangular"]
 
 _WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold
 # projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for
-_PROJECTIONS = {
+_PROJECTIONS: dict[str, tuple[type[Pinhole | Cylindrical | Equirectangular], float, float]] = {
     "perspective": (Pinhole, _WIDEST_PERSPECTIVE, _WIDEST_PERSPECTIVE),
     "cylindrical": (Cylindrical, 2 * math.pi, 2 * math.tan(math.radians(50))),
     "equirectangular": (Equirectangular, 2 * math.pi, math.pi),
@@ -34,7 +39,7 @@ class Dewarp(Warp):
             what the image's middle row and column show, and never more than 120 degrees in perspective.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
-        options: mode, padding_mode, fill, antialias and tolerance of `Warp`.
+        mode, padding_mode, fill, antialias, tolerance: as `Warp` takes them.
 
     The target has square pixels, is chosen once, and does not learn. It is finite for every camera, also where the
     lens folds inside the image or sees past 90 degrees.
@@ -47,11 +52,15 @@ class Dewarp(Warp):
         self,
         camera: Camera,
         *,
-        projection: str = "perspective",
+        projection: Projection = "perspective",
         fov: float | None = None,
         image_size: tuple[int, int] | None = None,
         rotation: Tensor | None = None,
-        **options,
+        mode: Mode = "bilinear",
+        padding_mode: PaddingMode = "zeros",
+        fill: Fill = 0.0,
+        antialias: bool = False,
+        tolerance: float = 0.0,
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
@@ -68,7 +77,16 @@ class Dewarp(Warp):
             else:
                 intrinsics = _fitted(camera, projection, size, rotation)
         target = model(nn.Parameter(intrinsics, requires_grad=False), image_size=size)
-        super().__init__(camera, target, rotation, **options)
+        super().__init__(
+            camera,
+            target,
+            rotation,
+            mode=mode,
+            padding_mode=padding_mode,
+            fill=fill,
+            antialias=antialias,
+            tolerance=tolerance,
+        )
 
 
 def _plane_width(projection: str, fov: float) -> float:
@@ -87,18 +105,14 @@ def _plane_width(projection: str, fov: float) -> float:
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:
     """(*B, 4): the target that shows what the middle row and column of the camera's image show."""
     model, widest, tallest = _PROJECTIONS[projection]
-    height, width = camera.image_size
-    like = {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}
-    across = torch.linspace(-0.5, width - 0.5, _LINE_SAMPLES, **like)
-    down = torch.linspace(-0.5, height - 0.5, _LINE_SAMPLES, **like)
-    row = torch.stack((across, torch.full_like(across, (height - 1) / 2)), -1)
-    column = torch.stack((torch.full_like(down, (width - 1) / 2), down), -1)
+    row = image_lattice(camera, 3, _LINE_SAMPLES)[1]
+    column = image_lattice(camera, _LINE_SAMPLES, 3)[:, 1]
     pixels = torch.cat((row, column)).expand(*camera.batch_shape, -1, -1)
     rays, has_ray = camera.unproject(pixels)
     if rotation is not None:
         while rays.ndim - 2 < rotation.ndim - 2:
             rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-    plane, shown = model(torch.tensor([1.0, 1.0, 0.0, 0.0], **like)).project(turn(rotation, rays, "rays"))
+    plane, shown = model(camera.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0])).project(turn(rotation, rays, "rays"))
     shown = (shown & has_ray).unsqueeze(-1)
     limit = plane.new_tensor([widest, tallest]) / 2
     plane = torch.maximum(torch.minimum(plane, limit), -limit)

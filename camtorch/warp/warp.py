@@ -296,7 +296,8 @@ class Warp(GeometryModule):
             around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
         where = self._with_scale(*tabulate(self.source, self.target, self.rotation, self.tolerance, around))
         here = slice(rows.start - around.start, rows.stop - around.start)
-        return Sampling(*(t if t is None else t[:, here] for t in where))
+        scale = None if where.scale is None else where.scale[:, here]
+        return Sampling(where.grid[:, here], where.mapped[:, here], scale)
 
     def _rows(self, count: int | None) -> Iterator[range]:
         height, width = self.target._size("Warp")
