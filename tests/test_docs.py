@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import camtorch as ct
@@ -36,6 +37,7 @@ def commands():
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """The current folder, with the files that the pages speak of."""
+    torch.manual_seed(0)
     monkeypatch.chdir(tmp_path)
     shutil.copy(FILES / "opencv_fisheye.yml", "camera.yml")
     shutil.copy(FILES / "kalibr_camchain.yaml", "camchain.yaml")
