@@ -12,6 +12,7 @@ from camtorch._drawing import BOX, GAZE, POINT
 from camtorch.cli import labelled_image, labels, sheet
 from camtorch.cli.main import main
 from camtorch.demo import example
+from camtorch.rotations import mount_rotation
 
 CAMERA = (
     "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
@@ -96,6 +97,35 @@ def test_options_reach_the_cameras(folder, capsys):
     line = capsys.readouterr().out.splitlines()[0]
     assert "yaw +12.0 degrees, pitch +0.0 degrees, roll -5.0 degrees, surround190" in line
     assert 85 < float(line.split("surround190, ")[1].split()[0]) < 115
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (12, -7, 30), (-70, 60, -150), (170, 5, 90)])
+def test_captions_tell_the_mount(angles):
+    rotation = mount_rotation(*torch.tensor(angles, dtype=torch.float64))
+    assert labelled_image._mount_angles(rotation) == pytest.approx(angles, abs=1e-9)
+
+
+def test_mostly_empty_images_are_said_and_mended(folder, capsys):
+    narrow = "image_width: 96\nimage_height: 64\nK: [96, 0, 47.5, 0, 96, 31.5, 0, 0, 1]"
+    Path("narrow.yml").write_text(narrow)
+    words = ["in.png", "--camera", "narrow.yml", "--preset", "dms130", "-n", 4, "--force"]
+
+    def filled(*options):
+        augment(*words, *options)
+        told = capsys.readouterr()
+        return [float(line.split(" % filled")[0].split()[-1]) for line in told.out.splitlines()[:-1]], told.err
+
+    found, error = filled()
+    assert max(found) < 50
+    assert "of the new images shows nothing" in error
+    assert "--min-filled 0.9" in error
+    assert error.count("\n") == 1
+    found, error = filled("--min-filled", 0.9)
+    assert min(found) >= 89
+    assert error == ""
+    found, error = filled("--fov", "source", "--yaw", 0, "--pitch", 0, "--roll", 0)
+    assert min(found) > 85
+    assert error == ""
 
 
 def test_the_list_of_presets(folder, capsys):
@@ -194,6 +224,8 @@ def test_columns_leave_little_empty():
         (["-n", "many"], "argument -n: invalid int value"),
         (["--seed", "-1"], "--seed must be 0 or more"),
         (["--seed", str(1 << 64)], "--seed must be 0 or more"),
+        (["--min-filled", "90"], "--min-filled must be 0 to 1; got 90"),
+        (["--fov", "sources"], "--fov: 'sources' is neither a number nor LOW,HIGH"),
         (["--size", "8"], "'8' is not WIDTHxHEIGHT"),
         (["--yaw", "left"], "--yaw: 'left' is neither a number nor LOW,HIGH"),
         (["--yaw", "1,2,3"], "--yaw: '1,2,3' is neither"),

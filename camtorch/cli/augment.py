@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from camtorch.cli.demo import GET_IT, installed
-from camtorch.cli.options import add_output, add_photograph, parse_path, parse_range, parse_size
+from camtorch.cli.options import add_output, add_photograph, parse_fov, parse_path, parse_range, parse_size
 from camtorch.cli.terminal import note
 
 if TYPE_CHECKING:
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from camtorch.cli.options import Commands
 
 _MOST_IMAGES = 100
+_MUCH = 1 / 3  # of the new images
 
 
 def add(commands: Commands) -> None:
@@ -39,8 +40,26 @@ def add(commands: Commands) -> None:
     command.add_argument("-n", type=int, default=8, metavar="COUNT", help="how many other cameras; 8 by default")
     command.add_argument("--seed", type=int, default=0, help="of what is drawn; 0 by default")
     command.add_argument("--size", type=parse_size, metavar="WxH", help="of the new images; by default the old one's")
-    for name in ("yaw", "pitch", "roll", "zoom", "fov"):
-        command.add_argument(f"--{name}", type=parse_range, metavar="RANGE", help="see camtorch.augment.RandomCamera")
+    for name, text in (
+        ("yaw", "degrees by which the camera turns to its right"),
+        ("pitch", "degrees by which it then looks up"),
+        ("roll", "degrees by which it then leans to its right"),
+        ("zoom", "factor on the focal lengths"),
+    ):
+        command.add_argument(f"--{name}", type=parse_range, metavar="RANGE", help=text)
+    command.add_argument(
+        "--fov",
+        type=parse_fov,
+        metavar="RANGE",
+        help="horizontal field of view in degrees; or source: as much of the lens's as the image fills",
+    )
+    command.add_argument(
+        "--min-filled",
+        type=float,
+        default=0.0,
+        metavar="PART",
+        help="of each new image that has to show something, 0 to 1: it zooms until it does; 0 by default",
+    )
     add_photograph(command)
     add_output(command, "augment.png", "the sheet")
 
@@ -57,6 +76,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"-n must be 1 to {_MOST_IMAGES}; got {arguments.n}")
     if not 0 <= arguments.seed < 1 << 63:
         raise ValueError(f"--seed must be 0 or more, and below 2 to the 63rd; got {arguments.seed}")
+    if not 0 <= arguments.min_filled <= 1:
+        raise ValueError(f"--min-filled must be 0 to 1; got {arguments.min_filled:g}")
     needs = {"camera": ("model", "name"), "image": ("labels", "rescale")}
     for needed, names in needs.items():
         idle = [name for name in names if getattr(arguments, needed) is None and getattr(arguments, name)]
@@ -68,9 +89,17 @@ def run(arguments: argparse.Namespace) -> None:
     ranges = {name: getattr(arguments, name) for name in ("yaw", "pitch", "roll", "zoom", "fov")}
     ranges = {name: value for name, value in ranges.items() if value is not None}
     shown = [before]
-    for new in labelled_image.augmented(before, lens, arguments.n, arguments.seed, arguments.size, **ranges):
+    for new in labelled_image.augmented(
+        before, lens, arguments.n, arguments.seed, arguments.size, arguments.min_filled, **ranges
+    ):
         print(new.note, flush=True)
         shown.append(new)
+    empty = 1 - sum(new.filled for new in shown[1:]) / arguments.n
+    if empty > _MUCH and not arguments.min_filled:
+        note(
+            f"{100 * empty:.0f} % of the new images shows nothing, as the camera of the image does not see so far; "
+            "--fov source or --min-filled 0.9 takes less of that"
+        )
     title = f"One image, {sheet.counted(arguments.n, 'other camera')}"
     images.write(arguments.output, sheet.drawing(shown, title, labelled_image.origin(lens, before)))
     print(f"{arguments.output}: the image before, and as each of them sees it, with what became of the labels")

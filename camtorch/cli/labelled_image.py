@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from camtorch.augment import PRESETS, RandomCamera
+from camtorch.augment import PRESETS, RandomCamera, mount_rotation
 from camtorch.camera import Camera
 from camtorch.cli.labels import Labels
 
@@ -35,6 +35,8 @@ class LabelledImage:
     keypoints_valid: Tensor
     """(N,) bool; likewise the boxes'."""
     boxes_valid: Tensor
+    filled: float = 1.0
+    """The part of the image that shows something."""
     note: str = ""
     """The caption, and more, in one line."""
 
@@ -85,7 +87,13 @@ def _before(image: Tensor, camera: Camera, labels: Labels, title: str) -> Labell
 
 @torch.no_grad()
 def augmented(
-    before: LabelledImage, like: str | None, count: int, seed: int, size: tuple[int, int] | None = None, **ranges: Any
+    before: LabelledImage,
+    like: str | None,
+    count: int,
+    seed: int,
+    size: tuple[int, int] | None = None,
+    min_filled: float = 0.0,
+    **ranges: Any,
 ) -> Iterator[LabelledImage]:
     """What `count` random cameras make of an image.
 
@@ -96,7 +104,8 @@ def augmented(
         seed: of the draws; the first ones are the same for every count.
         size: (height, width) of the new images; by default that of the old one. They are scaled to fit `NEW_SIZE`
             and show the same.
-        ranges: of `RandomCamera`.
+        min_filled: of `RandomCamera`; likewise `ranges`.
+        ranges: its other ones.
     """
     height, width = size or (before.camera.height, before.camera.width)
     scale = min(NEW_SIZE[1] / width, NEW_SIZE[0] / height)
@@ -108,7 +117,7 @@ def augmented(
         antialias=True,
         fill=NOTHING,
         valid_mask=True,
-        min_filled=0.0,  # the notes say how much is filled
+        min_filled=min_filled,
         **ranges,
     )
     labels = before.labels
@@ -126,17 +135,21 @@ def augmented(
             draw=draw,
         )
         camera, valid = moved["camera"], (moved["keypoints_valid"], moved["boxes_valid"])
-        angles = [f"{name} {float(draw[name]):+.1f}°" for name in ("yaw", "pitch", "roll")]
-        filled = 100 * float(moved["image_valid"].double().mean())
+        turn = zip(("yaw", "pitch", "roll"), _mount_angles(moved["rotation"]), strict=True)
+        # a sum with zero has no negative one
+        angles = [f"{name} {round(angle, 1) + 0.0:+.1f}°" for name, angle in turn]
+        filled = float(moved["image_valid"].double().mean())
         lens = f"{like or camera.key}, {_degrees(camera):.0f}° wide"
         inside = [f"{int(v.sum())} of {len(v)} {n}" for n, v in zip(("points", "boxes"), valid, strict=True) if len(v)]
+        told = [*angles, lens, f"{100 * filled:.0f} % filled", *inside]
         yield LabelledImage(
             moved["image"],
             camera,
             Labels(moved["keypoints"], moved["boxes"], moved["points"], moved["gaze"]),
-            ["   ".join(angles), f"{lens}, {filled:.0f} % filled"],
+            ["   ".join(angles), f"{lens}, {100 * filled:.0f} % filled"],
             *valid,
-            note=f"{i + 1:3}: {', '.join([*angles, lens, f'{filled:.0f} % filled', *inside])}".replace("°", " degrees"),
+            filled=filled,
+            note=f"{i + 1:3}: {', '.join(told)}".replace("°", " degrees"),
         )
 
 
@@ -164,6 +177,14 @@ def presets() -> Iterator[str]:
     for name, preset in PRESETS.items():
         height, width = preset.image_size
         yield f"{name:<12} {preset.model:<15} {f'{width}x{height}':<10} {preset.origin}"
+
+
+def _mount_angles(rotation: Tensor) -> tuple[float, float, float]:
+    """Yaw, pitch and roll in degrees, of which `mount_rotation` makes this rotation."""
+    x, y, z = rotation[2].double().tolist()  # where the new camera looks, in the old one's frame
+    yaw, pitch = math.degrees(math.atan2(x, z)), math.degrees(math.atan2(-y, math.hypot(x, z)))
+    rest = rotation.double() @ mount_rotation(*torch.tensor([yaw, pitch, 0.0], dtype=torch.float64)).mT
+    return yaw, pitch, math.degrees(math.atan2(float(rest[0, 1]), float(rest[0, 0])))
 
 
 def _degrees(camera: Camera) -> float:

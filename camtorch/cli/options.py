@@ -41,6 +41,11 @@ def parse_range(text: str) -> float | tuple[float, float]:
     return (numbers[0], numbers[1]) if len(numbers) == 2 else numbers[0]
 
 
+def parse_fov(text: str) -> float | tuple[float, float] | str:
+    """A range, or the word "source"."""
+    return text if text == "source" else parse_range(text)
+
+
 def add_photograph(command: argparse.ArgumentParser) -> None:
     """The calibration of an image."""
     command.add_argument("--camera", type=parse_path, metavar="FILE", help="its calibration, of any format")
