@@ -57,7 +57,7 @@ def parse(record: Record) -> Rig:
     return Rig(cameras, extrinsics)
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file that projectaria_tools reads."""
     lossy = Lossy(path, NAMES.title)
     entries = []

@@ -59,7 +59,7 @@ def parse(record: Record) -> Rig:
     return Rig(cameras, extrinsics)
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file; the cameras lose their names, and the IMU is Basalt's default."""
     lossy = Lossy(path, NAMES.title)
     placed, models, sizes = [], [], []
@@ -69,8 +69,8 @@ def render(rig: Rig, path) -> str:
         key = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
         intrinsics, distortion = lossy.numbers(name, camera)
         camera_type, names = next((kind, names) for kind, (k, names) in _MODELS.items() if k == key)
-        values = [*intrinsics, *lossy.at_most(name, camera, distortion, (len(names),))]
-        values = dict(zip((*_CORE, *names), values, strict=True))
+        numbers = [*intrinsics, *lossy.at_most(name, camera, distortion, (len(names),))]
+        values = dict(zip((*_CORE, *names), numbers, strict=True))
         if camera_type == "pinhole-radtan8":
             values["rpmax"] = 0.0
         models.append({"camera_type": camera_type, "intrinsics": values})

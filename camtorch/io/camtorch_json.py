@@ -104,7 +104,7 @@ def _flat(record: Record, depth: int) -> tuple[list[float], list[int]]:
     return [value for values, _ in parts for value in values], [len(parts), *(parts[0][1] if parts else [])]
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file. Numbers are float64, which holds those of a float32 camera exactly."""
     lossy = Lossy(path, NAMES.title)
     cameras, extrinsics = {}, {}

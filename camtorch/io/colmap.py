@@ -61,9 +61,10 @@ def read(path: str, content: bytes) -> Rig:
     """The cameras, called by their ids, and the poses of the images beside them, by the names of the images."""
     cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
     beside = _images_beside(path)
-    if beside is None or not os.path.exists(beside):
-        lost = None if beside is None else left_over(beside)
-        if lost is not None:
+    if beside is None:
+        return Rig(cameras)
+    if not os.path.exists(beside):
+        if (lost := left_over(beside)) is not None:
             Record(beside, None, "file").fail(f"missing; an interrupted save left {lost}: rename it, or delete it")
         return Rig(cameras)
     images = colmap_images.read(beside)

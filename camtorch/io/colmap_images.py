@@ -11,7 +11,7 @@ import numpy as np
 
 from camtorch.io import poses
 from camtorch.io.parsing import MOST_COMMENTS, check_ordinary
-from camtorch.io.record import Record
+from camtorch.io.record import Record, repeated
 from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 
@@ -54,12 +54,9 @@ def read(path: str) -> Images:
     check_ordinary(path)
     with open(path, "rb", buffering=1 << 16) as file:
         images = (_from_bytes if path.endswith(".bin") else _from_text)(path, file)
-    if len(set(images.names)) < len(images.names):
-        seen: set[str] = set()
-        for row, name in enumerate(images.names):
-            if name in seen:
-                images.record(row).fail(f"a second image is called {name!r:.60}")
-            seen.add(name)
+    if (twice := repeated(images.names)) is not None:
+        row = images.names.index(twice, images.names.index(twice) + 1)
+        images.record(row).fail(f"a second image is called {twice!r:.60}")
     finite = np.isfinite(images.values).all(1)
     if not finite.all():
         row = int(finite.argmin())

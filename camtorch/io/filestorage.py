@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from typing import Any, NoReturn
 from xml.parsers import expat
 
 from camtorch.io._errors import CameraFileError
+from camtorch.io.record import repeated
 from camtorch.io.writing import number
 
 Value = float | list[list[float]]
@@ -72,7 +74,7 @@ _MOST_VALUES = 1 << 17
 _MOST_ATTRIBUTES = 1 << 14
 
 
-def parse_storage(path, content: bytes) -> dict[str, Any]:
+def parse_storage(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
     """The keys of an XML file in UTF-8, as `camtorch.io.parsing.parse_mapping`.
 
     Raises:
@@ -99,8 +101,9 @@ def parse_storage(path, content: bytes) -> dict[str, Any]:
 class _Elements:
     """The open elements: name, whether a matrix, text so far, children."""
 
-    def __init__(self, path, parser):
-        self.path, self.parser, self.root = path, parser, None
+    def __init__(self, path: str | os.PathLike[str], parser: expat.XMLParserType):
+        self.path, self.parser = path, parser
+        self.root: Any = None
         self.open: list[tuple[str, list[str], list[tuple[str, Any]]]] = []
         self.count = 0
 
@@ -133,9 +136,7 @@ class _Elements:
         if not self.open or (children and set(names) != {"_"}):
             if words:
                 self.fail(f"text between the elements of <{name:.60}>")
-            if len(set(names)) < len(names):
-                seen = set()
-                twice = next(key for key in names if key in seen or seen.add(key))
+            if (twice := repeated(names)) is not None:
                 self.fail(f"the key {twice!r:.60} stands there twice")
             value: Any = dict(children)
         elif children or len(words) != 1 or name == "data":

@@ -77,7 +77,7 @@ def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
     return chain
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file; the cameras become cam0, cam1, ... in their order."""
     lossy = Lossy(path, NAMES.title)
     lossy.no_images(rig)

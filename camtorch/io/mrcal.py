@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
@@ -30,7 +31,7 @@ def parse(record: Record) -> Rig:
     key, count = _MODELS[one_of(name, _MODELS)]
     values = record["intrinsics"].numbers(4 + count)
     camera = record["intrinsics"].camera(key, values[:4], values[4:], record["imagersize"].size())
-    extrinsics = {}
+    extrinsics: dict[str, Extrinsics] = {}
     for place in ("rt_cam_ref", "extrinsics"):
         if place in record and not extrinsics:
             rt = record[place].numbers(6)
@@ -38,7 +39,7 @@ def parse(record: Record) -> Rig:
     return Rig({"camera": camera}, extrinsics)
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file."""
     lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -97,13 +98,12 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
         if size is None:
             merged["w"].fail("missing")
         return merged.camera(key, panorama(size), [], size)
-    fx, fy = _focal(merged, "x", "w"), _focal(merged, "y", "h")
-    if fx is None and fy is None:
+    focals = [focal for focal in (_focal(merged, "x", "w"), _focal(merged, "y", "h")) if focal is not None]
+    if not focals:
         merged["fl_x"].fail("missing")
-    fx, fy = fx or fy, fy or fx
     centre = [merged[c].number() if c in merged else merged[side].side() / 2 for c, side in (("cx", "w"), ("cy", "h"))]
     key, distortion = _distortion(merged, key)
-    return merged.camera(key, [fx, fy, centre[0] - 0.5, centre[1] - 0.5], distortion, size)
+    return merged.camera(key, [focals[0], focals[-1], centre[0] - 0.5, centre[1] - 0.5], distortion, size)
 
 
 def _equal(one: Record, other: Record) -> bool:
@@ -164,7 +164,7 @@ def panorama(size: tuple[int, int]) -> list[float]:
     return [width / (2 * math.pi), height / math.pi, width / 2 - 0.5, height / 2 - 0.5]
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file: one camera for all, or one for each frame."""
     lossy = Lossy(path, NAMES.title)
     written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
@@ -190,7 +190,7 @@ def render(rig: Rig, path) -> str:
 def _entries(lossy: Lossy, name: str, camera: Camera) -> dict:
     (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
     key = lossy.model(name, camera, set(_MODELS.values()))
-    entries = {"camera_model": next(model for model, k in _MODELS.items() if k == key)}
+    entries: dict[str, Any] = {"camera_model": next(model for model, k in _MODELS.items() if k == key)}
     if key == "equirectangular":
         size = lossy.size(name, camera)
         if [fx, fy, cx, cy] != panorama(size):

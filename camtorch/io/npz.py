@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import zipfile
 import zlib
 from typing import Any
@@ -16,7 +17,7 @@ _MOST_ARRAYS = 1000
 _LARGEST_ARRAY = 1 << 16  # bytes; that of a camera has 14 numbers
 
 
-def parse_archive(path, content: bytes) -> dict[str, Any]:
+def parse_archive(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
     """The keys of an archive, as `camtorch.io.parsing.parse_mapping`: arrays as lists, single numbers as text.
 
     Arrays that no camera has, large ones or those of objects, are None.

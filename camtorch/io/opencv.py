@@ -9,8 +9,6 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-import torch
-
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
@@ -101,7 +99,7 @@ class _File:
 
     def __init__(self, record: Record):
         self.record, self.path, self.keys = record, record.path, record.keys()
-        self.found: dict[re.Pattern, Any] = {}
+        self.found: dict[re.Pattern[str], Any] = {}
         self.check_that_none_is_left_over()
 
     def check_that_none_is_left_over(self) -> None:
@@ -116,41 +114,22 @@ class _File:
             self.fail(orphans[0], "looks like the distortion of a camera; there is none of this name")
 
     def camera(self, model: str | None, name: str | None) -> Camera:
-        key, distortion_key = self.keys_of_camera(name)
-        matrix = self.numbers(key)
-        if len(matrix) != 9:
-            self.fail(key, f"a camera matrix has 3 x 3 numbers, this has {len(matrix)}")
-        fx, skew, cx, below, fy, cy, *bottom = matrix
-        if skew:
-            self.fail(
-                f"{key}[1]", f"a skew of {skew:g}, which no model here has; write 0 there to ignore it as OpenCV does"
-            )
-        if below or bottom != [0, 0, 1]:
-            self.fail(key, "is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+        end, key, distortion_key = self.keys_of_camera(name)
+        core = self.record[key].core(self.numbers(key))
         distortion = self.numbers(distortion_key) if distortion_key else []
-        xi_key = self.by_name(_XI).get(_MATRIX.fullmatch(key)[1])
+        xi_key = self.by_name(_XI).get(end)
         if xi_key:  # cv2.omnidir
             xi = self.record[xi_key]
             distortion = [*(self.numbers(xi_key) if isinstance(xi.value, (dict, list)) else [xi.number()]), *distortion]
         fitting, place = (("mei",), xi_key) if xi_key else self.fitting()
         if place is not None and model is not None and model not in fitting:
             self.fail(place, f"says that the model is {fitting[0]}; do not name {model}, or correct the file")
-        kind = MODELS[model or ("mei" if xi_key else self.model(distortion, place))]
-        arguments = [torch.tensor([fx, fy, cx, cy], dtype=torch.float64)]
-        if distortion:
-            if kind.names_of(len(distortion)) is None or not kind.distortion_names:
-                place = distortion_key or xi_key
-                self.fail(place, f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
-            arguments.append(torch.tensor(distortion, dtype=torch.float64))
-        try:
-            return kind(*arguments, image_size=self.image_size())
-        except CameraFileError:
-            raise
-        except ValueError as error:
-            self.fail(key, error)
+        kind = model or ("mei" if xi_key else self.model(distortion, place))
+        lens = self.record[distortion_key or xi_key or key]
+        return self.record[key].camera(kind, core, distortion, self.image_size(), lens)
 
-    def keys_of_camera(self, name: str | None) -> tuple[str, str | None]:
-        """The keys of the camera's matrix and distortion, None where it has no distortion."""
+    def keys_of_camera(self, name: str | None) -> tuple[str, str, str | None]:
+        """The camera's name, and the keys of its matrix and distortion, None where it has no distortion."""
         matrices, distortions = self.by_name(_MATRIX), self.by_name(_DISTORTION)
         if not matrices:
             self.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
@@ -163,9 +142,9 @@ class _File:
         if name not in matrices:
             there = f"there are {sorted(matrices)}" if any(matrices) else "the only one has no name"
             self.fail(", ".join(matrices.values()), f"no camera is called {name!r:.60}; {there}")
-        return matrices[name], distortions.get(name)
+        return name, matrices[name], distortions.get(name)
 
-    def by_name(self, pattern: re.Pattern) -> dict[str, str]:
+    def by_name(self, pattern: re.Pattern[str]) -> dict[str, str]:
         if pattern in self.found:
             return self.found[pattern]
         named: dict[str, str] = {}
@@ -190,9 +169,9 @@ class _File:
 
     def model(self, distortion: list[float], flag: str | None) -> str:
         """The model where nobody names it; `flag` is the key of the flag of fisheyes."""
-        if self.find(_OTHER_LENS) is not None:
+        if (other := self.find(_OTHER_LENS)) is not None:
             self.fail(
-                self.find(_OTHER_LENS),
+                other,
                 "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
                 "or --model kannala_brandt",
             )
@@ -223,16 +202,15 @@ class _File:
         return poses.pose(self.record[translation_key], rotation, translation)
 
     def image_size(self) -> tuple[int, int] | None:
-        keys = self.find(_HEIGHT), self.find(_WIDTH)
-        if keys == (None, None):
+        height, width = self.find(_HEIGHT), self.find(_WIDTH)
+        if height is None and width is None:
             size = self.find(_SIZE)
             return None if size is None else self.record[size].size()
-        if None in keys:
-            self.fail("image_height" if keys[0] is None else "image_width", "missing, while the other side is given")
-        height, width = (self.record[key].side() for key in keys)
-        return height, width
+        if height is None or width is None:
+            self.fail("image_height" if height is None else "image_width", "missing, while the other side is given")
+        return self.record[height].side(), self.record[width].side()
 
-    def find(self, pattern: re.Pattern) -> str | None:
+    def find(self, pattern: re.Pattern[str]) -> str | None:
         if pattern not in self.found:
             self.found[pattern] = next(filter(pattern.fullmatch, self.keys), None)
         return self.found[pattern]
@@ -266,7 +244,7 @@ class _File:
 # -- writing
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file of one camera, or of several of which the second of two may have a pose."""
     lossy = Lossy(path, NAMES.title)
     lossy.no_images(rig)

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 from camtorch.io._errors import CameraFileError
 from camtorch.io.filestorage import parse_storage
 from camtorch.io.npz import parse_archive
+from camtorch.io.record import repeated
 
 LARGEST_FILE = 1 << 24
 _LARGEST_YAML = 1 << 22
@@ -35,7 +36,7 @@ _OTHERS = (
 )
 
 
-def read_bytes(path) -> bytes:
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """The content of a file that is not suspiciously large.
 
     Raises:
@@ -51,7 +52,7 @@ def read_bytes(path) -> bytes:
     return content
 
 
-def check_ordinary(path) -> None:
+def check_ordinary(path: str | os.PathLike[str]) -> None:
     """Refuse devices and pipes, which may have no end.
 
     Raises:
@@ -61,7 +62,7 @@ def check_ordinary(path) -> None:
         raise CameraFileError(path, "content", "no ordinary file")
 
 
-def decoded(path, content: bytes) -> str:
+def decoded(path: str | os.PathLike[str], content: bytes) -> str:
     """The text of a content.
 
     Raises:
@@ -74,7 +75,7 @@ def decoded(path, content: bytes) -> str:
         raise CameraFileError(path, f"byte {error.start}", reason) from None
 
 
-def read_mapping(path) -> dict[str, Any]:
+def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The keys of a file. Values are text, lists and mappings: numbers stay text until someone asks, but for JSON's.
 
     Raises:
@@ -84,7 +85,7 @@ def read_mapping(path) -> dict[str, Any]:
     return parse_mapping(path, read_bytes(path))
 
 
-def parse_mapping(path, content: bytes) -> dict[str, Any]:
+def parse_mapping(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
     """The keys of a content, as `read_mapping`; `path` is for the errors."""
     try:
         keys = parse_archive(path, content) if content.startswith(b"PK\3\4") else _from_text(path, content)
@@ -95,7 +96,7 @@ def parse_mapping(path, content: bytes) -> dict[str, Any]:
     return keys
 
 
-def _from_text(path, content: bytes) -> Any:
+def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
     text = decoded(path, content)
     first = next(re.finditer(r"\S", text), None)
     if _is_literal(text):
@@ -110,7 +111,7 @@ def _from_text(path, content: bytes) -> Any:
 # -- JSON
 
 
-def _from_json(path, text: str) -> Any:
+def _from_json(path: str | os.PathLike[str], text: str) -> Any:
     # in units of 32 bytes, what a number takes in memory
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
     if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_VALUE):
@@ -128,11 +129,7 @@ def _from_json(path, text: str) -> Any:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     keys = dict(pairs)
     if len(keys) < len(pairs):
-        names: set[str] = set()
-        for key, _ in pairs:
-            if key in names:
-                raise ValueError(f"the key {key!r:.60} stands there twice")
-            names.add(key)
+        raise ValueError(f"the key {repeated(key for key, _ in pairs)!r:.60} stands there twice")
     return keys
 
 
@@ -153,7 +150,7 @@ def _is_literal(text: str) -> bool:
     return re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)) is not None
 
 
-def _from_literal(path, text: str) -> Any:
+def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
     """Texts, numbers, lists, tuples and mappings."""
     position, comments, expected = 0, 0, "value"
     tree = Tree(path, lambda: f"line {text.count(chr(10), 0, position) + 1}")
@@ -198,7 +195,7 @@ def _from_literal(path, text: str) -> Any:
 # -- YAML
 
 
-def _from_yaml(path, text: str) -> Any:
+def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
     import yaml  # a fiftieth of a second: only when needed
 
     loader = getattr(yaml, "CSafeLoader", None)
@@ -266,7 +263,7 @@ class Tree:
         place: says where in it the parser is, for the errors.
     """
 
-    def __init__(self, path, place: Callable[[], str]):
+    def __init__(self, path: str | os.PathLike[str], place: Callable[[], str]):
         self.path, self.place = path, place
         self.root: Any = None
         self._open: list[list[Any]] = []  # container, key that waits for its value, anchor, how many values

@@ -101,8 +101,10 @@ def batch(rotation: np.ndarray, translation: np.ndarray, kind: str, values: np.n
 def written_rows(rig: Rig, kind: str) -> dict[str, Any]:
     """What a file said of the images that are rows of the rig's batch of poses, where they have not changed since."""
     poses = rig.extrinsics.batch
-    was_kind, values, then = (None, None, None) if poses is None else vars(poses).get(_KEPT_ROWS, (None, None, None))
-    if poses is None or was_kind != kind or len(values) != len(poses):
+    if poses is None or _KEPT_ROWS not in vars(poses):
+        return {}
+    was_kind, values, then = vars(poses)[_KEPT_ROWS]
+    if was_kind != kind or len(values) != len(poses):
         return {}
     rows, same = values.tolist(), (_both(poses) == then).all(1)
     places = ((name, rig.extrinsics.row(name)) for name in rig.extrinsics)

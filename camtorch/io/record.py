@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any, NoReturn
 
 import torch
@@ -27,7 +28,7 @@ class Record:
         place: where it stands.
     """
 
-    def __init__(self, path, value: Any, place: str = ""):
+    def __init__(self, path: str | os.PathLike[str], value: Any, place: str = ""):
         self.path, self.value, self.place = path, value, place
 
     def fail(self, reason: object) -> NoReturn:
@@ -133,13 +134,22 @@ class Record:
         if count > _MOST_CAMERAS:
             self.fail(f"{count} cameras; more than {_MOST_CAMERAS} are not read")
 
-    def camera(self, key: str, intrinsics: list[float], distortion: list[float], size) -> Camera:
-        """The camera of a model of `camtorch.MODELS`, in float64."""
+    def camera(
+        self,
+        key: str,
+        intrinsics: list[float],
+        distortion: list[float],
+        size: tuple[int, int] | None,
+        lens: Record | None = None,
+    ) -> Camera:
+        """The camera of a model of `camtorch.MODELS`, in float64; `lens` is where its distortion stands."""
         kind = self.model(key)
         arguments = [torch.tensor(intrinsics, dtype=torch.float64)]
         if distortion:
             if kind.names_of(len(distortion)) is None or not kind.names_of(len(distortion)):
-                self.fail(f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
+                (self if lens is None else lens).fail(
+                    f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}"
+                )
             arguments.append(torch.tensor(distortion, dtype=torch.float64))
         try:
             return kind(*arguments, image_size=size)
@@ -148,6 +158,18 @@ class Record:
         except (ValueError, TypeError) as error:
             self.fail(error)
 
+    def core(self, matrix: list[float]) -> list[float]:
+        """The focal lengths and principal point of a camera matrix of 3 x 3 numbers, which stands here."""
+        if len(matrix) != 9:
+            self.fail(f"a camera matrix has 3 x 3 numbers, this has {len(matrix)}")
+        fx, skew, cx, below, fy, cy, *bottom = matrix
+        if skew:
+            place = Record(self.path, None, f"{self.place}[1]")
+            place.fail(f"a skew of {skew:g}, which no model here has; write 0 there to ignore it as OpenCV does")
+        if below or bottom != [0, 0, 1]:
+            self.fail("is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+        return [fx, fy, cx, cy]
+
     def model(self, key: str) -> type[Camera]:
         """The model of that key."""
         if key not in MODELS:
@@ -155,7 +177,17 @@ class Record:
         return MODELS[key]
 
 
-def one_of(record: Record, names) -> str:
+def repeated(names: Iterable[str]) -> str | None:
+    """The first of the names that stands there a second time."""
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            return name
+        seen.add(name)
+    return None
+
+
+def one_of(record: Record, names: Collection[str]) -> str:
     """The text of a record, which must be one of the names."""
     if record.text() not in names:
         record.fail(f"{record.text()!r:.60} is not known here; known are {', '.join(sorted(filter(None, names)))}")

@@ -29,11 +29,7 @@ def parse(record: Record) -> Rig:
     name = record["camera_name"].text() if "camera_name" in record else "camera"
     width, height = (_either(record, f"image_{side}", side).side() for side in ("width", "height"))
     matrix = _either(record, "camera_matrix", "K", "k")
-    fx, skew, cx, below, fy, cy, *bottom = _numbers(matrix, 9)
-    if skew:
-        matrix.fail(f"a skew of {skew:g}, which no model here has; write 0 there to ignore it as OpenCV does")
-    if below or bottom != [0, 0, 1]:
-        matrix.fail("is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+    intrinsics = matrix.core(_numbers(matrix))
     key, counts = _MODELS[one_of(record["distortion_model"], _MODELS)]
     coefficients = _either(record, "distortion_coefficients", "D", "d")
     distortion = _numbers(coefficients)
@@ -44,7 +40,7 @@ def parse(record: Record) -> Rig:
     elif len(distortion) not in counts:
         takes = " or ".join(map(str, counts)) or "none"
         coefficients.fail(f"{len(distortion)} coefficients; {record['distortion_model'].value!r} takes {takes}")
-    camera = coefficients.camera(key, [fx, fy, cx, cy], distortion, (height, width))
+    camera = coefficients.camera(key, intrinsics, distortion, (height, width))
     return Rig({name or "camera": camera})
 
 
@@ -52,16 +48,16 @@ def _either(record: Record, *keys: str) -> Record:
     return record[next((key for key in keys if key in record), keys[0])]
 
 
-def _numbers(record: Record, count: int | None = None) -> list[float]:
+def _numbers(record: Record) -> list[float]:
     if isinstance(record.value, dict):
         rows, cols = (record[key].whole(0, 1000, "number of rows or columns") for key in ("rows", "cols"))
         if len(record["data"]) != rows * cols:
             record["data"].fail(f"{len(record['data'])} numbers, where rows and cols say {rows} x {cols}")
         record = record["data"]
-    return record.numbers(count)
+    return record.numbers()
 
 
-def render(rig: Rig, path) -> str:
+def render(rig: Rig, path: str) -> str:
     """The text of a file: R is the identity, and P is K."""
     lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)

@@ -134,7 +134,7 @@ _SURROGATES = re.compile(r"\\ud[89ab]..\\ud[c-f]..")  # which JSON writes, and Y
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
-def as_json(value) -> str:
+def as_json(value: object) -> str:
     """Indented JSON, lists of numbers in one line."""
     text = json.dumps(value, indent=2, allow_nan=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda match: re.sub(r"\s*\n\s*", " ", match[0]), text) + "\n"
@@ -151,7 +151,7 @@ class Lossy:
         format: what the errors call the format.
     """
 
-    def __init__(self, path, format: str):
+    def __init__(self, path: str, format: str):
         self.path, self.format = path, format
 
     def fail(self, name: str, reason: str) -> NoReturn:
