@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -74,7 +75,8 @@ class Camera(BatchedModule):
         TypeError: parameters that are not numbers, an image size that is not two integers.
     """
 
-    key: ClassVar[str]
+    key: ClassVar[str] = ""
+    """Under which `ct.MODELS` and files know the model; without one of its own a class cannot be saved."""
     default_count: ClassVar[int] = 0
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
@@ -105,9 +107,22 @@ class Camera(BatchedModule):
         super().__init_subclass__(**kwargs)
         if cls.__module__ == parametrize.__name__:  # the class of one parametrized camera is no model of its own
             return
+        for name in ("optics", "defined"):
+            if not isinstance(inspect.getattr_static(cls, name), staticmethod):
+                raise TypeError(
+                    f"{cls.__name__}: {name} must be a @staticmethod of the coefficients k alone; got a "
+                    f"{type(inspect.getattr_static(cls, name)).__name__}"
+                )
         cls._model = register_camera(cls)
-        if "key" in cls.__dict__:
-            MODELS[cls.key] = cls
+        if "key" not in cls.__dict__:
+            cls.key = ""
+            return
+        known = MODELS.get(cls.key)
+        # a class that is defined again, in a notebook, takes its own place
+        if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            owner = f"{known.__module__}.{known.__qualname__}"
+            raise ValueError(f"{cls.__name__}: the key {cls.key!r} is that of {owner}; choose another")
+        MODELS[cls.key] = cls
 
     _model: ClassVar[str]
 

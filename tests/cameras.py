@@ -54,13 +54,13 @@ RANGES = {
 
 # Real calibrations of models that no reference file is of: intrinsics, distortion, image size
 CALIBRATIONS = {
-    # KITTI-360, calibration/image_02.yaml
     # WoodScape, as its polynomial in pixels: 339.749, -31.988, 48.275, -7.201, and an offset of (3.942, -3.093)
     "woodscape": (
         (339.749, 339.749, 643.442, 479.407),
         (-31.988 / 339.749, 48.275 / 339.749, -7.201 / 339.749),
         (966, 1280),
     ),
+    # KITTI-360, calibration/image_02.yaml
     "mei": (
         (1336.3220825849971, 1335.7883350012958, 716.94323510126321, 705.76498308221585),
         (2.2134047507854890, 1.6798235660113681e-2, 1.6548773243373522, 4.2223943394772046e-4, 4.2462134260997584e-4),

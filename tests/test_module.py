@@ -406,15 +406,15 @@ def test_the_models_that_must_be_there():
 
 def test_a_model_is_one_class():
     """Defining a class with a key is all that a new model needs."""
-    from camtorch.optics.charts import Equidistant
-    from camtorch.optics.lens import Lens
+    from camtorch.optics import Equidistant, Lens
 
     try:
 
         class Spherical(ct.Camera):
             key = "spherical_of_this_test"
 
-            def optics(self, k):
+            @staticmethod
+            def optics(k):
                 return Equidistant(), Lens()
 
         camera = ct.MODELS["spherical_of_this_test"]([100.0, 100.0, 50.0, 40.0])

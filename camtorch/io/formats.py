@@ -129,6 +129,9 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
     path = _path(path, "save")
     if not rig.cameras:
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
+    for name, camera in rig.cameras.items():
+        if not camera.key:
+            raise TypeError(f"{path}: {name} is a {type(camera).__name__}, which has no key of its own to be loaded by")
     format = _known(format) or _format_of(rig, path)
     if os.path.isdir(path):
         inside = [os.path.join(path, name) for name in _NAMES[format].in_folder]

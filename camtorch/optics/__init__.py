@@ -12,7 +12,7 @@ from camtorch.optics.charts import (
     Perspective,
     SphereChart,
 )
-from camtorch.optics.lens import Lens, Planar, Tilt
+from camtorch.optics.lens import Lens, Planar, Stage, Tilt
 from camtorch.optics.radial import AnglePerRadius, Polynomial, RadialFactor, RadiusPolynomial, RadiusTable, Rational
 from camtorch.optics.unified import Unified
 
@@ -35,6 +35,7 @@ __all__ = [
     "RadiusTable",
     "Rational",
     "SphereChart",
+    "Stage",
     "Tilt",
     "Unified",
 ]

@@ -102,7 +102,12 @@ class Inverted(Chart):
         return at.vjp(ga, gb, want_parameters)
 
     def end(self, dtype):
-        return self._inverse.inner2.sqrt().to(dtype)
+        inverse = self._inverse
+        last = inverse.inner2.sqrt()
+        # beyond half a turn a ray is seen from the other side
+        most2 = (math.pi * (1 - 32 * torch.finfo(dtype).eps)) ** 2
+        turned = math.pi * inverse(inverse.most2.clamp(max=most2))
+        return torch.where(inverse.inner2 * inverse.radial(inverse.inner2) ** 2 > most2, turned, last).to(dtype)
 
     def radii(self, count, like):
         return even_steps_and_ratios(count, FURTHEST, FURTHEST, like, torch.positive)

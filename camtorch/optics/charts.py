@@ -6,12 +6,12 @@ points of its plane are the image of a ray; the camera hands it nothing else, so
 
 from __future__ import annotations
 
-import copy
 import math
 
 import torch
 from torch import Tensor
 
+from camtorch.optics.derivatives import vjp_of
 from camtorch.optics.special import angle_per_radius, cos_root, sinc_root, tanc_root
 
 Planes2 = tuple[Tensor, Tensor]
@@ -73,7 +73,7 @@ class Chart:
         self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
     ) -> tuple[Planes3, list[Tensor]]:
         """The cotangents of a covered ray and of the parameters, these summed over the rays, of that of its point."""
-        return self._pull(type(self).to_plane, (x, y, z), (ga, gb), want_parameters)
+        return vjp_of(self, _to_plane, (x, y, z), (ga, gb), want_parameters)
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         """Positive for the points of the plane that are the image of a ray."""
@@ -87,18 +87,7 @@ class Chart:
         self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
     ) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of a point on the plane and of the parameters, these summed, of the cotangent of its ray."""
-        return self._pull(type(self).to_ray, (a, b), (gx, gy, gz), want_parameters)
-
-    def _pull(self, formula, inputs: tuple[Tensor, ...], cotangents: tuple[Tensor, ...], want_parameters: bool):
-        """By autograd: for charts that leave their derivatives to it."""
-        with torch.enable_grad():
-            learning = copy.copy(self)
-            learning.parameters = tuple(w.detach().requires_grad_(want_parameters) for w in self.parameters)
-            leaves = [w.detach().requires_grad_() for w in inputs]
-            wanted = leaves + (list(learning.parameters) if want_parameters else [])
-            results = formula(learning, *leaves, order=1)
-            gradients = torch.autograd.grad(results, wanted, cotangents, materialize_grads=True)
-        return gradients[: len(inputs)], list(gradients[len(inputs) :])
+        return vjp_of(self, _to_ray, (a, b), (gx, gy, gz), want_parameters)
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
         """The radius on the plane at which the chart ends, one or (C, 1). Only charts that a lens follows need it."""
@@ -114,6 +103,14 @@ class Chart:
         Half of them in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree.
         """
         raise NotImplementedError
+
+
+def _to_plane(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> Planes2:
+    return chart.to_plane(x, y, z, order=1)
+
+
+def _to_ray(chart: Chart, a: Tensor, b: Tensor) -> Planes3:
+    return chart.to_ray(a, b, order=1)
 
 
 def even_steps_and_ratios(count: int, steps_to: float, end: float, like: Tensor, bend) -> Tensor:

@@ -14,17 +14,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from camtorch.optics.derivatives import jacobian_of, vjp_of
 from camtorch.optics.radial import RadialFactor, total
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
 Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
 
-
-def _orientation(jacobian: Jacobian) -> Tensor:
-    ua, ub, va, vb = jacobian
-    # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
-    return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
+_DIRECTIONS = 64  # in which a stage is looked at that states no bounds
 
 
 def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes3:
@@ -39,8 +36,100 @@ def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes3:
     return da * reciprocal, db * reciprocal, reciprocal
 
 
+class Stage:
+    """A planar map (a, b) -> (u, v) that is regular at the centre. A new one states its formula, `__call__`.
+
+    All else has defaults, by autograd or from samples, which a stage that is to be fast replaces by its own.
+    """
+
+    parameters: tuple[Tensor, ...] = ()
+    """What the formula learns: columns that broadcast against planes, in the order of their cotangents.
+
+    The formula reads them here, and nothing else that depends on the coefficients.
+    """
+    radial: RadialFactor | None = None
+    """What of a first stage is tabulated, to start the inverse from."""
+    is_radial = False
+    """Whether that is the whole stage."""
+
+    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
+        """Where points are sent."""
+        raise NotImplementedError
+
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> StageAt:
+        """The stage at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
+        return StageAt(self, a, b)
+
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """How regular the stage is on circles, and how far from the centre their points go.
+
+        Args:
+            radius: (*C, S) ascending.
+
+        Returns:
+            Positive where the orientation is certainly positive on the whole circle; an upper bound of the distances.
+            By default both are read off points of the circle, with what they may miss in between.
+        """
+        turn = torch.arange(_DIRECTIONS, dtype=radius.dtype, device=radius.device) * (2 * math.pi / _DIRECTIONS)
+        at = self.at(*((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn))))
+        shape = (radius.shape[-1], _DIRECTIONS)
+        orientation, distance = at.orientation.unflatten(-1, shape), torch.hypot(*at.value).unflatten(-1, shape)
+        least, furthest = orientation.amin(-1), distance.amax(-1)
+        missed = (orientation - orientation.roll(1, -1)).abs().amax(-1)
+        return least - missed / 2, furthest + (distance - distance.roll(1, -1)).abs().amax(-1) / 2
+
+    def start(self, u: Tensor, v: Tensor) -> Planes2:
+        """A point near the one that is sent to (u, v), where to start the search for it."""
+        a, b = u, v
+        for _ in range(2):
+            at = self.at(a, b)
+            x, y = at.value
+            da, db, _ = newton_step(at.jacobian, u - x, v - y)
+            a, b = a + da, b + db
+        return a, b
+
+
+class StageAt:
+    """A stage at points (a, b)."""
+
+    def __init__(self, stage: Stage, a: Tensor, b: Tensor):
+        self.stage, self.a, self.b = stage, a, b
+
+    @property
+    def value(self) -> Planes2:
+        """Where the points are sent."""
+        return self.stage(self.a, self.b)
+
+    @property
+    def jacobian(self) -> Jacobian:
+        """Graph-free."""
+        # each camera's own derivatives, also by points that all share
+        a, b, *_ = torch.broadcast_tensors(self.a, self.b, *self.stage.parameters)
+        return jacobian_of(self.stage, a, b)
+
+    @property
+    def orientation(self) -> Tensor:
+        """Positive where the map is defined, regular and not turned over."""
+        return _orientation(self.jacobian)
+
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
+        """The cotangents of the point and of the parameters, these summed over the points."""
+        point, sums = vjp_of(self.stage, _value, (self.a, self.b), (gu, gv), want_parameters)
+        return (point[0], point[1]), sums
+
+
+def _orientation(jacobian: Jacobian) -> Tensor:
+    ua, ub, va, vb = jacobian
+    # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
+    return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
+
+
+def _value(stage: Stage, a: Tensor, b: Tensor) -> Planes2:
+    return stage(a, b)
+
+
 @dataclass
-class Planar:
+class Planar(Stage):
     """m -> m R(t) + (p t + 2 m (p . m)) + (s0 t + s1 t^2, s2 t + s3 t^2), with t = |m|^2.
 
     radial: the factor R, or None for 1.
@@ -88,7 +177,7 @@ class Planar:
         return 2 * u - x, 2 * v - y
 
 
-class PlanarAt:
+class PlanarAt(StageAt):
     """A `Planar` stage at points m = (a, b)."""
 
     def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
@@ -178,14 +267,12 @@ class PlanarAt:
         return point, sums
 
 
-class Tilt:
+class Tilt(Stage):
     """The homography of a sensor tilted by (tau_x, tau_y) radians.
 
     Source: OpenCV `computeTiltProjectionMatrix`: the plane point is turned by R = R_y(tau_y) R_x(tau_x) and
     projected back along the optical axis. It fixes the origin; OpenCV's R_x, R_y turn clockwise.
     """
-
-    is_radial = False
 
     def __init__(self, tau_x: Tensor, tau_y: Tensor):
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
@@ -215,7 +302,7 @@ class Tilt:
         return (r00 * x + r10 * y + r20) * reciprocal, (r01 * x + r11 * y + r21) * reciprocal
 
 
-class TiltAt:
+class TiltAt(StageAt):
     """A `Tilt` stage at points."""
 
     def __init__(self, stage: Tilt, a: Tensor, b: Tensor):
@@ -261,11 +348,11 @@ class TiltAt:
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
-    def __init__(self, *stages: Planar | Tilt):
+    def __init__(self, *stages: Stage):
         self.stages = stages
         self.is_radial = len(stages) == 1 and stages[0].is_radial
         """Whether the lens is a single radial factor: then its inverse is a matter of one variable."""
-        self.radial: RadialFactor | None = getattr(stages[0], "radial", None) if stages else None
+        self.radial = stages[0].radial if stages else None
         """The radial factor of the first stage, if it has one."""
 
     @property
@@ -291,8 +378,8 @@ class Lens:
         return torch.stack(torch.broadcast_tensors(*bounds)).amin(0)
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """Back from (u, v), nearly, to the stage that has the radial factor."""
-        for stage in reversed(self.stages[1:]):
+        """Back from (u, v), nearly, to the stage that has a radial factor, or through all of them."""
+        for stage in reversed(self.stages if self.radial is None else self.stages[1:]):
             u, v = stage.start(u, v)
         return u, v
 
@@ -300,8 +387,8 @@ class Lens:
 class LensAt:
     """A chain of stages at points."""
 
-    def __init__(self, stages: Sequence[Planar | Tilt], a: Tensor, b: Tensor, order: int, t: Tensor | None):
-        self.stages: list[PlanarAt | TiltAt] = []
+    def __init__(self, stages: Sequence[Stage], a: Tensor, b: Tensor, order: int, t: Tensor | None):
+        self.stages: list[StageAt] = []
         self.value = a, b
         for stage in stages:
             here = stage.at(*self.value, order, None if self.stages else t)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
 from camtorch._tracing import register
+from camtorch.optics.derivatives import derivatives_of, vjp_of
 from camtorch.optics.special import angle_per_radius, root
 
 FACTORS: dict[str, type[RadialFactor]] = {}
@@ -36,17 +37,21 @@ class RadialFactor:
         super().__init_subclass__(**kwargs)
         cls.name = register(FACTORS, cls)
 
+    def __init__(self, coefficients: Sequence[Tensor]):
+        self.parameters = tuple(coefficients)
+
     def __call__(self, t: Tensor) -> Tensor:
-        """The factor itself."""
+        """The factor itself: all that a new one has to state."""
         raise NotImplementedError
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
         """R and its first `order` derivatives by t, up to two."""
-        raise NotImplementedError
+        # each camera's own derivatives, also by points that all share
+        return derivatives_of(self, torch.broadcast_tensors(t, *self.parameters)[0], order)
 
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each parameter c."""
-        raise NotImplementedError
+        return vjp_of(self, lambda factor, t: factor(t), (t,), (weight,), True)[1]
 
     def margin(self, t: Tensor) -> Tensor | None:
         """Positive where the factor is defined; None where it is so everywhere."""
@@ -68,9 +73,6 @@ class RadialFactor:
 
 class Polynomial(RadialFactor):
     """The radial factor R(t) = 1 + c0 t + c1 t^2 + ... of t = radius^2; radius R(t) is the distorted radius."""
-
-    def __init__(self, coefficients: Sequence[Tensor]):
-        self.parameters = tuple(coefficients)
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]

@@ -1,0 +1,93 @@
+"""Derivatives by autograd, for charts, stages and radial factors that state their formula only."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from camtorch._tracing import is_concrete
+
+
+def vjp_of(
+    part: Any,
+    formula: Callable[..., Tensor | tuple[Tensor, ...]],
+    inputs: Sequence[Tensor],
+    cotangents: Sequence[Tensor],
+    want_parameters: bool,
+) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    """The cotangents of planes and of the parameters of a chart, a stage or a factor, these summed over the points.
+
+    Args:
+        part: it reads what it learns from its `parameters` alone.
+        formula: called with a copy of the part and the planes.
+        inputs: the planes.
+        cotangents: of what the formula returns.
+        want_parameters: whether theirs are asked for.
+    """
+    with _recorded():
+        learning = copy.copy(part)
+        learning.parameters = tuple(w.detach().requires_grad_(want_parameters) for w in part.parameters)
+        leaves = [w.detach().requires_grad_() for w in inputs]
+        wanted = leaves + (list(learning.parameters) if want_parameters else [])
+        results = formula(learning, *leaves)
+        gradients = torch.autograd.grad(results, wanted, cotangents, materialize_grads=True)
+    return gradients[: len(leaves)], list(gradients[len(leaves) :])
+
+
+def jacobian_of(
+    formula: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], a: Tensor, b: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """du/da, du/db, dv/da, dv/db of a map (a, b) -> (u, v) of each point by itself. Graph-free."""
+    if not is_concrete(a):
+        one, zero = torch.ones_like(a), torch.zeros_like(a)
+        (ua, va), (ub, vb) = (torch.func.jvp(formula, (a, b), along)[1] for along in ((one, zero), (zero, one)))
+        return ua, ub, va, vb
+    # an operator's code may run where no transform works, so by reverse mode
+    with _recorded():
+        leaves = _leaf(a), _leaf(b)
+        u, v = formula(*leaves)
+        ua, ub = torch.autograd.grad(u.sum(), leaves, retain_graph=True, materialize_grads=True)
+        va, vb = torch.autograd.grad(v.sum(), leaves, materialize_grads=True)
+    return ua, ub, va, vb
+
+
+def derivatives_of(formula: Callable[[Tensor], Tensor], t: Tensor, order: int) -> tuple[Tensor, ...]:
+    """The value and the first `order` derivatives of a function of each number by itself; those are graph-free."""
+    if order == 0:
+        return (formula(t),)
+    if not is_concrete(t):
+
+        def slope(of: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+            return lambda t: torch.func.jvp(of, (t,), (torch.ones_like(t),))[1]
+
+        results = [formula(t)]
+        for _ in range(order):
+            formula = slope(formula)
+            results.append(formula(t))
+        return tuple(results)
+    with _recorded():
+        leaf = _leaf(t)
+        results = [formula(leaf)]
+        for _ in range(order):
+            results += torch.autograd.grad(results[-1].sum(), leaf, create_graph=True, materialize_grads=True)
+    return tuple([w.detach() for w in results])
+
+
+@contextmanager
+def _recorded() -> Iterator[None]:
+    """A graph for this derivative alone, whatever is recorded around it, and however that keeps its tensors."""
+    with (
+        torch.inference_mode(False),
+        torch.enable_grad(),
+        torch.autograd.graph.saved_tensors_hooks(lambda tensor: tensor, lambda tensor: tensor),
+    ):
+        yield
+
+
+def _leaf(plane: Tensor) -> Tensor:
+    return (plane.clone() if plane.is_inference() else plane.detach()).requires_grad_()
