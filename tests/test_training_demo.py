@@ -5,7 +5,7 @@ from PIL import Image
 
 from camtorch.cli.main import main
 from camtorch.demo import cabin, training, training_data
-from camtorch.demo.training_data import PLANNED, TEACHERS, Samples
+from camtorch.demo.training_data import PLANNED, TRAINING_SETS, Samples
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def seen() -> Samples:
 
 def learned_from(name: str, seen: Samples, seed: int = 1) -> Samples:
     torch.manual_seed(seed)
-    return training_data.teacher(name, *training_data.cameras())(seen, torch.Generator().manual_seed(seed))
+    return training_data.augmentation(name, *training_data.cameras())(seen, torch.Generator().manual_seed(seed))
 
 
 def test_labels_learned_from_are_where_their_cameras_see_them(seen):
@@ -58,7 +58,7 @@ def test_both_augmentations_turn_and_scale_alike(seen):
 def test_learning_lowers_the_loss(seen):
     torch.manual_seed(0)
     network = training.Network(seen.camera.image_size)
-    losses = training.learn(network, seen, lambda p, generator: p, 30, 12)
+    losses = training.train(network, seen, lambda p, generator: p, 30, 12)
     assert len(losses) == 30
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
 
@@ -77,8 +77,8 @@ def test_a_small_run_by_the_command_line(tmp_path, monkeypatch, capsys):
     for _ in range(2):
         assert main(["demo", "training", "-o", str(tmp_path / "training.png"), "--force"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert all(any(line.startswith(title) for line in lines) for title in TEACHERS.values())
-    assert [result.teacher for result in kept[0]] == list(TEACHERS)
+    assert all(any(line.startswith(title) for line in lines) for title in TRAINING_SETS.values())
+    assert [result.training_set for result in kept[0]] == list(TRAINING_SETS)
     for first, again in zip(*kept, strict=True):
         assert first.losses == again.losses
         assert bool(torch.isfinite(first.pixels).all())

@@ -1,4 +1,4 @@
-"""A driver in a car's cabin that exist as formulas, as a driver-monitoring camera on the dashboard sees them.
+"""Images of a driver in a car, as a driver-monitoring camera on the dashboard sees them: both are formulas.
 
 Convention: everything is in the camera's frame, x right, y down, z forward, in metres; the camera stands at the origin
 and looks along z at the driver, who sits about 0.65 m before it. Images are (B, 3, H, W) in [0, 1].
@@ -16,7 +16,7 @@ from camtorch.camera import Camera
 from camtorch.demo import driver, landmarks
 from camtorch.demo.driver import FRIENDLY, LOOKS
 from camtorch.demo.landmarks import LANDMARKS
-from camtorch.demo.sight import BACKGROUND, CLASSES, Scene, see
+from camtorch.demo.ray_tracing import BACKGROUND, CLASSES, Scene, trace
 
 __all__ = ["CLASSES", "LANDMARKS", "LOOKS", "Drivers", "random_drivers", "render", "render_classes"]
 
@@ -136,7 +136,7 @@ def _scan(rays: Tensor, scene: Scene, dots: Tensor | None, radius: float) -> tup
         index = torch.arange(start, min(start + _CHUNK, count * size))
         row = index // size
         ray = rays[row if len(rays) > 1 else 0, index % size]
-        colours.view(-1, 3)[index], kind = see(ray, turned.view(-1, 3)[index], row, scene)
+        colours.view(-1, 3)[index], kind = trace(ray, turned.view(-1, 3)[index], row, scene)
         classes.view(-1)[index] = kind.to(torch.uint8)
     for dot in () if dots is None else dots.unbind(1):
         toward = (dot / dot.norm(dim=-1, keepdim=True)).to(torch.float32)

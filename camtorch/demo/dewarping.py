@@ -1,4 +1,4 @@
-"""The demonstration: a room seen through five lenses, dewarped, and measured against what it should be."""
+"""The demo `camtorch demo`: a room seen through five lenses, dewarped, and measured against what it should be."""
 
 from __future__ import annotations
 

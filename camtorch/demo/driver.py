@@ -1,4 +1,4 @@
-"""The driver in `cabin`: a head and a body that exist as formulas.
+"""The shape of the driver in `cabin`: distances to head and body, as formulas.
 
 Convention: the head's frame has its origin midway between the two eyeballs' centres, x to the image's right when the
 head faces the camera (the person's left), y down, z into the head, in metres; all sizes below are in it. The body's

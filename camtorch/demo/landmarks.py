@@ -1,4 +1,4 @@
-"""Places with names on the driver in `cabin`; positions are in the frame of the head, see `driver`."""
+"""Landmarks of the face of the driver in `cabin`; positions are in the frame of the head, see `driver`."""
 
 from __future__ import annotations
 

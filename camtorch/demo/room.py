@@ -1,4 +1,4 @@
-"""A sunlit room that exists as formulas: every ray has a colour, every edge and corner a known place.
+"""Images of a sunlit room that is a formula: every ray has a colour, every edge and corner a known place.
 
 Convention: the room's frame is x right, y down, z forward, in metres; every camera stands at its origin.
 """

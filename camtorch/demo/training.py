@@ -1,7 +1,7 @@
-"""The demonstration of training: pinhole images teach a network that is to work behind a fisheye mounted elsewhere.
+"""The demo `camtorch demo training`: pinhole images teach a network that is to work behind a fisheye elsewhere.
 
 Four networks start from the same weights and take as many steps on as many images. They find landmarks of drivers'
-faces in the image, and where these are in space. What they learn from differs: see `TEACHERS`.
+faces in the image, and where these are in space. What they learn from differs: see `TRAINING_SETS`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from camtorch._drawing import GREY, MARGIN, MIDDLE, POINT, Marks, Sheet, shown
 from camtorch.demo import cabin
-from camtorch.demo.training_data import MOUNT, NAMES, TEACHERS, Augment, Samples, cameras, photograph, teacher
+from camtorch.demo.training_data import MOUNT, NAMES, TRAINING_SETS, Augment, Samples, augmentation, cameras, photograph
 
 _METRE = 40.0  # what a metre of error costs in the loss, where a pixel costs 1
 
@@ -30,7 +30,7 @@ _METRE = 40.0  # what a metre of error costs in the loss, where a pixel costs 1
 class Result:
     """What a network learned, and what it then finds in the test images."""
 
-    teacher: str
+    training_set: str
     training_images: Samples
     """A few of the images that it learned from."""
     test: Samples
@@ -80,7 +80,7 @@ def loss_of(found: tuple[Tensor, Tensor], p: Samples) -> Tensor:
     return (off * p.seen).sum() / p.seen.sum().clamp(min=1)
 
 
-def learn(
+def train(
     network: Network,
     images: Samples,
     augment: Augment,
@@ -110,7 +110,7 @@ def learn(
 
 
 @torch.no_grad()
-def examine(name: str, network: Network, training_images: Samples, test: Samples, losses: list[float]) -> Result:
+def evaluate(name: str, network: Network, training_images: Samples, test: Samples, losses: list[float]) -> Result:
     """Have a network find what it has not seen."""
     keypoints, points = (torch.cat(part) for part in zip(*map(network, test.image.split(50)), strict=True))
     pixels = (keypoints - test.keypoints).norm(dim=-1)
@@ -127,19 +127,19 @@ def run(
     steps: int = 500,
     seed: int = 0,
 ) -> list[Result]:
-    """Render, train and examine.
+    """Render, train and evaluate.
 
     Args:
         report: gets lines on the progress, and those of the table.
         images: how many to learn from; of pinhole and fisheye alike.
-        tests: how many fisheye images of other drivers to be examined on.
+        tests: how many fisheye images of other drivers to be tested on.
         steps: of 24 images each.
         seed: of everything drawn.
 
     Returns:
-        A result for each of `TEACHERS`.
+        A result for each of `TRAINING_SETS`.
     """
-    begin, workers = time.monotonic(), min(os.cpu_count() or 1, len(TEACHERS))
+    begin, workers = time.monotonic(), min(os.cpu_count() or 1, len(TRAINING_SETS))
 
     def say(text: str) -> None:
         report(f"{time.monotonic() - begin:4.0f} s  {text}")
@@ -153,7 +153,7 @@ def run(
     try:
         with torch.random.fork_rng(devices=[]), ThreadPoolExecutor(workers) as pool:
             torch.manual_seed(seed)
-            say(f"rendering {2 * images} images to learn from and {tests} to be examined on")
+            say(f"rendering {2 * images} images to learn from and {tests} to be tested on")
             seen = photograph(camera, drivers, workers=workers)
             test, bound = (photograph(like, d, MOUNT, workers) for d in (others, drivers))
             first = Network((camera.height, camera.width))
@@ -162,23 +162,23 @@ def run(
                 # torch's own generator is RandomAffine's alone from here on
                 network = copy.deepcopy(first)
                 source = bound if name == "fisheye" else seen
-                augment = teacher(name, camera, like)
+                augment = augmentation(name, camera, like)
 
                 def tell(step: int, loss: float) -> None:
-                    say(f"{TEACHERS[name]:<24} step {step} of {steps}, loss {loss:.2f}")
+                    say(f"{TRAINING_SETS[name]:<24} step {step} of {steps}, loss {loss:.2f}")
 
-                losses = learn(network, source, augment, steps, seed=seed, report=tell)
+                losses = train(network, source, augment, steps, seed=seed, report=tell)
                 examples = augment(source[:2], torch.Generator().manual_seed(seed))
-                return examine(name, network, examples, test, losses)
+                return evaluate(name, network, examples, test, losses)
 
             # the slowest first
             studies = {name: pool.submit(study, name) for name in ("camtorch", "affine", "pinhole", "fisheye")}
-            results = [studies[name].result() for name in TEACHERS]
+            results = [studies[name].result() for name in TRAINING_SETS]
     finally:
         torch.set_num_threads(threads)
     report(f"\n{'learned from':<24}{'landmarks off by':>16}{'mean':>7}{'of eye distance':>16}{'in space':>10}")
     for result in results:
-        report(f"{TEACHERS[result.teacher]:<24}{result.numbers()}")
+        report(f"{TRAINING_SETS[result.training_set]:<24}{result.numbers()}")
     return results
 
 
@@ -188,12 +188,12 @@ def drawing(results: list[Result], tests: int = 5) -> Image.Image:
     height, width = (round(scale * side) for side in results[0].test.image.shape[-2:])
     left = 2 * (width + MARGIN) + 2 * MARGIN
     size = left + tests * (width + MARGIN), head + len(results) * (height + band + MARGIN)
-    sheet = Sheet(*size, "One network, four educations")
+    sheet = Sheet(*size, "One network, four training sets")
     sheet.text((MARGIN, 66), "what it learned from", colour=GREY)
     sheet.text((left, 66), "behind a fisheye mounted elsewhere: rings are true, dots are found", colour=GREY)
     for row, result in enumerate(results):
         top = head + row * (height + band + MARGIN)
-        sheet.text((MARGIN, top + 10), TEACHERS[result.teacher], size=MIDDLE)
+        sheet.text((MARGIN, top + 10), TRAINING_SETS[result.training_set], size=MIDDLE)
         off = f"{result.pixels.median():.1f} px in the image, {100 * result.metres.median():.0f} cm in space"
         sheet.text((left, top + 13), f"off by {off} (medians of {len(result.test)} drivers)")
         tiles = [(MARGIN + i * (width + MARGIN), result.training_images, i, False) for i in range(2)]

@@ -1,4 +1,4 @@
-"""What the demonstration of training learns from, and is examined on: drivers, seen by a pinhole and by a fisheye."""
+"""What networks of `training` learn from, and are tested on: drivers, seen by a pinhole and by a fisheye."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NAMES = (
     *("right_eye_outer", "right_eye_inner", "left_eye_inner", "left_eye_outer"),
     *("nose_tip", "mouth_right", "mouth_left", "chin"),
 )
-TEACHERS = {
+TRAINING_SETS = {
     "pinhole": "pinhole images",
     "affine": "... with RandomAffine",
     "camtorch": "... with camtorch",
@@ -89,7 +89,7 @@ def _turn(mount: tuple[float, float, float]) -> Tensor:
 # -- what is learned from
 
 
-def teacher(name: str, camera: Camera, like: Camera) -> Augment:
+def augmentation(name: str, camera: Camera, like: Camera) -> Augment:
     """What makes of samples of `camera` those that a network for the lens `like` learns from."""
     if name == "camtorch":
         yaw, pitch, roll = ((a - b, a + b) for a, b in zip(PLANNED, WITHIN, strict=True))

@@ -1,4 +1,4 @@
-"""What rays meet in `cabin`, and in what light.
+"""Ray tracing of `cabin`: what rays meet, and in what light.
 
 Convention: that of `cabin`; rays are unit vectors from the camera.
 """
@@ -42,7 +42,7 @@ def _columns(rows: Tensor) -> Planes:
     return tuple(rows.T.contiguous().unbind(0))
 
 
-def see(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
+def trace(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
     """Colours (M, 3) and classes (M) of unit rays (M, 3), in the head's frame too, each of one driver's image."""
     rays = torch.where(rays.abs() < 1e-7, 1e-7, rays)
     ray = _columns(rays)
@@ -95,7 +95,7 @@ def see(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tensor
     on_body = on_body[seat[on_body] < 0]
 
     here = on_head.nonzero()[:, 0]
-    light[:, here], classes[here] = _see_head(ray, head_ray, best[here], here, row[here], scene)
+    light[:, here], classes[here] = _trace_head(ray, head_ray, best[here], here, row[here], scene)
 
     k = row[on_body]
     p = tuple(best[on_body] * c[on_body] for c in ray)
@@ -133,7 +133,7 @@ def see(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tensor
     return (1 - torch.exp(-1.3 * light)).pow(1 / 2.2).T, classes
 
 
-def _see_head(ray: Planes, turned: Planes, t: Tensor, here: Tensor, k: Tensor, scene: Scene):
+def _trace_head(ray: Planes, turned: Planes, t: Tensor, here: Tensor, k: Tensor, scene: Scene):
     """Light (3, N) and classes (N) of rays `here` that meet the head at distances t."""
     o, r, shape = _columns(scene.origin[k]), tuple(c[here] for c in turned), Shape._make(c[k] for c in scene.shape)
     p = tuple(a + t * b for a, b in zip(o, r, strict=True))
