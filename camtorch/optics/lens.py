@@ -7,6 +7,7 @@ Jacobian, the orientation and the vjp, and computes once what they share.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -231,10 +232,14 @@ class PlanarAt(StageAt):
         return ua, ub, va, vb
 
     @property
+    def margin(self) -> Tensor | None:
+        """Positive where the map is defined; None where it is so everywhere."""
+        return self.stage.radial.margin(self.t) if self.stage.radial else None
+
+    @property
     def orientation(self) -> Tensor:
         """Positive where the map is defined, regular and not turned over."""
-        orientation = _orientation(self.jacobian)
-        margin = self.stage.radial.margin(self.t) if self.stage.radial else None
+        orientation, margin = _orientation(self.jacobian), self.margin
         return orientation if margin is None else torch.minimum(orientation, margin)
 
     def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
@@ -326,9 +331,14 @@ class TiltAt(StageAt):
         return ua * self.reciprocal, ub * self.reciprocal, va * self.reciprocal, vb * self.reciprocal
 
     @property
+    def margin(self) -> Tensor:
+        """Positive before the horizon."""
+        return self.depth
+
+    @property
     def orientation(self) -> Tensor:
         """Positive where the map is defined, regular and not turned over."""
-        return torch.minimum(_orientation(self.jacobian), self.depth)
+        return torch.minimum(_orientation(self.jacobian), self.margin)
 
     def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of the point and of the nine entries of R, these summed over the points."""
@@ -404,6 +414,12 @@ class LensAt:
             pa, pb, qa, qb = chained
             chained = ua * pa + ub * qa, ua * pb + ub * qb, va * pa + vb * qa, va * pb + vb * qb
         return chained
+
+    @property
+    def margin(self) -> Tensor | None:
+        """The smallest of the stages: positive where the lens is defined; None where it is so everywhere."""
+        margins = [margin for stage in self.stages if (margin := stage.margin) is not None]
+        return functools.reduce(torch.minimum, margins) if margins else None
 
     @property
     def orientation(self) -> Tensor:

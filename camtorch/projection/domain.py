@@ -74,8 +74,7 @@ class Domain:
     @cached_property
     def azimuths(self) -> Azimuths:
         """Of all cameras, also where this is a part."""
-        with torch.no_grad():
-            return Azimuths(self.chart, self.lens, self.k)
+        return Azimuths(self.optics, self.k) if self.whole is None else self.whole.azimuths
 
     @_per_camera
     def inner2(self) -> Tensor:
@@ -91,7 +90,8 @@ class Domain:
     @_per_camera
     def limits2(self) -> Tensor:
         """(C, azimuths): the squared radius, up to the next azimuth, before which the orientation decides."""
-        return self.azimuths.limits.clamp(max=self.chart.end(self.k.dtype)) ** 2
+        pairs = torch.ones(len(self.k), AZIMUTHS, device=self.k.device).nonzero()
+        return self.azimuths.limits2(*pairs.unbind(-1)).view(len(self.k), AZIMUTHS)
 
     @_per_camera
     def _fold(self) -> Tensor:
@@ -123,6 +123,13 @@ class Domain:
         """Positive for the plane points (C, N) in the domain; t = a^2 + b^2."""
         inside = self.inner2 - t
         if self.lens.is_radial:
+            return inside
+        if may_look(inside):  # only the azimuths on which something lies so far out
+            camera, point = (~(inside > 0)).nonzero(as_tuple=True)
+            a, b, t = a[camera, point], b[camera, point], t[camera, point]
+            first = self.cameras.start or 0
+            limits2 = self.azimuths.limits2(camera + first, azimuth(a, b))
+            inside[camera, point] = torch.minimum(limits2 - t, regular(self.optics_of(camera)[1], a, b))
             return inside
         row = torch.arange(len(self.k), device=t.device, dtype=torch.int32).unsqueeze(-1) * AZIMUTHS
         index = row + azimuth(a, b)

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
+from camtorch._arguments import columns
 from camtorch.optics.radial_inverse import first_loss
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
     from camtorch.optics.radial import RadialFactor
+    from camtorch.projection.domain import Optics
 
 AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # to find the fold of the radial factor
 _SMOOTH, _BULGE = 0.02, 0.001
 _DIP = 65  # radii at which a dip between two nodes is looked at
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
+_ROWS = 2048  # azimuths that are followed at a time
+_KEPT = 64  # cameras whose outlines are kept
+_BEYOND, _ASIDE = 1.01, 4  # what an outline allows for outside of its rim and, in azimuths, beside it
+_SPAN = 12  # how many azimuths the rim may go on from one to the next, and beside it, or else it becomes a circle
 
 
 class Azimuths:
-    """The lens of each camera, one that is not radial, on azimuths and radii of the chart's plane. Graph-free.
+    """Lenses that are not radial, followed outwards on azimuths of the chart's plane, as far as is asked. Graph-free.
 
     On each azimuth the orientation of the lens (positive where it is regular) is followed outwards. It is
     lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
@@ -32,56 +38,107 @@ class Azimuths:
     Such a lens mostly folds where its radial factor does: there the radii are dense.
     """
 
-    def __init__(self, chart: Chart, lens: Lens, like: Tensor):
-        """The tables of cameras (C,): limits (C, azimuths), reach (C, azimuths, radii); like gives dtype and device."""
-        fine = chart.radii(_RADII, like)
-        margin = lens.radial.margin(fine * fine) if lens.radial else None
-        self.has_pole = None if margin is None else ~(margin > 0).all(-1)
-        self.radii = _around(lens.radial, chart, fine)
-        a, b = (c[:, None] * self.radii.unsqueeze(-2) for c in _directions(like))
-        at = lens.at(a.flatten(-2), b.flatten(-2))
-        x, y = at.value
-        shape = (AZIMUTHS, self.radii.shape[-1])
-        lost = self._lost(lens, at.orientation.unflatten(-1, shape))
-        self.limits = self._limits(lost)
-        self.reach = _ascending((x * x + y * y).sqrt().unflatten(-1, shape), lost)
+    def __init__(self, optics: Optics, k: Tensor):
+        """optics: a model's. k: (C, n) coefficients of cameras, in the dtype and on the device of the points."""
+        self.optics, self.k = optics, k
+        # what is not known yet is NaN
+        self._radii = k.new_full((len(k), _COARSE + _CLOSE), torch.nan)
+        self._lost = k.new_full((len(k), AZIMUTHS), torch.nan)
+        self._limits2 = self._lost.clone()
+        self._outlines: dict[int, Outline] = {}
 
-    def _lost(self, lens: Lens, orientation: Tensor) -> Tensor:
-        """(C, azimuths): `first_loss`, where dips between coarse nodes count only if a closer look finds them."""
-        spared = torch.zeros_like(orientation, dtype=torch.bool)
-        last = orientation.shape[-1] - 1
-        a, b = (c.unsqueeze(-1) for c in _directions(orientation))
-        steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
-        while True:
-            lost = first_loss(orientation, spared)
-            node = lost.round().long().clamp(max=last).unsqueeze(-1)
-            assumed = (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
-            if not bool(assumed.any()):
-                return lost
-            shape = (AZIMUTHS, _DIP)
-            closer = (node + steps).clamp(0, last).flatten(-2)
-            radius = _radius_at(self.radii.unsqueeze(-2), closer).unflatten(-1, shape)
-            seen = lens.at((a * radius).flatten(-2), (b * radius).flatten(-2)).orientation.unflatten(-1, shape)
-            spared_now = assumed & (seen > 0).all(-1, keepdim=True)
-            if not bool(spared_now.any()):
-                return lost
-            spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
+    def limits2(self, camera: Tensor, index: Tensor) -> Tensor:
+        """(M,): the squared radius, up to the next azimuth, before which the orientation decides.
 
-    def _limits(self, lost: Tensor) -> Tensor:
-        """(C, azimuths): the radius, up to the next azimuth, before which the orientation decides."""
-        limit = _radius_at(self.radii.unsqueeze(-2), lost)
-        following = limit.roll(-1, -1)
-        nearer, further = torch.minimum(limit, following), torch.maximum(limit, following)
+        camera, index: (M,) of cameras and of azimuths.
+        """
+        limits2 = self._limits2[camera, index]
+        if bool(limits2.isnan().any()):
+            wanted = torch.zeros_like(self._limits2, dtype=torch.bool)
+            wanted[camera, index] = True
+            wanted &= self._limits2.isnan()
+            for some in ((wanted | wanted.roll(1, -1)) & self._lost.isnan()).nonzero().split(_ROWS):
+                self._follow(*some.unbind(-1))
+            for some in wanted.nonzero().split(_ROWS):
+                self._limits2[some[:, 0], some[:, 1]] = self._limit(*some.unbind(-1)) ** 2
+            limits2 = self._limits2[camera, index]
+        return limits2
+
+    def _limit(self, camera: Tensor, index: Tensor) -> Tensor:
+        lost = torch.stack((self._lost[camera, index], self._lost[camera, (index + 1).remainder(AZIMUTHS)]), -1)
+        limits = _radius_at(self._radii[camera], lost)
+        nearer, further = limits.amin(-1), limits.amax(-1)
         # Between two azimuths the fold moves smoothly, and may bulge: the orientation tells where it lies.
         # Or it ends there: then the nearer one is on the safe side.
-        smooth = ((lost - lost.roll(-1, -1)).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
-        return torch.where(smooth, further * (1 + _BULGE), nearer)
+        smooth = (lost.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
+        limit = torch.where(smooth, further * (1 + _BULGE), nearer).unsqueeze(-1)
+        chart, _ = self.optics(columns(self.k if len(self.k) == 1 else self.k[camera]))
+        return limit.clamp(max=chart.end(limit.dtype)).squeeze(-1)
 
-    def furthest(self) -> Tensor:
-        """(C,): how far from the centre the lens sends any point before the fold, with what nodes may miss."""
-        furthest = 1.02 * torch.where(self.reach < torch.inf, self.reach, 0.0).flatten(1).amax(-1)
+    def outline(self, camera: Tensor) -> Outline:
+        """Of several cameras (G,), each given once."""
+        known = [self._outlines.get(c) for c in camera.tolist()]
+        (missing,) = torch.tensor([o is None for o in known]).nonzero(as_tuple=True)
+        if len(missing):
+            made = self._made_outline(camera[missing.to(camera.device)])
+            for i, c in enumerate(missing.tolist()):
+                known[c] = Outline(*(w[i : i + 1] for w in made))
+            if len(self._outlines) + len(missing) <= _KEPT:
+                self._outlines.update(zip(camera.tolist(), known, strict=True))
+        return Outline(*(torch.cat(w) for w in zip(*known, strict=True))) if len(known) > 1 else known[0]
+
+    def _made_outline(self, camera: Tensor) -> Outline:
+        index = torch.arange(AZIMUTHS, device=camera.device).repeat(len(camera))
+        rows = camera.repeat_interleave(AZIMUTHS)
+        parts = [self._follow(*some) for some in zip(rows.split(_ROWS), index.split(_ROWS), strict=True)]
+        reach, furthest, x, y = (torch.cat(w).unflatten(0, (len(camera), AZIMUTHS)) for w in zip(*parts, strict=True))
+        return Outline(self._radii[camera], reach, _envelope(furthest, x, y))
+
+    def _radii_of(self, camera: Tensor) -> Tensor:
+        """(M, radii), those of cameras that are asked for the first time made now."""
+        wanted = torch.zeros(len(self.k), dtype=torch.bool, device=self.k.device)
+        wanted[camera] = True
+        (new,) = (wanted & self._radii[:, 0].isnan()).nonzero(as_tuple=True)
+        if len(new):
+            chart, lens = self.optics(columns(self.k[new]))
+            self._radii[new] = _around(lens.radial, chart, chart.radii(_RADII, self.k)).expand(len(new), -1)
+        return self._radii[camera]
+
+    def _follow(self, camera: Tensor, index: Tensor) -> tuple[Tensor, ...]:
+        """Rows (M,) of azimuths, of which it keeps at which node the lens is lost.
+
+        Returns how far out the lens sends each radius, the largest of that, and where it sends the last point.
+        """
+        radii = self._radii_of(camera)
+        # a single camera serves all rows
+        chart, lens = self.optics(columns(self.k if len(self.k) == 1 else self.k[camera]))
+        a, b = (c[index].unsqueeze(-1) for c in _directions(radii))
+        at = lens.at(a * radii, b * radii)
+        lost = self._lost[camera, index] = _lost(lens, a, b, radii, at.orientation)
+        (x, y), end = at.value, chart.end(radii.dtype)
+        reach = _ascending((x * x + y * y).sqrt(), lost)
+        nodes = lost.clamp(max=radii.shape[-1] - 1).unsqueeze(-1)
+        last = _radius_at(radii, nodes).clamp(max=end)
+        x, y = lens.at(a * last, b * last, order=0).value
+        before = torch.where((radii < last) & (reach < torch.inf), reach, 0.0).amax(-1, keepdim=True)
+        furthest = torch.maximum((x * x + y * y).sqrt(), before)
         # before a pole there is no end to it
-        return furthest if self.has_pole is None else torch.where(self.has_pole, torch.inf, furthest)
+        beyond = radii.gather(-1, nodes.ceil().long()).clamp(max=end)
+        margin = lens.at(a * beyond, b * beyond).margin
+        open_ended = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)
+        return reach, torch.where(open_ended, torch.inf, furthest).squeeze(-1), x.squeeze(-1), y.squeeze(-1)
+
+
+class Outline(NamedTuple):
+    """Where the lenses of cameras (G,) send azimuths.
+
+    radii: (G, radii). reach: (G, azimuths, radii), how far from the centre they go, ascending; infinite past the fold.
+    furthest: (G, azimuths) in each direction of the image no point before the fold goes further.
+    """
+
+    radii: Tensor
+    reach: Tensor
+    furthest: Tensor
 
     def start(self, camera: Tensor, target: Tensor, a: Tensor, b: Tensor) -> Tensor:
         """The radius (M,) at which the lens of each point's camera nearly reaches `target` on the azimuth of (a, b).
@@ -95,9 +152,46 @@ class Azimuths:
         near, far = table[row * size + low], table[row * size + low + 1]
         # next to the fold only its inner side is safe to start from
         fraction = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
-        radii, row = self.radii.flatten(), camera * size if self.radii.ndim > 1 else 0
-        inner, outer = (radii[row + low + i] for i in range(2))
+        inner, outer = (self.radii.flatten()[camera * size + low + i] for i in range(2))
         return inner + fraction.clamp(0, 1) * (outer - inner)
+
+
+def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """(G, azimuths), by direction of the image, from the images (x, y) of where the azimuths end."""
+    # a regular map sends what lies inside inside: no point goes further than the outermost of the rim
+    here = azimuth(x.nan_to_num(0.0, 0.0, 0.0), y.nan_to_num(0.0, 0.0, 0.0)).long()
+    turn = (here.roll(-1, -1) - here + AZIMUTHS // 2).remainder(AZIMUTHS) - AZIMUTHS // 2
+    level = torch.maximum(furthest, furthest.roll(-1, -1))
+    envelope = torch.zeros_like(level)
+    for step in range(-_SPAN, _SPAN + 1):
+        between = (step >= turn.clamp(max=0) - _ASIDE) & (step <= turn.clamp(min=0) + _ASIDE)
+        direction = (here + step).remainder(AZIMUTHS)
+        envelope = envelope.scatter_reduce(-1, direction, torch.where(between, level, 0.0), "amax")
+    # where the rim has no end, or turns by leaps, a circle
+    leaps = (level == torch.inf) | (turn.abs() > _SPAN - _ASIDE)
+    circle = torch.where(leaps.any(-1, keepdim=True), level.amax(-1, keepdim=True), 0.0)
+    return _BEYOND * torch.maximum(envelope, circle)
+
+
+def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) -> Tensor:
+    """(M,): `first_loss`, where dips between coarse nodes count only if a closer look finds them.
+
+    a, b: (M, 1) directions. radii, orientation: (M, S).
+    """
+    spared = torch.zeros_like(orientation, dtype=torch.bool)
+    last = orientation.shape[-1] - 1
+    steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
+    while True:
+        lost = first_loss(orientation, spared)
+        node = lost.round().long().clamp(max=last).unsqueeze(-1)
+        assumed = (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
+        if not bool(assumed.any()):
+            return lost
+        radius = _radius_at(radii, (node + steps).clamp(0, last))
+        spared_now = assumed & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
+        if not bool(spared_now.any()):
+            return lost
+        spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
 
 
 def _directions(like: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,7 +224,8 @@ def _around(radial: RadialFactor | None, chart: Chart, fine: Tensor) -> Tensor:
     """(C, radii): the chart's, and more of them the nearer to the fold of the radial factor, if it has one."""
     if radial is None:
         return chart.radii(_COARSE + _CLOSE, fine)
-    fold = _radius_at(fine, first_loss(radial.orientation(fine)).unsqueeze(-1))
+    orientation = radial.orientation(fine)
+    fold = _radius_at(fine.expand_as(orientation), first_loss(orientation).unsqueeze(-1))
     # without a fold on the chart, the middle of a chart does no harm
     fold = torch.where(fold < torch.inf, fold, 1.0)
     spread = 1 + 0.5 * torch.linspace(-1, 1, _CLOSE, dtype=fine.dtype, device=fine.device) ** 3
@@ -140,13 +235,11 @@ def _around(radial: RadialFactor | None, chart: Chart, fine: Tensor) -> Tensor:
 
 
 def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
-    """The radius at fractional node positions (*B, A) of radii (*B, 1 or A, S); infinite from S on."""
+    """The radii (M, P) at fractional node positions (M, P) of radii (M, S); infinite from S on."""
     last = radii.shape[-1] - 1
-    index = position.floor().long().clamp(max=last).unsqueeze(-1)
-    radii = radii.expand(*index.shape[:-1], -1)
-    inner, outer = torch.gather(radii, -1, index), torch.gather(radii, -1, (index + 1).clamp(max=last))
-    between = inner + (position.unsqueeze(-1) - index) * (outer - inner)
-    return torch.where(position <= last, between.squeeze(-1), torch.inf)
+    index = position.floor().long().clamp(max=last)
+    inner, outer = radii.gather(-1, index), radii.gather(-1, (index + 1).clamp(max=last))
+    return torch.where(position <= last, inner + (position - index) * (outer - inner), torch.inf)
 
 
 def _ascending(reach: Tensor, lost: Tensor) -> Tensor:

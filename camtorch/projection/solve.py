@@ -14,6 +14,7 @@ from camtorch.projection.fold import azimuth
 
 if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
+    from camtorch.projection.fold import Outline
 
 Planes2 = tuple[Tensor, Tensor]
 
@@ -21,6 +22,7 @@ _START_ROUNDS = 6
 _CLOSE = 0.1
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
+_CAMERAS = 32  # that are searched at a time
 _FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
 
 
@@ -29,20 +31,27 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
 
     camera: (M,) the index of each point's camera. Takes many steps, and finds what lies next to a fold as well.
     """
-    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
     if domain.lens.is_radial:
         return _Search(domain, camera)(u, v)
-    (some,) = (torch.hypot(u, v) <= domain.azimuths.furthest()[camera]).nonzero(as_tuple=True)
-    if len(some):
-        a[some], b[some], found[some] = _Search(domain, camera[some])(u[some], v[some])
+    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
+    cameras, row = camera.unique(return_inverse=True)
+    for first in range(0, len(cameras), _CAMERAS):
+        outline = domain.azimuths.outline(cameras[first : first + _CAMERAS])
+        (some,) = ((row >= first) & (row < first + _CAMERAS)).nonzero(as_tuple=True)
+        within = torch.hypot(u[some], v[some]) <= outline.furthest[row[some] - first, azimuth(u[some], v[some])]
+        some = some[within]
+        if len(some):
+            alone = _Search(domain, camera[some], outline, row[some] - first)
+            a[some], b[some], found[some] = alone(u[some], v[some])
     return a, b, found
 
 
 class _Search:
     """The lenses of single points (M,), and the inverse by bracketing and damped steps."""
 
-    def __init__(self, domain: Domain, camera: Tensor):
-        self.domain, self.camera = domain, camera
+    def __init__(self, domain: Domain, camera: Tensor, outline: Outline | None = None, row: Tensor | None = None):
+        """outline: of some of the cameras, unless the lens is radial. row: (M,) which of them."""
+        self.domain, self.camera, self.outline, self.row = domain, camera, outline, row
         self.chart, self.lens = domain.optics_of(camera)
 
     def __call__(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -73,7 +82,7 @@ class _Search:
         inside = t < self.domain.inner2[self.camera, 0]
         if self.lens.is_radial:
             return inside
-        before = t < self.domain.limits2[self.camera, azimuth(a, b)]
+        before = t < self.domain.azimuths.limits2(self.camera, azimuth(a, b))
         return inside | (before & (regular(self.lens, a, b) > 0))
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
@@ -133,7 +142,7 @@ class _Search:
         angle, step, last_off = wanted, torch.zeros_like(u), torch.zeros_like(u)
         for _ in range(_START_ROUNDS):
             c, s = torch.cos(angle), torch.sin(angle)
-            rho = self.domain.azimuths.start(self.camera, target, c, s)
+            rho = self.outline.start(self.row, target, c, s)
             x, y = self.lens(rho * c, rho * s)
             error = (u - x) ** 2 + (v - y) ** 2
             better = (error < best) & ~close  # what is close stays, whatever else is in its batch
