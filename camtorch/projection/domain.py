@@ -119,12 +119,12 @@ class Domain:
         """(C, 1): `inner2`, but no further out than images reach."""
         return self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
 
-    def margin(self, a: Tensor, b: Tensor, t: Tensor) -> Tensor:
-        """Positive for the plane points (C, N) in the domain; t = a^2 + b^2."""
+    def margin(self, a: Tensor, b: Tensor, t: Tensor, looks: bool) -> Tensor:
+        """Positive for the plane points (C, N) in the domain; t = a^2 + b^2. looks: whether it may look at values."""
         inside = self.inner2 - t
         if self.lens.is_radial:
             return inside
-        if may_look(inside):  # only the azimuths on which something lies so far out
+        if looks:  # at the azimuths on which something lies so far out, only
             camera, point = (~(inside > 0)).nonzero(as_tuple=True)
             a, b, t = a[camera, point], b[camera, point], t[camera, point]
             first = self.cameras.start or 0

@@ -125,7 +125,7 @@ def see(
             inside = None
         else:
             if not lens.is_radial:
-                inside = domain.margin(a.detach(), b.detach(), t.detach())
+                inside = domain.margin(a.detach(), b.detach(), t.detach(), looks)
             inside = to_mask(inside, looks)
         if inside is not None:
             inside = as_kept(inside)
