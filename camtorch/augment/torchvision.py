@@ -36,7 +36,7 @@ _OWNER = "torchvision.Transform"
 _PLACES: Any = (tv_tensors.BoundingBoxes, *([tv_tensors.KeyPoints] if hasattr(tv_tensors, "KeyPoints") else []))
 
 
-class Transform(v2.Transform):  # type: ignore[misc]
+class Transform(v2.Transform):
     """A transform of v2: one draw for all that a sample holds, a dict or any other nest.
 
     * `Image` (..., C, H, W), `Video` (..., T, C, H, W), PIL images, and by v2's rule the first plain tensor

@@ -6,7 +6,7 @@ As operators of their own they keep compiled graphs small, and look at values in
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,15 +20,18 @@ from camtorch.projection.domain import Domain, Optics
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
 
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
 Result = TypeVar("Result")
 
 OPTICS: dict[str, Optics] = {}
 """The optics of every class of cameras, by its full name: operators take no functions."""
-CLASSES: dict[str, type] = {}
+CLASSES: dict[str, type[Camera]] = {}
 """The classes."""
 
 
-def register_camera(camera_class: type) -> str:
+def register_camera(camera_class: type[Camera]) -> str:
     """The name under which operators find the optics of a class."""
     name = register(CLASSES, camera_class)
     OPTICS[name] = camera_class.optics

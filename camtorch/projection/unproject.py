@@ -59,10 +59,12 @@ def invert(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
 
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     r2 = torch.addcmul(u * u, v, v)
-    eps, table = torch.finfo(u.dtype).eps, domain.inverse
+    eps, radial, table = torch.finfo(u.dtype).eps, domain.lens.radial, domain.inverse
+    assert radial is not None  # a radial lens has both
+    assert table is not None
     possible = table.most2 * (1 + 8 * eps) - r2
     r2 = torch.minimum(r2, table.most2)
-    scale, settled = solve(domain.lens.radial, table, r2, looks)
+    scale, settled = solve(radial, table, r2, looks)
     # a ray's rounding must not carry it across the fold
     inside = domain.inner2 * (1 - 32 * eps) - r2 * scale * scale
     return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
@@ -88,6 +90,7 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
             settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
             if not looks or bool(settled.amin() > 0):
                 break
+    assert settled is not None  # there are more steps than those before the first look
     # further out than images reach a determinant may overflow, and a step seem short
     solved = torch.minimum(torch.minimum(settled, domain.usual2 - t), reciprocal.abs())
     return Found(a, b, solved, torch.ones_like(a))
@@ -102,10 +105,10 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
     """
     a, b = solution
     with torch.no_grad():
-        jacobian = tuple([w.detach() for w in lens.at(a, b).jacobian])
+        xa, xb, ya, yb = [w.detach() for w in lens.at(a, b).jacobian]
     for _ in range(steps):
         x, y = lens(a, b)
-        da, db, _ = newton_step(jacobian, target[0] - x, target[1] - y)
+        da, db, _ = newton_step((xa, xb, ya, yb), target[0] - x, target[1] - y)
         a, b = a + da, b + db
     return a, b
 
@@ -207,7 +210,8 @@ class Unproject(Function):
             if torch.compiler.is_compiling():
                 search_in_place(model._model, usual.domain.k, *target, *found)
                 return found
-            return Found(*search_open(model._model, usual.domain.k, *target, *found), found.possible)
+            a, b, solved = search_open(model._model, usual.domain.k, *target, *found)
+            return Found(a, b, solved, found.possible)
 
         columns_now = columns(usual.intrinsics.detach())
         a, b, mask, _, _ = solutions(u.detach(), v.detach(), columns_now, usual.domain, usual.usable, finish)
