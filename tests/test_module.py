@@ -283,6 +283,7 @@ def test_a_camera_is_found_from_its_own_pixels(key):
     assert residuals(vector).abs().max() < 1e-9
 
 
+@pytest.mark.filterwarnings("ignore:.*became unusable")
 @every_model
 @both_directions
 @pytest.mark.parametrize("broken", ["nan focal", "negative focal", "zero focal", "infinite centre", "nan coefficient"])
