@@ -24,6 +24,7 @@ _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with m
 _MARGIN = 0.05  # of half an image: what lies beyond is not sampled
 _OVERSHOOT = 0.5  # of the range of its nodes by which a cubic may leave it: 0.27 along each axis
 _CUBIC = 3 / 128  # a cubic through four even nodes misses its middle by this part of their fourth difference
+_SAFETY = 3.0  # times that is assumed: at a step of the curvature, fourth differences tell less; 0.6 of it is then used
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
@@ -39,6 +40,15 @@ class Sampling(NamedTuple):
     """(B or 1, h, W') bool: the pixel has a ray, and the source maps it."""
     scale: Tensor | None
     """(B or 1, h, W'): see `local_scale`; None where nobody asks for it."""
+
+    def cameras(self, rows: slice) -> Sampling:
+        """Of these cameras of the batch."""
+        return Sampling(self.grid[rows], self.mapped[rows], None if self.scale is None else self.scale[rows])
+
+    def part(self, down: slice, across: slice = slice(None)) -> Sampling:
+        """Of these rows and columns of the target."""
+        scale = None if self.scale is None else self.scale[:, down, across]
+        return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale)
 
 
 def tabulate(
@@ -131,8 +141,9 @@ def on_lattice(
     """Positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
     Between nodes a cubic is laid through four of them along each axis. Cells where fourth differences say that this
-    misses by more than the tolerance, and cells at the limit of what is mapped, are computed pixel by pixel. None if
-    that would be most of the image.
+    misses by more than the tolerance, and cells at the limit of what is mapped and beside it, are computed pixel by
+    pixel. None if that would be most of the image. What is mapped, or is not, between four nodes alone and away from
+    that limit is not seen.
 
     Args:
         exact: see `Exact`.
@@ -145,53 +156,92 @@ def on_lattice(
     height, n, m = len(rows), math.ceil(len(rows) / _STEP), math.ceil(width / _STEP)  # n by m cells
     if min(n, m) < _FEWEST:
         return None
-    v, u = ((torch.arange(k + 3, dtype=like.dtype, device=like.device) - 1) * _STEP for k in (n, m))
+    # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
+    v, u = ((torch.arange(k + 5, dtype=like.dtype, device=like.device) - 2) * _STEP for k in (n, m))
     nodes, mapped = exact(torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"), -1))
-    nodes = nodes.movedim(-1, 1)  # (B, 2, n + 3, m + 3)
-    some, open_cells = _open_cells(nodes, mapped, source, tolerance)
-    most = int(open_cells.sum((1, 2)).max()) if open_cells.numel() else 0
-    if most > n * m / 2:
+    nodes = nodes.movedim(-1, 1)  # (B, 2, n + 5, m + 5)
+    some, todo = _open_cells(nodes, mapped[:, 1:-1, 1:-1], source, tolerance)
+    _open_rim(exact, rows, width, some, todo, like)
+    if bool((todo.sum((1, 2)) > n * m / 2).any()):
         return None
-    planes = _interpolated(nodes, n, m)  # (B, 2, 8 n, 8 m)
+    planes = _interpolated(nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
     blocks = planes.unflatten(2, (n, _STEP)).unflatten(4, (m, _STEP))
     camera, i, j = (~some).nonzero(as_tuple=True)
     blocks[camera, :, i, :, j] = OUTSIDE
     seen = some[:, :, None, :, None].expand(-1, -1, _STEP, -1, _STEP).flatten(3, 4).flatten(1, 2)
-    if most:
-        # as many cells of every camera as the one with the most has: more of them exact does no harm
-        cells = open_cells.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
-        i, j = cells // m, cells % m
-        offset = torch.arange(_STEP, dtype=like.dtype, device=like.device)
-        down, across = (i[..., None, None] * _STEP + offset[:, None]), (j[..., None, None] * _STEP + offset)
-        pixels = torch.stack(torch.broadcast_tensors(across, down + rows.start), -1)  # (B, cells, 8, 8, 2)
-        positions, known = exact(pixels.flatten(2, 3))
-        camera = torch.arange(len(cells), device=like.device)[:, None]
-        blocks[camera, :, i, :, j] = positions.unflatten(2, (_STEP, _STEP)).movedim(-1, 2)
-        known = known.unflatten(2, (_STEP, _STEP))
-        seen.unflatten(1, (n, _STEP)).unflatten(3, (m, _STEP))[camera, i, :, j] = known
+    cells = seen.unflatten(1, (n, _STEP)).unflatten(3, (m, _STEP))
+    done = torch.zeros_like(todo)
+    while bool(todo.any()):
+        _compute(exact, rows.start, todo, blocks, cells)
+        done |= todo
+        # the limit goes on where it is thinner than cells
+        limit = todo & cells.any(4).any(2) & ~cells.all(4).all(2)
+        todo = (F.max_pool2d(limit.to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0] > 0) & ~done
     return planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width]
 
 
-def _open_cells(nodes: Tensor, mapped: Tensor, source: tuple[int, int], tolerance: float) -> tuple[Tensor, ...]:
-    """Bool (B, rows, columns) each: some nodes of a cell are mapped; the cell wants exact positions."""
+def _compute(exact: Exact, first: int, todo: Tensor, blocks: Tensor, seen: Tensor) -> None:
+    """Exact positions in the cells (B, n, m) of a lattice that starts at row `first`.
+
+    Args:
+        exact: see `Exact`.
+        first: see above.
+        todo: the cells.
+        blocks: (B, 2, n, 8, m, 8), the positions.
+        seen: (B, n, 8, m, 8), which are mapped.
+    """
+    # as many cells of every camera as the one with the most has: more of them exact does no harm
+    most = int(todo.sum((1, 2)).max())
+    cells = todo.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
+    i, j = cells // todo.shape[2], cells % todo.shape[2]
+    offset = torch.arange(_STEP, dtype=blocks.dtype, device=blocks.device)
+    down, across = (i[..., None, None] * _STEP + offset[:, None]), (j[..., None, None] * _STEP + offset)
+    pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, cells, 8, 8, 2)
+    positions, known = exact(pixels.flatten(2, 3))
+    camera = torch.arange(len(cells), device=blocks.device)[:, None]
+    blocks[camera, :, i, :, j] = positions.unflatten(2, (_STEP, _STEP)).movedim(-1, 2)
+    seen[camera, i, :, j] = known.unflatten(2, (_STEP, _STEP))
+
+
+def _open_rim(exact: Exact, rows: range, width: int, some: Tensor, todo: Tensor, like: Tensor) -> None:
+    """Have cells (B, n, m) computed where a pixel at the rim of the image says that nodes do not tell all."""
+    v, u = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (len(rows), width))
+    sides = [(u, torch.full_like(u, end)) for end in (0, len(rows) - 1)]
+    sides += [(torch.full_like(v, end), v) for end in (0, width - 1)]
+    across, down = (torch.cat(parts) for parts in zip(*sides, strict=True))
+    _, mapped = exact(torch.stack((across, down + rows.start), -1).unsqueeze(0))
+    i, j = (down // _STEP).long(), (across // _STEP).long()
+    camera, pixel = (mapped[:, 0] != some[:, i, j]).nonzero(as_tuple=True)
+    todo[camera, i[pixel], j[pixel]] = True
+
+
+def _open_cells(nodes: Tensor, mapped: Tensor, source: tuple[int, int], tolerance: float) -> tuple[Tensor, Tensor]:
+    """Bool (B, n, m) each: some nodes of a cell are mapped; the cell wants exact positions.
+
+    Args:
+        nodes: (B, 2, n + 5, m + 5).
+        mapped: (B, n + 3, m + 3): without those that only fourth differences are made of.
+        source: see `on_lattice`.
+        tolerance: likewise.
+    """
     some, every = (
         _over_windows(_over_windows(mapped, -1, 4, pick), -2, 4, pick) for pick in (torch.logical_or, torch.logical_and)
     )
-    missed = _CUBIC * (_fourth_difference(nodes, -1) + _fourth_difference(nodes, -2))
     half = nodes.new_tensor([source[1] / 2, source[0] / 2])[:, None, None]
+    missed = _SAFETY * _CUBIC * half * (_fourth_difference(nodes, -1) + _fourth_difference(nodes, -2))
+    near = nodes[:, :, 1:-1, 1:-1]
     high, low = (
-        _over_windows(_over_windows(nodes, -1, 4, pick), -2, 4, pick) for pick in (torch.maximum, torch.minimum)
+        _over_windows(_over_windows(near, -1, 4, pick), -2, 4, pick) for pick in (torch.maximum, torch.minimum)
     )
     reach = _MARGIN + _OVERSHOOT * (high - low)
     sampled = ((high + reach > -1) & (low - reach < 1)).all(1)
-    return some, some & (~every | (sampled & (missed * half > tolerance).any(1)))
+    return some, some & (~every | (sampled & (torch.hypot(*missed.unbind(1)) > tolerance)))
 
 
 def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
-    """(B, 2, rows, columns): the largest absolute fourth difference along an axis, at and beside each cell."""
-    d = nodes.diff(4, dim=dim).abs()
-    d = F.pad(d, (1, 1, 0, 0) if dim == -1 else (0, 0, 1, 1), mode="replicate")
-    d = d.narrow(-2, 1, d.shape[-2] - 2) if dim == -1 else d.narrow(-1, 1, d.shape[-1] - 2)
+    """(B, 2, n, m): the largest absolute fourth difference along an axis at the corners of each cell."""
+    other = -3 - dim
+    d = nodes.narrow(other, 2, nodes.shape[other] - 4).diff(4, dim=dim).abs()
     return _over_windows(_over_windows(d, -1, 2, torch.maximum), -2, 2, torch.maximum)
 
 

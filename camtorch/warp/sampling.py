@@ -65,22 +65,28 @@ def render(
             return _pick(images, where, padding_mode, fill)
     where = where._replace(grid=where.grid.to(_wide(dtype)))
     plain = images.is_cpu and not any(in_graph(t) for t in (images, where.grid)) and not in_transform()
-    if not plain or dtype == _wide(dtype):
-        levels = Pyramid(images) if kept is None else kept.setdefault(0, Pyramid(images))
+    wide, finite = dtype == _wide(dtype), not dtype.is_floating_point
+    large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
+    step = count if wide or not plain else 1 if large else torch.get_num_threads()
+    if not large and count <= step:
+        levels = _levels(kept, 0, widen(images), finite)
         return narrow(_render(levels.images, where.grid, where, levels, mode, padding_mode, fill), dtype)
-    large = math.prod(images.shape[1:]) > _LARGE
-    step = 1 if large else torch.get_num_threads()
     result = images.new_empty(*images.shape[:2], *where.grid.shape[1:3])
     for i in range(0, count, step):
         part = slice(i, i + step)
-        levels = Pyramid(images[part]) if kept is None else kept.setdefault(i, Pyramid(images[part]))
-        here = where if len(where.grid) == 1 else Sampling(*(t if t is None else t[part] for t in where))
+        levels = _levels(kept, i, images[part], finite)
+        here = where if len(where.grid) == 1 else where.cameras(part)
         if large:
             _render_tiles(result[part], levels, here, mode, padding_mode, fill)
         else:
             made = _render(widen(images[part]), here.grid, here, levels, mode, padding_mode, fill)
             result[part] = narrow(made, dtype)
     return result
+
+
+def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor, finite: bool) -> Pyramid:
+    """Of the images from the i-th on: those kept, with the halves that they have got."""
+    return Pyramid(images, finite) if kept is None else kept.setdefault(i, Pyramid(images, finite))
 
 
 def _render_tiles(
@@ -94,10 +100,12 @@ def _render_tiles(
     """One image in tiles of the target, each from a copy of what it reads."""
     for top in range(0, result.shape[2], _TILE):
         for left in range(0, result.shape[3], _TILE):
-            tile = (..., slice(top, top + _TILE), slice(left, left + _TILE))
-            here = Sampling(where.grid[(*tile, slice(None))], *(t if t is None else t[tile] for t in where[1:]))
+            down, across = slice(top, top + _TILE), slice(left, left + _TILE)
+            here = where.part(down, across)
             images, grid = _read(levels.images, here, mode, padding_mode)
-            result[tile] = narrow(_render(images, grid, here, levels, mode, padding_mode, fill), result.dtype)
+            result[:, :, down, across] = narrow(
+                _render(images, grid, here, levels, mode, padding_mode, fill), result.dtype
+            )
 
 
 def _read(images: Tensor, where: Sampling, mode: Mode, padding_mode: PaddingMode) -> tuple[Tensor, Tensor]:
@@ -141,7 +149,7 @@ def _render(
     minifies = where.scale is not None
     # what lies beyond the rim is left out by coverage: at small levels the rim's pixels are wide
     beyond: PaddingMode = "border" if minifies and padding_mode == "zeros" else padding_mode
-    result = sample(images, grid, mode, beyond)
+    result = sample(images, grid, mode, beyond, levels.finite)
     if where.scale is not None:
         result = _minified(result, levels, where.grid, where.scale, mode, beyond)
     if any(fill) or padding_mode != "zeros" or minifies:
@@ -149,7 +157,7 @@ def _render(
         if padding_mode == "zeros":
             # what part of a sample comes from the image, and not from the zeros around it
             ones = images.new_ones(1, 1, *images.shape[-2:]).expand(grid.shape[0], -1, -1, -1)
-            covered = sample(ones, grid, mode, "zeros")
+            covered = sample(ones, grid, mode, "zeros", True)
             result = torch.where(covered != 0, result * covered, 0) if minifies else result
             result = result + value * (1 - covered)
         else:
@@ -164,8 +172,8 @@ class Pyramid:
     filter, and between levels is interpolated.
     """
 
-    def __init__(self, images: Tensor):
-        self.images = images
+    def __init__(self, images: Tensor, finite: bool):
+        self.images, self.finite = images, finite
 
     @cached_property
     def half(self) -> Pyramid:
@@ -174,7 +182,7 @@ class Pyramid:
         # a copy in another dtype is large
         channels = self.images.split(1 if self.images.dtype != _wide(self.images.dtype) else self.images.shape[1], 1)
         halves = [F.interpolate(widen(c), size, mode="bilinear", align_corners=False, antialias=True) for c in channels]
-        return Pyramid(torch.cat(halves, 1))
+        return Pyramid(torch.cat(halves, 1), self.finite)
 
 
 def _minified(
@@ -195,14 +203,15 @@ def _minified(
     wanted = int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS
     for n in range(min(wanted, last)):
         levels = levels.half
-        smaller, share = sample(levels.images, grid, mode, padding_mode), (level - n).clamp(0, 1).to(result)
+        smaller = sample(levels.images, grid, mode, padding_mode, levels.finite)
+        share = (level - n).clamp(0, 1).to(result)
         # an image without a share has no part either in what is not a number
         blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
         result = torch.where(share > 0, blended, result)
     return result
 
 
-def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
+def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
     """`grid_sample` with align_corners=False.
 
     Args:
@@ -210,6 +219,7 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) 
         grid: (B or 1, H', W', 2), normalised positions.
         mode: one of `MODES`.
         padding_mode: one of `PADDINGS`.
+        finite: no pixel is infinite or NaN.
 
     Returns:
         (B, C, H', W'). On a CPU, and unless it is compiled, an infinite or NaN pixel has a part in those samples alone
@@ -219,12 +229,12 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) 
     if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
     if images.is_cpu and not any(in_graph(t) for t in (images, grid)) and not in_transform():
-        return _sample(images, grid, mode, padding_mode)
+        return _sample(images, grid, mode, padding_mode, finite)
     result: Tensor = _Sample.apply(images, grid, mode, padding_mode)
     return result
 
 
-def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
+def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
     """On a CPU, with work for every thread, of which grid_sample gives one to each image."""
     threads = torch.get_num_threads()
     if len(images) >= threads:
@@ -233,7 +243,7 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode)
         result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
         for image in zip(result, images, grid, strict=True):
             _sample_tiles(*image, threads, mode, padding_mode)
-    if mode != "nearest" and not math.isfinite(result.sum()):
+    if not finite and mode != "nearest" and not math.isfinite(result.sum()):
         _sample_again(result, images, grid, mode, padding_mode)
     return result
 

@@ -61,9 +61,8 @@ class Warp(GeometryModule):
         fill: the value of pixels that show nothing, blended in at the rim of "zeros"; one, or one for each channel.
         antialias: where the image shrinks, a pixel takes the mean of what it covers, as wide in all directions as in
             the widest; compiled down to a sixteenth. "nearest" does not.
-        tolerance: pixels of the source by which sampling positions may be off, as far as fourth differences tell. From
-            0.01 on they come from a lattice, several times as fast. Zero is exact; so are labels always, warps
-            with a graph, and those on a GPU.
+        tolerance: pixels of the source by which sampling positions may be off at most. From 0.01 on they come from a
+            lattice, several times as fast. Zero is exact; so are labels always, warps with a graph, and those on a GPU.
 
     The sampling grid is kept while nothing that it depends on can learn or has changed.
 
@@ -156,13 +155,14 @@ class Warp(GeometryModule):
             ValueError: another shape or size. TypeError: no tensor, or a complex one.
         """
         sampled = self._checked(images, mode, padding_mode, fill)
-        learns = images.is_floating_point() and torch.is_grad_enabled()
-        if self._is_long() and not (in_graph(images) or (learns and self._learns())):
+        inputs = self._inputs()
+        learns = images.is_floating_point() and self._learns(inputs)
+        if self._is_long() and not (learns or in_graph(images)):
             result = images.new_empty(self._count(images), images.shape[1], *self.target._size("Warp"))
             for rows, part, _ in self._strips(images, None, *sampled):
                 result[:, :, rows] = part
             return result
-        return render(images, self._sampling() if learns else self._kept(), *sampled)
+        return render(images, self._learned() if learns else self._kept(inputs), *sampled)
 
     def strips(
         self,
@@ -260,7 +260,7 @@ class Warp(GeometryModule):
         if self._is_long():
             with torch.no_grad():
                 return torch.cat([self._on_image(self._strip(rows)) for rows in self._rows(None)], 2)
-        return self._on_image(self._kept())
+        return self._on_image(self._kept(self._inputs()))
 
     def _on_image(self, where: Sampling) -> Tensor:
         grid = where.grid.detach()
@@ -270,18 +270,24 @@ class Warp(GeometryModule):
     # -- where the images are sampled
 
     def _sampling(self) -> Sampling:
-        """With a graph, where something learns, or else `_kept`."""
-        if self._pinned is None and torch.is_grad_enabled() and self._learns():
-            return self._with_scale(*tabulate(self.source, self.target, self.rotation))
-        return self._kept()
+        inputs = self._inputs()
+        return self._learned() if self._learns(inputs) else self._kept(inputs)
 
-    def _kept(self) -> Sampling:
+    def _learns(self, inputs: list[Tensor]) -> bool:
+        """Whether there is to be a graph of the grid that is not there yet."""
+        return torch.is_grad_enabled() and self._pinned is None and any(t.requires_grad for t in inputs)
+
+    def _learned(self) -> Sampling:
+        """With a graph."""
+        return self._with_scale(*tabulate(self.source, self.target, self.rotation))
+
+    def _kept(self, inputs: list[Tensor]) -> Sampling:
         """Without a graph, until something changes; or what is pinned."""
         if self._pinned is not None:
             return self._pinned
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
         options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
-        kept: Sampling = self._memo(self._inputs(), options, self._whole)
+        kept: Sampling = self._memo(inputs, options, self._whole)
         return kept
 
     def _whole(self) -> Sampling:
@@ -295,9 +301,7 @@ class Warp(GeometryModule):
         if self.antialias:  # the scale is that between neighbours
             around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
         where = self._with_scale(*tabulate(self.source, self.target, self.rotation, self.tolerance, around))
-        here = slice(rows.start - around.start, rows.stop - around.start)
-        scale = None if where.scale is None else where.scale[:, here]
-        return Sampling(where.grid[:, here], where.mapped[:, here], scale)
+        return where.part(slice(rows.start - around.start, rows.stop - around.start))
 
     def _rows(self, count: int | None) -> Iterator[range]:
         height, width = self.target._size("Warp")
@@ -306,11 +310,9 @@ class Warp(GeometryModule):
 
     def _is_long(self) -> bool:
         """Whether the grid is not to be made at once, nor kept."""
-        long = math.prod((*self.batch_shape, *self.target._size("Warp"))) > _MOST_KEPT
-        tensors = self._inputs()
-        return (
-            long and self._pinned is None and not in_transform() and all(t.is_cpu and is_concrete(t) for t in tensors)
-        )
+        if self._pinned is not None or math.prod((*self.batch_shape, *self.target._size("Warp"))) <= _MOST_KEPT:
+            return False
+        return not in_transform() and all(t.is_cpu and is_concrete(t) for t in self._inputs())
 
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
@@ -326,9 +328,6 @@ class Warp(GeometryModule):
     def _inputs(self) -> list[Tensor]:
         s, t = self.source, self.target
         return [p for p in (s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation) if p is not None]
-
-    def _learns(self) -> bool:
-        return any(t.requires_grad for t in self._inputs())
 
     # -- labels
 
