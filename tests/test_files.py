@@ -1,12 +1,15 @@
 """Every format: what the files say, and load -> save -> load."""
 
+import importlib
 import math
+import pkgutil
 
 import pytest
 import torch
 from rigs import MANIFEST, POINT, SAMPLES, SUFFIXES, assert_same, float64, load
 
 import camtorch as ct
+import camtorch.io
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -16,6 +19,15 @@ def test_load_save_load_is_the_identity(name, tmp_path):
     again = ct.load(tmp_path / name)
     assert_same(rig, again)
     assert again.format == rig.format
+
+
+def test_every_format_is_a_file_of_the_room():
+    """And each says itself what it is called, so that adding one is a file and its place in a list."""
+    modules = [importlib.import_module(f"camtorch.io.{m.name}") for m in pkgutil.iter_modules(camtorch.io.__path__)]
+    names = [vars(module)["NAMES"] for module in modules if "NAMES" in vars(module)]
+    assert sorted(names_of.format for names_of in names) == sorted(camtorch.io.FORMATS)
+    patterns = [pattern for names_of in names for pattern in names_of.patterns]
+    assert len(set(patterns)) == len(patterns)
 
 
 @pytest.mark.parametrize("name", SAMPLES)

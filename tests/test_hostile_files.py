@@ -267,6 +267,7 @@ LARGE = {
     "cameras.json": many(b'"K%d":[5,0,3,0,5,2,0,0,1],', 6 * MB, b"{", b'"":1}'),
     "nested.json": filled(b'{"a":'),
     "digits.json": filled(b"9", start=b'{"fl_x": ', end=b"}"),
+    "patterns.json": filled(b"coef", start=b'{"K": [5], "', end=b'\\n": [1]}'),
     "escapes.json": filled(b"\\n", start=b'{"a": "', end=b'"}'),
     "words.xml": filled(b"1 ", start=b"<opencv_storage><K>", end=b"</K></opencv_storage>"),
     "quotes.xml": filled(b'" ', start=b"<opencv_storage><K>", end=b"</K></opencv_storage>"),

@@ -125,6 +125,13 @@ def test_what_looks_like_distortion_is_not_passed_over(path, key):
         ct.load(written(path, f"camera_matrix: {K}\n{key}: [0.3, 0.1, 0, 0, 0]"))
 
 
+def test_keys_that_would_spoil_an_error_are_shown_as_python_does(path):
+    path.write_text(json.dumps({"K": K, "coef\x01": [1], "M1": K}))
+    with pytest.raises(CameraFileError, match=r"camera.yml: 'coef\\x01': looks like the distortion") as caught:
+        ct.load(path)
+    assert str(caught.value).isprintable()
+
+
 def test_what_opencvs_own_programs_write_besides(path):
     """interactive-calibration, and others: statistics are no distortion."""
     text = f"""cameraResolution: [640, 480]

@@ -12,6 +12,7 @@ import struct
 
 from camtorch.camera import Camera
 from camtorch.io import colmap_images, poses
+from camtorch.io.colmap_images import LARGEST_ID
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import decoded
 from camtorch.io.protocol import Names
@@ -48,7 +49,6 @@ _IDS = {values[0]: name for name, values in _MODELS.items()}
 _MOST_WORDS = 32
 _LINE = re.compile(rb"^[^\S\n]*([^\s#][^\n]*)", re.MULTILINE)  # no comment
 _CAMERA = re.compile(rb"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)")
-_LARGEST_ID = (1 << 32) - 2  # the one above means none
 
 
 def matches(path: str, content: bytes) -> bool:
@@ -95,7 +95,7 @@ def _from_text(path: str, content: bytes) -> dict[str, Camera]:
         if len(words) < 4:
             record.fail("less than an id, a model, a width and a height")
         first, name, width, height, *values = record
-        identity = str(first.whole(0, _LARGEST_ID, "camera id"))
+        identity = str(first.whole(0, LARGEST_ID, "camera id"))
         if identity in cameras:
             record.fail(f"a second camera has the id {identity}")
         if name.value not in _MODELS:
@@ -125,7 +125,7 @@ def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
         name = _IDS.get(model) or record.fail(f"the model {model} is not known here; known are {sorted(_IDS)}")
         if str(identity) in cameras:
             record.fail(f"a second camera has the id {identity}")
-        if identity > _LARGEST_ID:
+        if identity > LARGEST_ID:
             record.fail(f"{identity} is no camera id")
         height, width = Record(path, [str(width), str(height)], record.place).size()
         values = list(take(f"<{_parameters(name)}d"))
@@ -167,7 +167,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
     """
     lossy = Lossy(path, NAMES.title)
     ids = [int(name) if re.fullmatch(r"0|[1-9]\d{0,9}", name) else -1 for name in rig.cameras]
-    if not all(0 <= i <= _LARGEST_ID for i in ids):
+    if not all(0 <= i <= LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
     identities = dict(zip(rig.cameras, ids, strict=True))
     entries = []

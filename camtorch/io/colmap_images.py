@@ -20,7 +20,7 @@ _POINT = 24  # x, y and the id of a 3D point
 _MOST_IMAGES = 1 << 18  # each takes some 400 bytes
 _LONGEST_NAME = 4096
 _LONGEST_LINE = 1 << 26
-_LARGEST_ID = (1 << 32) - 2
+LARGEST_ID = (1 << 32) - 2  # of cameras; the one above means none
 
 
 class Images(NamedTuple):
@@ -91,7 +91,7 @@ def _from_text(path: str, file: BinaryIO) -> Images:
             for word in words[1:8]:
                 Record(path, _text(record, word), record.place).number()
         if words[8] not in identities:
-            identity = Record(path, _text(record, words[8]), record.place).whole(0, _LARGEST_ID, "camera id")
+            identity = Record(path, _text(record, words[8]), record.place).whole(0, LARGEST_ID, "camera id")
             identities[words[8]] = str(identity)
         cameras.append(identities[words[8]])
         name = words[9].strip()

@@ -36,14 +36,15 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
     A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
 
     Args:
-        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal or camtorch; or the folder
-            of a COLMAP or Nerfstudio reconstruction. COLMAP's images beside the cameras are read with them.
+        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal or camtorch; an archive of
+            `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
+            beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
 
     Returns:
         A `Rig`: `rig.cameras`, `rig.extrinsics` (camera from rig, or from world for posed images), `rig.camera` if
-        there is only one. Pixel centres, axes and directions are camtorch's, whatever the file's are. Names are the
-        file's; one nameless camera is "camera".
+        there is only one. Poses of images are the rows of one batch, `rig.extrinsics.batch`. Pixel centres, axes and
+        directions are camtorch's, whatever the file's are. Names are the file's; one nameless camera is "camera".
 
     Raises:
         CameraFileError: the file cannot be used; it says where and why. OSError: it cannot be opened.

@@ -38,6 +38,7 @@ _SIZE = re.compile(r"(?i:camera_?resolution|im(?:age|g)_?size)")  # width and he
 _FISHEYE = re.compile(r"(?i:(?:is_?)?fisheye(?:_?model)?)")
 _OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model)")
 _FISHEYE_COUNT = 4  # of cv2.fisheye, and one of the counts of cv2.calibrateCamera
+_LONGEST_KEY = 200
 _PAIRS = (["1", "2"], ["left", "right"])
 
 
@@ -75,7 +76,7 @@ def _known(model: str | None) -> str | None:
 
 def matches(keys: dict) -> bool:
     """Whether these may be the keys of such a file."""
-    return any(_MATRIX.fullmatch(key) for key in keys)
+    return any(len(key) <= _LONGEST_KEY and _MATRIX.fullmatch(key) for key in keys)
 
 
 def parse(record: Record, model: str | None = None) -> Rig:
@@ -98,7 +99,9 @@ class _File:
     """The keys of a file."""
 
     def __init__(self, record: Record):
-        self.record, self.path, self.keys = record, record.path, record.keys()
+        self.record, self.path = record, record.path
+        # a pattern may take time that is quadratic in the length of a key
+        self.keys = [key for key in record.keys() if len(key) <= _LONGEST_KEY]  # noqa: SIM118
         self.found: dict[re.Pattern[str], Any] = {}
         self.check_that_none_is_left_over()
 
@@ -115,7 +118,7 @@ class _File:
 
     def camera(self, model: str | None, name: str | None) -> Camera:
         end, key, distortion_key = self.keys_of_camera(name)
-        core = self.record[key].core(self.numbers(key))
+        intrinsics = self.record[key].intrinsics(self.numbers(key))
         distortion = self.numbers(distortion_key) if distortion_key else []
         xi_key = self.by_name(_XI).get(end)
         if xi_key:  # cv2.omnidir
@@ -126,7 +129,7 @@ class _File:
             self.fail(place, f"says that the model is {fitting[0]}; do not name {model}, or correct the file")
         kind = model or ("mei" if xi_key else self.model(distortion, place))
         lens = self.record[distortion_key or xi_key or key]
-        return self.record[key].camera(kind, core, distortion, self.image_size(), lens)
+        return self.record[key].camera(kind, intrinsics, distortion, self.image_size(), lens)
 
     def keys_of_camera(self, name: str | None) -> tuple[str, str, str | None]:
         """The camera's name, and the keys of its matrix and distortion, None where it has no distortion."""
@@ -238,7 +241,7 @@ class _File:
         return record.numbers() if isinstance(record.value, list) else [record.number()]
 
     def fail(self, place: str, reason: object) -> NoReturn:
-        raise CameraFileError(self.path, place, reason) from None
+        raise CameraFileError(self.path, self.record.place_of(place), reason) from None
 
 
 # -- writing

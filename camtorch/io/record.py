@@ -158,7 +158,7 @@ class Record:
         except (ValueError, TypeError) as error:
             self.fail(error)
 
-    def core(self, matrix: list[float]) -> list[float]:
+    def intrinsics(self, matrix: list[float]) -> list[float]:
         """The focal lengths and principal point of a camera matrix of 3 x 3 numbers, which stands here."""
         if len(matrix) != 9:
             self.fail(f"a camera matrix has 3 x 3 numbers, this has {len(matrix)}")

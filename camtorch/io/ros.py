@@ -29,7 +29,7 @@ def parse(record: Record) -> Rig:
     name = record["camera_name"].text() if "camera_name" in record else "camera"
     width, height = (_either(record, f"image_{side}", side).side() for side in ("width", "height"))
     matrix = _either(record, "camera_matrix", "K", "k")
-    intrinsics = matrix.core(_numbers(matrix))
+    intrinsics = matrix.intrinsics(_numbers(matrix))
     key, counts = _MODELS[one_of(record["distortion_model"], _MODELS)]
     coefficients = _either(record, "distortion_coefficients", "D", "d")
     distortion = _numbers(coefficients)
