@@ -41,7 +41,7 @@ def _positions(
         (target_model, target_intrinsics, target_distortion, sizes[2:]),
     ):
         numbers = [intrinsics, distortion] if distortion.shape[-1] else [intrinsics]
-        camera = CLASSES[model](*(t.detach() for t in numbers), image_size=tuple(size))
+        camera = CLASSES[model](*(t.detach() for t in numbers), image_size=(size[0], size[1]))
         cameras.append(camera.requires_grad_(False))
     grid, mapped = tabulate(cameras[0], cameras[1], rotation, tolerance)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()

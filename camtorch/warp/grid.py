@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import torch
@@ -256,7 +256,8 @@ def _over_windows(values: Tensor, dim: int, width: int, pick: Callable) -> Tenso
 def _interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     """(B, 2, rows + 3, columns + 3) to (B, 2, 8 rows, 8 columns)."""
     weights = _weights(nodes)
-    lines = sum(nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4)).flatten(2, 3)
+    terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
+    lines = reduce(torch.add, terms).flatten(2, 3)
     # torch may be told to multiply matrices in less than float32
     wide = torch.float32 if torch.get_float32_matmul_precision() == "highest" else torch.float64
     lines = lines.to(torch.promote_types(lines.dtype, wide))

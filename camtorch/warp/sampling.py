@@ -133,7 +133,7 @@ def _read(images: Tensor, where: Sampling, mode: Mode, padding_mode: PaddingMode
         stop = int(min(max(last + _REACH[mode] + 2, start + 1), side))
         slices.append(slice(start, stop))
         axes.append(((plane + 1) * side - 2 * start) / (stop - start) - 1)
-    return widen(images[(..., *slices[::-1])]), torch.stack(axes, -1)
+    return widen(images[:, :, slices[1], slices[0]]), torch.stack(axes, -1)
 
 
 def _render(
