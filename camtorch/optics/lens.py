@@ -109,9 +109,15 @@ class StageAt:
         return jacobian_of(self.stage, a, b)
 
     @property
+    def margin(self) -> Tensor | None:
+        """Positive where the map is defined; None where it is so everywhere."""
+        return None
+
+    @property
     def orientation(self) -> Tensor:
         """Positive where the map is defined, regular and not turned over."""
-        return _orientation(self.jacobian)
+        orientation, margin = _orientation(self.jacobian), self.margin
+        return orientation if margin is None else torch.minimum(orientation, margin)
 
     def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of the point and of the parameters, these summed over the points."""
@@ -233,14 +239,7 @@ class PlanarAt(StageAt):
 
     @property
     def margin(self) -> Tensor | None:
-        """Positive where the map is defined; None where it is so everywhere."""
         return self.stage.radial.margin(self.t) if self.stage.radial else None
-
-    @property
-    def orientation(self) -> Tensor:
-        """Positive where the map is defined, regular and not turned over."""
-        orientation, margin = _orientation(self.jacobian), self.margin
-        return orientation if margin is None else torch.minimum(orientation, margin)
 
     def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of the point and of the parameters, these summed over the points."""
@@ -332,13 +331,8 @@ class TiltAt(StageAt):
 
     @property
     def margin(self) -> Tensor:
-        """Positive before the horizon."""
+        # before the horizon
         return self.depth
-
-    @property
-    def orientation(self) -> Tensor:
-        """Positive where the map is defined, regular and not turned over."""
-        return torch.minimum(_orientation(self.jacobian), self.margin)
 
     def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of the point and of the nine entries of R, these summed over the points."""
