@@ -57,7 +57,8 @@ class Azimuths:
             wanted = torch.zeros_like(self._limits2, dtype=torch.bool)
             wanted[camera, index] = True
             wanted &= self._limits2.isnan()
-            for some in ((wanted | wanted.roll(1, -1)) & self._lost.isnan()).nonzero().split(_ROWS):
+            unknown = ((wanted | wanted.roll(1, -1)) & self._lost.isnan()).nonzero()
+            for some in unknown.split(_ROWS) if len(unknown) else ():
                 self._follow(*some.unbind(-1))
             for some in wanted.nonzero().split(_ROWS):
                 self._limits2[some[:, 0], some[:, 1]] = self._limit(*some.unbind(-1)) ** 2
