@@ -23,7 +23,7 @@ from camtorch.warp.sampling import as_options
 from camtorch.warp.warp import Warp
 
 _FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
-_TRIES = 16
+_TRIES = 8
 
 
 @dataclass(frozen=True)

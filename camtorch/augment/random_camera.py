@@ -335,6 +335,8 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     step = amounts[..., columns] * share * _kept(_sensitivity, usual, nominal, camera.distortion).to(amounts)
     rim = _rim(camera)
     unseen = ~camera.unproject(rim)[1]
+    # nothing is asked for there, and pixels without a ray are dear
+    rim = torch.where(unseen.unsqueeze(-1), camera.intrinsics[..., None, 2:], rim)
     result = base.expand_as(step)
     left = torch.ones(step.shape[:-1], dtype=torch.bool, device=step.device)
     for part in (sign / 2**halving for halving in range(_HALVINGS) for sign in (1, -1)):
