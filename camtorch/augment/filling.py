@@ -11,11 +11,13 @@ from camtorch.augment.change import camera_like, frozen, size_of
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
 from camtorch.rotations import rotation_matrix, rotation_vector
+from camtorch.warp.polygons import along_edges
 from camtorch.warp.warp import Warp
 
-# points along a side; those on the rim, where images stay empty first, count as much as others: a careful estimate
-_SIDE = 33
-_CARE = 0.01  # what a lattice may miss by where a rim runs along its lines
+_POINTS, _RIM = 1000, 16  # over the image, and along each of its edges
+_ROOT = 1.324717957244746
+_CARE = 0.01  # what the points may miss by
+_NEARLY = 0.999
 _ZOOM = 4.0  # at most, before the camera turns back
 _FAR_ZOOM = 1000.0  # of a camera that is not turned
 _TURNS = 1.0, 0.5, 0.25, 0.0
@@ -23,13 +25,23 @@ _HALVINGS = 10
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
-    """(*B,): the part of the target's image that shows something of the source's, of a lattice of its pixels."""
+    """(*B,): the part of the target's image that shows something of the source's; 1 where its whole rim does.
+
+    As told by points that are spread evenly without rows, which a rim might run along: multiples of the inverse powers
+    of the root of x^3 = x + 1, modulo 1.
+    """
     height, width = size_of(target)
     like = target.intrinsics
-    v, u = (torch.linspace(0, side - 1, _SIDE, dtype=like.dtype, device=like.device) for side in (height, width))
-    pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).flatten(0, 1)
+    steps = torch.arange(1, _POINTS + 1, dtype=torch.float64)[:, None]
+    spread = (steps / torch.tensor([_ROOT, _ROOT**2], dtype=torch.float64)).frac()
+    corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
+    # half a pixel in, at the centres of the outermost pixels
+    rim = along_edges(corners * spread.new_tensor([width - 1, height - 1]), _RIM)
+    pixels = torch.cat((spread * spread.new_tensor([width, height]) - 0.5, rim)).to(like)
     back = Warp(target, source, None if rotation is None else rotation.mT)
-    return back.transform_points(pixels.expand(*(back.batch_shape or ()), -1, -1))[1].to(like.dtype).mean(-1)
+    shown = back.transform_points(pixels.expand(*(back.batch_shape or ()), -1, -1))[1]
+    part = shown[..., :_POINTS].to(like.dtype).mean(-1)
+    return torch.where(shown[..., _POINTS:].all(-1), part, part.clamp(max=_NEARLY))
 
 
 def scaled(camera: Camera, factor: Tensor) -> Camera:
