@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,7 @@ def parse(record: Record) -> Rig:
     """The camera of all frames, called "camera", or one for each frame; and the poses of the frames."""
     cameras: dict[str, Camera] = {}
     names: dict[str, str | None] = {}  # of the images, and of the camera that they share
-    found = []
+    found = array("d")
     frames = list(record["frames"]) if "frames" in record else []
     own = [any(key in frame for key in _OF_A_CAMERA) for frame in frames]
     record.few(sum(own))
@@ -71,11 +72,13 @@ def parse(record: Record) -> Rig:
         if has_own:
             cameras[name] = _camera(record, frame)
         names[name] = None if has_own else "camera"
-        found.append(_pose(frame["transform_matrix"]))
+        rotation, translation, rows = _pose(frame["transform_matrix"])
+        for vector in (rotation, translation, *rows):
+            found.extend(vector)
     if not found:
         return Rig(cameras)
-    rotation, translation, rows = map(np.array, zip(*found, strict=True))
-    batch = poses.batch(rotation, translation, "nerfstudio", rows)
+    numbers = np.array(found).reshape(len(names), 22)
+    batch = poses.batch(numbers[:, :3], numbers[:, 3:6], "nerfstudio", numbers[:, 6:].reshape(-1, 4, 4))
     return Rig(cameras, (list(names), batch), images={name: camera for name, camera in names.items() if camera})
 
 

@@ -119,6 +119,12 @@ class Record:
         """A list of finite numbers, of that many if given."""
         if count is not None and len(self) != count:
             self.fail(f"{len(self)} numbers where {count} belong")
+        if (
+            isinstance(self.value, list)
+            and set(map(type, self.value)) == {float}
+            and all(map(math.isfinite, self.value))
+        ):
+            return list(self.value)
         return [item.number() for item in self]
 
     def rows(self, rows: int, columns: int) -> list[list[float]]:
