@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE
+"""The key of a FakeTensorMode among the modes that are under way."""
+
 
 def has_tangent(tensor: Tensor) -> bool:
     """Whether forward-mode derivatives pass through the tensor."""
@@ -35,7 +38,7 @@ def _is_traced(tensor: Tensor) -> bool:
 
 
 def _is_fake(tensor: Tensor) -> bool:
-    if torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.FAKE) is not None:
+    if torch._C._get_dispatch_mode(FAKE_MODE) is not None:
         return True
     # not imported for its name alone: that takes a third of a second
     return type(tensor) is not Tensor and type(tensor).__name__ == "FakeTensor"

@@ -26,7 +26,7 @@ from camtorch._arguments import (
     is_predicted,
 )
 from camtorch._module import BatchedModule, Memo
-from camtorch._tracing import has_tangent, is_concrete
+from camtorch._tracing import FAKE_MODE, has_tangent, is_concrete
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
@@ -685,6 +685,7 @@ def _is_plain(inputs: Sequence[Tensor]) -> bool:
         torch.compiler.is_compiling()
         or torch._C._functorch.peek_interpreter_stack() is not None
         or forward_ad._current_level >= 0
+        or torch._C._get_dispatch_mode(FAKE_MODE) is not None
     ):
         return False
     return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)

@@ -280,6 +280,7 @@ def test_a_batch_is_its_rows_one_by_one(target, options):
             )
 
 
+@pytest.mark.filterwarnings("ignore:.*became unusable")
 def test_a_row_that_is_no_camera_leaves_the_others_alone():
     source = fisheye((3,))
     before = source.convert("brown_conrady", max_angle=0.8)

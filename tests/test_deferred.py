@@ -101,3 +101,11 @@ def test_shapes_without_values(key, mode):
         assert layer["pose"].inverse().compose(layer["pose"]).matrix().shape == (4, 4)
         assert ct.Extrinsics(torch.eye(3), torch.zeros(3)).batch_shape == ()
         assert repr(layer)
+
+
+def test_a_camera_with_values_among_tensors_without():
+    camera = ct.KannalaBrandt([300.0, 310.0, 31.5, 23.5], image_size=(48, 64))
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        assert camera.project(torch.ones(5, 3))[0].shape == (5, 2)
+        assert camera.unproject(torch.ones(5, 2))[0].shape == (5, 3)
+    assert camera.project(POINTS)[1].all()
