@@ -422,7 +422,7 @@ class Camera(BatchedModule):
         if _is_plain(inputs):
             learns = rows.requires_grad or inputs[1].requires_grad or inputs[2].requires_grad
             keeps = learns and torch.is_grad_enabled()
-            planes, valid = direction.apply(*inputs, self._cameras(*inputs[1:]), type(self), keeps)
+            planes, valid = direction.apply(*inputs, self._cameras(*inputs[1:]), type(self), keeps)  # type: ignore[no-untyped-call]
         else:
             # what is compiled has no derivatives of derivatives
             order = 1 if torch.compiler.is_compiling() else 2

@@ -7,6 +7,7 @@ points of its plane are the image of a ray; the camera hands it nothing else, so
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -67,13 +68,15 @@ class Chart:
         scale: that of these rays, where there is one and it is known already.
         """
         scale = self.scale(x, y, z, order) if scale is None else scale
+        assert scale is not None  # a chart that has none has a `to_plane` of its own
         return x * scale, y * scale
 
     def to_plane_vjp(
         self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
     ) -> tuple[Planes3, list[Tensor]]:
         """The cotangents of a covered ray and of the parameters, these summed over the rays, of that of its point."""
-        return vjp_of(self, _to_plane, (x, y, z), (ga, gb), want_parameters)
+        (gx, gy, gz), sums = vjp_of(self, _to_plane, (x, y, z), (ga, gb), want_parameters)
+        return (gx, gy, gz), sums
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         """Positive for the points of the plane that are the image of a ray."""
@@ -87,7 +90,8 @@ class Chart:
         self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
     ) -> tuple[Planes2, list[Tensor]]:
         """The cotangents of a point on the plane and of the parameters, these summed, of the cotangent of its ray."""
-        return vjp_of(self, _to_ray, (a, b), (gx, gy, gz), want_parameters)
+        (ga, gb), sums = vjp_of(self, _to_ray, (a, b), (gx, gy, gz), want_parameters)
+        return (ga, gb), sums
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
         """The radius on the plane at which the chart ends, one or (C, 1). Only charts that a lens follows need it."""
@@ -113,12 +117,14 @@ def _to_ray(chart: Chart, a: Tensor, b: Tensor) -> Planes3:
     return chart.to_ray(a, b, order=1)
 
 
-def even_steps_and_ratios(count: int, steps_to: float, end: float, like: Tensor, bend) -> Tensor:
+def even_steps_and_ratios(
+    count: int, steps_to: float, end: float, like: Tensor, bend: Callable[[Tensor], Tensor]
+) -> Tensor:
     """(count,) radii for `Chart.radii`: bend makes radii of even steps up to `steps_to`; the ratios go on to `end`."""
-    options = {"dtype": like.dtype, "device": like.device}
-    steps = bend(torch.linspace(0, steps_to, count // 2, **options))
-    ratios = torch.linspace(math.log(_SMALLEST_RADIUS), math.log(end), count - count // 2, **options).exp()
-    return torch.cat((steps, ratios)).sort().values
+    dtype, device = like.dtype, like.device
+    steps = torch.linspace(0, steps_to, count // 2, dtype=dtype, device=device)
+    powers = torch.linspace(math.log(_SMALLEST_RADIUS), math.log(end), count - count // 2, dtype=dtype, device=device)
+    return torch.cat((bend(steps), powers.exp())).sort().values
 
 
 class Perspective(Chart):

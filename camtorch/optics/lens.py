@@ -11,6 +11,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,7 +73,8 @@ class Stage:
             By default both are read off points of the circle, with what they may miss in between.
         """
         turn = torch.arange(_DIRECTIONS, dtype=radius.dtype, device=radius.device) * (2 * math.pi / _DIRECTIONS)
-        at = self.at(*((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn))))
+        a, b = ((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn)))
+        at = self.at(a, b)
         shape = (radius.shape[-1], _DIRECTIONS)
         orientation, distance = at.orientation.unflatten(-1, shape), torch.hypot(*at.value).unflatten(-1, shape)
         least, furthest = orientation.amin(-1), distance.amax(-1)
@@ -148,14 +150,9 @@ class Planar(Stage):
     tangential: Sequence[Tensor] = ()
     prism: Sequence[Tensor] = ()
 
-    @property
-    def is_radial(self) -> bool:
-        return len(self.tangential) == len(self.prism) == 0
-
-    @property
-    def parameters(self) -> tuple[Tensor, ...]:
-        """All coefficients, in the order in which `vjp` gives their cotangents."""
-        return *(self.radial.parameters if self.radial else ()), *self.tangential, *self.prism
+    def __post_init__(self) -> None:
+        self.is_radial = len(self.tangential) == len(self.prism) == 0
+        self.parameters = *(self.radial.parameters if self.radial else ()), *self.tangential, *self.prism
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> PlanarAt:
         """The stage at points; see `PlanarAt`."""
@@ -187,13 +184,16 @@ class Planar(Stage):
 class PlanarAt(StageAt):
     """A `Planar` stage at points m = (a, b)."""
 
+    stage: Planar
+
     def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
         """order: 1 if any derivative will be asked for. t: |m|^2, if it is known."""
         self.stage, self.a, self.b = stage, a, b
         self.t = torch.addcmul(a * a, b, b) if t is None else t
         if stage.radial:
             self.factor, *slope = stage.radial.derivatives(self.t, order)
-            self.slope = slope[0] if order else None
+            if order:
+                self.slope = slope[0]
         if stage.tangential:
             px, py = stage.tangential
             self.twice_dot = torch.addcmul(a * (2 * px), b, 2 * py)
@@ -203,7 +203,7 @@ class PlanarAt(StageAt):
         stage = self.stage
         value = [self.a * self.factor, self.b * self.factor] if stage.radial else [self.a, self.b]
         for i, m in enumerate((self.a, self.b)):
-            even = stage.tangential[i] if stage.tangential else 0
+            even: Any = stage.tangential[i] if stage.tangential else 0
             if stage.tangential:
                 value[i] = torch.addcmul(value[i], m, self.twice_dot)
             if stage.prism:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,7 +34,7 @@ class RadialFactor:
     parameters: tuple[Tensor, ...]
     """What the formula learns, in the order in which `vjp` gives the cotangents."""
 
-    def __init_subclass__(cls, **kwargs):
+    def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         cls.name = register(FACTORS, cls)
 
@@ -80,8 +81,9 @@ class Polynomial(RadialFactor):
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
         """R and its first `order` derivatives by t: Horner's scheme, extended to the Taylor coefficients at t."""
         # a zero stays a number until it is none: no work for what the highest powers do not have
-        taylor = [self.parameters[-1]] + [0.0] * order
-        for c in (*reversed(self.parameters[:-1]), 1.0):
+        taylor: list[Any] = [self.parameters[-1]] + [0.0] * order
+        lower: tuple[Any, ...] = (*reversed(self.parameters[:-1]), 1.0)
+        for c in lower:
             for i in range(order, 0, -1):
                 if isinstance(taylor[i], float):
                     taylor[i] = taylor[i - 1]
@@ -111,10 +113,7 @@ class Rational(RadialFactor):
 
     def __init__(self, numerator: Sequence[Tensor], denominator: Sequence[Tensor]):
         self.numerator, self.denominator = Polynomial(numerator), Polynomial(denominator)
-
-    @property
-    def parameters(self) -> tuple[Tensor, ...]:
-        return *self.numerator.parameters, *self.denominator.parameters
+        self.parameters = *self.numerator.parameters, *self.denominator.parameters
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.numerator(t) / self.denominator(t)
@@ -149,10 +148,7 @@ class RadiusPolynomial(RadialFactor):
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.of_radius = Polynomial(coefficients)
-
-    @property
-    def parameters(self) -> tuple[Tensor, ...]:
-        return self.of_radius.parameters
+        self.parameters = self.of_radius.parameters
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
@@ -178,10 +174,7 @@ class AnglePerRadius(RadialFactor):
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.ahead = Polynomial(coefficients)
-
-    @property
-    def parameters(self) -> tuple[Tensor, ...]:
-        return self.ahead.parameters
+        self.parameters = self.ahead.parameters
 
     def __call__(self, t: Tensor) -> Tensor:
         return angle_per_radius(t, self.ahead(t))
@@ -218,24 +211,20 @@ class RadiusTable(RadialFactor):
         """nodes: ascending radii. values: r at the nodes, as many, two at least."""
         zero = torch.zeros_like(values[0])
         self.nodes, self.end = (zero, *nodes[:-1]), nodes[-1]
-        nodes, values = (torch.stack(torch.broadcast_tensors(zero, *w), -1) for w in (nodes, values))
-        steps = nodes.diff(dim=-1)
-        secants = values.diff(dim=-1) / steps
-        self._table = nodes, secants
+        radii, heights = (torch.stack(torch.broadcast_tensors(zero, *w), -1) for w in (nodes, values))
+        steps = radii.diff(dim=-1)
+        secants = heights.diff(dim=-1) / steps
+        self._table = radii, secants
         slopes = _slopes(steps, secants)
         before, after = slopes[..., :-1], slopes[..., 1:]
         squares = (3 * secants - 2 * before - after) / steps
         # of the first piece it is zero, unless the filter was at work; not rounding, which the axis divides by zero
         first = (squares * steps).abs() < 64 * torch.finfo(steps.dtype).eps * secants.abs()
-        squares = torch.where(first & (nodes[..., :-1] == 0), 0.0, squares)
+        squares = torch.where(first & (radii[..., :-1] == 0), 0.0, squares)
         cubes = (before + after - 2 * secants) / (steps * steps)
         # by powers of the distance from the node: those of the radius itself would cancel, the more the finer the table
-        self.cubics = tuple(power.unbind(-1) for power in (values[..., :-1], before, squares, cubes))
-
-    @property
-    def parameters(self) -> tuple[Tensor, ...]:
-        """The four coefficients of every piece, by powers."""
-        return tuple(c for power in self.cubics for c in power)
+        self.cubics = tuple(power.unbind(-1) for power in (heights[..., :-1], before, squares, cubes))
+        self.parameters = tuple(c for power in self.cubics for c in power)
 
     @property
     def fold(self) -> Tensor:
@@ -284,7 +273,7 @@ class RadiusTable(RadialFactor):
         return sums
 
 
-def _piece(nodes: Sequence[Tensor], place: Tensor) -> Tensor:
+def _piece(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
     """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
     table = torch.stack(nodes, -1).contiguous()
     if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own

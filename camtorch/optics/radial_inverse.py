@@ -194,6 +194,7 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor, looks: bool) ->
             settled = short(scale.dtype) * scale - step.abs()
             if not looks or bool(settled.amin() > 0):
                 break
+    assert settled is not None  # there are more steps than those before the first look
     return scale, settled
 
 
@@ -306,7 +307,7 @@ def _radial_scale(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
     camera, point = (~(settled > 0)).nonzero(as_tuple=True)
     if len(camera):
         # a single camera serves all points
-        radial = FACTORS[name](k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT)
+        radial = FACTORS[name]((k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT).unbind())
         scale[camera, point] = bracketed(radial, r2[camera, point], inner2[camera, 0])
     return scale
 

@@ -98,6 +98,7 @@ class Domain:
         """(C, 1): that of the radial factor of the first stage, in double precision where there is one."""
         k = precise(self.k)
         chart, lens = self.optics(columns(k))
+        assert lens.radial is not None  # nobody asks for it otherwise
         return fold_of(
             lens.radial, chart.radii(RADII, k), chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25
         )
@@ -107,6 +108,7 @@ class Domain:
         """(C, 2 + 2 nodes): what `inverse` is made of."""
         k = precise(self.k)
         chart, lens = self.optics(columns(k))
+        assert lens.radial is not None
         return tabulate(lens.radial, self._fold, chart.usual_end(self.k.dtype)).to(self.k.dtype)
 
     @cached_property

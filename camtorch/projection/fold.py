@@ -78,15 +78,17 @@ class Azimuths:
 
     def outline(self, camera: Tensor) -> Outline:
         """Of several cameras (G,), each given once."""
-        known = [self._outlines.get(c) for c in camera.tolist()]
-        (missing,) = torch.tensor([o is None for o in known]).nonzero(as_tuple=True)
+        wanted = camera.tolist()
+        (missing,) = torch.tensor([c not in self._outlines for c in wanted]).nonzero(as_tuple=True)
+        known = {c: self._outlines[c] for c in wanted if c in self._outlines}
         if len(missing):
             made = self._made_outline(camera[missing.to(camera.device)])
             for i, c in enumerate(missing.tolist()):
-                known[c] = Outline(*(w[i : i + 1] for w in made))
+                known[wanted[c]] = Outline(*(w[i : i + 1] for w in made))
             if len(self._outlines) + len(missing) <= _KEPT:
-                self._outlines.update(zip(camera.tolist(), known, strict=True))
-        return Outline(*(torch.cat(w) for w in zip(*known, strict=True))) if len(known) > 1 else known[0]
+                self._outlines.update(known)
+        rows = [known[c] for c in wanted]
+        return Outline(*(torch.cat(w) for w in zip(*rows, strict=True))) if len(rows) > 1 else rows[0]
 
     def _made_outline(self, camera: Tensor) -> Outline:
         index = torch.arange(AZIMUTHS, device=camera.device).repeat(len(camera))

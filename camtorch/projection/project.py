@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch._arguments import columns
-from camtorch.optics.charts import floor_of
+from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection.ops import positive, to_planes, without_keeping
 from camtorch.projection.rows import (
     Cameras,
@@ -95,7 +95,7 @@ def _power_of_two(size: Tensor) -> Tensor:
 
 
 def see(
-    points: tuple[Tensor, ...],
+    points: Planes3,
     chart: Chart,
     lens: Lens,
     domain: Domain,
@@ -157,8 +157,8 @@ class Project(Function):
             chart, lens = model.optics(columns(distortion))
             a, b, mask, _, _ = see((x, y, z), chart, lens, usual.domain, usual.usable, order)
             focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
-            pixels = focal_x * a + centre_x, focal_y * b + centre_y
-            pixels = torch.stack([replace(mask, w, INVALID_PIXEL) for w in pixels])
+            planes = focal_x * a + centre_x, focal_y * b + centre_y
+            pixels = torch.stack([replace(mask, w, INVALID_PIXEL) for w in planes])
             return pixels, torch.ones_like(pixels[0]) if mask is None else mask.expand_as(pixels[0])
 
         pixels, mask = without_keeping(evaluate, *to_planes(points), usual.intrinsics, usual.distortion)
@@ -174,8 +174,8 @@ class Project(Function):
         ctx.plain, looks = [], cameras.looks
         for block in blocks(cameras, points):
             here, domain = block.here, block.domain
-            planes = planes_of(points[here])
-            a, b, mask, scale, is_plain = see(planes, domain.chart, domain.lens, domain, block.usable, 1, looks)
+            x, y, z = planes_of(points[here])
+            a, b, mask, scale, is_plain = see((x, y, z), domain.chart, domain.lens, domain, block.usable, 1, looks)
             for plane, m, focal, centre in zip(pixels, (a, b), block.intrinsics[:2], block.intrinsics[2:], strict=True):
                 torch.add(focal * m, centre, out=plane[here])
                 if mask is not None:

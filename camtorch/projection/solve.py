@@ -68,9 +68,8 @@ class _Search:
         # next to a fold the polished solution may lie on its other side: what counts is where its ray is seen
         ray = self.chart.to_ray(a, b, order=1)
         covered = self.chart.margin(*ray) > 0
-        seen = self.chart.to_plane(
-            *(torch.where(covered, w, axis) for w, axis in zip(ray, (0, 0, 1), strict=True)), order=1
-        )
+        dx, dy, dz = (torch.where(covered, w, axis) for w, axis in zip(ray, (0, 0, 1), strict=True))
+        seen = self.chart.to_plane(dx, dy, dz, order=1)
         x, y = self.lens(*seen)
         miss = torch.maximum((x - u).abs(), (y - v).abs())
         valid = valid & covered & self.contains(*seen) & (miss <= rounding(u, v, stretch))
@@ -89,6 +88,7 @@ class _Search:
         """In a bracket up to the fold."""
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit
         fold2 = self.domain.inner2[self.camera, 0] * (1 - 64 * torch.finfo(u.dtype).eps)
+        assert self.lens.radial is not None
         scale = bracketed(self.lens.radial, torch.addcmul(u * u, v, v), fold2)
         return u * scale, v * scale
 
@@ -126,8 +126,8 @@ class _Search:
             nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < step[0] * step[0] + step[1] * step[1]
             good = active & nearer & self.contains(*trial)
             old, new = (a, b, *value, *jacobian), (*trial, *trial_value, *trial_jacobian)
-            a, b, x, y, *jacobian = (torch.where(good, n, o) for n, o in zip(new, old, strict=True))
-            value = x, y
+            a, b, x, y, xa, xb, ya, yb = (torch.where(good, n, o) for n, o in zip(new, old, strict=True))
+            value, jacobian = (x, y), (xa, xb, ya, yb)
             length = torch.where(good, (length * 4).clamp(max=1), length / 4)
         return a, b, active
 
@@ -136,6 +136,8 @@ class _Search:
 
         The azimuth is followed by the secant method: it is nearly that of (u, v), unless a prism dominates.
         """
+        assert self.outline is not None  # a lens that is not radial has one
+        assert self.row is not None
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
         a, b, best = torch.zeros_like(u), torch.zeros_like(v), target * target
         close = torch.zeros_like(u, dtype=torch.bool)
