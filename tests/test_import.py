@@ -94,6 +94,17 @@ print(function(torch.ones(3))[0].item())
     assert python(code) == "4.0\n"
 
 
+def test_output_that_nobody_reads_is_no_error():
+    code = "from camtorch.cli.main import main; import sys; sys.exit(main(['augment', '--list']))"
+    for unbuffered in ("", "1"):
+        environment = ENVIRONMENT | {"PYTHONUNBUFFERED": unbuffered}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        with subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes) as process:
+            process.stdout.close()
+            assert process.stderr.read() == b""
+        assert process.returncode == 141
+
+
 INTERRUPTED = """
 import sys, types
 import camtorch.cli.main as command

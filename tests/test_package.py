@@ -70,6 +70,22 @@ def test_what_is_installed_dewarps_a_photograph(installed, tmp_path):
         assert image.size == (96, 64)
 
 
+def test_no_module_of_the_wheel_lacks_another(installed, tmp_path):
+    code = """
+import importlib, pkgutil
+import camtorch
+print(camtorch.__file__)
+for module in pkgutil.walk_packages(camtorch.__path__, "camtorch."):
+    # the first one runs the command; the others are for libraries that may not be there
+    if module.name.split(".")[-1] not in ("__main__", "albumentations", "torchvision"):
+        importlib.import_module(module.name)
+"""
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path, env=environment)
+    assert Path(done.stdout.strip()).parent.parent == installed
+
+
 @pytest.mark.parametrize("words", [["demo"], ["demo", "training"], ["augment"]])
 def test_what_needs_the_repository_says_so(installed, tmp_path, words):
     status, told, error = camtorch(installed, tmp_path, *words)

@@ -19,6 +19,8 @@ from camtorch import __version__
 from camtorch.cli import augment, convert, demo, dewarp, show
 from camtorch.cli.terminal import note, say
 
+_INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
+
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
@@ -29,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`, by default the process's own.
 
     Returns:
-        The exit status: 0; 2 after an error, which is one line on stderr; 130 after an interrupt.
+        The exit status: 0; 2 after an error, which is one line on stderr; 130 after an interrupt; 141 where nobody
+        reads what is printed.
     """
     try:
         arguments = _parser().parse_args(argv)
@@ -40,9 +43,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments.run(arguments)
         for warning in caught:
             note(warning.message)
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _PIPE
     except KeyboardInterrupt:
         say("interrupted")
-        return 130
+        return _INTERRUPT
     except Exception as error:
         if not (isinstance(error, (ValueError, ImportError, OSError)) or _lacks_memory(error)):
             raise
@@ -83,7 +90,7 @@ def _interrupts_end_the_process() -> Iterator[None]:
 
     def end(number: int, frame: object) -> NoReturn:
         say("interrupted")
-        os._exit(130)
+        os._exit(_INTERRUPT)
 
     before = signal.signal(signal.SIGINT, end)
     try:
