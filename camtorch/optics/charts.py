@@ -288,7 +288,7 @@ def _length(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sum(z: Tensor, root: Tensor, difference: Tensor) -> Tensor:
-    """Z + root, where difference = root^2 - z^2, without the cancellation for z < 0."""
+    """The sum z + root where difference = root^2 - z^2, without the cancellation for z < 0."""
     ahead = z > 0
     return torch.where(ahead, z + root, difference / torch.where(ahead, 1.0, root - z))
 
