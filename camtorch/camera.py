@@ -200,6 +200,11 @@ class Camera(BatchedModule):
         if distortion is None:
             return cls(intrinsics, image_size=image_size)
         distortion = as_real(distortion, "distortion", cls.__name__)
+        if not cls.distortion_names:
+            raise ValueError(
+                f"{cls.__name__}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
+                "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
+            )
         if K.ndim == 2 == distortion.ndim and 1 in distortion.shape:
             distortion = distortion.flatten()
         elif cls._is_column(distortion):

@@ -74,6 +74,12 @@ def test_intrinsics_as_a_column_are_refused_with_a_hint():
         ct.Pinhole(np.array([[300.0], [310.0], [319.5], [239.5]]))
 
 
+def test_a_model_without_distortion_says_which_has_it():
+    for model in (ct.Pinhole, ct.Equirectangular):
+        with pytest.raises(ValueError, match=rf"{model.__name__}: it has no distortion.*\(1, 5\).*BrownConrady"):
+            model.from_matrix(K, np.zeros((1, 5)))
+
+
 # -- poses
 
 R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
