@@ -1,6 +1,6 @@
 """Contents of files as keys and values: YAML, JSON, OpenCV's XML, Python literals and NumPy archives, never trusted.
 
-Whatever a file holds, reading takes at most a second for 10 MB and ten times its size in memory.
+A file that is refused, whatever it holds, has cost at most a second for 10 MB and ten times its size in memory.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
 _MOST_DIRECTIVES = 100  # libyaml compares each with all
 _MOST_VALUES = 1 << 17
-_MOST_JSON_UNITS = 1 << 20
-_BYTES_PER_VALUE = 4  # where there are more
+_MOST_JSON_UNITS = 1 << 20  # of 32 bytes, what a number takes in memory
+_BYTES_PER_UNIT = 4  # of the file, where there are more
 MOST_COMMENTS = 10_000
 _START = 1 << 16  # of a text, where its kind shows
 
@@ -112,9 +112,8 @@ def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
 
 
 def _from_json(path: str | os.PathLike[str], text: str) -> Any:
-    # in units of 32 bytes, what a number takes in memory
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
-    if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_VALUE):
+    if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
         raise CameraFileError(path, "content", "too many values")
     # floats at once: no text is made of a number, and integers of any length are no work
     options: dict[str, Any] = {"parse_int": float, "parse_constant": float}
