@@ -172,10 +172,27 @@ class InverseTable:
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
 
 
+class BriefTable:
+    """The same up to a radius, read off the factor at few radii: for few points of a camera that is about to change."""
+
+    def __init__(self, radial: RadialFactor, radii: Tensor):
+        """radii: (C, K) ascending from 0, on which the factor is followed without a fold."""
+        factor = radial(radii * radii)
+        self.images, self.values = (radii * factor).contiguous(), factor.reciprocal()
+        self.slopes = self.values.diff(dim=-1) / self.images.diff(dim=-1)
+
+    def __call__(self, r2: Tensor) -> Tensor:
+        """The factor for (C, N), to about 1e-5."""
+        r = r2.sqrt()
+        node = (torch.searchsorted(self.images, r) - 1).clamp(0, self.slopes.shape[-1] - 1)
+        value, image, slope = (w.gather(-1, node) for w in (self.values, self.images, self.slopes))
+        return torch.addcmul(value, r - image, slope)
+
+
 # -- the solution
 
 
-def solve(radial: RadialFactor, table: InverseTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
+def solve(radial: RadialFactor, table: InverseTable | BriefTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
     """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
 
     Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is

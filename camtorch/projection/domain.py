@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
 
 _RADII = 512
+_BRIEF, _LOOKS = 129, 2  # radii of a brief look, one of which each direction may take
 
 
 def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property:
@@ -50,6 +51,7 @@ class Domain:
         """
         self.optics, self.k, self.whole, self.cameras = optics, k, whole, cameras
         self.chart, self.lens = optics(columns(k))
+        self.looks = 0
 
     def part(self, cameras: slice) -> Domain:
         """The domain of some of the cameras."""
@@ -120,6 +122,24 @@ class Domain:
     def usual2(self) -> Tensor:
         """(C, 1): `inner2`, but no further out than images reach."""
         return self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+
+    def brief(self, furthest2: Tensor) -> Tensor | None:
+        """Radii (C, K) from the centre to the given ones, (C, 1) squared, if a brief look shows no fold before them.
+
+        What changes less from radius to radius than it is large has no zero in between. None where that is not so, and
+        for a lens that has its tables, or is asked for often enough to make them.
+        """
+        radial = self.lens.radial
+        self.looks += 1
+        if self.looks > _LOOKS or "inner2" in self.__dict__ or (radial is not None and radial.fold is not None):
+            return None
+        radii = furthest2.sqrt() * torch.linspace(0, 1, _BRIEF, dtype=self.k.dtype, device=self.k.device)
+        is_radial = radial is not None and self.lens.is_radial
+        least = radial.orientation(radii) if is_radial else self.lens.lower_bound(radii)
+        certain = least.amin(-1) - least.diff(dim=-1).abs().amax(-1)
+        end = self.chart.usual_end(self.k.dtype)
+        certain = torch.minimum(certain.unsqueeze(-1), end - 1.01 * radii[..., -1:])
+        return radii if bool(certain.amin() > 0) else None
 
     def margin(self, a: Tensor, b: Tensor, t: Tensor, looks: bool) -> Tensor:
         """Positive for the plane points (C, N) in the domain; t = a^2 + b^2. looks: whether it may look at values."""

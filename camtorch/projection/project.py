@@ -12,6 +12,7 @@ from camtorch._arguments import columns
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection.ops import positive, to_planes, without_keeping
 from camtorch.projection.rows import (
+    FEW,
     Cameras,
     Sums,
     Traced,
@@ -102,6 +103,7 @@ def see(
     usable: Tensor | None,
     order: int,
     looks: bool = False,
+    brief: bool = False,
 ) -> PlanePoints:
     """Where points, planes (C, N), are seen: the formula of every camera, and all that makes a point invalid.
 
@@ -113,6 +115,7 @@ def see(
         usable: the mask of the cameras whose parameters make a camera.
         order: of the derivatives that shall be exact.
         looks: whether a look at the values may find a shorter way, and no graph is recorded.
+        brief: whether the points are few, and the camera about to change: too few for tables.
     """
     x, y, z, shrink, mask = normalise(chart, *points, looks)
     is_plain = shrink is None and mask is None
@@ -120,13 +123,15 @@ def see(
     a, b = chart.to_plane(x, y, z, order, scale)
     if lens.stages:
         t = torch.addcmul(a * a, b, b)
-        inside = domain.inner2 - t.detach()
-        if looks and bool(inside.amin() > 0):
-            inside = None
-        else:
-            if not lens.is_radial:
-                inside = domain.margin(a.detach(), b.detach(), t.detach(), looks)
-            inside = to_mask(inside, looks)
+        inside = None
+        if not (brief and domain.brief(t.amax(-1, keepdim=True)) is not None):
+            inside = domain.inner2 - t.detach()
+            if looks and bool(inside.amin() > 0):
+                inside = None
+            else:
+                if not lens.is_radial:
+                    inside = domain.margin(a.detach(), b.detach(), t.detach(), looks)
+                inside = to_mask(inside, looks)
         if inside is not None:
             inside = as_kept(inside)
             a, b, t = (replace(inside, w, 0.0, looks) for w in (a, b, t))
@@ -172,10 +177,13 @@ class Project(Function):
         valid = torch.ones(shape, dtype=torch.bool, device=points.device)
         scales = points.new_empty(shape if keeps and cameras.domain.chart.has_scale else (0, 0))
         ctx.plain, looks = [], cameras.looks
+        brief = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
         for block in blocks(cameras, points):
             here, domain = block.here, block.domain
             x, y, z = planes_of(points[here])
-            a, b, mask, scale, is_plain = see((x, y, z), domain.chart, domain.lens, domain, block.usable, 1, looks)
+            a, b, mask, scale, is_plain = see(
+                (x, y, z), domain.chart, domain.lens, domain, block.usable, 1, looks, brief
+            )
             for plane, m, focal, centre in zip(pixels, (a, b), block.intrinsics[:2], block.intrinsics[2:], strict=True):
                 torch.add(focal * m, centre, out=plane[here])
                 if mask is not None:

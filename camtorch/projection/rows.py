@@ -24,6 +24,8 @@ Planes3 = tuple[Tensor, Tensor, Tensor]
 Columns = tuple[Tensor, ...]
 
 _BLOCK = 1 << 17  # points
+FEW = 1024
+"""Points of one camera that are fewer than the nodes of its table."""
 
 
 # -- the cameras of rows (C, N)
@@ -49,10 +51,14 @@ class Cameras(NamedTuple):
         """Those of concrete values (C, 4), (C, n)."""
         with torch.no_grad():
             given = intrinsics.detach().clone(), distortion.detach().clone()
-            usable = _usable(model, *given)
-            values = [torch.where(usable, w, ideal) for w, ideal in zip(given, _ideal(model, *given), strict=True)]
-            mask = None if may_look(usable) and bool(usable.all()) else usable.to(intrinsics.dtype)
-            domain = domain_of(model._model, values[1], model.optics)
+            usable, values, mask = _usable(model, *given), given, None
+            if not (may_look(usable) and bool(usable.all())):
+                ideal = _ideal(model, *given)
+                values = torch.where(usable, given[0], ideal[0]), torch.where(usable, given[1], ideal[1])
+                mask = usable.to(intrinsics.dtype)
+            # what learns will not be seen again
+            learns = distortion.requires_grad
+            domain = Domain(model.optics, values[1]) if learns else domain_of(model._model, values[1], model.optics)
             return cls(given, values[0], columns(values[0]), domain, mask, intrinsics.is_cpu)
 
     def are(self, intrinsics: Tensor, distortion: Tensor) -> bool:

@@ -11,9 +11,10 @@ from torch.autograd import Function
 
 from camtorch._arguments import columns
 from camtorch.optics.lens import newton_step
-from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
+from camtorch.optics.radial_inverse import MOST_STEPS, BriefTable, short, solve
 from camtorch.projection.ops import positive, search_in_place, search_open, to_planes, without_keeping
 from camtorch.projection.rows import (
+    FEW,
     Block,
     Cameras,
     Sums,
@@ -70,6 +71,27 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
 
 
+def invert_briefly(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
+    """The same without the tables of the domain, for few points; None where it takes those to tell."""
+    a, b = domain.lens.start(u, v)
+    r2 = torch.addcmul(a * a, b, b)
+    # further out than the last point, for a lens that compresses
+    radii = domain.brief(2 * r2.amax(-1, keepdim=True) + 1e-6)
+    if radii is None or domain.lens.radial is None:
+        return None
+    table = BriefTable(domain.lens.radial, radii)
+    if not bool((table.images[..., -1:] ** 2 - r2).amin() > 0):
+        return None
+    if domain.lens.is_radial:
+        scale, settled = solve(domain.lens.radial, table, r2, looks=True)
+        found = Found(u * scale, v * scale, settled, settled)
+    else:
+        scale = table(r2)
+        found = _newton(domain, u, v, a * scale, b * scale, looks=True)
+        settled = torch.minimum(found.solved, radii[..., -1:] ** 2 - torch.addcmul(found.a**2, found.b, found.b))
+    return found if bool(settled.amin() > 0) else None
+
+
 def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     """Newton's method in the plane, from the inverse of the radial factor."""
     a, b = domain.lens.start(u, v)
@@ -77,6 +99,14 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
         # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
+    found = _newton(domain, u, v, a, b, looks)
+    # further out than images reach a determinant may overflow, and a step seem short
+    inside = domain.usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
+    return found._replace(solved=torch.minimum(found.solved, inside))
+
+
+def _newton(domain: Domain, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool) -> Found:
+    """From (a, b) on, wherever that leads."""
     short2, settled = short(u.dtype) ** 2, None
     for count in range(1, MOST_STEPS + 1):
         at = domain.lens.at(a, b)
@@ -91,9 +121,7 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
             if not looks or bool(settled.amin() > 0):
                 break
     assert settled is not None  # there are more steps than those before the first look
-    # further out than images reach a determinant may overflow, and a step seem short
-    solved = torch.minimum(torch.minimum(settled, domain.usual2 - t), reciprocal.abs())
-    return Found(a, b, solved, torch.ones_like(a))
+    return Found(a, b, torch.minimum(settled, reciprocal.abs()), torch.ones_like(a))
 
 
 def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
@@ -152,6 +180,7 @@ def solutions(
     usable: Tensor | None,
     finish: Callable[[Planes2, Found], Found] | None = None,
     looks: bool = False,
+    brief: bool = False,
 ) -> Solution:
     """Where pixels, planes (C, N), come from: graph-free, with all that makes a pixel invalid.
 
@@ -163,6 +192,7 @@ def solutions(
         usable: the mask of the cameras whose parameters make a camera.
         finish: adds to what was found at p, q what a search finds; by default that is left open.
         looks: whether a look at the values may find a shorter way.
+        brief: whether the points are few, and the camera about to change: too few for tables.
     """
     p, q, known = to_target(u, v, intrinsics, looks)
     known = known if usable is None else both(known, usable)
@@ -170,7 +200,7 @@ def solutions(
         p, q = replace(known, p, 0.0, looks), replace(known, q, 0.0, looks)
     target, left = Target(p, q, known), None
     if domain.lens.stages:
-        found = invert(domain, p, q, looks)
+        found = (invert_briefly(domain, p, q) if brief else None) or invert(domain, p, q, looks)
         if finish is not None:
             found = finish((p, q), found)
         solved = to_mask(found.solved, looks)
@@ -236,11 +266,11 @@ class Unproject(Function):
         rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
         left_open: list[tuple[Tensor, ...]] = []
-        all_valid = True
+        all_valid, brief = True, looks and ctx.needs_input_grad[2] and shape[1] <= FEW
         for block in blocks(cameras, pixels):
             here, domain = block.here, block.domain
             u, v = planes_of(pixels[here])
-            a, b, mask, target, left = solutions(u, v, block.intrinsics, domain, block.usable, None, looks)
+            a, b, mask, target, left = solutions(u, v, block.intrinsics, domain, block.usable, None, looks, brief)
             made = domain.chart.to_ray(a, b, 1)
             for plane, w, axis in zip(rays, made, (0.0, 0.0, 1.0), strict=True):
                 plane[here] = replace(mask, w, axis, looks)
