@@ -134,8 +134,8 @@ class Domain:
         if self.looks > _LOOKS or "inner2" in self.__dict__ or (radial is not None and radial.fold is not None):
             return None
         radii = furthest2.sqrt() * torch.linspace(0, 1, _BRIEF, dtype=self.k.dtype, device=self.k.device)
-        is_radial = radial is not None and self.lens.is_radial
-        least = radial.orientation(radii) if is_radial else self.lens.lower_bound(radii)
+        followed = radial.orientation if radial is not None and self.lens.is_radial else self.lens.lower_bound
+        least = followed(radii)
         certain = least.amin(-1) - least.diff(dim=-1).abs().amax(-1)
         end = self.chart.usual_end(self.k.dtype)
         certain = torch.minimum(certain.unsqueeze(-1), end - 1.01 * radii[..., -1:])
