@@ -7,6 +7,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 
 import camtorch as ct
 from camtorch.warp import sampling
+from camtorch.warp.grid import tabulate
 
 SIZE = (40, 50)
 MODES = ("nearest", "bilinear", "bicubic")
@@ -240,3 +241,17 @@ def test_masks_and_grids_may_be_changed():
         mask &= False
         assert torch.equal(warp.grid(), expected[0])
         assert torch.equal(warp.valid_mask(), expected[1])
+
+
+def test_a_loaded_calibration_makes_its_grid_once(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr("camtorch.warp.warp.tabulate", lambda *a: made.append(a) or tabulate(*a))
+    ct.save(fisheye(torch.float64), tmp_path / "camera.yaml", format="opencv")
+    camera = ct.load(tmp_path / "camera.yaml").camera
+    assert camera.intrinsics.dtype == torch.float64
+    dewarp = ct.Dewarp(camera)
+    for dtype in (torch.float32, torch.uint8, torch.float64, torch.float32):
+        result = dewarp(torch.zeros(1, 3, *SIZE, dtype=dtype))
+        assert result.grad_fn is None
+        assert result.dtype == dtype
+    assert len(made) == 1
