@@ -37,6 +37,7 @@ RANGES = {
     "stereographic": {"k": (0.02, 0.3)},
     "orthographic_fisheye": {"k": (0.05, 0.5)},
     "thin_prism_fisheye": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
+    "ocamcalib": {"d": (0.01, 0.3), "e": (0.01, 0.3), "a": (0.1, 0.5)},
     # steps from one node to the next
     "tabulated": {"theta": ((0.2, 0.4), (0.2, 0.8)), "r": ((0.15, 0.4), (-0.1, 1.0))},
     "f_theta": {"k": (0.1, 0.5)},
@@ -61,6 +62,18 @@ CALIBRATIONS = {
         (966, 1280),
     ),
     # KITTI-360, calibration/image_02.yaml
+    # a result of the toolbox, printed in the README of omni_cam: ss is -206.517, 0, 2.207161e-3, -4.879622e-6,
+    # 1.865656e-8, the centre is row 241.800066 and column 394.552874, and c, d, e are 1.00033, 0.000219, 0.000257
+    "ocamcalib": (
+        (206.517, 206.517 * 1.00033, 394.552874, 241.800066),
+        (
+            0.000219 / 1.00033,
+            0.000257,
+            0.0,
+            *(-w * 206.517**i for i, w in enumerate((2.207161e-3, -4.879622e-6, 1.865656e-8), 1)),
+        ),
+        (480, 752),
+    ),
     "mei": (
         (1336.3220825849971, 1335.7883350012958, 716.94323510126321, 705.76498308221585),
         (2.2134047507854890, 1.6798235660113681e-2, 1.6548773243373522, 4.2223943394772046e-4, 4.2462134260997584e-4),
@@ -70,7 +83,7 @@ CALIBRATIONS = {
 
 
 # Cameras with one continuous derivative on the axis, and no second one
-NOT_ANALYTIC = {"f_theta", "f_theta_backward", "woodscape"}
+NOT_ANALYTIC = {"f_theta", "f_theta_backward", "ocamcalib", "woodscape"}
 
 
 def constants(camera):

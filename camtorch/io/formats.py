@@ -14,7 +14,7 @@ import os
 from typing import Any
 
 from camtorch.camera import Camera
-from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, opencv, ros
+from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, ocamcalib, opencv, ros
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat
@@ -23,7 +23,7 @@ from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
 # in the order in which they are asked
-_BY_CONTENT: tuple[ContentFormat, ...] = (colmap,)
+_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, ocamcalib)
 _BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, nerfstudio, ros, kalibr, opencv)
 
 _NAMES = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
@@ -102,7 +102,8 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         rig: a `Rig`, or one camera.
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch". If left out:
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ocamcalib" or
+            "camtorch". If left out:
             the format that the rig was loaded from if its files end like this one, else what the name says
             (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
             else camtorch's own for `.json`.

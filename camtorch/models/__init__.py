@@ -20,6 +20,7 @@ from camtorch.models.fisheye624 import Fisheye624, FisheyeRadTanThinPrism
 from camtorch.models.fov import FOV
 from camtorch.models.kannala_brandt import KannalaBrandt
 from camtorch.models.mei import Mei
+from camtorch.models.ocamcalib import OCamCalib
 from camtorch.models.orthographic_fisheye import OrthographicFisheye
 from camtorch.models.pinhole import Pinhole
 from camtorch.models.stereographic import Stereographic
@@ -46,6 +47,7 @@ __all__ = [
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
     "Mei",
+    "OCamCalib",
     "OrthographicFisheye",
     "Pinhole",
     "Stereographic",

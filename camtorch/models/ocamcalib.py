@@ -1,0 +1,126 @@
+"""OCamCalib's omnidirectional camera, from the pixel to the ray: (x, y, 1 + a1 r + a2 r^2 + ...)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import TensorLike, as_real
+from camtorch._tracing import is_concrete
+from camtorch.camera import Camera
+from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Stage
+from camtorch.optics.lens import StageAt
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class AngleOfAllPowers(AnglePerRadius):
+    """The radial factor theta / r of the ray (r, 0, D), D = 1 + a1 r + a2 r^2 + ..."""
+
+    def __init__(self, coefficients: Sequence[Tensor]):
+        self.ahead = RadiusPolynomial(coefficients)
+
+
+class Shear(Stage):
+    """(x + e y, d x + y): a sensor out of line with the lens."""
+
+    def __init__(self, d: Tensor, e: Tensor):
+        self.parameters = (d, e)
+
+    def __call__(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        d, e = self.parameters
+        return a + e * b, b + d * a
+
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> ShearAt:
+        return ShearAt(self, a, b)
+
+    def start(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        d, e = self.parameters
+        return (u - e * v) / (1 - d * e), (v - d * u) / (1 - d * e)
+
+
+class ShearAt(StageAt):
+    """A `Shear` at points."""
+
+    @property
+    def jacobian(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        d, e = (w + torch.zeros_like(self.a) for w in self.stage.parameters)
+        return torch.ones_like(d), e, d, torch.ones_like(e)
+
+    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[tuple[Tensor, Tensor], list[Tensor]]:
+        d, e = self.stage.parameters
+        sums = [(g * w).sum(-1, keepdim=True) for g, w in ((gv, self.a), (gu, self.b))] if want_parameters else []
+        return (gu + d * gv, gv + e * gu), sums
+
+
+class OCamCalib(Camera):
+    """The omnidirectional camera of Scaramuzza's toolbox: the point (x, y) sees along (x, y, 1 + a1 r + a2 r^2 + ...).
+
+    r = hypot(x, y); (u, v) = f (x + e y, d x + y) + c. A ray is valid before its angle from the axis ceases to ascend
+    with r, and up to a radius of 19 focal lengths. The inverse, for which the toolbox fits a second polynomial, is
+    exact. With odd powers (a1 is mostly zero) the camera has one continuous derivative on the axis, and no second one.
+
+    Distortion: d e a1 a2 ... by the power of r, n >= 3 numbers; four powers if left out. What the toolbox calls ss, c,
+    d, e, with its axes and its centre, comes in through `from_ocamcalib`. Even powers alone are `Division`. Source:
+    Scaramuzza, Martinelli and Siegwart, "A toolbox for easily calibrating omnidirectional cameras", IROS 2006. See
+    `Camera` for shapes, conventions and errors.
+    """
+
+    key = "ocamcalib"
+    distortion_names = ("d", "e", "a1", "a2", "a3", "a4")
+    default_count = 6
+    odd_in_x = odd_in_y = frozenset({"d", "e"})
+    special_cases = (("division", ("a2", "a4", "a6")), ("pinhole", ()))
+    fit_counts = (6, 8, 10)
+
+    @classmethod
+    def names_of(cls, count: int) -> tuple[str, ...] | None:
+        return ("d", "e", *(f"a{i}" for i in range(1, count - 1))) if count >= 3 else None
+
+    @classmethod
+    def counts_text(cls) -> str:
+        return "n >= 3 (d e a1 a2 ...)"
+
+    @staticmethod
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
+        return Inverted(AngleOfAllPowers, k[2:]), Lens(Shear(*k[:2]))
+
+    @classmethod
+    def from_ocamcalib(
+        cls,
+        polynomial: TensorLike,
+        centre: TensorLike,
+        affine: TensorLike = (1.0, 0.0, 0.0),
+        *,
+        image_size: tuple[int, int] | None = None,
+    ) -> Self:
+        """From the numbers of the toolbox: its x goes down the rows, and its z backwards where ss[0] is negative.
+
+        Args:
+            polynomial: (n,) ss, n >= 2, from the constant on: z over the distance from the centre, both in pixels.
+            centre: (2,) xc, yc: row and column, counted from 0 as in `calib_results.txt`; those of MATLAB are one more.
+            affine: (3,) c, d, e: (row, column) = [[c, d], [e, 1]] (x, y) + (xc, yc).
+            image_size: (height, width) in pixels.
+
+        Raises:
+            ValueError: another shape; ss[0] that is zero; c that is not positive.
+        """
+        owner = cls.__name__
+        named = ((polynomial, "polynomial"), (centre, "centre"), (affine, "affine"))
+        polynomial, centre, affine = (as_real(value, name, owner) for value, name in named)
+        shapes = [tuple(t.shape) for t in (polynomial, centre, affine)]
+        if polynomial.ndim != 1 or len(polynomial) < 2 or shapes[1:] != [(2,), (3,)]:
+            raise ValueError(f"{owner}: polynomial must be (n,), n >= 2, centre (2,), affine (3,); got shapes {shapes}")
+        if is_concrete(polynomial) and not (polynomial[0] != 0 and affine[0] > 0):
+            raise ValueError(
+                f"{owner}: ss[0], the focal length, must not be zero, and c must be positive; got ss[0] = "
+                f"{float(polynomial[0])}, c = {float(affine[0])}"
+            )
+        focal, (c, d, e) = polynomial[0].abs(), affine.unbind()
+        powers = torch.arange(1, len(polynomial), device=polynomial.device)
+        distortion = torch.cat((torch.stack((d / c, e)), polynomial[1:] / polynomial[0] * focal**powers)) + 0.0
+        return cls(torch.stack((focal, focal * c, centre[1], centre[0])), distortion, image_size=image_size)

@@ -1,0 +1,184 @@
+"""OCamCalib against its published formulas, evaluated here by themselves, and its text file."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+import torch
+from cameras import fan, one, pixel_lattice
+from rigs import assert_same, float64
+
+import camtorch as ct
+
+SS = (-206.517, 0.0, 2.207161e-03, -4.879622e-06, 1.865656e-08)
+# the toolbox's own polynomial of the other direction
+INVERSE = (294.182260, 152.289570, -12.191217, 27.959546, 8.241525, -1.970397)
+INVERSE += (10.689256, 1.871609, -6.437684, 0.430037, 3.215544, 0.921484)
+CENTRE, AFFINE, SIZE = (241.800066, 394.552874), (1.000330, 0.000219, 0.000257), (480, 752)
+
+
+def text(ss=SS, inverse=INVERSE, centre=CENTRE, affine=AFFINE, size=SIZE, more=""):
+    rows = (len(ss), *ss), (len(inverse), *inverse), centre, affine, size
+    return "\n\n".join(f"#a comment\n\n{' '.join(map(str, row))} " for row in rows) + f"\n\n{more}"
+
+
+def seen(row, column, ss=SS, centre=CENTRE, affine=AFFINE):
+    """cam2world: the direction of a pixel with the toolbox's axes, x down the rows, y along the columns."""
+    c, d, e = affine
+    x, y = np.linalg.solve([[c, d], [e, 1.0]], [row - centre[0], column - centre[1]])
+    rho = math.sqrt(x * x + y * y)
+    z = sum(a * rho**i for i, a in enumerate(ss))
+    return np.array([x, y, z]) / math.sqrt(x * x + y * y + z * z)
+
+
+def test_rays_are_those_of_the_toolbox():
+    camera = ct.OCamCalib.from_ocamcalib(*map(float64, (SS, CENTRE, AFFINE)), image_size=SIZE)
+    pixels = pixel_lattice(camera, 9, 11)
+    rays, valid = camera.unproject(pixels)
+    assert valid.all()
+    for (u, v), ray in zip(pixels.tolist(), rays.tolist(), strict=True):
+        down, right, backwards = seen(v, u)
+        np.testing.assert_allclose(ray, [right, down, -backwards], atol=1e-14)
+
+
+def test_the_polynomial_of_the_other_direction_is_close():
+    """world2cam, which a fit of the toolbox approximates to a few hundredths of a pixel."""
+    camera = ct.OCamCalib.from_ocamcalib(*map(float64, (SS, CENTRE, AFFINE)))
+    rays = fan(100, 12, 8)[8:]
+    pixels, valid = camera.project(rays)
+    assert valid.all()
+    for (x, y, z), pixel in zip(rays.tolist(), pixels.tolist(), strict=True):
+        theta = math.atan2(-z, math.hypot(x, y))
+        rho = sum(a * theta**i for i, a in enumerate(INVERSE))
+        x, y = rho * y / math.hypot(x, y), rho * x / math.hypot(x, y)
+        c, d, e = AFFINE
+        assert math.dist(pixel, (e * x + y + CENTRE[1], c * x + d * y + CENTRE[0])) < 0.05
+
+
+def test_a_camera_that_looks_along_z_is_the_same():
+    forwards = ct.OCamCalib.from_ocamcalib(*map(float64, ([-a for a in SS], CENTRE, AFFINE)))
+    backwards = ct.OCamCalib.from_ocamcalib(*map(float64, (SS, CENTRE, AFFINE)))
+    assert torch.equal(forwards.distortion, backwards.distortion)
+    assert torch.equal(forwards.intrinsics, backwards.intrinsics)
+
+
+def test_even_powers_are_a_division_camera():
+    camera = ct.OCamCalib(float64([300, 300, 320, 240]), float64([0, 0, 0, -0.2, 0, 0.01]), image_size=SIZE)
+    division = ct.Division(float64([300, 300, 320, 240]), float64([-0.2, 0.01]), image_size=SIZE)
+    torch.testing.assert_close(camera.rays()[0], division.rays()[0])
+    assert division.convert("ocamcalib").max_error < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([0.0, 0, 1e-3], CENTRE), "must not be zero"),
+        (([-200.0], CENTRE), r"polynomial must be \(n,\), n >= 2"),
+        ((SS, (1.0, 2, 3)), r"centre \(2,\)"),
+        ((SS, CENTRE, (-1.0, 0, 0)), "c must be positive; got .* c = -1.0"),
+    ],
+)
+def test_numbers_that_are_no_camera_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ct.OCamCalib.from_ocamcalib(*arguments)
+
+
+# -- the file
+
+
+def test_a_file_is_the_camera_of_its_numbers_and_saves_to_the_last_bit(tmp_path):
+    path, again = tmp_path / "calib_results.txt", tmp_path / "calib_results_2.txt"
+    path.write_text(text(more="#camera Intrinsics\n\n300 0 1 0 300 2 0 0 1\n"))
+    rig = ct.load(path)
+    assert rig.format == "ocamcalib"
+    expected = ct.OCamCalib.from_ocamcalib(*map(float64, (SS, CENTRE, AFFINE)), image_size=SIZE)
+    assert_same(rig, ct.Rig({"camera": expected}))
+    ct.save(rig, again)
+    assert_same(ct.load(again), rig)
+    # its C code reads one line of comment before each line of numbers
+    lines = [line for line in again.read_text().splitlines() if line]
+    assert [line.startswith("#") for line in lines] == [True, False] * 5
+    assert list(map(float, lines[1].split()[1:])) == list(SS)
+    assert list(map(float, lines[7].split())) == list(AFFINE)
+    written = again.read_bytes()
+    ct.save(ct.load(again), again)
+    assert again.read_bytes() == written
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_was_read_is_written_to_the_last_bit(seed, tmp_path):
+    source = np.random.default_rng(seed)
+    ss = [-source.uniform(50, 900), 0.0, *(source.normal() * 0.3 / 300**i for i in range(1, 6))]
+    affine = 1 + source.normal() * 0.01, source.normal() * 0.01, source.normal() * 0.01
+    path, again = tmp_path / "a.txt", tmp_path / "b.txt"
+    path.write_text(text(ss=ss, affine=affine, centre=tuple(source.uniform(200, 400, 2))))
+    ct.save(ct.load(path), again)
+    assert_same(ct.load(again), ct.load(path))
+
+
+def test_the_inverse_that_is_written_is_as_good_as_it_says(tmp_path):
+    camera = one("ocamcalib").requires_grad_(False)
+    ct.save(camera, tmp_path / "calib_results.txt")
+    lines = [line for line in (tmp_path / "calib_results.txt").read_text().splitlines() if line]
+    count, *inverse = map(float, lines[3].split())
+    assert len(inverse) == count
+    error, angle = (float(lines[2].split(word)[1].split()[0]) for word in ("off by ", "up to "))
+    assert error < 0.01
+    assert 100 < angle < 180
+    straight = ct.OCamCalib(float64([*camera.intrinsics[:1].tolist() * 2, 0, 0]), camera.distortion.clone())
+    straight.distortion.data[:2] = 0
+    theta = torch.linspace(1e-3, math.radians(angle) - 1e-3, 300, dtype=torch.float64)
+    pixels, valid = straight.project(torch.stack((theta.sin(), 0 * theta, theta.cos()), -1))
+    assert valid.all()
+    fitted = sum(a * (theta - math.pi / 2) ** i for i, a in enumerate(inverse))
+    assert (fitted - pixels[:, 0]).abs().max() < 1.1 * error + 1e-6
+
+
+BAD = {
+    "no size": (text().rsplit("#", 1)[0], "image size: missing"),
+    "a count that is wrong": (text().replace("5 -206", "6 -206"), "polynomial"),
+    "a word": (text().replace("0.000219", "x"), "affine.*no finite number"),
+    "nan": (text().replace("-206.517", "nan"), "polynomial.*no finite number"),
+    "no focal length": (text(ss=(0.0, 0.0, 1e-3)), "must not be zero"),
+    "mirrored": (text(affine=(-1.0, 0.0, 0.0)), "c must be positive"),
+    "half a pixel": (text(size=(480.5, 752)), "number of pixels"),
+    "three sides": (text(size=(480, 752, 3)), "not a height and a width"),
+    "too many": (text(ss=(-200.0, *[0.0] * 80)), "number of coefficients up to 64"),
+    "overflow": (text(ss=(-1e300, 0.0, 1e300)), "finite"),
+    "no affine": (text(affine=(1.0, 0.0)), "2 numbers where 3 belong"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_say_what_is_wrong(name, tmp_path):
+    content, message = BAD[name]
+    path = tmp_path / "calib_results.txt"
+    path.write_text(content)
+    with pytest.raises(ct.CameraFileError, match=message):
+        ct.load(path, format="ocamcalib")
+
+
+def test_large_files_are_refused_at_once(tmp_path):
+    path = tmp_path / "calib_results.txt"
+    for filling in ("# a comment\n", "0 ", "\n"):
+        path.write_text(text(more=filling * ((10 << 20) // len(filling))))
+        start = time.process_time()
+        with pytest.raises(ct.CameraFileError, match=r"10\d* bytes; a calibration of OCamCalib"):
+            ct.load(path)
+        assert time.process_time() - start < 1
+
+
+@pytest.mark.parametrize(
+    ("rig", "lost"),
+    [
+        (ct.Pinhole(float64([300, 300, 1, 2]), image_size=SIZE), "OCamCalib has no name for pinhole"),
+        (ct.OCamCalib(float64([300, 300, 1, 2])), "no image_size, which OCamCalib needs"),
+        (ct.Rig({"a": one("ocamcalib"), "b": one("ocamcalib")}), "2 cameras; OCamCalib holds one"),
+        (ct.Rig({"a": one("ocamcalib")}, {"a": ct.Extrinsics([0, 0, 0.1], [0, 0, 0])}), "would be lost"),
+    ],
+)
+def test_what_the_file_cannot_hold_is_said(rig, lost, tmp_path):
+    with pytest.raises(ct.CameraFileError, match=lost):
+        ct.save(rig, tmp_path / "calib_results.txt")
+    assert not list(tmp_path.iterdir())
