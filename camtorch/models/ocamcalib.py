@@ -22,6 +22,7 @@ class AngleOfAllPowers(AnglePerRadius):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + a1 r + a2 r^2 + ..."""
 
     def __init__(self, coefficients: Sequence[Tensor]):
+        super().__init__(coefficients)
         self.ahead = RadiusPolynomial(coefficients)
 
 

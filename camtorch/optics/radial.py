@@ -173,7 +173,7 @@ class AnglePerRadius(RadialFactor):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + c0 t + c1 t^2 + ... of t = r^2."""
 
     def __init__(self, coefficients: Sequence[Tensor]):
-        self.ahead = Polynomial(coefficients)
+        self.ahead: RadialFactor = Polynomial(coefficients)
         self.parameters = self.ahead.parameters
 
     def __call__(self, t: Tensor) -> Tensor:
