@@ -39,40 +39,38 @@ def vjp_of(
     return gradients[: len(leaves)], list(gradients[len(leaves) :])
 
 
-def jacobian_of(
-    formula: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], a: Tensor, b: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """du/da, du/db, dv/da, dv/db of a map (a, b) -> (u, v) of each point by itself. Graph-free."""
+def jacobian_of(part: Any, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """du/da, du/db, dv/da, dv/db of a stage (a, b) -> (u, v), of each point by itself. Graph-free."""
     if not is_concrete(a):
         one, zero = torch.ones_like(a), torch.zeros_like(a)
-        (ua, va), (ub, vb) = (torch.func.jvp(formula, (a, b), along)[1] for along in ((one, zero), (zero, one)))
+        (ua, va), (ub, vb) = (torch.func.jvp(part, (a, b), along)[1] for along in ((one, zero), (zero, one)))
         return ua, ub, va, vb
     # an operator's code may run where no transform works, so by reverse mode
     with _recorded():
         leaves = _leaf(a), _leaf(b)
-        u, v = formula(*leaves)
+        u, v = _usable(part)(*leaves)
         ua, ub = torch.autograd.grad(u.sum(), leaves, retain_graph=True, materialize_grads=True)
         va, vb = torch.autograd.grad(v.sum(), leaves, materialize_grads=True)
     return ua, ub, va, vb
 
 
-def derivatives_of(formula: Callable[[Tensor], Tensor], t: Tensor, order: int) -> tuple[Tensor, ...]:
-    """The value and the first `order` derivatives of a function of each number by itself; those are graph-free."""
+def derivatives_of(part: Any, t: Tensor, order: int) -> tuple[Tensor, ...]:
+    """The value and the first `order` derivatives of a factor, of each number by itself; those are graph-free."""
     if order == 0:
-        return (formula(t),)
+        return (part(t),)
     if not is_concrete(t):
 
         def slope(of: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
             return lambda t: torch.func.jvp(of, (t,), (torch.ones_like(t),))[1]
 
-        results = [formula(t)]
+        formula, results = part, [part(t)]
         for _ in range(order):
             formula = slope(formula)
             results.append(formula(t))
         return tuple(results)
     with _recorded():
         leaf = _leaf(t)
-        results = [formula(leaf)]
+        results = [_usable(part)(leaf)]
         for _ in range(order):
             results += torch.autograd.grad(results[-1].sum(), leaf, create_graph=True, materialize_grads=True)
     return tuple([w.detach() for w in results])
@@ -87,6 +85,15 @@ def _recorded() -> Iterator[None]:
         torch.autograd.graph.saved_tensors_hooks(lambda tensor: tensor, lambda tensor: tensor),
     ):
         yield
+
+
+def _usable(part: Any) -> Any:
+    """The stage or factor, with parameters that a graph may keep: not those that inference mode made."""
+    if not any(w.is_inference() for w in part.parameters):
+        return part
+    usable = copy.copy(part)
+    usable.parameters = tuple(w.clone() for w in part.parameters)
+    return usable
 
 
 def _leaf(plane: Tensor) -> Tensor:
