@@ -87,7 +87,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
         terms,
         lambda w: OCamCalib.from_ocamcalib(torch.cat((_float64([-fx]), w)), [0, 0]).distortion[2:].tolist(),
     )
-    inverse, error, angle = _inverse(camera)
+    inverse, error, angle = _inverse(camera, (height, width))
     lines = (
         ("direct mapping: how many coefficients; z of the distance from the centre", [1 + len(terms), -fx, *terms]),
         (
@@ -116,13 +116,13 @@ def _that_give(wanted: list[float], guesses: list[float], function: Callable[[Te
     return best
 
 
-def _inverse(camera: Camera) -> tuple[list[float], float, float]:
+def _inverse(camera: Camera, size: tuple[int, int]) -> tuple[list[float], float, float]:
     """The coefficients of the distance, in pixels, by powers of the angle from the camera's plane; of the least degree
     that is good enough, or of the best one. And the largest error in pixels, and up to which angle from the axis.
     """
     square = type(camera)(camera.intrinsics.detach().double(), camera.distortion.detach().double())
-    height, width = camera.image_size
-    corners = _float64([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]])
+    bottom, right = (side - 1.0 for side in size)
+    corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]], dtype=torch.float64)
     fx, fy, cx, cy = square.intrinsics.detach().unbind()
     furthest = float((((corners - torch.stack((cx, cy))) / torch.stack((fx, fy))).norm(dim=-1)).max())
     with torch.no_grad():
