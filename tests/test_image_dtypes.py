@@ -100,10 +100,9 @@ def test_wide_unsigned_integers_stay_in_range(mode, padding_mode):
 
 @pytest.mark.parametrize("bad", [torch.inf, -torch.inf, torch.nan])
 @pytest.mark.parametrize("padding_mode", PADDINGS)
-@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
-def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(mode, padding_mode, bad):
+def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(padding_mode, bad):
     for rotation in (None, turn(3, 2, 5), turn(0, 0, 90)):
-        warp = ct.Warp(pinhole(), pinhole(), rotation, mode=mode, padding_mode=padding_mode)
+        warp = ct.Warp(pinhole(), pinhole(), rotation, mode="bicubic", padding_mode=padding_mode)
         for row, column in ((20, 25), (0, 0), (39, 13), (20, 49)):
             image = torch.rand(1, 2, *SIZE, generator=torch.Generator().manual_seed(0))
             expected = warp(image)
@@ -119,8 +118,6 @@ def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(mode, padding_mode
             torch.testing.assert_close(result[finite], expected[finite], atol=1e-3, rtol=0)
             if rotation is None:
                 assert (~finite).nonzero().tolist() == [[0, 0, row, column]]
-            if bad == torch.inf and mode == "bilinear":
-                assert (result[~finite] == torch.inf).all()
 
 
 def test_sampling_again_is_sampling():
@@ -128,12 +125,11 @@ def test_sampling_again_is_sampling():
     generator = torch.Generator().manual_seed(0)
     images = torch.rand(2, 3, 7, 9, generator=generator, dtype=torch.float64)
     grid = 5 * torch.rand(2, 30, 31, 2, generator=generator, dtype=torch.float64) - 2.5
-    for mode in ("bilinear", "bicubic"):
-        for padding_mode in PADDINGS:
-            expected = F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
-            result = torch.full_like(expected, torch.nan)
-            sampling._sample_again(result, images, grid, mode, padding_mode)
-            torch.testing.assert_close(result, expected, atol=1e-12, rtol=0)
+    for padding_mode in PADDINGS:
+        expected = F.grid_sample(images, grid, "bicubic", padding_mode, align_corners=False)
+        result = torch.full_like(expected, torch.nan)
+        sampling._sample_again(result, images, grid, padding_mode)
+        torch.testing.assert_close(result, expected, atol=1e-12, rtol=0)
 
 
 # -- layouts

@@ -222,8 +222,8 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
         finite: no pixel is infinite or NaN.
 
     Returns:
-        (B, C, H', W'). On a CPU, and unless it is compiled, an infinite or NaN pixel has a part in those samples alone
-        in which it has a weight.
+        (B, C, H', W'). On a CPU, and unless it is compiled, an infinite or NaN pixel has a part in those bicubic
+        samples alone in which it has a weight.
     """
     grid = grid.to(images.dtype).expand(images.shape[0], -1, -1, -1)
     if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
@@ -243,8 +243,8 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode,
         result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
         for image in zip(result, images, grid, strict=True):
             _sample_tiles(*image, threads, mode, padding_mode)
-    if not finite and mode != "nearest" and not math.isfinite(result.sum()):
-        _sample_again(result, images, grid, mode, padding_mode)
+    if mode == "bicubic" and not finite and not math.isfinite(result.sum()):
+        _sample_again(result, images, grid, padding_mode)
     return result
 
 
@@ -262,12 +262,12 @@ def _sample_tiles(result: Tensor, image: Tensor, grid: Tensor, count: int, mode:
         result[:, tiles:] = rest[0]
 
 
-def _sample_again(result: Tensor, images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> None:
-    """Where the result is not finite, pixels without a weight, but for rounding, lose their part in it."""
+def _sample_again(result: Tensor, images: Tensor, grid: Tensor, padding_mode: PaddingMode) -> None:
+    """Where the bicubic result is not finite, pixels without a weight, but for rounding, lose their part in it."""
     b, y, x = (~torch.isfinite(result)).any(1).nonzero(as_tuple=True)
     height, width = images.shape[-2:]
     columns, rows = (
-        _taps(position, side, mode, padding_mode)
+        _taps(position, side, padding_mode)
         for position, side in zip(grid[b, y, x].unbind(-1), (width, height), strict=True)
     )
     total = result.new_zeros(len(b), result.shape[1])
@@ -278,21 +278,24 @@ def _sample_again(result: Tensor, images: Tensor, grid: Tensor, mode: Mode, padd
     result[b, :, y, x] = total
 
 
-def _taps(position: Tensor, side: int, mode: Mode, padding_mode: PaddingMode) -> list[tuple[Tensor, Tensor]]:
-    """The pixels along an axis that have a part in positions (K,), and their weights, both (K,)."""
+def _taps(position: Tensor, side: int, padding_mode: PaddingMode) -> list[tuple[Tensor, Tensor]]:
+    """The four pixels along an axis that have a part in positions (K,), and their weights, both (K,).
+
+    The cubic convolution of torch and OpenCV: Keys, 1981, with a = -3/4.
+    """
     u = ((position + 1) * side - 1) / 2
-    if mode == "bilinear":
-        u = _padded(u, side, padding_mode)  # of neighbouring pixels it is the same
     cell = u.floor()
     t = u - cell
-    if mode == "bilinear":
-        weights = [1 - t, t]
-    else:  # the cubic convolution of torch and OpenCV: Keys, 1981, with a = -3/4
-        near, far = (lambda d: (1.25 * d - 2.25) * d * d + 1), (lambda d: ((-0.75 * d + 3.75) * d - 6) * d + 3)
-        weights = [far(t + 1), near(t), near(1 - t), far(2 - t)]
+
+    def near(d: Tensor) -> Tensor:
+        return (1.25 * d - 2.25) * d * d + 1
+
+    def far(d: Tensor) -> Tensor:
+        return ((-0.75 * d + 3.75) * d - 6) * d + 3
+
     lost = 4 * side * torch.finfo(u.dtype).eps  # in rounding the position
     taps = []
-    for k, weight in enumerate(weights, start=1 - len(weights) // 2):
+    for k, weight in enumerate((far(t + 1), near(t), near(1 - t), far(2 - t)), start=-1):
         pixel = _padded(cell + k, side, padding_mode)
         known = (pixel >= 0) & (pixel <= side - 1) & (weight.abs() > lost)
         taps.append((pixel.clamp(0, side - 1).long(), torch.where(known, weight, 0)))
