@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch._tracing import is_concrete
+from camtorch._tracing import in_transform, is_concrete
 
 
 def vjp_of(
@@ -41,7 +41,7 @@ def vjp_of(
 
 def jacobian_of(part: Any, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """du/da, du/db, dv/da, dv/db of a stage (a, b) -> (u, v), of each point by itself. Graph-free."""
-    if not is_concrete(a):
+    if in_transform() or not is_concrete(a):
         one, zero = torch.ones_like(a), torch.zeros_like(a)
         (ua, va), (ub, vb) = (torch.func.jvp(part, (a, b), along)[1] for along in ((one, zero), (zero, one)))
         return ua, ub, va, vb
@@ -58,7 +58,7 @@ def derivatives_of(part: Any, t: Tensor, order: int) -> tuple[Tensor, ...]:
     """The value and the first `order` derivatives of a factor, of each number by itself; those are graph-free."""
     if order == 0:
         return (part(t),)
-    if not is_concrete(t):
+    if in_transform() or not is_concrete(t):
 
         def slope(of: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
             return lambda t: torch.func.jvp(of, (t,), (torch.ones_like(t),))[1]
