@@ -679,7 +679,7 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
             meant = f"did you mean {keys[close[0]]!r}? Known" if close else "known"
             raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")
         return MODELS[model]
-    if not (isinstance(model, type) and issubclass(model, Camera) and hasattr(model, "key")):
+    if not (isinstance(model, type) and issubclass(model, Camera) and model.optics is not Camera.optics):
         raise TypeError(f"{owner} takes a camera model, or its key in ct.MODELS; got {model!r}")
     return model
 
