@@ -55,7 +55,18 @@ def invert(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     What is solved is the solution in the domain, to rounding: the last step was so short that the next one would be
     nothing. What is not, and yet possible, is left to `search`.
     """
-    return (_invert_radial if domain.lens.is_radial else _invert_planar)(domain, u, v, looks)
+    if domain.lens.is_radial:
+        return _invert_radial(domain, u, v, looks)
+    # in the plane, from the inverse of the radial factor
+    a, b = domain.lens.start(u, v)
+    if domain.inverse is not None:
+        # a stage may have sent a pixel far off the image out of the floating-point range
+        scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
+        a, b = a * scale, b * scale
+    found = _newton(domain, u, v, a, b, looks)
+    # further out than images reach a determinant may overflow, and a step seem short
+    inside = domain.usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
+    return found._replace(solved=torch.minimum(found.solved, inside))
 
 
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
@@ -90,19 +101,6 @@ def invert_briefly(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
         found = _newton(domain, u, v, a * scale, b * scale, looks=True)
         settled = torch.minimum(found.solved, radii[..., -1:] ** 2 - torch.addcmul(found.a**2, found.b, found.b))
     return found if bool(settled.amin() > 0) else None
-
-
-def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
-    """Newton's method in the plane, from the inverse of the radial factor."""
-    a, b = domain.lens.start(u, v)
-    if domain.inverse is not None:
-        # a stage may have sent a pixel far off the image out of the floating-point range
-        scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
-        a, b = a * scale, b * scale
-    found = _newton(domain, u, v, a, b, looks)
-    # further out than images reach a determinant may overflow, and a step seem short
-    inside = domain.usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
-    return found._replace(solved=torch.minimum(found.solved, inside))
 
 
 def _newton(domain: Domain, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool) -> Found:
