@@ -11,7 +11,7 @@ from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
 from camtorch.augment.sample import from_pitch_yaw, to_pitch_yaw
 from camtorch.rotations import mount_rotation
-from camtorch.warp.polygons import outlines
+from camtorch.warp.warp import outlines
 
 __all__ = [
     "PRESETS",

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from camtorch._tracing import in_graph
 from camtorch.camera import Camera
-from camtorch.warp.polygons import EDGE_SAMPLES, along_edges, corners_of
 from camtorch.warp.sampling import Mode, narrow, widen
-from camtorch.warp.warp import Warp
+from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of
 
 
 def _same(value: Tensor) -> Tensor:

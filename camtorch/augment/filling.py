@@ -11,8 +11,7 @@ from camtorch.augment.change import camera_like, frozen, size_of
 from camtorch.camera import Camera
 from camtorch.projection.ops import CLASSES
 from camtorch.rotations import rotation_matrix, rotation_vector
-from camtorch.warp.polygons import along_edges
-from camtorch.warp.warp import Warp
+from camtorch.warp.warp import Warp, along_edges
 
 _POINTS, _RIM = 1000, 16  # over the image, and along each of its edges
 _ROOT = 1.324717957244746

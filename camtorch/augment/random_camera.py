@@ -22,8 +22,7 @@ from camtorch.models import MODELS
 from camtorch.projection.ops import CLASSES
 from camtorch.projection.rays import field_of_view, image_lattice
 from camtorch.rotations import mount_rotation
-from camtorch.warp.polygons import along_edges
-from camtorch.warp.warp import Warp
+from camtorch.warp.warp import Warp, along_edges
 
 RangeLike = float | Sequence[float]
 

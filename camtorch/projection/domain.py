@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._module import same
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import AZIMUTHS, Azimuths, azimuth
 
@@ -163,3 +164,20 @@ def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
     """Positive where the lens is regular at the point itself, and its inverse has a derivative."""
     # nearer to zero the reciprocal could leave the floating-point range
     return torch.nan_to_num(lens.at(a, b).orientation, nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
+
+
+_KEPT = 8
+_domains: list[tuple[str, Tensor, Domain]] = []
+
+
+def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
+    """The domain of these values: one of the last ones, or a new one."""
+    for name, values, domain in _domains:
+        if name == model and same(values, k):
+            return domain
+    with torch.inference_mode(False), torch.no_grad():
+        values = k.detach().clone()
+        domain = Domain(optics, values)
+    _domains.insert(0, (model, values, domain))
+    del _domains[_KEPT:]
+    return domain

@@ -13,10 +13,9 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from camtorch._arguments import columns
-from camtorch._module import same
 from camtorch._tracing import register
 from camtorch.optics.radial_inverse import table_width
-from camtorch.projection.domain import Domain, Optics
+from camtorch.projection.domain import Optics, domain_of
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
 
@@ -36,23 +35,6 @@ def register_camera(camera_class: type[Camera]) -> str:
     name = register(CLASSES, camera_class)
     OPTICS[name] = camera_class.optics
     return name
-
-
-_KEPT = 8
-_domains: list[tuple[str, Tensor, Domain]] = []
-
-
-def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
-    """The domain of these values: one of the last ones, or a new one."""
-    for name, values, domain in _domains:
-        if name == model and same(values, k):
-            return domain
-    with torch.inference_mode(False), torch.no_grad():
-        values = k.detach().clone()
-        domain = Domain(optics, values)
-    _domains.insert(0, (model, values, domain))
-    del _domains[_KEPT:]
-    return domain
 
 
 @torch.library.custom_op("camtorch::tables", mutates_args=())

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._tracing import may_look
-from camtorch.projection.domain import Domain
-from camtorch.projection.ops import domain_of, tables
+from camtorch.projection.domain import Domain, domain_of
+from camtorch.projection.ops import tables
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
