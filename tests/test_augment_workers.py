@@ -97,7 +97,9 @@ def test_an_augmentation_pickles_with_its_options():
     assert second.last is None
     assert torch.equal(second(image=image, draw=draw)["image"], before["image"])
     copy = pickle.loads(pickle.dumps(ct.augment.numpy.Transform(first)))
-    assert np.array_equal(copy(image=image[0].numpy(), draw=draw)["image"], before["image"][0].detach().numpy())
+    # without a graph positions are rounded otherwise, by 1e-6 px or so
+    again = copy(image=image[0].numpy(), draw=draw)["image"]
+    np.testing.assert_allclose(again, before["image"][0].detach().numpy(), rtol=0, atol=1e-5)
 
 
 class Learner(torch.nn.Module):

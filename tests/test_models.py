@@ -158,6 +158,7 @@ BREAKS = [
 ]
 
 
+@pytest.mark.filterwarnings("ignore:.*became unusable")
 @pytest.mark.parametrize(("model", "coefficients", "text"), BREAKS)
 def test_coefficients_without_a_formula(model, coefficients, text):
     """Refused at the door; where learning ended there, all is invalid, and finite."""

@@ -412,7 +412,8 @@ class Warp(GeometryModule):
 def corners_of(boxes: Tensor) -> Tensor:
     """(..., 4, 2): the corners of boxes (..., 4) of x1 y1 x2 y2, clockwise from (x1, y1)."""
     x1, y1, x2, y2 = boxes.unbind(-1)
-    return torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2))
+    corners: Tensor = torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2))
+    return corners
 
 
 def along_edges(corners: Tensor, samples: int) -> Tensor:
