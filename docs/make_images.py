@@ -57,5 +57,8 @@ def overview() -> Image.Image:
 
 if __name__ == "__main__":
     overview().save(HERE / "overview.jpg", quality=88)
-    for words in (["augment", "--preset", "dms130", "-n", "5"], ["demo"]):
-        main([*words, "-o", str(HERE / f"{words[0]}.jpg"), "--force"])
+    full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]
+    for words in (["augment", *full], ["demo"]):
+        path = HERE / f"{words[0]}.jpg"
+        main([*words, "-o", str(path), "--force"])
+        Image.open(path).save(path, quality=85)
