@@ -190,7 +190,8 @@ def as_points(
             raise ValueError
         lead = lead if lead == batch else broadcast_shapes(lead, batch)
     except ValueError:
-        raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}") from None
+        hint = f". What all of the batch share goes in as {name}[None]" if values.ndim > 1 and len(batch) else ""
+        raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}{hint}") from None
     values = values.to(working_dtype(values, *parameters))
     if values.shape[: len(lead)] != lead:
         values = values.expand(*lead, *rest, size)

@@ -455,11 +455,14 @@ class Camera(BatchedModule):
         if found is not None and isinstance(getattr(self, found[0]), nn.Parameter):
             self._warned = True
             where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
+            keeps = (
+                "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
+                '"intrinsics", camtorch.PositiveFocal())'
+            )
+            keeps = keeps if found[0] == "intrinsics" else ""
             warnings.warn(
                 f"{type(self).__name__}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
-                "and its gradients zero from here on. A smaller learning rate keeps it from there; focal lengths stay "
-                'positive after torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", '
-                "camtorch.PositiveFocal())",
+                f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
                 stacklevel=2,
             )
 

@@ -329,7 +329,7 @@ def test_cotangents_of_invalid_rows_may_be_anything(key, again):
     """The root of a pixel of -1, or of the radius of the axis: an invalid row is left out later, not before."""
     camera = one(key)
     points = torch.tensor([[0.1, 0.2, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
-    pixels = torch.cat((pixel_lattice(camera)[412:413], torch.full((1, 2), math.nan, dtype=torch.float64)))
+    pixels = torch.cat((pixel_lattice(camera)[100:101], torch.full((1, 2), math.nan, dtype=torch.float64)))
 
     def of_points(points):
         return camera.project(points)[0].sqrt().sum(-1)

@@ -75,9 +75,8 @@ def test_numpy_archives(names, save, tmp_path):
     views = np.empty(2, dtype=object)
     views[:] = [np.zeros((3, 1)), np.zeros((3, 1))]
     poses = {"rvecs": views, "tvecs": np.zeros((2, 3, 1)), "objpoints": np.zeros((100, 50, 3))}
-    save(
-        tmp_path / "calibration.npz", **dict(zip(names, (K, D), strict=True)), **poses, image_size=np.array([640, 480])
-    )
+    size = {"image_width": 640, "image_height": 480}
+    save(tmp_path / "calibration.npz", **dict(zip(names, (K, D), strict=True)), **poses, **size)
     camera = ct.load(tmp_path / "calibration.npz").camera
     assert type(camera) is ct.BrownConrady
     assert camera.intrinsics.tolist() == [500, 501, 320, 240]
@@ -91,6 +90,14 @@ def test_numpy_archives_of_a_fisheye(tmp_path):
     camera = ct.load(tmp_path / "fisheye.npz").camera
     assert type(camera) is ct.KannalaBrandt
     assert torch.equal(camera.distortion, torch.full((4,), 0.01, dtype=torch.float64))
+
+
+def test_sizes_without_an_order_are_refused(tmp_path):
+    np.savez(tmp_path / "calibration.npz", K=K, D=D, image_size=[480, 640])
+    with pytest.raises(
+        ct.CameraFileError, match=r"image_size: 480 640 may be \(width, height\) or .* save image_width"
+    ):
+        ct.load(tmp_path / "calibration.npz")
 
 
 def archive(**files):

@@ -243,3 +243,12 @@ def test_reasons_in_batches_and_of_cameras_that_learning_broke():
     assert lines[2:4] == ["the camera itself is unusable: fx = -3 is not positive"] * 2
     assert lines[4:6] == ["the camera itself is unusable: cy = nan"] * 2
     assert lines[6:] == ["the camera itself is unusable: the formula needs xi > -1"] * 2
+
+
+def test_the_backward_direction_is_explained_by_itself():
+    wide = ct.KannalaBrandt.from_fov(180, image_size=(480, 640))
+    lines = wide.explain(torch.tensor([[0.0, 0.0, -1.0], [1e-6, 0.0, -1.0]]))
+    assert lines[0] == "the chart does not cover it: the backward direction, where all azimuths meet"
+    assert "90.00" not in lines[1]
+    narrow = ct.Pinhole.from_fov(60, image_size=(480, 640)).explain(torch.tensor([[0.0, 0.0, -1.0]]))
+    assert narrow == ["the chart does not cover it: the backward direction; on this side it ends at 90.00 degrees"]

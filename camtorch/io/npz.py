@@ -14,6 +14,7 @@ import numpy as np
 from camtorch.io._errors import CameraFileError
 
 _MOST_ARRAYS = 1000
+_SIZES = ("image_size", "imagesize", "img_size", "imgsize", "size", "resolution")
 _LARGEST_ARRAY = 1 << 16  # bytes; that of a camera has 14 numbers
 
 
@@ -40,6 +41,13 @@ def parse_archive(path: str | os.PathLike[str], content: bytes) -> dict[str, Any
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
         place = name if name.isprintable() and len(name) <= 60 else f"{name!r:.60}"
         raise CameraFileError(path, place, f"no array of NumPy's: {error}") from None
+    for name, value in keys.items():
+        if name.lower() in _SIZES and isinstance(value, list) and len(set(value)) == 2:
+            raise CameraFileError(
+                path,
+                name,
+                f"{' '.join(value)} may be (width, height) or (height, width); save image_width and image_height",
+            )
     return keys
 
 

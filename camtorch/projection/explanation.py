@@ -79,7 +79,10 @@ def _reason(camera: Camera, row: dict[str, Tensor], point: Tensor) -> str:
 
     if not bool(covered(ray[None])):
         end = _last(covered, ray, theta)
-        what = "the backward direction" if theta == math.pi else angle
+        backward = not bool(ray[:2].any())
+        if backward and end > math.pi - 1e-3:
+            return "the chart does not cover it: the backward direction, where all azimuths meet"
+        what = "the backward direction" if backward else angle
         return f"the chart does not cover it: {what}; on this side it ends at {math.degrees(end):.2f} degrees"
     fold = _last(lambda rays: camera.project(rays)[1], ray, theta)
     return f"beyond the fold at {math.degrees(fold):.2f} degrees: {angle}"
@@ -87,7 +90,10 @@ def _reason(camera: Camera, row: dict[str, Tensor], point: Tensor) -> str:
 
 def _last(holds: Callable[[Tensor], Tensor], ray: Tensor, theta: float) -> float:
     """The angle up to which something holds from the axis on towards a ray at the angle theta."""
-    across = ray[:2].double() / torch.linalg.vector_norm(ray[:2].double()).clamp(min=1e-300)
+    across = ray[:2].double()
+    length = torch.linalg.vector_norm(across)
+    # the backward direction has every azimuth
+    across = across / length if length > 0 else across.new_tensor([1.0, 0.0])
     low, high = 0.0, theta
     for _ in range(3):
         angles = torch.linspace(low, high, _STEPS, dtype=torch.float64, device=ray.device)
