@@ -454,6 +454,7 @@ class Camera(BatchedModule):
         found = unusable(self, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
         if found is not None and isinstance(getattr(self, found[0]), nn.Parameter):
             self._warned = True
+            name = parametrize.type_before_parametrizations(self).__name__
             where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
             keeps = (
                 "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
@@ -461,7 +462,7 @@ class Camera(BatchedModule):
             )
             keeps = keeps if found[0] == "intrinsics" else ""
             warnings.warn(
-                f"{type(self).__name__}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
+                f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
                 f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
                 stacklevel=2,
             )
@@ -682,6 +683,8 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
             meant = f"did you mean {keys[close[0]]!r}? Known" if close else "known"
             raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")
         return MODELS[model]
+    if isinstance(model, type) and model.__module__ == parametrize.__name__:  # of one parametrized camera
+        model = model.__bases__[0]
     if not (isinstance(model, type) and issubclass(model, Camera) and model.optics is not Camera.optics):
         raise TypeError(f"{owner} takes a camera model, or its key in ct.MODELS; got {model!r}")
     return model

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.analysis import difference as differences
 from camtorch.projection.rays import angles_from_axis, followed, ideal, image_lattice
@@ -188,7 +189,9 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
     radius_curve([camera] if other is None else [camera, other], axes[1], labels=labels)
     if other is not None:
         difference(camera, other, axes[2])
-    figure.suptitle(title or f"{type(camera).__name__}, {width} x {height}", color=_INK, fontsize=15)
+    figure.suptitle(
+        title or f"{type_before_parametrizations(camera).__name__}, {width} x {height}", color=_INK, fontsize=15
+    )
     return figure
 
 

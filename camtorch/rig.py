@@ -6,6 +6,7 @@ from collections.abc import ItemsView, Iterator, KeysView, Mapping, MutableMappi
 from typing import TypeVar, cast
 
 from torch import nn
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._module import BatchedModule
 from camtorch._tracing import is_concrete
@@ -232,4 +233,4 @@ def _line(name: str, camera: Camera, extrinsics: Extrinsics | None) -> str:
         numbers = " ({:.7g}, {:.7g}, {:.7g}, {:.7g})".format(*camera.intrinsics.tolist())
     if extrinsics is not None and not extrinsics.batch_shape and is_concrete(extrinsics.translation):
         where = " at ({:.4g}, {:.4g}, {:.4g})".format(*(extrinsics.position + 0.0).tolist())
-    return f"  {name}: {type(camera).__name__}{size}{numbers}{where}"
+    return f"  {name}: {type_before_parametrizations(camera).__name__}{size}{numbers}{where}"

@@ -116,6 +116,34 @@ def test_training_never_leaves_the_positive(parametrization, batch):
     assert torch.equal(fx, fy) == (parametrization is ct.TiedFocal)
 
 
+@PARAMETRIZATIONS
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_parametrized_cameras_are_of_their_model(parametrization, batch, tmp_path):
+    intrinsics = torch.tensor([300.0, 300.0, 319.5, 239.5]).expand(*batch, 4)
+    plain, camera = (ct.KannalaBrandt(intrinsics, [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)) for _ in "ab")
+    parametrize.register_parametrization(camera, "intrinsics", parametrization())
+    for model in ("fisheye62", "kannala_brandt", "mei"):
+        expected, conversion = plain.convert(model), camera.convert(model)
+        assert conversion.source_name == "KannalaBrandt"
+        assert type(conversion.camera) is ct.MODELS[model]
+        assert torch.equal(conversion.exact, expected.exact)
+        torch.testing.assert_close(conversion.max_error, expected.max_error, rtol=1e-3, atol=1e-6)
+        assert all(p.requires_grad for p in conversion.camera.parameters())
+    assert parametrize.is_parametrized(camera, "intrinsics")
+    assert type(plain.convert(type(camera)).camera) is ct.KannalaBrandt
+    assert not any(p.requires_grad for p in camera.requires_grad_(False).convert("fisheye62").camera.parameters())
+    turned = ct.augment.RandomMount(yaw=5)(image=torch.rand(2, 1, 480, 640), camera=camera)["camera"]
+    assert type(turned) is ct.KannalaBrandt
+    assert type(copy.deepcopy(camera).crop(1, 2, 30, 40)) is type(camera.resize(240, 320)) is ct.KannalaBrandt
+    if batch:
+        camera, plain = camera[1], plain[1]
+    path = tmp_path / "camera.json"
+    ct.save(camera, path)
+    loaded = ct.load(path).cameras["camera"]
+    assert type(loaded) is ct.KannalaBrandt
+    torch.testing.assert_close(loaded.intrinsics, plain.intrinsics, check_dtype=False)
+
+
 def test_tied_focal_lengths_are_the_geometric_mean():
     camera = ct.Pinhole([100.0, 400.0, 3.0, 4.0])
     parametrize.register_parametrization(camera, "intrinsics", ct.TiedFocal())

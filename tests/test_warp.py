@@ -107,6 +107,19 @@ def test_boxes_enclose_the_curved_outline():
     assert moved[0, 0] < corners[0, 0] - 1  # the corners would miss more than a pixel
 
 
+def test_boxes_with_their_corners_out_of_order_are_invalid():
+    boxes = torch.tensor([[30.0, 20.0, 8.0, 25.0], [3.0, 20.0, 8.0, 5.0], [30.0, 20.0, 8.0, 5.0]])
+    fine = torch.tensor([[3.0, 5.0, 3.0, 9.0], [3.0, 5.0, 8.0, 5.0], [3.0, 5.0, 3.0, 5.0], [3.0, 5.0, 8.0, 9.0]])
+    camera = ct.Pinhole([30.0, 30.0, 19.5, 14.5], image_size=(30, 40))
+    moved, valid = ct.Warp(camera, camera).transform_boxes(torch.cat((boxes, fine)))
+    assert valid.tolist() == [False] * 3 + [True] * 4
+    assert (moved[:3] == -1).all()
+    torch.testing.assert_close(moved[3:], fine)
+    for p in (0.0, 1.0):
+        augmentation = ct.augment.RandomMount(yaw=(0, 0), pitch=(0, 0), roll=(0, 0), p=p, camera=camera)
+        assert torch.equal(augmentation(boxes=torch.cat((boxes, fine)))["boxes_valid"], valid)
+
+
 def test_boxes_off_the_image_keep_their_place_and_say_so():
     camera = pinhole(dtype=torch.float64)
     boxes = torch.tensor([[[-50.0, 5.0, -10.0, 9.0], [-5.0, 5.0, 9.0, 9.0], [math.nan, 0.0, 1.0, 1.0]]])

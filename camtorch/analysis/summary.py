@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.camera import Camera
 from camtorch.projection.rays import field_of_view, followed, ideal, image_lattice
@@ -38,7 +39,7 @@ class Summary:
         size = "not stated" if camera.image_size is None else "{1} x {0}".format(*camera.image_size)
         named = zip(camera.distortion_names, camera.distortion.tolist(), strict=True)
         rows = [
-            ("model", f"{type(camera).__name__} ({camera.key})"),
+            ("model", f"{type_before_parametrizations(camera).__name__} ({camera.key})"),
             ("image", size),
             ("focal length", f"fx {fx:.8g}, fy {fy:.8g} px"),
             ("principal point", f"cx {cx:.8g}, cy {cy:.8g} px"),

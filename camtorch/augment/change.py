@@ -8,11 +8,12 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._tracing import in_graph
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode, narrow, widen
-from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of
+from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
 
 
 def _same(value: Tensor) -> Tensor:
@@ -197,7 +198,7 @@ class Change:
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
             on_image = camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
-            return rows, on_image & torch.isfinite(rows).all(-1)
+            return rows, on_image & in_order(rows) & torch.isfinite(rows).all(-1)
 
         return self.each(boxes, lambda part, warp, rows: warp.transform_boxes(rows), stay)
 
@@ -267,7 +268,8 @@ def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Any) -> An
 def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same model with these numbers; nothing in it learns that is not part of a graph already."""
     held = [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in (intrinsics, distortion)]
-    return type(camera)(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
+    model: type[Camera] = type_before_parametrizations(camera)
+    return model(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
 
 
 def numbers_by(camera: Camera, change: Callable[[Tensor], Tensor]) -> Camera:
@@ -297,7 +299,7 @@ def size_of(camera: Camera) -> tuple[int, int]:
 
 def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
     """What cameras must have in common to be rows of one batch."""
-    return type(camera), camera.distortion.shape[-1], camera.image_size
+    return type_before_parametrizations(camera), camera.distortion.shape[-1], camera.image_size
 
 
 def alone(camera: Camera) -> Camera:

@@ -17,6 +17,7 @@ from kornia.constants import Resample, SamplePadding
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._module import Memo
 from camtorch.augment import random_camera
@@ -345,4 +346,8 @@ def _numbers(params: Params, cameras: Camera) -> dict[str, Tensor]:
 
 def _kind(camera: Camera) -> list[int]:
     """Model, number of coefficients and image_size as integers, for params hold tensors only."""
-    return [zlib.crc32(type(camera).__name__.encode()), camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
+    return [
+        zlib.crc32(type_before_parametrizations(camera).__name__.encode()),
+        camera.distortion.shape[-1],
+        *(camera.image_size or (0, 0)),
+    ]

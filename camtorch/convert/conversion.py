@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_image_size, as_whole
 from camtorch.convert import views
@@ -76,7 +76,7 @@ def convert(
     **options: Any,
 ) -> Conversion[CameraT]:
     """See `Camera.convert`; models: all that there are, by key, some of which may relate the two."""
-    owner = f"{type(source).__name__}.convert"
+    owner = f"{type_before_parametrizations(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
     if max_angle is not None and not 0 < float(max_angle) <= math.pi * (1 + 1e-6):
         raise ValueError(f"{owner}: max_angle must be positive radians, up to pi; got {max_angle}")
@@ -114,17 +114,14 @@ def convert(
         max_angle=result.max_angle.reshape(batch),
         valid_fraction=result.valid_fraction.reshape(batch),
         exact=result.exact.reshape(batch),
-        source_name=type(source).__name__,
+        source_name=type_before_parametrizations(source).__name__,
     )
 
 
 def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Camera:
-    """A frozen camera like the source, in float64 and with these rows of numbers, even if they are none."""
-    camera = copy.deepcopy(source).double()
-    for name, value in (("intrinsics", intrinsics), ("distortion", distortion)):
-        delattr(camera, name)
-        camera.hold(name, nn.Parameter(value, requires_grad=False), tuple(value.shape))
-    return camera.requires_grad_(False)
+    """A frozen camera of the source's model with these rows of numbers, even if they are none."""
+    rows = {"intrinsics": intrinsics, "distortion": distortion}
+    return source.with_tensors(**{name: nn.Parameter(value, requires_grad=False) for name, value in rows.items()})
 
 
 class _Task(NamedTuple):

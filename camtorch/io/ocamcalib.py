@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.camera import Camera
 from camtorch.io._errors import CameraFileError
@@ -120,14 +121,15 @@ def _inverse(camera: Camera, size: tuple[int, int]) -> tuple[list[float], float,
     """The coefficients of the distance, in pixels, by powers of the angle from the camera's plane; of the least degree
     that is good enough, or of the best one. And the largest error in pixels, and up to which angle from the axis.
     """
-    square = type(camera)(camera.intrinsics.detach().double(), camera.distortion.detach().double())
+    model = type_before_parametrizations(camera)
+    square = model(camera.intrinsics.detach().double(), camera.distortion.detach().double())
     bottom, right = (side - 1.0 for side in size)
     corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]], dtype=torch.float64)
     fx, fy, cx, cy = square.intrinsics.detach().unbind()
     furthest = float((((corners - torch.stack((cx, cy))) / torch.stack((fx, fy))).norm(dim=-1)).max())
     with torch.no_grad():
         # without the affine part, along x
-        straight = type(camera)([1.0, 1, 0, 0], torch.cat((square.distortion[:2] * 0, square.distortion[2:]))).double()
+        straight = model([1.0, 1, 0, 0], torch.cat((square.distortion[:2] * 0, square.distortion[2:]))).double()
         radius = torch.linspace(0, furthest, _SAMPLES, dtype=torch.float64)
         rays, valid = straight.unproject(torch.stack((radius, 0 * radius), -1))
     rays, radius = rays[valid], radius[valid] * float(fx)

@@ -355,14 +355,16 @@ class Warp(GeometryModule):
         Returns:
             the boxes that enclose the moved outlines (curved: the edges are sampled), not clipped to the
             image, and valid (B, *N) bool: some part of the outline lies on the target's image. A box
-            none of whose outline can be mapped is (-1, -1, -1, -1).
+            none of whose outline can be mapped, or with x2 < x1 or y2 < y1, is (-1, -1, -1, -1).
         """
         boxes = as_values(boxes, "boxes", "Warp", self.source.intrinsics.device)
         if boxes.ndim == 0 or boxes.shape[-1] != 4:
             raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
         if not boxes.is_floating_point():
             boxes = boxes.to(self.source.intrinsics.dtype)
-        return self.enclose(corners_of(boxes))
+        enclosing, valid = self.enclose(corners_of(boxes))
+        ordered = in_order(boxes)
+        return torch.where(ordered.unsqueeze(-1), enclosing, -1.0), valid & ordered
 
     def enclose(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """As `transform_boxes`, of closed polygons (B, *N, K, 2), or (*N, K, 2)."""
@@ -414,6 +416,12 @@ def corners_of(boxes: Tensor) -> Tensor:
     x1, y1, x2, y2 = boxes.unbind(-1)
     corners: Tensor = torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2))
     return corners
+
+
+def in_order(boxes: Tensor) -> Tensor:
+    """(...) bool: whether boxes (..., 4) have x1 <= x2 and y1 <= y2; those of x, y, width, height seldom do."""
+    ordered: Tensor = (boxes[..., :2] <= boxes[..., 2:]).all(-1)
+    return ordered
 
 
 def along_edges(corners: Tensor, samples: int) -> Tensor:
