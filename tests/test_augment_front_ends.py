@@ -133,6 +133,42 @@ def test_faces_are_normalised():
     np.testing.assert_allclose(back["keypoints"], points[:1], atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["keypoints", "landmarks"])
+def test_keypoints_keep_the_shape_of_opencv(name):
+    image, _, points, _ = images()
+    planes = torch.from_numpy(image).permute(2, 0, 1)
+    column = points[:, None]
+    arrays = ct.augment.numpy.Transform(augmentation(camera=camera()))
+    tensors = augmentation(camera=camera())
+    for call, frame, flat, given in (
+        (arrays, image, points, column),
+        (tensors, planes, torch.from_numpy(points), torch.from_numpy(column)),
+        (tensors, planes[None], torch.from_numpy(points)[None], torch.from_numpy(column)[None]),
+        (tensors, planes[None], [torch.from_numpy(points)], [torch.from_numpy(column)]),
+    ):
+        torch.manual_seed(1)
+        expected = call({"image": frame, name: flat})
+        torch.manual_seed(1)
+        out = call({"image": frame, name: given})
+        for key, axis in ((name, -2), (f"{name}_valid", -1)):
+            many = isinstance(out[key], list)
+            one, want = (torch.as_tensor(v[key][0] if many else v[key]) for v in (out, expected))
+            assert torch.equal(one, want.unsqueeze(axis))
+    with pytest.raises(ValueError, match=rf"{name} must be .* got shape \(2, 2, 2\)"):
+        tensors({"image": planes, name: torch.zeros(2, 2, 2)})
+
+
+@pytest.mark.parametrize("kind", ["image", "image_left"])
+def test_channels_last_are_told_how_to_go_in(kind):
+    image = np.ascontiguousarray(images()[0])
+    own = augmentation(camera=camera())
+    one = torch.from_numpy(image)
+    for given, axes in ((image, "2, 0, 1"), (one, "2, 0, 1"), (one[None], "0, 3, 1, 2"), ([one, one], "2, 0, 1")):
+        with pytest.raises(ValueError, match=rf"{kind} is \(.*channels last.*{kind}.permute\({axes}\)"):
+            own({kind: given})
+    assert own(image=image.transpose(2, 0, 1))["image"].shape == own(image=one.permute(2, 0, 1))["image"].shape
+
+
 def test_errors_name_the_field_and_its_shape():
     image, mask, points, _ = images()
     transform = ct.augment.numpy.Transform(augmentation(camera=camera()))

@@ -522,6 +522,26 @@ def test_every_clip_its_own_camera():
     assert torch.equal(aug.last.source.intrinsics, several(6).intrinsics)
 
 
+@pytest.mark.parametrize("of", [adapter.RandomLens, adapter.RandomCamera])
+def test_camera_and_lens_go_in_by_name(of):
+    made = []
+    for arguments, named in (
+        ((camera(), "dms60"), {}),
+        ((camera(),), {"like": "dms60"}),
+        (("dms60",), {"camera": camera()}),
+        ((), {"like": "dms60", "camera": camera()}),
+    ):
+        torch.manual_seed(3)
+        made.append(of(*arguments, **named)(images()))
+    assert all(torch.equal(one, made[0]) for one in made)
+    says = rf"^{of.__name__}: camera must be .* comes first: {of.__name__}\(camera, 'dms60'\); got 'dms60'$"
+    for beside in ((), (camera(),)):
+        with pytest.raises(TypeError, match=says):
+            of("dms60", *beside)
+    with pytest.raises(TypeError, match=rf"^{of.__name__}: camera must be .*\(camera\); got NoneType"):
+        of()
+
+
 def test_errors_say_what_is_wrong():
     aug = adapter.RandomMount(camera())
     with pytest.raises(ValueError, match=r"\(50, 60\).*\(96, 128\)"):

@@ -112,9 +112,9 @@ class Augmentation(SampleTransform):
 
     * `image` (B, C, H, W); `mask` (B, C, H, W) or (B, H, W), of any dtype, moved by the nearest value; `depth` along z
       and `distance` along the ray, likewise.
-    * `keypoints` (B, N, 2) and `polygons` (B, M, K, 2) in pixels, `boxes` (B, M, 4) as x1 y1 x2 y2. Count and order
-      stay; beside them comes `keypoints_valid` and so on, bool: it lies on the new image (and was valid before, if
-      the sample says so).
+    * `keypoints` (B, N, 2), or OpenCV's (B, N, 1, 2), and `polygons` (B, M, K, 2) in pixels, `boxes` (B, M, 4) as
+      x1 y1 x2 y2. Count and order stay; beside them comes `keypoints_valid` and so on, bool: it lies on the new
+      image (and was valid before, if the sample says so). A box with x2 < x1 or y2 < y1 is not valid.
     * `points` (B, N, 3) of the camera frame; `landmarks` are keypoints or points by their last dim.
     * `gaze`, `directions` (B, *N, 3): turned by R, nothing else. `pitch_yaw` (B, *N, 2): a gaze in the angles of
       ETH-XGaze.

@@ -254,16 +254,22 @@ class _Random(CameraAugmentation):
 
     def __init__(
         self,
-        camera: Camera,
-        *like: Camera | PresetName | str,
+        *given: Camera | PresetName | str,
+        camera: Camera | None = None,
         p: float = 1.0,
         p_batch: float = 1.0,
         same_on_batch: bool = False,
         keepdim: bool = False,
         **options: Any,
     ):
+        name = type(self).__name__
+        first, like = (given[0], given[1:]) if camera is None and given else (camera, given)
+        if not isinstance(first, Camera):
+            shown = repr(first) if isinstance(first, str) else type(first).__name__
+            example = f"{name}(camera, {first!r})" if isinstance(first, str) else f"{name}(camera)"
+            raise TypeError(f"{name}: camera must be the Camera of the images and comes first: {example}; got {shown}")
         own = self._wraps(*like, **options)
-        super().__init__(own, camera, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
+        super().__init__(own, first, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
 
 
 class RandomMount(_Random):
@@ -284,7 +290,7 @@ class RandomMount(_Random):
 class RandomLens(_Random):
     """`camtorch.augment.RandomLens` for kornia: another lens before the camera, which stays where it looks.
 
-    Args and Convention are as in `RandomMount`; after the camera comes `like`.
+    Args and Convention are as in `RandomMount`; after the camera comes `like`. Both may be given by name.
     """
 
     _wraps = random_camera.RandomLens
@@ -293,7 +299,7 @@ class RandomLens(_Random):
 class RandomCamera(_Random):
     """`camtorch.augment.RandomCamera` for kornia: another camera in the same place, turned and with another lens.
 
-    Args and Convention are as in `RandomMount`; after the camera comes `like`.
+    Args and Convention are as in `RandomMount`; after the camera comes `like`. Both may be given by name.
     """
 
     _wraps = random_camera.RandomCamera

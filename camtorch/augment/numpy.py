@@ -35,8 +35,9 @@ class Transform:
     * `image` (H, W, C) or (H, W), of any real dtype, usually uint8, uint16 or float32; `mask`, `depth`, `distance`
       likewise. `images` and `masks` are lists of such, or arrays (N, H, W) or (N, H, W, C). Three channels are red,
       green, blue, which matters to chromatic aberration only.
-    * `keypoints` (N, 2); `bboxes` or `boxes` (M, 4) as x1 y1 x2 y2; both in pixels with the centre of the top-left one
-      at (0, 0). Boxes between pixel edges, albumentations' "pascal_voc", are these plus 0.5.
+    * `keypoints` (N, 2), or OpenCV's (N, 1, 2); `bboxes` or `boxes` (M, 4) as x1 y1 x2 y2; both in pixels with
+      the centre of the top-left one at (0, 0). Boxes between pixel edges, albumentations' "pascal_voc", are these
+      plus 0.5.
     * `gaze` (3,), `head_pose` (4, 4), `rvec` (3,), `tvec` (3,), `points` (N, 3), and all other fields.
     * `camera`: the camera of the images, unless the augmentation has one.
 

@@ -110,10 +110,10 @@ KINDS = {
     "mask": Field(2, 3, (), "(B, C, H, W) or (B, H, W)", _mask),
     "depth": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along z", _depth),
     "distance": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along the ray", _distance),
-    "keypoints": Field(2, 2, (2,), "(B, N, 2) pixels x, y", _pixels, True),
+    "keypoints": Field(2, 3, (2,), "(B, N, 2) pixels x, y", _pixels, True),
     "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
     "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", _boxes, True),
-    "landmarks": Field(2, 2, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
+    "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
     "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _rays),
     "gaze": _RAYS,
     "directions": _RAYS,
@@ -124,6 +124,7 @@ KINDS = {
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _rays),
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation),
 }
+_SINGLE_FILE = ("keypoints", "landmarks")  # which OpenCV has as (N, 1, 2)
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
@@ -194,6 +195,8 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     field = KINDS[kind]
     dims = value.ndim - batched
     least, most = field.dims, field.most_dims
+    if kind in _SINGLE_FILE and dims == most and value.shape[-2] != 1:
+        most -= 1
     if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{_hint(name)}")
@@ -297,14 +300,14 @@ class SampleTransform(nn.Module):
             count = next(iter(counts.values()))
             if counts[name] != count:
                 raise ValueError(f"{self._name}: {name} is of {counts[name]} samples, other fields are of {count}")
-        self._check_cameras(camera, count, named)
+        self._check_cameras(camera, count, named, batched)
         values = [v for _, value in named.values() for v in (value if isinstance(value, list) else [value])]
         device = values[0].device if values else torch.device("cpu")
         many = isinstance(camera, (list, tuple))
         camera = [on_device(one, device) for one in camera] if many else on_device(alone(camera), device)
         return named, batched, count, camera
 
-    def _check_cameras(self, camera: object, count: int, named: Named) -> None:
+    def _check_cameras(self, camera: object, count: int, named: Named, batched: bool) -> None:
         cameras = list(camera) if isinstance(camera, (list, tuple)) else [camera]
         if not cameras:
             raise ValueError(f"{self._name}: an empty list of cameras; no samples have one camera, too")
@@ -323,8 +326,17 @@ class SampleTransform(nn.Module):
                 # one for each sample where there are as many cameras
                 images = value if isinstance(value, list) else [value]
                 images = images[i : i + 1] if isinstance(value, list) and len(cameras) > 1 else images
-                for size in {tuple(image.shape[-2:]) for image in images if found in IMAGES}:
+                for shape in {tuple(image.shape) for image in images if found in IMAGES}:
+                    size = shape[-2:]
                     if size != one.image_size:
+                        if shape[-3:-1] == one.image_size:
+                            shape = shape if batched or isinstance(value, list) else shape[1:]
+                            to = "0, 3, 1, 2" if len(shape) == 4 else "2, 0, 1"
+                            raise ValueError(
+                                f"{self._name}: {field} is {shape}, with the channels last. A tensor goes in as "
+                                f"{field}.permute({to}), an array as {field}.transpose({to}); "
+                                "camtorch.augment.numpy takes arrays as they are"
+                            )
                         raise ValueError(
                             f"{self._name}: {field} is {size} (height, width), but the image_size of {name} is "
                             f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
