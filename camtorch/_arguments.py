@@ -7,6 +7,7 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -40,9 +41,9 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
             raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
         try:
             if isinstance(value, (list, tuple)) and value and all(getattr(v, "ndim", 0) for v in value):
-                value = torch.stack([torch.as_tensor(v) for v in value])
+                value = torch.stack([torch.as_tensor(_as_plain(v)) for v in value])
             else:
-                value = torch.as_tensor(value)
+                value = torch.as_tensor(_as_plain(value))
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(
                 f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
@@ -53,6 +54,16 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
         value = value.to(torch.get_default_dtype())
     if is_concrete(value) and not is_predicted(value) and not bool(torch.isfinite(value).all()):
         raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
+    return value
+
+
+def _as_plain(value: Numbers) -> Numbers:
+    """What torch takes without a complaint: of an array that is turned round, foreign or read-only, a copy."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+        if value.dtype.kind == "f" and value.dtype.itemsize > 8:
+            return value.astype(np.float64)
+        odd = not value.dtype.isnative or not value.flags.writeable or any(step < 0 for step in value.strides)
+        return value.astype(value.dtype.newbyteorder("="), order="C", copy=True) if odd else value
     return value
 
 
@@ -77,6 +88,8 @@ def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
         flat = vectors.squeeze(-1)
     elif vectors.shape == (1, 3) and not isinstance(value, (Tensor, list, tuple)):
         flat = vectors[0]
+    elif vectors.ndim > 2 and vectors.shape[-2:] == (1, 3) and not isinstance(value, Tensor):
+        flat = vectors.squeeze(-2)  # OpenCV's rows, stacked or in a list
     elif vectors.ndim and vectors.shape[-1] == 3:
         return vectors
     else:

@@ -205,8 +205,10 @@ class Camera(BatchedModule):
                 f"{cls.__name__}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
                 "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
             )
-        if K.ndim == 2 == distortion.ndim and 1 in distortion.shape:
+        if K.ndim == 2 and distortion.numel() == max(distortion.shape, default=0):
             distortion = distortion.flatten()
+        elif 2 < K.ndim == distortion.ndim and distortion.shape[-2] == 1:  # OpenCV's rows (1, n), stacked
+            distortion = distortion.squeeze(-2)
         elif cls._is_column(distortion):
             raise ValueError(
                 f"{cls.__name__}: distortion {tuple(distortion.shape)} beside K {tuple(K.shape)} leaves a doubt"
@@ -272,12 +274,12 @@ class Camera(BatchedModule):
     @classmethod
     def _is_column(cls, distortion: Tensor) -> bool:
         """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
-        count = distortion.shape[-2] if distortion.ndim > 1 and distortion.shape[-1] == 1 else 1
+        count = max(distortion.shape[:-1], default=1) if distortion.shape[-1:] == (1,) else 1
         return count > 1 and cls.names_of(count) is not None
 
     @staticmethod
     def _column_hint(distortion: Tensor) -> str:
-        count = distortion.shape[-2]
+        count = max(distortion.shape)
         return (
             f". The {count} coefficients of one lens, a column in OpenCV, are distortion[..., 0]; one coefficient of "
             f"each of {count} cameras goes with intrinsics ({count}, 4)"

@@ -42,10 +42,8 @@ class Extrinsics(BatchedModule):
     def __init__(self, rotation: Numbers, translation: Numbers):
         super().__init__()
         translation = as_vectors(translation, "translation", "Extrinsics")
-        if isinstance(rotation, (list, tuple)):
-            rotation = as_real(rotation, "rotation", "Extrinsics")
         # columns (3, 3, 1) are vectors without a doubt
-        undecided = tuple(getattr(rotation, "shape", ()))[-2:] == (3, 3)
+        undecided = as_real(rotation, "rotation", "Extrinsics").shape[-2:] == (3, 3)
         rotation = as_vectors(rotation, "rotation", "Extrinsics")
         if undecided and _are_matrices(rotation, translation):
             rotation = rotation_vector(rotation)

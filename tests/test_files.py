@@ -3,6 +3,7 @@
 import importlib
 import math
 import pkgutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -185,3 +186,12 @@ def test_each_model_of_colmap(entry, suffix, tmp_path):
         assert torch.allclose(found, float64(reference), rtol=0, atol=1e-9)
     if suffix == "txt":
         assert path.read_text().splitlines()[-1].split()[1] == name
+
+
+def test_texts_of_mrcal_may_have_escapes(tmp_path):
+    given = Path(__file__).parent / "files" / "mrcal_pinhole.cameramodel"
+    text = given.read_text()
+    before, after = text.split("{", 1)
+    path = tmp_path / "noted.cameramodel"
+    path.write_text(before + "{\n 'note': 'C:\\\\cam, it\\'s\\n', 'other': b'\\x00',\n" + after)
+    assert torch.equal(ct.load(path).camera.intrinsics, ct.load(given).camera.intrinsics)

@@ -11,6 +11,7 @@ import torch
 import camtorch as ct
 
 K = np.array([[300.0, 0.0, 319.5], [0.0, 310.0, 239.5], [0.0, 0.0, 1.0]])
+FISHEYE = np.array([0.01, -0.002, 0.0003, -0.0004])
 LENSES = [
     (ct.KannalaBrandt, 4),
     (ct.BrownConrady, 4),
@@ -205,3 +206,24 @@ ct.Dewarp(camera.requires_grad_(False))(torch.rand(1, 3, 480, 640))
 assert "sympy" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_stacked_results_of_opencv_are_a_batch():
+    matrices, rows = np.stack([K, K]), np.stack([FISHEYE.reshape(1, 4)] * 2)
+    assert ct.KannalaBrandt.from_matrix(matrices, rows).batch_shape == (2,)
+    assert ct.KannalaBrandt.from_matrix(list(matrices), list(rows)).batch_shape == (2,)
+    for shape in ((4, 1, 1), (1, 1, 4), (1, 4)):
+        assert ct.KannalaBrandt.from_matrix(K, FISHEYE.reshape(shape)).batch_shape == ()
+    with pytest.raises(ValueError, match="coefficients of one lens"):
+        ct.KannalaBrandt([500.0, 500.0, 320.0, 240.0], FISHEYE.reshape(4, 1, 1))
+    vectors = [np.full((1, 3), 0.1 * i) for i in range(4)]
+    assert ct.Extrinsics(vectors, vectors).batch_shape == (4,)
+    assert ct.Extrinsics(np.stack([np.eye(3)] * 2), np.zeros((2, 1, 3))).batch_shape == (2,)
+
+
+def test_arrays_of_any_layout_are_numbers():
+    camera = ct.KannalaBrandt.from_matrix(K.astype(">f8"), FISHEYE[::-1])
+    assert camera.distortion.tolist() == FISHEYE[::-1].tolist()
+    locked = FISHEYE.copy()
+    locked.setflags(write=False)
+    assert ct.KannalaBrandt.from_matrix(K.astype(np.longdouble), locked).distortion.tolist() == FISHEYE.tolist()

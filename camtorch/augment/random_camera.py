@@ -200,6 +200,10 @@ class RandomMount(RandomCamera):
         zoom: RangeLike | None = (1.0, 1.0),
         **options: Any,
     ):
+        if isinstance(options.get("fov"), str):
+            raise ValueError(
+                f"{type(self).__name__}: the lens stays, so fov is a range of degrees; got {options['fov']!r}"
+            )
         none = self._without(options, "focal", "centre", "distortion", "crop")
         super().__init__(yaw=yaw, pitch=pitch, roll=roll, zoom=zoom, **none, **options)
 

@@ -43,7 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments.run(arguments)
         for warning in caught:
             note(warning.message)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # closed by whoever called
+            sys.stdout.flush()
     except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _PIPE

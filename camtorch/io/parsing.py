@@ -5,6 +5,7 @@ A file that is refused, whatever it holds, has cost at most a second for 10 MB a
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -136,7 +137,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _TOKEN = re.compile(
-    r"""\s*(?:(?P<mark>[][{}(),:])|b?'(?P<text>[^'\\\n]*)'|b?"(?P<quoted>[^"\\\n]*)"|(?P<comment>\#[^\n]*)"""
+    r"""\s*(?:(?P<mark>[][{}(),:])|b?'(?P<text>[^'\\\n]*(?:\\.[^'\\\n]*){0,999})'|"""
+    r"""b?"(?P<quoted>[^"\\\n]*(?:\\.[^"\\\n]*){0,999})"|(?P<comment>\#[^\n]*)"""
     r"""|(?P<word>[^][\s{}(),:'"#]+)|(?P<end>\Z))"""
 )
 _CLOSING = {"{": "}", "[": "]", "(": ")"}
@@ -183,7 +185,12 @@ def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
             tree.open({} if value == "{" else [])
             closing.append(_CLOSING[value])
         else:
-            tree.add(value)
+            if "\\" in value:
+                try:
+                    value = ast.literal_eval(token[0].strip())
+                except (SyntaxError, ValueError):
+                    tree.fail(f"{value!r:.40} is no text")
+            tree.add(value if isinstance(value, str) else value.decode("latin-1"))
             expected = "separator" if closing else "end"
         position = token.end()
     if closing or not isinstance(tree.root, dict):

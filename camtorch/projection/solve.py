@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Planes2 = tuple[Tensor, Tensor]
 
 _START_ROUNDS = 6
-_CLOSE = 0.1
+_CLOSE = 0.02
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
 _CAMERAS = 32  # that are searched at a time

@@ -40,8 +40,11 @@ def _positions(
         (source_model, source_intrinsics, source_distortion, sizes[:2]),
         (target_model, target_intrinsics, target_distortion, sizes[2:]),
     ):
-        numbers = [intrinsics, distortion] if distortion.shape[-1] else [intrinsics]
-        camera = CLASSES[model](*(t.detach() for t in numbers), image_size=(size[0], size[1]))
+        kind, count = CLASSES[model], distortion.shape[-1]
+        usual = [torch.ones(4), torch.tensor(kind.ideal(count))] if count else [torch.ones(4)]
+        camera = kind(*usual, image_size=(size[0], size[1]))
+        # what is bad makes an image that shows nothing, and no error
+        camera = camera.with_tensors(intrinsics=intrinsics.detach(), distortion=distortion.detach())
         cameras.append(camera.requires_grad_(False))
     grid, mapped = tabulate(cameras[0], cameras[1], rotation, tolerance)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
