@@ -216,7 +216,7 @@ def test_columns_leave_little_empty():
         (["in.png", "--camera", "none.yml"], "none.yml: No such file"),
         (["--labels", "labels.json"], "--labels needs IMAGE"),
         (["--rescale"], "--rescale needs IMAGE"),
-        (["--model", "pinhole"], "--model needs --camera FILE"),
+        (["--model", "pinhole"], "--from-model needs --camera FILE"),
         (["--name", "left"], "--name needs --camera FILE"),
         (["--preset", "fish"], "no preset 'fish'. There are none, the image's own lens; webcam, a VGA camera"),
         (["-n", "0"], "-n must be 1 to 100; got 0"),

@@ -1,6 +1,7 @@
 """`camtorch show` and `camtorch convert`."""
 
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -177,6 +178,49 @@ def test_convert_keeps_poses(folder, capsys):
         assert torch.equal(after.extrinsics[name].translation, pose.translation)
 
 
+def test_convert_of_coefficients_of_no_model_wants_it_named(folder, capsys):
+    Path("open.yml").write_text(FISHEYE.replace("fisheye_model: 1\n", ""))
+    error = refused(capsys, "convert", "open.yml", "o.json", "--model", "kannala_brandt")
+    assert "open.yml: 4 coefficients" in error
+    assert "--from-model kannala_brandt" in error
+    assert "--from-model brown_conrady" in error
+    assert not Path("o.json").exists()
+    command("convert", "open.yml", "o.json", "--model", "kannala_brandt", "--from-model", "brown_conrady")
+    assert "brown_conrady to kannala_brandt: rms" in capsys.readouterr().out
+    command("convert", "open.yml", "o.json", "--from-model", "kannala_brandt", "--force")
+    assert torch.equal(ct.load("o.json").camera.distortion, ct.load("camera.yml").camera.distortion)
+    capsys.readouterr()
+    # elsewhere it is supposed, and the note names the option
+    command("show", "open.yml")
+    captured = capsys.readouterr()
+    assert "BrownConrady" in captured.out
+    assert "--from-model" in captured.err
+    # the option is for the other camera too
+    command("show", "camera.yml", "--against", "open.yml", "--from-model", "kannala_brandt")
+    captured = capsys.readouterr()
+    assert "against open.yml: the same to rounding" in captured.out
+    assert captured.err == ""
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [("mrcal_opencv5.cameramodel", None), ("kalibr_camchain.yaml", "cam1"), ("nerfstudio_transforms.json", None)],
+)
+def test_convert_takes_a_camera_out_of_its_poses(folder, capsys, file, name):
+    rig = ct.load(FILES / file)
+    name = name or next(iter(rig.extrinsics))
+    camera = rig.camera_of(name)
+    if len(rig.cameras) == len(rig.extrinsics) == 1:
+        error = refused(capsys, "convert", FILES / file, "o.yml", "--format", "opencv")
+        assert "its extrinsics would be lost" in error
+        assert f"--name {name}" in error
+    command("convert", FILES / file, "o.yml", "--format", "opencv", "--name", name)
+    assert capsys.readouterr().err == f"camtorch: note: o.yml: {name} alone; its pose is left out\n"
+    new = ct.load("o.yml")
+    assert len(new.extrinsics) == 0
+    assert torch.equal(new.camera.distortion, camera.distortion)
+
+
 def test_convert_overwrites_no_images_unasked(folder, capsys):
     rig = ct.load(FILES / "nerfstudio_transforms.json")
     ct.save(rig, "rig.json", "camtorch")
@@ -211,6 +255,19 @@ def test_show_compares_without_an_image(folder, capsys):
     ct.save(ct.load(FILES / "kalibr_camchain.yaml").cameras["cam1"], "one.json")
     command("show", FILES / "kalibr_camchain.yaml", "--name", "cam1", "--against", "one.json")
     assert "the same to rounding" in capsys.readouterr().out
+
+
+def test_show_says_how_much_is_alike_where_the_rim_is_not(folder, capsys):
+    before = ct.load("camera.yml").camera
+    ct.save(before.convert("brown_conrady", count=8, max_angle=math.radians(60)).camera, "other.json")
+    command("show", "camera.yml", "--against", "other.json")
+    found = re.search(
+        r"rms (.+) px, at most .+ px, over (.+) % of the image; median (.+) px, (.+) % of the image within 1 px\n",
+        capsys.readouterr().out,
+    )
+    rms, over, median, alike = map(float, found.groups())
+    assert median < 1 < rms
+    assert 50 < alike < over
 
 
 def test_a_size_that_the_file_does_not_say(folder, capsys):

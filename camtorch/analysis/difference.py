@@ -36,6 +36,20 @@ class Difference(NamedTuple):
         return float(self.apart[self.both].max()) if bool(self.both.any()) else math.nan
 
     @property
+    def median(self) -> float:
+        """The median distance in pixels over what both have; NaN where that is nothing."""
+        return float(self.apart[self.both].median()) if bool(self.both.any()) else math.nan
+
+    def within(self, pixels: float) -> float:
+        """The part of the image, 0 to 1, that both have rays for, at most so many pixels apart."""
+        return float((self.both & (self.apart <= pixels)).double().mean())
+
+    @property
+    def same(self) -> bool:
+        """Whether they are the same to rounding, where both have the ray; not where both have nothing."""
+        return self.largest < _ROUNDING
+
+    @property
     def part(self) -> float:
         """The part of the image that both have rays for."""
         return float(self.both.double().mean())
@@ -43,7 +57,7 @@ class Difference(NamedTuple):
     def __str__(self) -> str:
         if not self.part:
             return "no ray in common"
-        if self.largest < _ROUNDING:
+        if self.same:
             return "the same to rounding"
         return f"rms {self.rms:.3g} px, at most {self.largest:.3g} px"
 

@@ -78,11 +78,11 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--seed must be 0 or more, and below 2 to the 63rd; got {arguments.seed}")
     if not 0 <= arguments.min_filled <= 1:
         raise ValueError(f"--min-filled must be 0 to 1; got {arguments.min_filled:g}")
-    needs = {"camera": ("model", "name"), "image": ("labels", "rescale")}
+    needs = {"camera": ("from_model", "name"), "image": ("labels", "rescale")}
     for needed, names in needs.items():
         idle = [name for name in names if getattr(arguments, needed) is None and getattr(arguments, name)]
         if idle:
-            raise ValueError(f"--{idle[0]} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
+            raise ValueError(f"--{idle[0].replace('_', '-')} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
     inputs = (arguments.image, arguments.camera, arguments.labels)
     images.check_target(arguments.output, force=arguments.force, inputs=inputs)
     before = _scene(arguments) if arguments.image is None else _photograph(arguments)
@@ -129,7 +129,7 @@ def _scene(arguments: argparse.Namespace) -> LabelledImage:
         )
     camera = None
     if arguments.camera is not None:
-        camera = cameras.read_camera(arguments.camera, arguments.name, arguments.model)
+        camera = cameras.read_camera(arguments.camera, arguments.name, arguments.from_model)
         if camera.image_size is None:
             raise ValueError(f"{arguments.camera} states no image size, which a rendered image needs")
     # not before: what is installed may be without it

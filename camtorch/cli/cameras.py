@@ -1,4 +1,4 @@
-"""What the command line reads: the cameras of a calibration file, by the options --name and --model."""
+"""What the command line reads: the cameras of a calibration file, by the options --name and --from-model."""
 
 from __future__ import annotations
 
@@ -11,8 +11,18 @@ from camtorch.cli.terminal import note
 from camtorch.io import CameraFileError, load, opencv
 from camtorch.rig import Rig
 
+_ASPECT = 0.01
+"""The part by which the aspect ratios of a camera and an image may differ, as sizes are rounded."""
 
-def read_rig(path: Path, name: str | None = None, model: str | None = None, size: tuple[int, int] | None = None) -> Rig:
+
+def read_rig(
+    path: Path,
+    name: str | None = None,
+    model: str | None = None,
+    size: tuple[int, int] | None = None,
+    *,
+    stated: bool = False,
+) -> Rig:
     """The cameras of a file.
 
     Args:
@@ -20,12 +30,18 @@ def read_rig(path: Path, name: str | None = None, model: str | None = None, size
         name: the only camera wanted.
         model: a key of `camtorch.MODELS`, for OpenCV's files, which may not say it.
         size: (height, width), for cameras whose file does not say it.
+        stated: whether a file that leaves the model open is refused, rather than taken for the usual one.
 
     Raises:
         CameraFileError: the file cannot be used. ValueError: no camera of that name, or of another size; a model for a
-            file that says its own.
+            file that says its own, or none for one that leaves it open and has to say it.
     """
     rig = load(path) if model is None else _of_model(path, model)
+    if stated and model is None and rig.format == "opencv" and _leaves_open(path):
+        raise ValueError(
+            f"{path}: 4 coefficients, and it does not say of which model: --from-model kannala_brandt if they come "
+            "from cv2.fisheye, else --from-model brown_conrady"
+        )
     if name is not None:
         if name not in rig.cameras and name not in rig.images:
             raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig.cameras)}")
@@ -36,6 +52,13 @@ def read_rig(path: Path, name: str | None = None, model: str | None = None, size
             raise ValueError(f"{path}: {found} is for {_shown(camera.image_size)}, not {_shown(size)}")
         camera.image_size = camera.image_size or size
     return rig
+
+
+def _leaves_open(path: Path) -> bool:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load(path)
+    return any(issubclass(warning.category, opencv.AmbiguousModelWarning) for warning in caught)
 
 
 def _of_model(path: Path, model: str) -> Rig:
@@ -62,13 +85,13 @@ def read_camera(path: Path, name: str | None = None, model: str | None = None) -
     return _single(path, *_only(path, read_rig(path, name, model)))
 
 
-def read_other(path: Path, name: str | None = None) -> Camera:
-    """The camera to compare with: the only one of its file, or the one of that name.
+def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
+    """The camera to compare with: the only one of its file, or the one of that name; a model if the file needs one.
 
     Raises:
         ValueError: there are several, and none of that name.
     """
-    rig = read_rig(path)
+    rig = read_rig(path, model=model if model is not None and _leaves_open(path) else None)
     if name is None or len(rig.cameras) == 1:
         name, camera = _only(path, rig)
     else:
@@ -87,13 +110,17 @@ def read_camera_of(image: Path, size: tuple[int, int], arguments: argparse.Names
         raise ValueError(
             f"{image}: which camera took it? --camera FILE, its calibration, says so: an image alone does not tell"
         )
-    camera = read_camera(path, arguments.name, arguments.model)
+    camera = read_camera(path, arguments.name, arguments.from_model)
     if camera.image_size is None:
         camera.image_size = size
         note(f"{path} states no image size; taken to be for {_shown(size)}, as {image} is")
     elif camera.image_size != size:
-        if not arguments.rescale:
-            raise ValueError(_resolutions(image, size, path, camera.image_size))
+        reason = _not_scaled(size, camera.image_size)
+        if reason or not arguments.rescale:
+            raise ValueError(
+                f"{image} is {_shown(size)}, but the camera in {path} is for {_shown(camera.image_size)}; "
+                f"{reason or '--rescale scales the camera to the image'}"
+            )
         camera = camera.resize(*size)
     return camera
 
@@ -110,14 +137,20 @@ def _single(path: Path, name: str, camera: Camera) -> Camera:
     return camera
 
 
-def _resolutions(image: Path, size: tuple[int, int], path: Path, camera: tuple[int, int]) -> str:
-    text = (
-        f"{image} is {_shown(size)}, but the camera in {path} is for {_shown(camera)}; "
-        "--rescale scales the camera to the image"
+def _not_scaled(image: tuple[int, int], camera: tuple[int, int]) -> str:
+    """Why a camera for one (height, width) is not to be scaled to another; empty if it may be."""
+    if image == camera[::-1]:
+        return (
+            "width and height are exchanged: is the photograph turned, or does the calibration exchange them? "
+            "Scaling undoes neither"
+        )
+    stretch = image[1] * camera[0] / (image[0] * camera[1])
+    if max(stretch, 1 / stretch) <= 1 + _ASPECT:
+        return ""
+    return (
+        f"their aspect ratios, {image[1] / image[0]:.4g} and {camera[1] / camera[0]:.4g}, differ by more than "
+        f"{100 * _ASPECT:g} %: the image may be cropped, which --rescale does not undo"
     )
-    if abs(size[1] / camera[1] - size[0] / camera[0]) * max(camera) > 1:
-        text += ", but their shapes differ too, so the image may be cropped, which scaling does not undo"
-    return text
 
 
 def _shown(size: tuple[int, int]) -> str:

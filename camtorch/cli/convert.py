@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from camtorch.cli.options import add_calibration, add_force, parse_path
+from camtorch.cli.terminal import note
 
 if TYPE_CHECKING:
     from camtorch.cli.options import Commands
@@ -25,11 +26,11 @@ def add(commands: Commands) -> None:
     command.set_defaults(run=run)
     command.add_argument("input", type=parse_path, metavar="IN", help="a calibration file")
     command.add_argument("output", type=parse_path, metavar="OUT", help="the new one")
-    command.add_argument("--model", metavar="KEY", help="the new model; by default the model stays")
+    command.add_argument("--model", metavar="KEY", help="the model of OUT; by default that of IN")
     command.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
     command.add_argument("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")
     command.add_argument("--format", help="of OUT; by default what its name says")
-    add_calibration(command)
+    add_calibration(command, "which camera is saved, alone and without its pose")
     add_force(command)
 
 
@@ -46,7 +47,8 @@ def run(arguments: argparse.Namespace) -> None:
     angle = arguments.max_angle
     if angle is not None and not 0 < angle <= 180:
         raise ValueError(f"--max-angle must be above 0 and at most 180 degrees; got {angle:g}")
-    rig = read_rig(arguments.input, arguments.name, arguments.from_model, arguments.size)
+    rig = read_rig(arguments.input, arguments.name, arguments.from_model, arguments.size, stated=True)
+    alone = arguments.name is not None
     cameras, notes = {}, []
     for name, camera in rig.cameras.items():
         model = arguments.model or camera.key
@@ -56,12 +58,14 @@ def run(arguments: argparse.Namespace) -> None:
         notes.append(f"{path}: {name}, {camera.key} to {result.camera.key}: {_quality(result)} of {part}")
     # camtorch's own JSON holds every model; the format that the rig comes from may not
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
-    changed = Rig(cameras, rig.extrinsics, images=rig.images, format=stays)
+    changed = Rig(cameras, None if alone else rig.extrinsics, images=rig.images, format=stays)
     for name in formats.rendered(changed, path, arguments.format):
         targets.check(Path(name), force=arguments.force, inputs=(arguments.input,))
     path.parent.mkdir(parents=True, exist_ok=True)
     formats.save(changed, path, arguments.format)
     print("\n".join(notes))
+    if alone and len(rig.extrinsics):
+        note(f"{path}: {arguments.name} alone; its pose is left out")
 
 
 def _quality(result: Conversion) -> str:

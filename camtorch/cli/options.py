@@ -49,20 +49,27 @@ def parse_fov(text: str) -> float | tuple[float, float] | str:
 def add_photograph(command: argparse.ArgumentParser) -> None:
     """The calibration of an image."""
     command.add_argument("--camera", type=parse_path, metavar="FILE", help="its calibration, of any format")
+    _add_from_model(command, "--model")
+    command.add_argument("--name", help="which camera, in a file with several")
     command.add_argument(
-        "--model",
-        metavar="KEY",
-        help="the camera model where the file does not say it: kannala_brandt, brown_conrady ...",
+        "--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio"
     )
-    command.add_argument("--name", help="which camera, in a file with several")
-    command.add_argument("--rescale", action="store_true", help="scale the camera to the image's resolution")
 
 
-def add_calibration(command: argparse.ArgumentParser) -> None:
+def add_calibration(command: argparse.ArgumentParser, of_name: str = "which camera, in a file with several") -> None:
     """How to read a calibration that is the command's subject."""
-    command.add_argument("--name", help="which camera, in a file with several")
-    command.add_argument("--from-model", metavar="KEY", help="the model in the file, where that does not say it")
+    command.add_argument("--name", help=of_name)
+    _add_from_model(command)
     command.add_argument("--size", type=parse_size, metavar="WxH", help="of images, where the file does not say")
+
+
+def _add_from_model(command: argparse.ArgumentParser, *others: str) -> None:
+    command.add_argument(
+        "--from-model",
+        *others,
+        metavar="KEY",
+        help="the model in the file, where that does not say it: kannala_brandt, brown_conrady ...",
+    )
 
 
 def add_output(command: argparse.ArgumentParser, default: str | None, text: str = "the new image") -> None:

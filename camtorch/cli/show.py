@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> None:
     if single and camera.image_size is None:
         raise ValueError(f"{path} states no image size; --size says which")
     if against is not None:
-        other = read_other(against, arguments.name)
+        other = read_other(against, arguments.name, arguments.from_model)
         if other.image_size not in (None, camera.image_size):
             sizes = f"{other.width}x{other.height}, but {path} for {camera.width}x{camera.height}"
             raise ValueError(f"{against} is for {sizes}: cameras of one image are compared")
@@ -53,7 +53,10 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"{path}: {name}", *summarise(camera).lines(), sep="\n")
     if other is not None:
         compared = difference(camera, other)
-        print(f"against {against}: {compared}, over {100 * compared.part:.4g} % of the image")
+        line = f"against {against}: {compared}, over {100 * compared.part:.4g} % of the image"
+        if compared.part and not compared.same:  # a few rays at the rim may make nearly all of the rms
+            line += f"; median {compared.median:.3g} px, {100 * compared.within(1):.3g} % of the image within 1 px"
+        print(line)
     if output is not None:
         which = name if name != "camera" else camera.key
         _draw(output, camera, other, f"{path.name}: {which}, {camera.width} x {camera.height}")

@@ -42,6 +42,10 @@ _LONGEST_KEY = 200
 _PAIRS = (["1", "2"], ["left", "right"])
 
 
+class AmbiguousModelWarning(UserWarning):
+    """A file leaves open of which model its coefficients are."""
+
+
 def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
     """The camera of an OpenCV YAML, JSON or XML file, in float64 and frozen.
 
@@ -176,14 +180,16 @@ class _File:
             self.fail(
                 other,
                 "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
-                "or --model kannala_brandt",
+                "or --from-model kannala_brandt",
             )
         if flag is not None and "kannala_brandt" in self.fitting()[0]:
             return "kannala_brandt"
         if len(distortion) == _FISHEYE_COUNT and flag is None:
             warnings.warn(
                 f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
-                "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt')",
+                "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt'); "
+                "on the command line, --from-model says which",
+                AmbiguousModelWarning,
                 stacklevel=4,
             )
         return "brown_conrady" if distortion else "pinhole"

@@ -203,7 +203,8 @@ class Lossy:
     def only_camera(self, rig: Rig) -> tuple[str, Camera]:
         """The one camera of a format that holds no more."""
         if len(rig.cameras) != 1:
-            self.fail("cameras", f"{len(rig.cameras)} cameras; {self.format} holds one")
+            count = f"{len(rig.cameras)} cameras; {self.format} holds one"
+            self.fail("cameras", f"{count}; on the command line --name says which")
         return next(iter(rig.cameras.items()))
 
     def no_images(self, rig: Rig) -> None:
@@ -217,7 +218,9 @@ class Lossy:
         for name, extrinsics in rig.extrinsics.items():
             if self.pose(name, extrinsics) != ([0.0] * 3, [0.0] * 3):
                 self.fail(
-                    name, f"its extrinsics would be lost; {self.format} has no place for them. Save the camera alone"
+                    name,
+                    f"its extrinsics would be lost; {self.format} has no place for them. Save the camera alone; on "
+                    f"the command line --name {name} does",
                 )
 
     def pose(self, name: str, extrinsics: Extrinsics) -> tuple[list[float], list[float]]:
