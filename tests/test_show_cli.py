@@ -327,3 +327,16 @@ def test_a_summary_says_what_it_cannot_know():
     assert summarise(lost).fov == (0, 0, 0)
     with pytest.raises(ValueError, match="one camera"):
         summarise(ct.Pinhole(torch.ones(2, 4)))
+
+
+def test_convert_overwrites_nothing_that_it_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    camera = ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640))
+    poses = {"a.jpg": ct.Extrinsics([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])}
+    ct.save(ct.Rig({"1": camera}, poses, images={"a.jpg": "1"}), "sparse", format="colmap")
+    before = {path.name: path.read_bytes() for path in Path("sparse").iterdir()}
+    assert len(before) > 1
+    for words in (["sparse", "sparse"], ["sparse", "sparse/cameras.txt"], ["sparse/cameras.txt", "sparse/images.txt"]):
+        assert main(["convert", *words, "--model", "fisheye624", "--format", "colmap", "--force"]) == 2
+        assert "is read" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in Path("sparse").iterdir()} == before

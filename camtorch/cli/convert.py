@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     path = arguments.output
     if not path.is_dir():  # some formats are folders
-        targets.check(path, force=arguments.force, inputs=(arguments.input,))
+        targets.check(path, force=arguments.force, inputs=_read(arguments.input))
     angle = arguments.max_angle
     if angle is not None and not 0 < angle <= 180:
         raise ValueError(f"--max-angle must be above 0 and at most 180 degrees; got {angle:g}")
@@ -60,12 +60,19 @@ def run(arguments: argparse.Namespace) -> None:
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, None if alone else rig.extrinsics, images=rig.images, format=stays)
     for name in formats.rendered(changed, path, arguments.format):
-        targets.check(Path(name), force=arguments.force, inputs=(arguments.input,))
+        targets.check(Path(name), force=arguments.force, inputs=_read(arguments.input))
     path.parent.mkdir(parents=True, exist_ok=True)
     formats.save(changed, path, arguments.format)
     print("\n".join(notes))
     if alone and len(rig.extrinsics):
         note(f"{path}: {arguments.name} alone; its pose is left out")
+
+
+def _read(path: Path) -> tuple[Path, ...]:
+    """The files that loading a path may read: all of a folder's, and COLMAP's images beside its cameras."""
+    if path.is_dir():
+        return tuple(path.iterdir())
+    return (path, *path.parent.glob("images.*")) if path.stem == "cameras" else (path,)
 
 
 def _quality(result: Conversion) -> str:
