@@ -5,6 +5,7 @@ import torch
 
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens
+from camtorch.warp.warp import along_edges
 
 WHOLE = [name for name in PRESETS if name != "aria"]
 """Of Aria's, the calibrated polynomial folds before the corners: they lie beyond what the lens lights."""
@@ -14,7 +15,7 @@ def rim(size):
     """(N, 2): the outer edges of an image, a point on every pixel edge."""
     height, width = size
     corners = torch.tensor([[[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]]])
-    return ct.warp.polygons.along_edges(corners, max(size))[0]
+    return along_edges(corners, max(size))[0]
 
 
 def source(size):

@@ -45,7 +45,11 @@ def folder(tmp_path, monkeypatch):
     height, width = camera.image_size
     ct.save(camera, "other.yml", format="opencv")
     Image.fromarray(np.full((height, width, 3), 128, np.uint8)).save("photo.jpg")
-    return tmp_path
+    known = dict(ct.MODELS)
+    yield tmp_path
+    # the models that pages define are theirs
+    ct.MODELS.clear()
+    ct.MODELS.update(known)
 
 
 @pytest.mark.parametrize(("page", "line", "code"), [*blocks("python")])

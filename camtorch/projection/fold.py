@@ -21,6 +21,7 @@ _RADII = 2048  # to find the fold of the radial factor
 _SMOOTH, _BULGE = 0.02, 0.001
 _DIP = 65  # radii at which a dip between two nodes is looked at
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
+_FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
 _ROWS = 2048  # azimuths that are followed at a time
 _KEPT = 64  # cameras whose outlines are kept
 _BEYOND, _ASIDE = 1.01, 4  # what an outline allows for outside of its rim and, in azimuths, beside it
@@ -95,7 +96,8 @@ class Azimuths:
         rows = camera.repeat_interleave(AZIMUTHS)
         parts = [self._follow(*some) for some in zip(rows.split(_ROWS), index.split(_ROWS), strict=True)]
         reach, furthest, x, y = (torch.cat(w).unflatten(0, (len(camera), AZIMUTHS)) for w in zip(*parts, strict=True))
-        return Outline(self._radii[camera], reach, _envelope(furthest, x, y))
+        envelope = _envelope(furthest, x, y)
+        return Outline(self._radii[camera], reach, torch.where(envelope < _FAR, envelope, torch.inf))
 
     def _radii_of(self, camera: Tensor) -> Tensor:
         """(M, radii), those of cameras that are asked for the first time made now."""
