@@ -31,7 +31,7 @@ from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.projection.explanation import explain, unusable
-from camtorch.projection.ops import register_camera
+from camtorch.projection.ops import CLASSES, register_camera
 from camtorch.projection.project import Project
 from camtorch.projection.rays import AXES, field_of_view, focal_for
 from camtorch.projection.rows import Cameras
@@ -387,6 +387,9 @@ class Camera(BatchedModule):
         """The same as `project`."""
         return self.project(points)
 
+    if TYPE_CHECKING:
+        __call__ = forward  # whose types nn.Module does not tell
+
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project points, or rays, of the camera frame to pixels.
 
@@ -690,6 +693,23 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     if not (isinstance(model, type) and issubclass(model, Camera) and model.optics is not Camera.optics):
         raise TypeError(f"{owner} takes a camera model, or its key in ct.MODELS; got {model!r}")
     return model
+
+
+def from_values(model: str, intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int]) -> Camera:
+    """The frozen camera of a class and of values that are not checked: what operators get instead of a camera.
+
+    Args:
+        model: the name of the class, a camera's `_model`.
+        intrinsics: (*B, 4).
+        distortion: (*B, n).
+        image_size: (height, width).
+    """
+    kind = CLASSES[model]
+    # of any values, to be replaced; bad ones give results that are invalid, and no error
+    usual = [torch.ones(4)] + [torch.tensor(kind.ideal(n)) for n in distortion.shape[-1:] if n]
+    made: Camera = kind(*usual, image_size=(image_size[0], image_size[1]))
+    made = made.with_tensors(intrinsics=intrinsics.detach(), distortion=distortion.detach())
+    return made.requires_grad_(False)
 
 
 def _is_plain(inputs: Sequence[Tensor]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -63,6 +63,9 @@ class Extrinsics(BatchedModule):
         rotation, translation = (t.expand(*lead, 3).reshape(-1, 3) for t in parameters)
         turned = rotate_planes(rotation_matrix(rotation), rows.unbind(-1))
         return restore(torch.stack([p + t for p, t in zip(turned, columns(translation), strict=True)]))
+
+    if TYPE_CHECKING:
+        __call__ = forward  # whose types nn.Module does not tell
 
     def matrix(self) -> Tensor:
         """The (*B, 4, 4) matrix [[R, t], [0, 1]]."""

@@ -182,3 +182,14 @@ def test_training_into_the_negative_warns():
     optimizer.step()
     with pytest.warns(UserWarning, match="Pinhole: intrinsics became unusable"):
         camera(POINTS.float())
+
+
+@pytest.mark.filterwarnings("ignore:.*became unusable")
+def test_a_compiled_warp_of_a_bad_camera_shows_nothing():
+    source = ct.KannalaBrandt([15.0, 15.0, 12.0, 9.0], [0.0, 0.0, 0.0, 0.0], image_size=(80, 96)).requires_grad_(False)
+    source.distortion.data[0] = torch.nan
+    target = ct.Pinhole([15.0, 15.0, 12.0, 9.0], image_size=(80, 96)).requires_grad_(False)
+    warp = ct.Warp(source, target, tolerance=0.05)
+    images = torch.rand(1, 1, 80, 96)
+    assert torch.equal(warp(images), torch.zeros(1, 1, 80, 96))
+    assert torch.equal(torch.compile(warp, fullgraph=True, backend="eager")(images), torch.zeros(1, 1, 80, 96))

@@ -428,15 +428,7 @@ class Augmentation(SampleTransform):
         return self._moved(sample, named, batched, change)
 
     if TYPE_CHECKING:
-
-        def __call__(
-            self,
-            sample: Mapping[str, Any] | None = None,
-            *,
-            draw: Mapping[str, Tensor] | None = None,
-            generator: torch.Generator | None = None,
-            **fields: Any,
-        ) -> Sample: ...
+        __call__ = forward  # whose types nn.Module does not tell
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "last": None}

@@ -169,8 +169,7 @@ class FaceNormalizer(SampleTransform):
         return moved
 
     if TYPE_CHECKING:
-
-        def __call__(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample: ...
+        __call__ = forward  # whose types nn.Module does not tell
 
     def extra_repr(self) -> str:
         """The virtual camera, and the options."""

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from camtorch._arguments import broadcast_shapes
 from camtorch.augment.change import camera_like, frozen, size_of
-from camtorch.camera import Camera
-from camtorch.projection.ops import CLASSES
+from camtorch.camera import Camera, from_values
 from camtorch.rotations import rotation_matrix, rotation_vector
 from camtorch.warp.warp import Warp, along_edges
 
@@ -119,8 +119,8 @@ def _opaque_enough(
     rotation: Tensor,
     share: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    before = _from_numbers(source, source_intrinsics, source_distortion, source_size)
-    after = _from_numbers(target, target_intrinsics, target_distortion, target_size)
+    before = from_values(source, source_intrinsics, source_distortion, source_size)
+    after = from_values(target, target_intrinsics, target_distortion, target_size)
     factor, turned, found = _enough(before, after, rotation, share)
     return factor.clone(), turned.clone(), found.clone()
 
@@ -139,11 +139,6 @@ def _(
     share: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
-    batch = torch.broadcast_shapes(*(t.shape[:-1] for t in numbers), rotation.shape[:-2])
+    batch = broadcast_shapes(*(t.shape[:-1] for t in numbers), rotation.shape[:-2])
     like = target_intrinsics
     return like.new_empty(batch), rotation.new_empty(*batch, 3, 3), like.new_empty(batch)
-
-
-def _from_numbers(model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int]) -> Camera:
-    numbers = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
-    return frozen(CLASSES[model](*(t.detach() for t in numbers)), (size[0], size[1]))

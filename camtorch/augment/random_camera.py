@@ -17,9 +17,8 @@ from camtorch.augment.augmentation import Augmentation, as_range
 from camtorch.augment.change import camera_like, frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.camera import Camera
+from camtorch.camera import Camera, from_values
 from camtorch.models import MODELS
-from camtorch.projection.ops import CLASSES
 from camtorch.projection.rays import field_of_view, image_lattice
 from camtorch.rotations import mount_rotation
 from camtorch.warp.warp import Warp, along_edges
@@ -358,8 +357,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
 def _opaque_jittered(
     model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
 ) -> Tensor:
-    camera = frozen(CLASSES[model](intrinsics.detach(), distortion.detach()), (size[0], size[1]))
-    return _jittered(camera, amounts, nominal).clone()
+    return _jittered(from_values(model, intrinsics, distortion, size), amounts, nominal).clone()
 
 
 @_opaque_jittered.register_fake

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from torch.utils.data import get_worker_info
 from camtorch.augment.change import Change, alone, copied, on_device, singles
 from camtorch.camera import Camera
 from camtorch.rotations import rotation_matrix, rotation_vector
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 Sample = dict[str, Any]
 """Name -> value; see `Augmentation`."""
@@ -226,11 +229,11 @@ def is_batch(named: Named, camera: object) -> bool:
 # -- moving a sample
 
 
-def without_graph_in_workers(method: Callable) -> Callable:
+def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
     """A method that records no graph in a worker of a DataLoader, which tensors of a graph cannot leave."""
 
     @functools.wraps(method)
-    def wrapped(*args, **kwargs):
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling() or get_worker_info() is None:
             return method(*args, **kwargs)
         with torch.no_grad():

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
-from camtorch.camera import Camera
-from camtorch.projection.ops import CLASSES
+from camtorch.camera import Camera, from_values
 from camtorch.warp.grid import tabulate
 
 
@@ -35,18 +34,9 @@ def _positions(
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
     """The positions: planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
-    cameras = []
-    for model, intrinsics, distortion, size in (
-        (source_model, source_intrinsics, source_distortion, sizes[:2]),
-        (target_model, target_intrinsics, target_distortion, sizes[2:]),
-    ):
-        kind, count = CLASSES[model], distortion.shape[-1]
-        usual = [torch.ones(4), torch.tensor(kind.ideal(count))] if count else [torch.ones(4)]
-        camera = kind(*usual, image_size=(size[0], size[1]))
-        # what is bad makes an image that shows nothing, and no error
-        camera = camera.with_tensors(intrinsics=intrinsics.detach(), distortion=distortion.detach())
-        cameras.append(camera.requires_grad_(False))
-    grid, mapped = tabulate(cameras[0], cameras[1], rotation, tolerance)
+    source = from_values(source_model, source_intrinsics, source_distortion, sizes[:2])
+    target = from_values(target_model, target_intrinsics, target_distortion, sizes[2:])
+    grid, mapped = tabulate(source, target, rotation, tolerance)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 

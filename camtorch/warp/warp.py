@@ -120,18 +120,6 @@ class Warp(GeometryModule):
 
     # -- images
 
-    if TYPE_CHECKING:
-
-        def __call__(
-            self,
-            images: Tensor,
-            *,
-            mode: Mode | None = None,
-            padding_mode: PaddingMode | None = None,
-            fill: Fill | None = None,
-        ) -> Tensor:
-            """`forward`, whose result nn.Module does not tell."""
-
     def forward(
         self,
         images: Tensor,
@@ -165,6 +153,9 @@ class Warp(GeometryModule):
                 result[:, :, rows] = part
             return result
         return render(images, self._learned() if learns else self._kept(inputs), *sampled)
+
+    if TYPE_CHECKING:
+        __call__ = forward  # whose types nn.Module does not tell
 
     def strips(
         self,
