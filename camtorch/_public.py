@@ -30,6 +30,7 @@ from camtorch.models import (
     ThinPrismFisheye,
     WoodScape,
 )
+from camtorch.native.library import native_available
 from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
 from camtorch.warp.dewarp import Dewarp
@@ -72,5 +73,6 @@ __all__ = [
     "augment",
     "io",
     "load",
+    "native_available",
     "save",
 ]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.metadata
 import os
 import signal
 import sys
@@ -18,6 +19,7 @@ from typing import NoReturn
 from camtorch import __version__
 from camtorch.cli import augment, convert, demo, dewarp, show
 from camtorch.cli.terminal import note, say
+from camtorch.native import library
 
 _INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
 
@@ -25,6 +27,18 @@ _INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message} (see {self.prog} --help)")
+
+
+class _Version(argparse.Action):
+    """Of what a result depends on, read where it is installed: nothing of it is imported for that."""
+
+    def __call__(self, *_: object) -> NoReturn:
+        try:
+            torch = importlib.metadata.version("torch")
+        except importlib.metadata.PackageNotFoundError:
+            torch = "not installed"
+        print(f"camtorch {__version__}, torch {torch}, native sampler: {library.state()}")
+        sys.exit()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.", allow_abbrev=False)
-    parser.add_argument("--version", action="version", version=f"camtorch {__version__}")
+    parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (dewarp, augment, convert, show, demo):
         command.add(commands)

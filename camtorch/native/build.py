@@ -1,0 +1,178 @@
+"""Compiles the sampler: `python -m camtorch.native.build`. Needs a C compiler and no package, not camtorch either.
+
+`kernel.c` is compiled once for each kind of CPU, `dispatch.c` once; one shared library of both has no symbol of Python
+or torch, so it fits every version of them. Never with `-march=native`, for a library may move to another machine, nor
+with `-ffast-math`, which links code that changes how the whole process rounds.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+_HERE = Path(__file__).resolve().parent
+_MACHINE = platform.machine().lower()
+_SUFFIX = {"win32": "dll", "darwin": "dylib"}.get(sys.platform, "so")
+
+# two dots in its name: what walks a package's modules would take _sampler.so for one, and import it
+LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
+
+_FLAGS = ["-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden"]
+_FLAGS += ["-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
+_AVX2 = ("-mavx2", "-mfma", "-mf16c", "-mbmi2")
+_AVX512 = ("-mavx512f", "-mavx512vl", "-mavx512bw", "-mavx512dq", "-mavx512vbmi")
+_VARIANTS: dict[str, tuple[str, ...]] = {"baseline": ()}
+if _MACHINE in ("x86_64", "amd64"):
+    _VARIANTS |= {"avx2": _AVX2, "avx512": (*_AVX512, *_AVX2, "-mprefer-vector-width=256")}
+
+# the oldest macOS that this Python runs on, as a wheel's name says; compilers take their own machine's
+_ENVIRONMENT: dict[str, str] = {}
+if sys.platform == "darwin":
+    _ENVIRONMENT["MACOSX_DEPLOYMENT_TARGET"] = str(sysconfig.get_config_var("MACOSX_DEPLOYMENT_TARGET"))
+
+
+class BuildError(RuntimeError):
+    """There is no C compiler, or it failed; says which command, and what the compiler said."""
+
+
+def switched_off() -> bool:
+    """Whether the environment says `CAMTORCH_NATIVE=0`."""
+    return os.environ.get("CAMTORCH_NATIVE", "").strip().lower() in ("0", "off", "false")
+
+
+def build(
+    directory: str | os.PathLike[str] | None = None,
+    *,
+    sources: str | os.PathLike[str] | None = None,
+    extra: Sequence[str] = (),
+    compiler: str | None = None,
+) -> Path:
+    """Compile the library, and put it in its place when it is whole: processes may be running the one that is there.
+
+    Args:
+        directory: where the library goes; by default where camtorch looks for it.
+        sources: the folder of `kernel.c` and `dispatch.c`; by default this file's.
+        extra: more words for the compiler, which compiles and links with them.
+        compiler: its command; by default the environment's CC, else the first of cc, gcc and clang that is there
+            (on Windows, where nobody has tried it yet: of gcc, clang and cl).
+
+    Returns:
+        The path of the library.
+
+    Raises:
+        BuildError: there is no compiler, or it fails.
+        OSError: `directory` cannot be written; on Windows also while a process has the library loaded.
+    """
+    command = _compiler(compiler)
+    toolchain = _Msvc if Path(command[0]).stem.lower() in ("cl", "clang-cl") else _Gcc
+    here = _HERE if sources is None else Path(sources).absolute()
+    target = (_HERE if directory is None else Path(directory).absolute()) / LIBRARY
+    # beside the target: a file is renamed in one step on one file system only
+    with tempfile.TemporaryDirectory(prefix="_building", dir=target.parent) as folder:
+        tools = toolchain(command, Path(folder), tuple(extra))
+        variants = {name: flags for name, flags in _VARIANTS.items() if tools.accepts(flags)}
+        has = [f"HAS_{name.upper()}" for name in variants if name != "baseline"]
+        units: list[tuple[str, str, tuple[str, ...], list[str]]] = [("dispatch.c", "dispatch", (), has)]
+        units += [("kernel.c", name, flags, [f"VARIANT={name}"]) for name, flags in variants.items()]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            objects = list(pool.map(lambda unit: tools.compile(here / unit[0], *unit[1:]), units))
+        os.replace(tools.link(objects), target)
+    return target
+
+
+def _compiler(named: str | None) -> list[str]:
+    """The words of its command, which may have options as in CC="ccache gcc"."""
+    named = named or os.environ.get("CC", "").strip()
+    if named:
+        words = [named] if shutil.which(named) else shlex.split(named)
+        if shutil.which(words[0]) is None:
+            raise BuildError(f"the C compiler {words[0]!r}, which CC or the caller names, is not there")
+        return words
+    # Visual Studio's compiler is found in its own command prompt, where it is on the PATH; its registry is not searched
+    names = ("gcc", "clang", "cl") if sys.platform == "win32" else ("cc", "gcc", "clang")
+    for name in names:
+        if shutil.which(name):
+            return [name]
+    raise BuildError(f"no C compiler: none of {', '.join(names)} is on the PATH, and CC names none")
+
+
+class _Gcc:
+    """GCC, clang, and what takes their options."""
+
+    def __init__(self, command: list[str], folder: Path, extra: tuple[str, ...]):
+        self.command, self.folder, self.extra = command, folder, extra
+
+    def accepts(self, flags: tuple[str, ...]) -> bool:
+        """Whether there is a variant by `flags`: a compiler may be older, or for another machine."""
+        probe = self.folder / "probe.c"
+        probe.write_text("int probe(int x) { return x + 1; }\n")
+        try:
+            self.compile(probe, "probe", flags, [])
+        except BuildError:
+            return not flags  # without any: the true reason comes with the sources
+        return True
+
+    def compile(self, source: Path, name: str, flags: Sequence[str], defined: Sequence[str]) -> Path:
+        """The path of the object `name` of `source`."""
+        target = self.folder / f"{name}.o"
+        options = [*_FLAGS, *flags, *(f"-D{word}" for word in defined), *self.extra]
+        self._run([*options, "-c", str(source), "-o", str(target)])
+        return target
+
+    def link(self, objects: Sequence[Path]) -> Path:
+        """The path of the library of `objects`."""
+        target = self.folder / LIBRARY
+        libraries = [] if sys.platform == "win32" else ["-lm"]
+        self._run(["-shared", *self.extra, "-o", str(target), *map(str, objects), *libraries])
+        return target
+
+    def _run(self, words: Sequence[str]) -> None:
+        command = [*self.command, *words]
+        try:
+            done = subprocess.run(
+                command,
+                cwd=self.folder,
+                env=_ENVIRONMENT | os.environ | {"LC_ALL": "C"},
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+            )
+        except OSError as error:
+            raise BuildError(f"{error}\n(of {shlex.join(command)})") from error
+        if done.returncode:
+            raise BuildError(f"{(done.stderr + done.stdout).strip()}\n(of {shlex.join(command)})")
+
+
+class _Msvc(_Gcc):
+    """Visual Studio's, which nobody has tried yet: it has no vectors of GCC's kind, and compiles plain loops."""
+
+    def accepts(self, flags: tuple[str, ...]) -> bool:
+        return not flags
+
+    def compile(self, source: Path, name: str, flags: Sequence[str], defined: Sequence[str]) -> Path:
+        target = self.folder / f"{name}.obj"
+        options = ["/nologo", "/O2", "/MD", "/std:c11", "/experimental:c11atomics", *(f"/D{word}" for word in defined)]
+        self._run([*options, *self.extra, "/c", str(source), f"/Fo{target}"])
+        return target
+
+    def link(self, objects: Sequence[Path]) -> Path:
+        target = self.folder / LIBRARY
+        self._run(["/nologo", "/LD", *self.extra, *map(str, objects), f"/Fe{target}"])
+        return target
+
+
+if __name__ == "__main__":
+    try:
+        print(build())
+    except (BuildError, OSError) as error:
+        sys.exit(f"camtorch.native.build: {error}")

@@ -1,0 +1,75 @@
+"""The compiled sampler, where there is one: which library is loaded, and why there is none."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+from camtorch.native.build import LIBRARY, switched_off
+
+# of dispatch.c's functions and structs; both numbers change when a caller of them has to
+ABI = 1
+
+# where installation says in one line why it built no library
+REASON = "_sampler.reason.txt"
+
+_HERE = Path(__file__).resolve().parent
+_BUILD = "python -m camtorch.native.build"
+
+
+class _Found(NamedTuple):
+    library: ctypes.CDLL | None
+    state: str  # a CPU's kind, or why there is no library
+    stale: bool = False
+
+
+@functools.cache
+def _find() -> _Found:
+    if switched_off():
+        return _Found(None, "off (CAMTORCH_NATIVE=0)")
+    path = _HERE / LIBRARY
+    if not path.exists():
+        reason = _HERE / REASON
+        why = reason.read_text("utf-8").strip() if reason.exists() else "camtorch was not installed from here"
+        return _Found(None, f"not built ({why}); with a C compiler `{_BUILD}` builds it")
+    try:
+        library = ctypes.CDLL(str(path))
+        library.camtorch_abi.restype = ctypes.c_int
+        library.camtorch_variant.restype = ctypes.c_char_p
+        abi = library.camtorch_abi()
+    except (OSError, AttributeError) as error:
+        return _Found(None, f"not loaded ({error}); `{_BUILD}` builds it again")
+    if abi != ABI:
+        why = f"not used (built from sources of another version: {abi} is not {ABI})"
+        return _Found(None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again", stale=True)
+    return _Found(library, library.camtorch_variant().decode())
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The library, loaded at first use; calls into it hold no lock of Python's.
+
+    None where it is turned off (`CAMTORCH_NATIVE=0`), was not built, does not load, or is of another version than these
+    files, which is a warning.
+    """
+    found = _find()
+    if found.stale:
+        warnings.warn(f"camtorch's native sampler is {found.state}", RuntimeWarning, stacklevel=2)
+    return found.library
+
+
+def state() -> str:
+    """Which variant of the library runs on this machine's CPU, "avx2" for one, or why none does."""
+    return _find().state
+
+
+def native_available() -> bool:
+    """Whether images are sampled by compiled code; else torch samples them, slower and to the same results.
+
+    It is not where the environment says `CAMTORCH_NATIVE=0`, or where camtorch was installed without a C compiler:
+    `camtorch --version` tells.
+    """
+    return library() is not None

@@ -1,0 +1,189 @@
+"""The compiled sampler is built where there is a C compiler, found where it lies, and its absence has a reason."""
+
+import ctypes
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import camtorch as ct
+from camtorch.native import build as building
+from camtorch.native import library
+from camtorch.native.build import LIBRARY, BuildError, build
+
+ROOT = Path(__file__).parent.parent
+COMPILER = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), None)
+compiles = pytest.mark.skipif(COMPILER is None, reason="no C compiler is here: neither CC nor cc, gcc or clang")
+
+# as small as a sampler can be: what is tested here is how it is built
+KERNEL = """
+#define NAME_(variant) twice_##variant
+#define NAME(variant) NAME_(variant)
+int NAME(VARIANT)(int x) { return 2 * x; }
+"""
+DISPATCH = """
+#define API __attribute__((visibility("default")))
+int twice_baseline(int);
+API int camtorch_abi(void) { return %d; }
+API const char *camtorch_variant(void) { return "stand-in"; }
+API int twice(int x) { return twice_baseline(x); }
+#ifdef HAS_AVX2
+int twice_avx2(int);
+API int twice_fast(int x) { return twice_avx2(x); }
+#endif
+"""
+
+
+def write(folder, kernel=KERNEL, abi=library.ABI):
+    (folder / "kernel.c").write_text(kernel)
+    (folder / "dispatch.c").write_text(DISPATCH % abi)
+    return folder
+
+
+@pytest.fixture
+def no_compiler(monkeypatch, tmp_path):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
+
+
+@compiles
+def test_a_library_is_built_and_nothing_else_is_left(tmp_path):
+    write(tmp_path)
+    path = build(tmp_path, sources=tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "dispatch.c", "kernel.c"])
+    loaded = ctypes.CDLL(str(path))
+    assert loaded.twice(21) == 42
+    assert not hasattr(loaded, "twice_baseline")  # what is not marked stays inside
+    symbols = path.read_bytes()
+    assert b"Py" not in symbols
+    assert b"crtfast" not in symbols
+    assert b"OMP" not in symbols
+
+
+@compiles
+def test_every_variant_that_the_compiler_knows_is_in_it(tmp_path, monkeypatch):
+    write(tmp_path)
+    monkeypatch.setattr(building, "_VARIANTS", {"baseline": (), "avx2": ("-O1",), "avx512": ("-mno-such-cpu",)})
+    loaded = ctypes.CDLL(str(build(tmp_path, sources=tmp_path)))
+    assert loaded.twice_fast(21) == 42
+    monkeypatch.setattr(building, "_VARIANTS", {"baseline": (), "avx2": ("-mno-such-cpu",)})
+    (tmp_path / "other").mkdir()
+    assert not hasattr(ctypes.CDLL(str(build(tmp_path / "other", sources=tmp_path))), "twice_fast")
+
+
+@compiles
+def test_more_words_reach_the_compiler_and_the_linker(tmp_path):
+    write(tmp_path, kernel="#ifndef MORE\n#error no MORE\n#endif\n" + KERNEL)
+    with pytest.raises(BuildError, match="no MORE"):
+        build(tmp_path, sources=tmp_path)
+    path = build(tmp_path, sources=tmp_path, extra=("-DMORE", "-g", "-fsanitize=undefined"))
+    assert b"ubsan" in path.read_bytes()
+
+
+@compiles
+def test_an_error_is_what_the_compiler_said_and_leaves_the_library_that_was(tmp_path):
+    write(tmp_path)
+    before = build(tmp_path, sources=tmp_path).read_bytes()
+    write(tmp_path, kernel="int broken(void) { return nowhere; }\n")
+    with pytest.raises(BuildError, match="nowhere") as caught:
+        build(tmp_path, sources=tmp_path)
+    assert "kernel.c" in str(caught.value)
+    assert (tmp_path / LIBRARY).read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "dispatch.c", "kernel.c"])
+
+
+@compiles
+def test_a_library_in_use_is_replaced_beneath_nobody(tmp_path):
+    write(tmp_path)
+    running = ctypes.CDLL(str(build(tmp_path, sources=tmp_path)))
+    inode = (tmp_path / LIBRARY).stat().st_ino
+    build(tmp_path, sources=tmp_path)
+    assert (tmp_path / LIBRARY).stat().st_ino != inode
+    assert running.twice(21) == 42
+
+
+@compiles
+def test_the_compiler_may_have_options(tmp_path, monkeypatch):
+    write(tmp_path, kernel="#ifndef MORE\n#error no MORE\n#endif\n" + KERNEL)
+    monkeypatch.setenv("CC", f"{COMPILER} -DMORE")
+    assert build(tmp_path, sources=tmp_path).exists()
+
+
+def test_without_a_compiler_the_error_says_what_was_sought(tmp_path, no_compiler, monkeypatch):
+    with pytest.raises(BuildError, match="no C compiler: none of cc, gcc, clang is on the PATH"):
+        build(tmp_path, sources=write(tmp_path))
+    monkeypatch.setenv("CC", "my-own-cc -m64")
+    with pytest.raises(BuildError, match="'my-own-cc'"):
+        build(tmp_path, sources=tmp_path)
+
+
+def copy(folder):
+    """A package of camtorch's with no library in it, and the path of its `native`."""
+    ignore = shutil.ignore_patterns("_sampler.*", "__pycache__", "demo")
+    return shutil.copytree(ROOT / "camtorch", folder / "camtorch", ignore=ignore) / "native"
+
+
+def python(folder, *words, **environment):
+    """What a fresh process that has camtorch in `folder` prints."""
+    environment = {k: v for k, v in os.environ.items() if k != "CAMTORCH_NATIVE"} | environment
+    words = [sys.executable, "-W", "error", *words]
+    environment["PYTHONPATH"] = str(folder)
+    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=folder, env=environment)
+    return done.stdout.strip()
+
+
+ASK = "from camtorch.native.library import native_available as asked; print(asked())"
+
+
+@compiles
+@pytest.mark.parametrize("value", ["0", "off", "FALSE"])
+def test_the_environment_turns_it_off(tmp_path, value):
+    folder = copy(tmp_path)
+    (tmp_path / "sources").mkdir()
+    build(folder, sources=write(tmp_path / "sources"))
+    assert python(tmp_path, "-c", ASK, CAMTORCH_NATIVE="1") == "True"
+    assert python(tmp_path, "-m", "camtorch", "--version").endswith("native sampler: stand-in")
+    assert python(tmp_path, "-c", ASK, CAMTORCH_NATIVE=value) == "False"
+    told = python(tmp_path, "-m", "camtorch", "--version", CAMTORCH_NATIVE=value)
+    assert told.endswith("native sampler: off (CAMTORCH_NATIVE=0)")
+
+
+@compiles
+def test_a_library_of_other_sources_is_not_used_and_said_once(tmp_path):
+    folder = copy(tmp_path)
+    (tmp_path / "sources").mkdir()
+    build(folder, sources=write(tmp_path / "sources", abi=library.ABI + 1))
+    code = """
+import warnings
+from camtorch.native.library import library, native_available
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    print(library(), native_available(), len(caught), caught[0].message)
+"""
+    told = python(tmp_path, "-c", code)
+    assert told.startswith("None False 1 camtorch's native sampler is not used (built from sources of another version")
+    assert "pip install -e ." in told
+    assert "not used" in python(tmp_path, "-m", "camtorch", "--version")
+
+
+def test_what_does_not_load_is_none_and_version_says_why(tmp_path):
+    (copy(tmp_path) / LIBRARY).write_bytes(b"no library")
+    assert python(tmp_path, "-c", ASK) == "False"
+    told = python(tmp_path, "-m", "camtorch", "--version")
+    assert "native sampler: not loaded (" in told
+    assert "python -m camtorch.native.build" in told
+
+
+def test_where_none_was_built_version_says_why(tmp_path):
+    folder = copy(tmp_path)
+    assert python(tmp_path, "-c", ASK) == "False"
+    assert "native sampler: not built (" in python(tmp_path, "-m", "camtorch", "--version")
+    (folder / library.REASON).write_text("the compiler was on holiday\n")
+    assert "native sampler: not built (the compiler was on holiday)" in python(tmp_path, "-m", "camtorch", "--version")
+
+
+def test_it_says_whether_it_is_there():
+    assert ct.native_available() is (library.library() is not None)
