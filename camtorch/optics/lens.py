@@ -358,6 +358,8 @@ class Lens:
         """Whether the lens is a single radial factor: then its inverse is a matter of one variable."""
         self.radial = stages[0].radial if stages else None
         """The radial factor of the first stage, if it has one."""
+        self.rest = Lens(*stages[1:]) if self.radial and stages[0].is_radial and len(stages) > 1 else None
+        """The stages after a first one that is a radial factor alone, if there are such."""
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
@@ -371,15 +373,17 @@ class Lens:
         """The lens at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
         return LensAt(self.stages, a, b, order, t)
 
-    def lower_bound(self, radius: Tensor) -> Tensor:
-        """(*B, S) ascending radii: positive where the orientation is positive on the whole circle."""
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """(*B, S) ascending radii: positive where the orientation is positive on the whole circle, and how far its
+        points go at the most; see `Stage.lower_bound`.
+        """
         bounds = []
         for stage in self.stages:
             least, radius = stage.lower_bound(radius)
             bounds.append(least)
             # the next stage sees what any smaller circle becomes as well
             radius = torch.cummax(radius, -1).values
-        return torch.stack(torch.broadcast_tensors(*bounds)).amin(0)
+        return torch.stack(torch.broadcast_tensors(*bounds)).amin(0), radius
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
         """Back from (u, v), nearly, to the stage that has a radial factor, or through all of them."""

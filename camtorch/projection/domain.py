@@ -22,6 +22,9 @@ Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
 
 _RADII = 512
 _BRIEF, _LOOKS = 129, 2  # radii of a brief look, one of which each direction may take
+# Stages after a radial one that change distances by less than a quarter, and so by less than that move what they are
+# given, are inverted by Newton's method from anywhere: a step comes nearer by a third at least
+_MILD, _WIDER = 0.75, 1.25
 
 
 def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property:
@@ -41,8 +44,9 @@ class Domain:
     """The lenses of cameras (C,), graph-free, and their domains.
 
     A point (a, b) of the chart's plane is in the domain if its lens is regular all the way from the centre. A radial
-    lens is followed to the root. Of others it is known from bounds of their terms how far out they certainly are; the
-    azimuths are followed only when a point lies further out.
+    lens is followed to the root, and so is one whose other stages are mild on all that the radial one sends to them.
+    Of others it is known from bounds of their terms how far out they certainly are; the azimuths are followed only when
+    a point lies further out.
     """
 
     def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice = slice(None)):
@@ -72,6 +76,7 @@ class Domain:
         usual2 = inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
         inverse = InverseTable(table) if self.lens.radial else None
         self.__dict__.update(inner2=inner2, usual2=usual2, limits2=limits2, inverse=inverse)
+        self.__dict__.update(staged=None, all_staged=False)  # which takes a look
         return self
 
     @cached_property
@@ -80,21 +85,64 @@ class Domain:
         return Azimuths(self.optics, self.k) if self.whole is None else self.whole.azimuths
 
     @_per_camera
+    def circle2(self) -> Tensor:
+        """(C, 1): the squared radius of a circle of the image beyond which there is nothing, infinite where unknown.
+
+        Where it is finite the domain ends at the fold of a first, radial stage: those after it are `_MILD` on all that
+        it sends to them. There the image has a limit that is found once, and the inverse goes stage by stage.
+        """
+        if self.lens.rest is None:
+            return self.k.new_full((len(self.k), 1), torch.inf)
+        k = precise(self.k)
+        _, lens = self.optics(columns(k))
+        assert lens.radial is not None
+        assert lens.rest is not None
+        edge = self._fold * lens.radial(self._fold * self._fold)
+        steps = torch.linspace(0, _WIDER, _BRIEF, dtype=k.dtype, device=k.device)
+        least, furthest = lens.rest.lower_bound(edge * steps)
+        # what changes less from radius to radius than it is large has no zero in between
+        certain = least.amin(-1, keepdim=True) - least.diff(dim=-1).abs().amax(-1, keepdim=True)
+        sent = torch.where(steps <= 1 + steps[1], furthest, 0.0).amax(-1, keepdim=True)
+        return torch.where(certain > _MILD, sent * sent, torch.inf).to(self.k.dtype)
+
+    @cached_property
+    def staged(self) -> Tensor | None:
+        """(C, 1) bool: whether the inverse goes stage by stage, see `circle2`; None where that is so for no camera."""
+        staged = torch.isfinite(self.circle2) if self.lens.rest is not None else None
+        return None if staged is None or not bool(staged.any()) else staged
+
+    @cached_property
+    def all_staged(self) -> bool:
+        """Whether it goes so for all cameras."""
+        return self.staged is not None and bool(self.staged.all())
+
+    @_per_camera
     def inner2(self) -> Tensor:
-        """(C, 1): the squared radius up to which the lens is certainly regular; for a radial lens the fold itself."""
-        radii = self.chart.radii(_RADII, self.k)
-        if self.lens.is_radial:
+        """(C, 1): the squared radius up to which the lens is certainly regular; the fold itself where that is a circle.
+
+        It is one for radial lenses, and for those that are inverted stage by stage.
+        """
+        if self.lens.is_radial or self.all_staged:
             inner = self._fold.to(self.k.dtype)
         else:
-            lost = first_loss(self.lens.lower_bound(radii.expand(len(self.k), -1)))
+            radii = self.chart.radii(_RADII, self.k)
+            lost = first_loss(self.lens.lower_bound(radii.expand(len(self.k), -1))[0])
             inner = radii[(lost - 1).floor().clamp(0, _RADII - 1).long()].unsqueeze(-1)
+            inner = inner if self.staged is None else torch.where(self.staged, self._fold.to(inner.dtype), inner)
         return within(inner.clamp(max=self.chart.end(inner.dtype)))
 
     @_per_camera
     def limits2(self) -> Tensor:
-        """(C, azimuths): the squared radius, up to the next azimuth, before which the orientation decides."""
-        pairs = torch.ones(len(self.k), AZIMUTHS, device=self.k.device).nonzero()
-        return self.azimuths.limits2(*pairs.unbind(-1)).view(len(self.k), AZIMUTHS)
+        """(C, azimuths): the squared radius, up to the next azimuth, before which the orientation decides.
+
+        Zero where that is known of every radius.
+        """
+        limits2 = self.k.new_zeros(len(self.k), AZIMUTHS)
+        wanted = limits2.new_ones(len(limits2), 1, dtype=torch.bool) if self.staged is None else ~self.staged
+        camera, index = wanted.expand_as(limits2).nonzero(as_tuple=True)
+        if len(camera):
+            limits2[camera, index] = self.azimuths.limits2(camera, index)
+        return limits2
 
     @_per_camera
     def _fold(self) -> Tensor:
@@ -135,8 +183,8 @@ class Domain:
         if self.looks > _LOOKS or "inner2" in self.__dict__ or (radial is not None and radial.fold is not None):
             return None
         radii = furthest2.sqrt() * torch.linspace(0, 1, _BRIEF, dtype=self.k.dtype, device=self.k.device)
-        followed = radial.orientation if radial is not None and self.lens.is_radial else self.lens.lower_bound
-        least = followed(radii)
+        radial_only = radial is not None and self.lens.is_radial
+        least = radial.orientation(radii) if radial_only else self.lens.lower_bound(radii)[0]
         certain = least.amin(-1) - least.diff(dim=-1).abs().amax(-1)
         end = self.chart.usual_end(self.k.dtype)
         certain = torch.minimum(certain.unsqueeze(-1), end - 1.01 * radii[..., -1:])
@@ -145,10 +193,11 @@ class Domain:
     def margin(self, a: Tensor, b: Tensor, t: Tensor, looks: bool) -> Tensor:
         """Positive for the plane points (C, N) in the domain; t = a^2 + b^2. looks: whether it may look at values."""
         inside = self.inner2 - t
-        if self.lens.is_radial:
+        if self.lens.is_radial or self.all_staged:
             return inside
         if looks:  # at the azimuths on which something lies so far out, only
-            camera, point = (~(inside > 0)).nonzero(as_tuple=True)
+            outside = ~(inside > 0) if self.staged is None else ~((inside > 0) | self.staged)
+            camera, point = outside.nonzero(as_tuple=True)
             a, b, t = a[camera, point], b[camera, point], t[camera, point]
             first = self.cameras.start or 0
             limits2 = self.azimuths.limits2(camera + first, azimuth(a, b))

@@ -172,8 +172,8 @@ def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
         between = (step >= turn.clamp(max=0) - _ASIDE) & (step <= turn.clamp(min=0) + _ASIDE)
         direction = (here + step).remainder(AZIMUTHS)
         envelope = envelope.scatter_reduce(-1, direction, torch.where(between, level, 0.0), "amax")
-    # where the rim has no end, or turns by leaps, a circle
-    leaps = (level == torch.inf) | (turn.abs() > _SPAN - _ASIDE)
+    # where the rim has no end, or turns by leaps, or is not seen to go once around the centre, a circle
+    leaps = (level == torch.inf) | (turn.abs() > _SPAN - _ASIDE) | (turn.sum(-1, keepdim=True) != AZIMUTHS)
     circle = torch.where(leaps.any(-1, keepdim=True), level.amax(-1, keepdim=True), 0.0)
     return _BEYOND * torch.maximum(envelope, circle)
 

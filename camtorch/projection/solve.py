@@ -23,6 +23,7 @@ _CLOSE = 0.02
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
 _CAMERAS = 32  # that are searched at a time
+_STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._MILD`
 _FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
 
 
@@ -33,6 +34,37 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     """
     if domain.lens.is_radial:
         return _Search(domain, camera)(u, v)
+    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
+    staged = torch.zeros_like(found) if domain.staged is None else domain.staged[camera, 0]
+    for ways, way in ((staged, _by_stages), (~staged, _within_outlines)):
+        (some,) = ways.nonzero(as_tuple=True)
+        if len(some):
+            a[some], b[some], found[some] = way(domain, camera[some], u[some], v[some])
+    return a, b, found
+
+
+def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`search` where only the first stage, which is radial, has a limit: what it would have to reach tells at once."""
+    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
+    rest, table = domain.optics_of(camera)[1].rest, domain.inverse
+    assert rest is not None  # or there would be no stages to go by
+    assert table is not None
+    p, q = rest.start(u, v)
+    for _ in range(_STAGE_STEPS):
+        at = rest.at(p, q)
+        x, y = at.value
+        dp, dq, _ = newton_step(at.jacobian, u - x, v - y)
+        p, q = p + dp, q + dq
+    most2 = table.most2[camera, 0] * (1 + 64 * torch.finfo(u.dtype).eps)
+    (some,) = ((u * u + v * v <= domain.circle2[camera, 0]) & (p * p + q * q <= most2)).nonzero(as_tuple=True)
+    if len(some):
+        alone = _Search(domain, camera[some], is_circle=True)
+        a[some], b[some], found[some] = alone(u[some], v[some], (p[some], q[some]))
+    return a, b, found
+
+
+def _within_outlines(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`search` of any other lens, for the points within the outline of what it shows."""
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
     cameras, row = camera.unique(return_inverse=True)
     for first in range(0, len(cameras), _CAMERAS):
@@ -49,13 +81,26 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
 class _Search:
     """The lenses of single points (M,), and the inverse by bracketing and damped steps."""
 
-    def __init__(self, domain: Domain, camera: Tensor, outline: Outline | None = None, row: Tensor | None = None):
-        """outline: of some of the cameras, unless the lens is radial. row: (M,) which of them."""
+    def __init__(
+        self,
+        domain: Domain,
+        camera: Tensor,
+        outline: Outline | None = None,
+        row: Tensor | None = None,
+        *,
+        is_circle: bool = False,
+    ):
+        """outline: of some of the cameras, unless the fold is a circle. row: (M,) which of them.
+
+        is_circle: whether the fold is one, as it is for every radial lens.
+        """
         self.domain, self.camera, self.outline, self.row = domain, camera, outline, row
         self.chart, self.lens = domain.optics_of(camera)
+        self.is_circle = is_circle or self.lens.is_radial
 
-    def __call__(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        a, b = self.radial(u, v) if self.lens.is_radial else self.planar(u, v)
+    def __call__(self, u: Tensor, v: Tensor, sent: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """sent: where the first stage has to send the points, if the fold is a circle; by default to (u, v)."""
+        a, b = self.radial(*(sent or (u, v))) if self.is_circle else self.planar(u, v)
         at = self.lens.at(a, b)
         (x, y), jacobian = at.value, at.jacobian
         valid = self.contains(a, b)
@@ -79,13 +124,13 @@ class _Search:
         """Bool: what `Domain.margin` says of single points."""
         t = torch.addcmul(a * a, b, b)
         inside = t < self.domain.inner2[self.camera, 0]
-        if self.lens.is_radial:
+        if self.is_circle:
             return inside
         before = t < self.domain.azimuths.limits2(self.camera, azimuth(a, b))
         return inside | (before & (regular(self.lens, a, b) > 0))
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
-        """In a bracket up to the fold."""
+        """In a bracket up to the fold, by the radial factor alone."""
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit
         fold2 = self.domain.inner2[self.camera, 0] * (1 - 64 * torch.finfo(u.dtype).eps)
         assert self.lens.radial is not None

@@ -57,16 +57,45 @@ def invert(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     """
     if domain.lens.is_radial:
         return _invert_radial(domain, u, v, looks)
+    if domain.all_staged:
+        return _invert_staged(domain, u, v, looks)
+    found = _invert_planar(domain, u, v, looks)
+    if domain.staged is None:
+        return found
+    # each camera alike, whatever else is in its batch
+    pairs = zip(_invert_staged(domain, u, v, looks), found, strict=True)
+    return Found(*(torch.where(domain.staged, staged, planar) for staged, planar in pairs))
+
+
+def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     # in the plane, from the inverse of the radial factor
     a, b = domain.lens.start(u, v)
     if domain.inverse is not None:
         # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
-    found = _newton(domain, u, v, a, b, looks)
+    found = _newton(domain.lens, u, v, a, b, looks)
     # further out than images reach a determinant may overflow, and a step seem short
     inside = domain.usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
     return found._replace(solved=torch.minimum(found.solved, inside))
+
+
+def _invert_staged(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+    """The stages after the radial one first: only that one has a limit, and what it would have to reach tells at once.
+
+    Pixels beyond the image of every ray are never solved for.
+    """
+    rest = domain.lens.rest
+    assert rest is not None
+    within = domain.circle2 - torch.addcmul(u * u, v, v)
+    mask = to_mask(within, looks)
+    u, v = replace(mask, u, 0.0, looks), replace(mask, v, 0.0, looks)
+    sent = _newton(rest, u, v, *rest.start(u, v), looks, near=True)
+    found = _invert_radial(domain, sent.a, sent.b, looks)
+    known = sent.solved > 0
+    possible = torch.minimum(torch.where(known, found.possible, 1.0), within)
+    solved = torch.where(known, torch.minimum(found.solved, within), -1.0)
+    return found._replace(solved=solved, possible=possible)
 
 
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
@@ -75,7 +104,8 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     assert radial is not None  # a radial lens has both
     assert table is not None
     possible = table.most2 * (1 + 8 * eps) - r2
-    r2 = torch.minimum(r2, table.most2)
+    # what is beyond the fold would never settle
+    r2 = torch.minimum(replace(to_mask(possible, looks), r2, 0.0, looks), table.most2)
     scale, settled = solve(radial, table, r2, looks)
     # a ray's rounding must not carry it across the fold
     inside = domain.inner2 * (1 - 32 * eps) - r2 * scale * scale
@@ -98,23 +128,23 @@ def invert_briefly(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
         found = Found(u * scale, v * scale, settled, settled)
     else:
         scale = table(r2)
-        found = _newton(domain, u, v, a * scale, b * scale, looks=True)
+        found = _newton(domain.lens, u, v, a * scale, b * scale, looks=True)
         settled = torch.minimum(found.solved, radii[..., -1:] ** 2 - torch.addcmul(found.a**2, found.b, found.b))
     return found if bool(settled.amin() > 0) else None
 
 
-def _newton(domain: Domain, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool) -> Found:
-    """From (a, b) on, wherever that leads."""
-    short2, settled = short(u.dtype) ** 2, None
+def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool, near: bool = False) -> Found:
+    """From (a, b) on, wherever that leads. near: whether most points begin a step nearer than from a table."""
+    short2, fewest, settled = short(u.dtype) ** 2, _STEPS[u.dtype] - near, None
     for count in range(1, MOST_STEPS + 1):
-        at = domain.lens.at(a, b)
+        at = lens.at(a, b)
         x, y = at.value
         da, db, reciprocal = newton_step(at.jacobian, u - x, v - y)
         if settled is not None:  # what is settled stays, whatever else is in its batch
             da, db = torch.where(settled > 0, 0.0, da), torch.where(settled > 0, 0.0, db)
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
-        if count >= _STEPS[u.dtype]:
+        if count >= fewest:
             settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
             if not looks or bool(settled.amin() > 0):
                 break

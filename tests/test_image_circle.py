@@ -1,0 +1,138 @@
+"""The limit of what a lens shows, found once: pixels beyond it cost nothing, and none is lost that has a ray."""
+
+import math
+
+import pytest
+import torch
+from cameras import KEYS, _limits, _summed, axis_slope, fan, make, one, pixel_lattice
+
+import camtorch as ct
+from camtorch.augment.presets import PRESETS
+from camtorch.optics import Equidistant, Lens, Planar, Polynomial, Tilt
+from camtorch.projection import domain, unproject
+from camtorch.projection.unproject import invert
+
+LENSES = [key for key in KEYS if one(key).distortion_names]
+# What rounding keeps the search of single pixels from, at steep places of a chart that is solved for itself
+MISSED = {"ocamcalib": 0.02}
+BY_STAGES = [key for key in LENSES if one(key).optics(one(key).distortion.unbind(-1))[1].rest is not None]
+
+
+class Leaning(ct.KannalaBrandt):
+    """A radial lens before a sensor that is tilted."""
+
+    distortion_names = ("k1", "k2", "tau_x", "tau_y")
+
+    @staticmethod
+    def optics(k):
+        return Equidistant(), Lens(Planar(Polynomial(k[:2])), Tilt(*k[2:]))
+
+
+def lenses(key, size, count=12):
+    """A batch of lenses: 'mild', as real ones are, or up to the 'plausible' or the 'wild' limits of the laws."""
+    generator = torch.Generator().manual_seed(count)
+    names = one(key).distortion_names
+    limits = torch.tensor([_limits(key, name, size == "wild") for name in names], dtype=torch.float64).view(-1, 2)
+    share = torch.rand(count, len(names), generator=generator, dtype=torch.float64)
+    distortion = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * share
+    if size == "mild":
+        lopsided = torch.tensor([name in one(key).odd_in_x | one(key).odd_in_y for name in names])
+        distortion = torch.where(lopsided, distortion / 4, distortion)
+    distortion = torch.stack([_summed(key, row) for row in distortion])
+    slopes = torch.tensor([axis_slope(key, row.tolist()) for row in distortion], dtype=torch.float64)
+    focal = torch.linspace(150, 400, count, dtype=torch.float64) / slopes
+    intrinsics = torch.stack((focal, focal * 1.05, *(torch.full_like(focal, c) for c in (322.0, 236.0))), -1)
+    return make(key, intrinsics, distortion, image_size=(480, 640)).requires_grad_(False)
+
+
+def around(camera):
+    """Pixels of the image and far around it, and close to the rim of what each lens shows, on both sides."""
+    wide = (pixel_lattice(camera, 21, 29) - 320) * 1.7 + 320
+    far = torch.tensor([[1e4, 100], [-1e7, 3e6], [320, -1e12]], dtype=torch.float64)
+    pixels = torch.cat((wide, far)).expand(len(camera), -1, -1)
+    rays = fan(179, 400, 16).expand(len(camera), -1, -1)
+    seen, valid = camera.project(rays)
+    seen, valid = (w.unflatten(1, (400, 16)) for w in (seen, valid))
+    last = (valid.long().cumprod(1).sum(1, keepdim=True) - 1).clamp(min=0)
+    rim = seen.gather(1, last.unsqueeze(-1).expand(-1, -1, -1, 2))[:, 0]
+    centre = camera.intrinsics[:, None, 2:]
+    return torch.cat((pixels, *(centre + (rim - centre) * f for f in (0.99, 0.9999, 1.0001, 1.003, 1.02))), 1)
+
+
+def hard(camera, pixels, monkeypatch):
+    """Every pixel by itself, by brackets and damped steps along followed azimuths."""
+
+    def nothing_solved(lenses, u, v, looks):
+        found = invert(lenses, u, v, looks)
+        return found._replace(solved=-torch.ones_like(u), possible=torch.ones_like(u))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(domain, "_MILD", math.inf)
+        patch.setattr(domain, "_domains", [])
+        patch.setattr(unproject, "invert", nothing_solved)
+        return type(camera)(camera.intrinsics, camera.distortion, image_size=camera.image_size).unproject(pixels)
+
+
+@pytest.mark.parametrize("key", LENSES)
+@pytest.mark.parametrize("size", ["mild", "plausible", pytest.param("wild", marks=pytest.mark.slow)])
+def test_what_has_a_ray_is_what_a_hard_search_finds(key, size, monkeypatch):
+    check(lenses(key, size), monkeypatch)
+
+
+def check(camera, monkeypatch):
+    """Nothing is lost that a search of every pixel finds, and what is found beyond that returns to its pixel."""
+    pixels = around(camera)
+    rays, valid = camera.unproject(pixels)
+    expected, found = hard(camera, pixels, monkeypatch)
+    assert not (found & ~valid).any(), pixels[found & ~valid][:3].tolist()
+    assert found.double().mean() > 0.05
+    # next to the fold rounding moves a ray by its root
+    torch.testing.assert_close(rays[found], expected[found], rtol=0, atol=2e-7)
+    seen, again = camera.project(rays)
+    more = valid & ~found
+    size = (pixels - camera.intrinsics[:, None, 2:]).norm(dim=-1)[more]
+    assert again[more].all()
+    assert bool(((seen - pixels).norm(dim=-1)[more] <= 1e-9 * (1 + size)).all())
+    assert more.double().mean() <= MISSED.get(camera.key, 0.0)
+
+
+@pytest.mark.parametrize("key", BY_STAGES)
+def test_most_lenses_of_stages_have_a_circle(key):
+    """And a batch of them is answered as each alone."""
+    camera = lenses(key, "mild")
+    staged = camera._cameras(camera.intrinsics, camera.distortion).domain.staged
+    assert staged.double().mean() > 0.3
+    pixels = around(camera)
+    rays, valid = camera.unproject(pixels)
+    for i, single in enumerate(camera):
+        alone, known = single.unproject(pixels[i])
+        assert torch.equal(known, valid[i])
+        torch.testing.assert_close(alone, rays[i], rtol=0, atol=1e-7)
+
+
+def test_a_tilted_sensor_behind_a_radial_lens(monkeypatch):
+    intrinsics = torch.tensor([[210.0, 212.0, 322.0, 236.0]], dtype=torch.float64)
+    distortion = torch.tensor([[-0.1, -0.02, 0.02, -0.03]], dtype=torch.float64)
+    camera = Leaning(intrinsics, distortion, image_size=(480, 640)).requires_grad_(False)
+    assert camera._cameras(camera.intrinsics, camera.distortion).domain.all_staged
+    check(camera, monkeypatch)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_corners_without_a_ray_are_searched_for_once(dtype, monkeypatch):
+    """A real lens whose image circle lies inside the image: no azimuth is followed, and no corner pixel is searched."""
+    searched, search = [], unproject.search
+
+    def counted(lenses, camera, u, v):
+        searched.append(len(camera))
+        return search(lenses, camera, u, v)
+
+    monkeypatch.setattr(unproject, "search", counted)
+    camera = PRESETS["aria"].camera().to(dtype)
+    camera.intrinsics[:2] *= 0.7
+    rays, valid = camera.rays()
+    assert 0.3 < valid.double().mean() < 0.9
+    assert sum(searched) < 0.001 * valid.numel()
+    lens = camera._cameras(camera.intrinsics[None], camera.distortion[None]).domain
+    assert "azimuths" not in lens.__dict__
+    assert torch.isfinite(rays).all()
