@@ -1,0 +1,75 @@
+/* The entry points: each is that of the best variant that this CPU can run. */
+#if defined(__linux__)
+#define _DEFAULT_SOURCE
+#include <sys/mman.h>
+#endif
+
+#include "sampler.h"
+
+#define DECLARED(variant)                                                                                              \
+    void sample_##variant(Job *);                                                                                      \
+    void classify_##variant(const Classification *);
+DECLARED(baseline)
+#ifdef HAS_AVX2
+DECLARED(avx2)
+#endif
+#ifdef HAS_AVX512
+DECLARED(avx512)
+#endif
+
+enum { BASELINE, AVX2, AVX512 };
+
+static int variant(void) {
+#if defined(HAS_AVX512) || defined(HAS_AVX2)
+    __builtin_cpu_init();
+#endif
+#ifdef HAS_AVX512
+    if (__builtin_cpu_supports("avx512vbmi") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
+        return AVX512;
+#endif
+#ifdef HAS_AVX2
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2")) return AVX2;
+#endif
+    return BASELINE;
+}
+
+EXPORTED int camtorch_abi(void) { return CAMTORCH_ABI; }
+
+EXPORTED const char *camtorch_variant(void) {
+    static const char *const names[] = {"baseline", "avx2", "avx512"};
+    return names[variant()];
+}
+
+#define CALLED(name, ...)                                                                                              \
+    switch (variant()) {                                                                                               \
+        IF_AVX512(case AVX512: name##_avx512(__VA_ARGS__); break;)                                                     \
+        IF_AVX2(case AVX2: name##_avx2(__VA_ARGS__); break;)                                                           \
+    default: name##_baseline(__VA_ARGS__);                                                                             \
+    }
+#ifdef HAS_AVX512
+#define IF_AVX512(code) code
+#else
+#define IF_AVX512(code)
+#endif
+#ifdef HAS_AVX2
+#define IF_AVX2(code) code
+#else
+#define IF_AVX2(code)
+#endif
+
+EXPORTED void camtorch_sample(Job *job) { CALLED(sample, job) }
+
+EXPORTED void camtorch_classify(const Classification *given) { CALLED(classify, given) }
+
+/* Asks for a part of memory that nobody has written to in large pages, if the system has them for those who ask */
+EXPORTED void camtorch_large_pages(void *from, int64_t bytes) {
+#if defined(MADV_HUGEPAGE)
+    const uintptr_t page = 4096, start = ((uintptr_t)from + page - 1) & ~(page - 1);
+    const uintptr_t end = ((uintptr_t)from + (uintptr_t)bytes) & ~(page - 1);
+    if (end > start) madvise((void *)start, end - start, MADV_HUGEPAGE);
+#else
+    (void)from;
+    (void)bytes;
+#endif
+}

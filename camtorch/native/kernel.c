@@ -1,0 +1,984 @@
+/* Samples images where a warp says, in tiles of rows: one variant, for the instructions that it is compiled for.
+ *
+ * A tile goes row by row, eight pixels at a time. Their positions come from a grid or from a lattice, between whose
+ * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others, and all
+ * pixels where the compiler has no vectors, go one by one through `sample_at`.
+ */
+#include "sampler.h"
+
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+#if defined(_MSC_VER)
+#include <intrin.h>
+#endif
+
+#define JOINED_(a, b) a##_##b
+#define JOINED(a, b) JOINED_(a, b)
+#define THIS(name) JOINED(name, VARIANT)
+
+#if defined(__GNUC__)
+#define VECTORS 1
+#define INLINE static inline __attribute__((always_inline))
+#define NOT_INLINE static __attribute__((noinline))
+#else
+#define VECTORS 0
+#define INLINE static inline
+#define NOT_INLINE static
+#endif
+
+enum { CHUNK = 256 };         /* cells whose lines of nodes are made at a time */
+enum { MOST_INTERLEAVED = 4 }; /* channels */
+
+typedef struct {
+    float u[STEP], v[STEP];
+} Positions;
+
+/* What eight pixels are written to and read from */
+typedef struct {
+    const Job *job;
+    const char *source; /* of the image */
+    char *result;       /* of the first of the pixels */
+    int64_t pixels;     /* how many there are */
+} Span;
+
+INLINE int64_t size_of(int type) {
+    switch (type) {
+    case UINT8: case BOOL: case BYTES1: return 1;
+    case UINT16: case BYTES2: return 2;
+    case FLOAT32: case BYTES4: return 4;
+    default: return 8;
+    }
+}
+
+/* -- one sample */
+
+INLINE float load(const char *plane, int64_t at, int type) {
+    switch (type) {
+    case UINT8: return ((const uint8_t *)plane)[at];
+    case BOOL: return ((const uint8_t *)plane)[at] != 0;
+    case UINT16: return ((const uint16_t *)plane)[at];
+    default: return ((const float *)plane)[at];
+    }
+}
+
+INLINE void store(char *plane, int64_t at, float value, int type) {
+    switch (type) {
+    case UINT8: ((uint8_t *)plane)[at] = (uint8_t)rintf(value < 0 ? 0 : value > 255 ? 255 : value); break;
+    case BOOL: ((uint8_t *)plane)[at] = value >= 0.5f; break;
+    case UINT16: ((uint16_t *)plane)[at] = (uint16_t)rintf(value < 0 ? 0 : value > 65535 ? 65535 : value); break;
+    default: ((float *)plane)[at] = value;
+    }
+}
+
+INLINE void move(char *to, int64_t i, const char *from, int64_t j, int type) {
+    switch (size_of(type)) {
+    case 1: to[i] = from[j]; break;
+    case 2: ((uint16_t *)to)[i] = ((const uint16_t *)from)[j]; break;
+    case 4: ((uint32_t *)to)[i] = ((const uint32_t *)from)[j]; break;
+    default: ((uint64_t *)to)[i] = ((const uint64_t *)from)[j];
+    }
+}
+
+static float clamped(float x, float last) { return x < 0 ? 0 : x > last ? last : x; }
+
+static float reflected(float x, float side) {
+    float extra, distance = fabsf(x + 0.5f);
+    extra = fmodf(distance, side);
+    if (fmodf(floorf(distance / side), 2) != 0) extra = side - extra;
+    return clamped(extra - 0.5f, side - 1);
+}
+
+/* A coordinate as the padding reads it */
+static float padded(float x, int64_t side, int padding) {
+    if (padding == BORDER) return clamped(x, (float)(side - 1));
+    return padding == REFLECTION ? reflected(x, (float)side) : x;
+}
+
+/* The cubic convolution of torch and OpenCV: Keys, 1981, with a = -3/4; for the pixels at -1, 0, 1, 2 */
+INLINE void cubic_weights(float t, float *w) {
+    const float s = 1 - t;
+    w[0] = -0.75f * t * s * s;
+    w[1] = (1.25f * t - 2.25f) * t * t + 1;
+    w[2] = (1.25f * s - 2.25f) * s * s + 1;
+    w[3] = -0.75f * s * t * t;
+}
+
+/* The taps of one axis: the pixels, -1 where there are none, and their weights; 1, 2 or 4 of them */
+INLINE int taps_of(float x, int64_t side, int mode, int padding, int64_t *at, float *weight) {
+    int k, n = mode == BILINEAR ? 2 : 4;
+    int64_t cell;
+    if (mode == BILINEAR) x = padded(x, side, padding);
+    /* beyond, floats have no part of a pixel, nor images a pixel */
+    if (x < -16777216.0f) x = -16777216.0f;
+    if (x > 16777216.0f) x = 16777216.0f;
+    cell = (int64_t)floorf(x);
+    if (mode == BILINEAR) {
+        weight[1] = x - (float)cell;
+        weight[0] = 1 - weight[1];
+    } else {
+        cubic_weights(x - (float)cell, weight);
+        cell -= 1;
+    }
+    for (k = 0; k < n; k++) {
+        int64_t i = cell + k;
+        if (mode == BICUBIC && padding != ZEROS) i = (int64_t)padded((float)i, side, padding);
+        /* what lies beyond by rounding alone has no weight */
+        if (mode == BILINEAR && padding != ZEROS && i >= side) i = side - 1;
+        at[k] = i >= 0 && i < side ? i : -1;
+    }
+    return n;
+}
+
+/* One channel of one pixel; `plane` is that of the channel, u and v are not NaN */
+INLINE float sample_at(const Job *job, const char *plane, float u, float v, float fill, int type, int mode) {
+    const int64_t *strides = job->source_strides;
+    int64_t columns[4], rows[4];
+    float across[4], down[4], sum = 0;
+    const int n = taps_of(u, job->source_width, mode, job->padding, columns, across);
+    int i, j;
+    taps_of(v, job->source_height, mode, job->padding, rows, down);
+    for (j = 0; j < n; j++)
+        for (i = 0; i < n; i++)
+            sum += down[j] * across[i] *
+                   (rows[j] < 0 || columns[i] < 0 ? fill
+                                                  : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
+    if (mode == BICUBIC && type == FLOAT32 && !(fabsf(sum) <= 3.4028235e38f)) {
+        /* a pixel that is not finite has no part where its weight is but a rounding error */
+        const float lost_u = 4 * (float)job->source_width * 1.1920929e-7f;
+        const float lost_v = 4 * (float)job->source_height * 1.1920929e-7f;
+        sum = 0;
+        for (j = 0; j < n; j++)
+            for (i = 0; i < n; i++)
+                if (fabsf(down[j]) > lost_v && fabsf(across[i]) > lost_u)
+                    sum += down[j] * across[i] *
+                           (rows[j] < 0 || columns[i] < 0
+                                ? fill
+                                : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
+    }
+    return sum;
+}
+
+/* The pixel nearest to a position, or -1 */
+INLINE int64_t nearest_of(float x, int64_t side, int padding) {
+    float i = rintf(padded(x, side, padding));
+    return i >= 0 && i <= (float)(side - 1) ? (int64_t)i : -1;
+}
+
+INLINE void show_nothing(const Span *span, int type) {
+    const Job *job = span->job;
+    int64_t c, i;
+    for (c = 0; c < job->channels; c++) {
+        char *plane = span->result + c * job->result_strides[1] * size_of(type);
+        for (i = 0; i < span->pixels; i++) move(plane, i * job->result_strides[3], job->fill_elements, c, type);
+    }
+}
+
+/* Pixels one by one */
+NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mode) {
+    const Job *job = span->job;
+    const int64_t bytes = size_of(type);
+    int64_t i, c;
+    for (i = 0; i < span->pixels; i++) {
+        const float u = at->u[i], v = at->v[i];
+        char *result = span->result + i * job->result_strides[3] * bytes;
+        int shows = u == u && v == v;
+        if (shows && job->padding == ZEROS) {
+            const float reach = mode == BICUBIC ? 2 : 1;
+            shows = u > -reach && v > -reach && u < (float)job->source_width - 1 + reach &&
+                    v < (float)job->source_height - 1 + reach;
+        }
+        if (shows && mode == NEAREST) {
+            const int64_t x = nearest_of(u, job->source_width, job->padding);
+            const int64_t y = nearest_of(v, job->source_height, job->padding);
+            shows = x >= 0 && y >= 0;
+            if (shows)
+                for (c = 0; c < job->channels; c++)
+                    move(result, c * job->result_strides[1], span->source,
+                         c * job->source_strides[1] + y * job->source_strides[2] + x * job->source_strides[3], type);
+        } else if (shows) {
+            for (c = 0; c < job->channels; c++) {
+                const char *plane = span->source + c * job->source_strides[1] * bytes;
+                const float fill = job->fill[c];
+                float value;
+                switch (type) {
+                case UINT8: value = mode == BILINEAR ? sample_at(job, plane, u, v, fill, UINT8, BILINEAR)
+                                                     : sample_at(job, plane, u, v, fill, UINT8, BICUBIC); break;
+                case BOOL: value = sample_at(job, plane, u, v, fill, BOOL, mode); break;
+                case UINT16: value = sample_at(job, plane, u, v, fill, UINT16, mode); break;
+                default: value = mode == BILINEAR ? sample_at(job, plane, u, v, fill, FLOAT32, BILINEAR)
+                                                  : sample_at(job, plane, u, v, fill, FLOAT32, BICUBIC);
+                }
+                store(result, c * job->result_strides[1], value, type);
+            }
+        }
+        if (!shows)
+            for (c = 0; c < job->channels; c++) move(result, c * job->result_strides[1], job->fill_elements, c, type);
+    }
+}
+
+#if VECTORS
+
+typedef float V8 __attribute__((vector_size(32)));
+typedef int32_t I8 __attribute__((vector_size(32)));
+typedef float V4 __attribute__((vector_size(16)));
+typedef int32_t I4 __attribute__((vector_size(16)));
+
+INLINE V8 load8(const float *from) {
+    V8 value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+INLINE V4 load4(const float *from) {
+    V4 value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+INLINE V8 every8(float value) { return (V8){value, value, value, value, value, value, value, value}; }
+INLINE I8 every8i(int32_t value) { return (I8){value, value, value, value, value, value, value, value}; }
+INLINE V4 every4(float value) { return (V4){value, value, value, value}; }
+INLINE I8 whole8(V8 value) { return __builtin_convertvector(value, I8); }
+INLINE V8 float8(I8 value) { return __builtin_convertvector(value, V8); }
+INLINE V4 float4(I4 value) { return __builtin_convertvector(value, V4); }
+
+INLINE int all8(I8 mask) {
+#if defined(__AVX2__)
+    return _mm256_movemask_ps((__m256)mask) == 0xff;
+#else
+    int64_t parts[4];
+    memcpy(parts, &mask, sizeof parts);
+    return (parts[0] & parts[1] & parts[2] & parts[3]) == -1;
+#endif
+}
+
+INLINE I8 least8(I8 a, I8 b) {
+    const I8 less = a < b;
+    return (a & less) | (b & ~less);
+}
+
+/* What is not a number fails every comparison, and stays */
+INLINE V8 clamped8(V8 x, float last) {
+    const I8 low = x < every8(0), high = x > every8(last);
+    return (V8)(((I8)x & ~low & ~high) | ((I8)every8(last) & high));
+}
+
+/* To the nearest whole number, of numbers whose size is below 2^22 */
+INLINE I8 rounded8(V8 value) {
+#if defined(__AVX2__)
+    return (I8)_mm256_cvtps_epi32((__m256)value);
+#else
+    const V8 large = every8(12582912.0f);
+    V8 sum = value + large;
+    return (I8)sum - (I8)large;
+#endif
+}
+
+/* Where eight pixels are read: from the corner (x, y) of a square of four pixels, at a part of its sides */
+typedef struct {
+    I8 x, y;
+    V8 u, v; /* parts of the right column and of the lower row */
+} Squares;
+
+/* Whether all lie on the image, with `right` and `below` more pixels to the right and below */
+INLINE int inside(const Job *job, V8 u, V8 v, float before, float beyond) {
+    const V8 low = every8(before);
+    const V8 right = every8((float)(job->source_width - 1) - beyond);
+    const V8 below = every8((float)(job->source_height - 1) - beyond);
+    return all8((u >= low) & (u <= right) & (v >= low) & (v <= below));
+}
+
+INLINE Squares squares_of(const Job *job, V8 u, V8 v) {
+    Squares at;
+    at.x = least8(whole8(u), every8i((int32_t)job->source_width - 2));
+    at.y = least8(whole8(v), every8i((int32_t)job->source_height - 2));
+    at.u = u - float8(at.x);
+    at.v = v - float8(at.y);
+    return at;
+}
+
+/* -- eight pixels of one channel whose neighbours in a row are neighbours in memory */
+
+INLINE void store_floats(char *to, V8 value, int64_t n) {
+    if (n == STEP) memcpy(to, &value, sizeof value);
+    else memcpy(to, &value, (size_t)n * sizeof(float));
+}
+
+INLINE void store_bytes(char *to, I8 value, int64_t n) {
+    uint64_t bytes;
+#if defined(__AVX2__)
+    const __m256i words = _mm256_packs_epi32((__m256i)value, (__m256i)value);
+    const __m256i packed = _mm256_packus_epi16(words, words);
+    const uint32_t low = (uint32_t)_mm256_cvtsi256_si32(packed);
+    const uint32_t high = (uint32_t)_mm_cvtsi128_si32(_mm256_extracti128_si256(packed, 1));
+    bytes = (uint64_t)high << 32 | low;
+#else
+    typedef uint8_t B8 __attribute__((vector_size(8)));
+    B8 packed = __builtin_convertvector(value, B8);
+    memcpy(&bytes, &packed, sizeof bytes);
+#endif
+    if (n == STEP) memcpy(to, &bytes, sizeof bytes);
+    else memcpy(to, &bytes, (size_t)n);
+}
+
+INLINE void store_words(char *to, I8 value, int64_t n) {
+    typedef uint16_t W8 __attribute__((vector_size(16)));
+    W8 words = __builtin_convertvector(value, W8);
+    memcpy(to, &words, (size_t)n * 2);
+}
+
+/* Two neighbours of each of eight rows, one to the left and one to the right */
+typedef struct {
+    V8 left, right;
+} Pairs;
+
+INLINE Pairs float_pairs(const float *plane, const int64_t *at) {
+    typedef uint64_t U4 __attribute__((vector_size(32)));
+    uint64_t p[STEP];
+    Pairs pairs;
+    int i;
+    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 8);
+    const V8 a = (V8)(U4){p[0], p[1], p[4], p[5]}, b = (V8)(U4){p[2], p[3], p[6], p[7]};
+#if defined(__AVX2__)
+    pairs.left = (V8)_mm256_shuffle_ps((__m256)a, (__m256)b, 0x88);
+    pairs.right = (V8)_mm256_shuffle_ps((__m256)a, (__m256)b, 0xdd);
+#else
+    pairs.left = (V8){a[0], a[2], b[0], b[2], a[4], a[6], b[4], b[6]};
+    pairs.right = (V8){a[1], a[3], b[1], b[3], a[5], a[7], b[5], b[7]};
+#endif
+    return pairs;
+}
+
+INLINE Pairs word_pairs(const uint16_t *plane, const int64_t *at) {
+    uint32_t p[STEP];
+    Pairs pairs;
+    int i;
+    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 4);
+    const I8 both = {(int32_t)p[0], (int32_t)p[1], (int32_t)p[2], (int32_t)p[3],
+                     (int32_t)p[4], (int32_t)p[5], (int32_t)p[6], (int32_t)p[7]};
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+    pairs.right = float8(both & 0xffff);
+    pairs.left = float8((both >> 16) & 0xffff);
+#else
+    pairs.left = float8(both & 0xffff);
+    pairs.right = float8((both >> 16) & 0xffff);
+#endif
+    return pairs;
+}
+
+INLINE I8 byte_pairs(const uint8_t *plane, const int64_t *at) {
+    uint16_t p[STEP];
+    int i;
+    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 2);
+    return (I8){p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]};
+}
+
+INLINE Pairs split_bytes(I8 both) {
+    Pairs pairs;
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+    pairs.right = float8(both & 0xff);
+    pairs.left = float8(both >> 8);
+#else
+    pairs.left = float8(both & 0xff);
+    pairs.right = float8(both >> 8);
+#endif
+    return pairs;
+}
+
+INLINE V8 across8(Pairs p, V8 u) { return p.left * (1 - u) + p.right * u; }
+
+#if defined(__AVX2__)
+
+/* Bytes of eight neighbouring squares that lie within sixteen columns and three rows: read as a whole, then picked */
+typedef struct {
+    int64_t at;          /* of the first byte of the first row */
+    int64_t below, last; /* from it to the second and to the third row */
+    __m256i pick;        /* of a row, the two neighbours of every square as 16 bits each */
+    __m256i lower;       /* which squares begin in the second row */
+    __m256i weights;     /* of the neighbours, in 2^-14 */
+    int one_row;         /* none does */
+} Window;
+
+INLINE int window_of(const Job *job, const Squares *at, Window *window) {
+    const int32_t x0 = at->x[0], x7 = at->x[7], y0 = at->y[0], y7 = at->y[7];
+    const int32_t x = x0 < x7 ? x0 : x7, y = y0 < y7 ? y0 : y7;
+    const __m256i dx = _mm256_sub_epi32((__m256i)at->x, _mm256_set1_epi32(x));
+    const __m256i dy = _mm256_sub_epi32((__m256i)at->y, _mm256_set1_epi32(y));
+    const __m256i one = _mm256_set1_epi32(1), fifteen = _mm256_set1_epi32(-16);
+    /* none of 0 ... 14 columns and 0, 1 rows */
+    const __m256i far = _mm256_or_si256(_mm256_and_si256(dy, _mm256_set1_epi32(-2)),
+                                        _mm256_or_si256(_mm256_and_si256(dx, fifteen),
+                                                        _mm256_and_si256(_mm256_add_epi32(dx, one), fifteen)));
+    if (!_mm256_testz_si256(far, far) || x + 16 > job->source_width) return 0;
+    window->lower = _mm256_sub_epi32(_mm256_setzero_si256(), dy);
+    window->one_row = _mm256_testz_si256(dy, dy);
+    window->at = (int64_t)y * job->source_strides[2] + x;
+    window->below = job->source_strides[2];
+    window->last = window->one_row ? window->below : 2 * window->below;
+    /* bytes d, none, d + 1, none */
+    window->pick = _mm256_add_epi32(_mm256_or_si256(dx, _mm256_slli_epi32(dx, 16)), _mm256_set1_epi32((int32_t)0x80018000));
+    const __m256i right = _mm256_cvtps_epi32(_mm256_mul_ps((__m256)at->u, _mm256_set1_ps(16384)));
+    const __m256i left = _mm256_sub_epi32(_mm256_set1_epi32(16384), right);
+    window->weights = _mm256_or_si256(left, _mm256_slli_epi32(right, 16));
+    return 1;
+}
+
+INLINE __m256i row16(const uint8_t *from) {
+    return _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)from));
+}
+
+/* The eight samples, times 2^14 */
+INLINE V8 window_bytes(const uint8_t *plane, const Window *window, V8 v) {
+    const uint8_t *from = plane + window->at;
+    __m256i upper = _mm256_shuffle_epi8(row16(from), window->pick);
+    __m256i lower = _mm256_shuffle_epi8(row16(from + window->below), window->pick);
+    if (!window->one_row) {
+        const __m256i third = _mm256_shuffle_epi8(row16(from + window->last), window->pick);
+        upper = _mm256_blendv_epi8(upper, lower, window->lower);
+        lower = _mm256_blendv_epi8(lower, third, window->lower);
+    }
+    const V8 above = (V8)_mm256_cvtepi32_ps(_mm256_madd_epi16(upper, window->weights));
+    const V8 below = (V8)_mm256_cvtepi32_ps(_mm256_madd_epi16(lower, window->weights));
+    return above * (1 - v) + below * v;
+}
+
+#endif
+
+INLINE void offsets_of(const Job *job, const Squares *at, int64_t *offsets) {
+    int i;
+    for (i = 0; i < STEP; i++)
+        offsets[i] = (int64_t)at->y[i] * job->source_strides[2] + (int64_t)at->x[i] * job->source_strides[3];
+}
+
+INLINE void bilinear_planes(const Span *span, Squares at, int type) {
+    const Job *job = span->job;
+    const int64_t bytes = size_of(type), below = job->source_strides[2];
+    const int64_t from = job->source_strides[1] * bytes, to = job->result_strides[1] * bytes;
+    const char *plane = span->source;
+    char *result = span->result;
+    int64_t offsets[STEP], c;
+#if defined(__AVX2__)
+    Window window;
+    if (type == UINT8 && window_of(job, &at, &window)) {
+        for (c = 0; c < job->channels; c++, plane += from, result += to) {
+            const V8 value = window_bytes((const uint8_t *)plane, &window, at.v);
+            store_bytes(result, rounded8(value * every8(1.0f / 16384)), span->pixels);
+        }
+        return;
+    }
+#endif
+    offsets_of(job, &at, offsets);
+    for (c = 0; c < job->channels; c++, plane += from, result += to) {
+        Pairs upper, lower;
+        V8 value;
+        if (type == FLOAT32) {
+            upper = float_pairs((const float *)plane, offsets);
+            lower = float_pairs((const float *)plane + below, offsets);
+        } else if (type == UINT16) {
+            upper = word_pairs((const uint16_t *)plane, offsets);
+            lower = word_pairs((const uint16_t *)plane + below, offsets);
+        } else {
+            upper = split_bytes(byte_pairs((const uint8_t *)plane, offsets));
+            lower = split_bytes(byte_pairs((const uint8_t *)plane + below, offsets));
+        }
+        value = across8(upper, at.u) * (1 - at.v) + across8(lower, at.u) * at.v;
+        if (type == FLOAT32) store_floats(result, value, span->pixels);
+        else if (type == UINT16) store_words(result, rounded8(value), span->pixels);
+        else store_bytes(result, rounded8(value), span->pixels);
+    }
+}
+
+/* -- eight pixels whose three or four channels are neighbours in memory, and then come those of the next pixel */
+
+INLINE V4 channels4(const char *at, int type) {
+    if (type == FLOAT32) return load4((const float *)at);
+    if (type == UINT16) {
+        typedef uint16_t W4 __attribute__((vector_size(8)));
+        W4 words;
+        memcpy(&words, at, sizeof words);
+        return __builtin_convertvector(words, V4);
+    } else {
+        typedef uint8_t B4 __attribute__((vector_size(4)));
+        B4 packed;
+        memcpy(&packed, at, sizeof packed);
+        return float4(__builtin_convertvector(packed, I4));
+    }
+}
+
+INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
+    const Job *job = span->job;
+    const int64_t bytes = size_of(type), channels = job->channels;
+    const int64_t right = channels * bytes, below = job->source_strides[2] * bytes;
+    float values[STEP * MOST_INTERLEAVED + 4];
+    int64_t offsets[STEP], i, n = span->pixels * channels;
+    offsets_of(job, &at, offsets);
+#if defined(__AVX2__)
+    if (type == UINT8) {
+        /* two pixels at a time: their channels' pairs of neighbours, as 16 bits each */
+        const __m256i pick = channels == 3
+            ? _mm256_setr_epi8(0, -1, 3, -1, 1, -1, 4, -1, 2, -1, 5, -1, -1, -1, -1, -1,
+                               0, -1, 3, -1, 1, -1, 4, -1, 2, -1, 5, -1, -1, -1, -1, -1)
+            : _mm256_setr_epi8(0, -1, 4, -1, 1, -1, 5, -1, 2, -1, 6, -1, 3, -1, 7, -1,
+                               0, -1, 4, -1, 1, -1, 5, -1, 2, -1, 6, -1, 3, -1, 7, -1);
+        const __m256i right_part = _mm256_cvtps_epi32(_mm256_mul_ps((__m256)at.u, _mm256_set1_ps(16384)));
+        const __m256i left_part = _mm256_sub_epi32(_mm256_set1_epi32(16384), right_part);
+        const __m256i weights = _mm256_or_si256(left_part, _mm256_slli_epi32(right_part, 16));
+        const __m256 down = _mm256_mul_ps((__m256)at.v, _mm256_set1_ps(1.0f / 16384));
+        const __m256 up = _mm256_sub_ps(_mm256_set1_ps(1.0f / 16384), down);
+        __m256i made[STEP / 2];
+        uint8_t packed[32 + 4];
+#define TWO(k)                                                                                                         \
+    {                                                                                                                  \
+        const char *a = span->source + offsets[2 * k], *b = span->source + offsets[2 * k + 1];                         \
+        const __m256i which = _mm256_setr_epi32(2 * k, 2 * k, 2 * k, 2 * k, 2 * k + 1, 2 * k + 1, 2 * k + 1, 2 * k + 1); \
+        const __m256i upper = _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_loadl_epi64((const __m128i *)a)),      \
+                                                      _mm_loadl_epi64((const __m128i *)b), 1);                         \
+        const __m256i lower = _mm256_inserti128_si256(                                                                 \
+            _mm256_castsi128_si256(_mm_loadl_epi64((const __m128i *)(a + below))),                                     \
+            _mm_loadl_epi64((const __m128i *)(b + below)), 1);                                                         \
+        const __m256i w = _mm256_permutevar8x32_epi32(weights, which);                                                 \
+        const __m256 above = _mm256_cvtepi32_ps(_mm256_madd_epi16(_mm256_shuffle_epi8(upper, pick), w));               \
+        const __m256 under = _mm256_cvtepi32_ps(_mm256_madd_epi16(_mm256_shuffle_epi8(lower, pick), w));               \
+        made[k] = _mm256_cvtps_epi32(_mm256_add_ps(_mm256_mul_ps(above, _mm256_permutevar8x32_ps(up, which)),          \
+                                                   _mm256_mul_ps(under, _mm256_permutevar8x32_ps(down, which))));      \
+    }
+        TWO(0) TWO(1) TWO(2) TWO(3)
+#undef TWO
+        /* packing goes by halves: pixels 0 2 4 6 and 1 3 5 7, four bytes each */
+        const __m256i bytes4 = _mm256_packus_epi16(_mm256_packs_epi32(made[0], made[1]), _mm256_packs_epi32(made[2], made[3]));
+        const __m256i ordered = _mm256_permutevar8x32_epi32(bytes4, _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7));
+        if (channels == 4) {
+            memcpy(packed, &ordered, 32);
+        } else {
+            const __m256i dense = _mm256_shuffle_epi8(ordered, _mm256_setr_epi8(
+                0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1,
+                0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1));
+            _mm_storeu_si128((__m128i *)packed, _mm256_castsi256_si128(dense));
+            _mm_storeu_si128((__m128i *)(packed + 12), _mm256_extracti128_si256(dense, 1));
+        }
+        if (span->pixels == STEP) memcpy(span->result, packed, (size_t)(channels == 4 ? 32 : 24));
+        else memcpy(span->result, packed, (size_t)n);
+        return;
+    }
+#endif
+    for (i = 0; i < STEP; i++) {
+        const char *upper = span->source + offsets[i] * bytes, *lower = upper + below;
+        const V4 u = every4(at.u[i]), v = every4(at.v[i]);
+        const V4 above = channels4(upper, type) * (1 - u) + channels4(upper + right, type) * u;
+        const V4 under = channels4(lower, type) * (1 - u) + channels4(lower + right, type) * u;
+        const V4 value = above * (1 - v) + under * v;
+        memcpy(values + i * channels, &value, sizeof value);
+    }
+    if (type == FLOAT32) {
+        if (span->pixels == STEP && channels == 3) memcpy(span->result, values, 24 * sizeof(float));
+        else memcpy(span->result, values, (size_t)n * sizeof(float));
+    } else {
+        for (i = 0; i < n; i += STEP) {
+            const I8 whole = rounded8(load8(values + i));
+            const int64_t left = n - i < STEP ? n - i : STEP;
+            if (type == UINT16) store_words(span->result + 2 * i, whole, left);
+            else store_bytes(span->result + i, whole, left);
+        }
+    }
+}
+
+/* -- eight pixels of one channel, sixteen neighbours each */
+
+INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
+    const Job *job = span->job;
+    const int64_t bytes = size_of(type), below = job->source_strides[2] * bytes;
+    const Squares at = squares_of(job, u, v);
+    int64_t offsets[STEP], c;
+    float across[STEP][4], down[STEP][4];
+    int i;
+    offsets_of(job, &at, offsets);
+    for (i = 0; i < STEP; i++) {
+        cubic_weights(at.u[i], across[i]);
+        cubic_weights(at.v[i], down[i]);
+    }
+    for (c = 0; c < job->channels; c++) {
+        const char *plane = span->source + c * job->source_strides[1] * bytes;
+        char *result = span->result + c * job->result_strides[1] * bytes;
+        for (i = 0; i < span->pixels; i++) {
+            const char *row = plane + (offsets[i] - 1) * bytes - below;
+            V4 sum = channels4(row, type) * every4(down[i][0]);
+            float value;
+            sum += channels4(row + below, type) * every4(down[i][1]);
+            sum += channels4(row + 2 * below, type) * every4(down[i][2]);
+            sum += channels4(row + 3 * below, type) * every4(down[i][3]);
+            sum *= load4(across[i]);
+            value = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+            if (type == FLOAT32 && !(fabsf(value) <= 3.4028235e38f))
+                value = sample_at(job, plane, u[i], v[i], 0, FLOAT32, BICUBIC);
+            store(result, i, value, type);
+        }
+    }
+}
+
+INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
+    const Job *job = span->job;
+    const I8 x = rounded8(u), y = rounded8(v);
+    int64_t offsets[STEP], c, i;
+    for (i = 0; i < STEP; i++)
+        offsets[i] = (int64_t)y[i] * job->source_strides[2] + (int64_t)x[i] * job->source_strides[3];
+    for (c = 0; c < job->channels; c++) {
+        const char *plane = span->source + c * job->source_strides[1] * size_of(type);
+        char *result = span->result + c * job->result_strides[1] * size_of(type);
+        if (span->pixels == STEP && job->result_strides[3] == 1)
+            for (i = 0; i < STEP; i++) move(result, i, plane, offsets[i], type);
+        else
+            for (i = 0; i < span->pixels; i++) move(result, i * job->result_strides[3], plane, offsets[i], type);
+    }
+}
+
+/* How pixels lie in memory, in source and result */
+enum { PLANES, INTERLEAVED, SCATTERED };
+
+INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
+    const Job *job = span->job;
+    Positions at;
+    if (job->padding == BORDER && mode != BICUBIC) {
+        u = clamped8(u, (float)(job->source_width - 1));
+        v = clamped8(v, (float)(job->source_height - 1));
+    }
+    if (mode == NEAREST) {
+        if (inside(job, u, v, 0, 0)) {
+            nearest8(span, u, v, type);
+            return;
+        }
+    } else if (mode == BILINEAR && layout == PLANES) {
+        if (job->source_width > 1 && job->source_height > 1 && inside(job, u, v, 0, 0)) {
+            bilinear_planes(span, squares_of(job, u, v), type);
+            return;
+        }
+    } else if (mode == BILINEAR && layout == INTERLEAVED) {
+        /* two pixels are read as eight elements, where six are theirs */
+        if (job->source_width > 2 && job->source_height > 1 && inside(job, u, v, 0, 1)) {
+            bilinear_interleaved(span, squares_of(job, u, v), type);
+            return;
+        }
+    } else if (mode == BICUBIC && layout == PLANES) {
+        if (job->source_width > 3 && job->source_height > 3 && inside(job, u, v, 1, 2)) {
+            bicubic_planes(span, u, v, type);
+            return;
+        }
+    }
+    if (job->padding == ZEROS) {
+        const float reach = mode == BICUBIC ? 2 : 1;
+        const V8 low = every8(-reach);
+        const V8 right = every8((float)(job->source_width - 1) + reach), below = every8((float)(job->source_height - 1) + reach);
+        if (all8(~((u > low) & (u < right) & (v > low) & (v < below)))) {
+            show_nothing(span, type);
+            return;
+        }
+    }
+    memcpy(at.u, &u, sizeof at.u);
+    memcpy(at.v, &v, sizeof at.v);
+    careful(span, &at, type, mode);
+}
+
+#else
+
+typedef struct { float lane[STEP]; } V8;
+
+enum { PLANES, INTERLEAVED, SCATTERED };
+
+INLINE V8 load8(const float *from) {
+    V8 value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
+    Positions at;
+    (void)layout;
+    memcpy(at.u, &u, sizeof at.u);
+    memcpy(at.v, &v, sizeof at.v);
+    careful(span, &at, type, mode);
+}
+
+#endif
+
+/* -- positions */
+
+/* Weights of the nodes at -1, 0, 1, 2 in the cubic through them, at 0, 1/8, ..., 7/8 */
+#define T(i) ((i) / 8.0f)
+#define ROW0(i) (-T(i) * (T(i) - 1) * (T(i) - 2) / 6)
+#define ROW1(i) ((T(i) + 1) * (T(i) - 1) * (T(i) - 2) / 2)
+#define ROW2(i) (-(T(i) + 1) * T(i) * (T(i) - 2) / 2)
+#define ROW3(i) ((T(i) + 1) * T(i) * (T(i) - 1) / 6)
+#define EIGHT(f) {f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)}
+static const float WEIGHTS[4][STEP] = {EIGHT(ROW0), EIGHT(ROW1), EIGHT(ROW2), EIGHT(ROW3)};
+
+/* The cubics through columns of nodes, at part k / 8 between two rows of them, in pixels of the source */
+INLINE void lay_lines(const float *nodes, int64_t stride, int64_t n, int part, float side, float *line) {
+    const float w0 = WEIGHTS[0][part], w1 = WEIGHTS[1][part], w2 = WEIGHTS[2][part], w3 = WEIGHTS[3][part];
+    const float half = side / 2, middle = (side - 1) / 2;
+    const float *a = nodes, *b = a + stride, *c = b + stride, *d = c + stride;
+    int64_t j;
+    for (j = 0; j < n; j++) line[j] = (a[j] * w0 + b[j] * w1 + c[j] * w2 + d[j] * w3) * half + middle;
+}
+
+INLINE V8 between(const float *line) {
+#if VECTORS
+    return load8(WEIGHTS[0]) * line[0] + load8(WEIGHTS[1]) * line[1] + load8(WEIGHTS[2]) * line[2] +
+           load8(WEIGHTS[3]) * line[3];
+#else
+    V8 value;
+    int i;
+    for (i = 0; i < STEP; i++)
+        value.lane[i] = WEIGHTS[0][i] * line[0] + WEIGHTS[1][i] * line[1] + WEIGHTS[2][i] * line[2] + WEIGHTS[3][i] * line[3];
+    return value;
+#endif
+}
+
+INLINE void row_of_lattice(Span span, int64_t b, int64_t y, int type, int mode, int layout) {
+    const Job *job = span.job;
+    const int64_t i = y / STEP, part = y % STEP, width = job->columns + 5;
+    const float *nodes = job->nodes + b * job->node_strides[0] + (i + 1) * width + 1;
+    const int32_t *cells = job->cells + b * job->cell_stride + i * job->columns;
+    const int64_t step = STEP * job->result_strides[3] * size_of(type);
+    float lines[2][CHUNK + 8];
+    int64_t first, j;
+    for (first = 0; first < job->columns; first += CHUNK) {
+        const int64_t n = job->columns - first < CHUNK ? job->columns - first : CHUNK;
+        lay_lines(nodes + first, width, n + 3, (int)part, (float)job->source_width, lines[0]);
+        lay_lines(nodes + first + job->node_strides[1], width, n + 3, (int)part, (float)job->source_height, lines[1]);
+        for (j = 0; j < n; j++, span.result += step) {
+            const int32_t cell = cells[first + j];
+            const int64_t left = job->width - (first + j) * STEP;
+            span.pixels = left < STEP ? left : STEP;
+            if (cell == CELL_EMPTY) {
+                show_nothing(&span, type);
+            } else if (cell == CELL_CUBIC) {
+                eight(&span, between(lines[0] + j), between(lines[1] + j), type, mode, layout);
+            } else {
+                const float *exact = job->exact + (int64_t)cell * STEP * STEP + part * STEP;
+                Positions at;
+                int k;
+                for (k = 0; k < STEP; k++) {
+                    at.u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
+                    at.v[k] = ((exact[k + job->exact_stride] + 1) * (float)job->source_height - 1) / 2;
+                }
+                eight(&span, load8(at.u), load8(at.v), type, mode, layout);
+            }
+        }
+    }
+}
+
+INLINE void row_of_grid(Span span, int64_t b, int64_t y, int type, int mode, int layout) {
+    const Job *job = span.job;
+    const int64_t across = job->grid_strides[2], to_v = job->grid_strides[3];
+    const int64_t start = b * job->grid_strides[0] + y * job->grid_strides[1];
+    const float *grid = (const float *)job->grid + start;
+    const double *wide = job->grid_is_double ? (const double *)job->grid + start : NULL;
+    const uint8_t *mapped = job->mapped ? job->mapped + b * job->mapped_stride + y * job->width : NULL;
+    const int64_t step = STEP * job->result_strides[3] * size_of(type);
+    const float half_u = (float)job->source_width / 2, half_v = (float)job->source_height / 2;
+    int64_t x;
+    for (x = 0; x < job->width; x += STEP, span.result += step) {
+        Positions at;
+        const int64_t n = job->width - x < STEP ? job->width - x : STEP;
+        int64_t k;
+        span.pixels = n;
+        if (wide) {
+            for (k = 0; k < STEP; k++) {
+                const int64_t i = (x + (k < n ? k : n - 1)) * across;
+                at.u[k] = (float)wide[i];
+                at.v[k] = (float)wide[i + to_v];
+            }
+        } else if (n == STEP && across == 1) {
+            memcpy(at.u, grid + x, sizeof at.u);
+            memcpy(at.v, grid + x + to_v, sizeof at.v);
+        } else if (n == STEP && across == 2 && to_v == 1) {
+            for (k = 0; k < STEP; k++) {
+                at.u[k] = grid[2 * (x + k)];
+                at.v[k] = grid[2 * (x + k) + 1];
+            }
+        } else {
+            for (k = 0; k < STEP; k++) {
+                const int64_t i = (x + (k < n ? k : n - 1)) * across;
+                at.u[k] = grid[i];
+                at.v[k] = grid[i + to_v];
+            }
+        }
+        /* as torch's grid_sample does: on noise every rounding shows */
+        for (k = 0; k < STEP; k++) {
+            at.u[k] = (at.u[k] + 1) * half_u - 0.5f;
+            at.v[k] = (at.v[k] + 1) * half_v - 0.5f;
+        }
+        if (mapped)
+            for (k = 0; k < n; k++)
+                if (!mapped[x + k]) at.u[k] = NAN;
+        eight(&span, load8(at.u), load8(at.v), type, mode, layout);
+    }
+}
+
+/* -- tiles */
+
+INLINE void tile(const Job *job, int64_t b, int64_t from, int64_t to, int type, int mode, int layout) {
+    Span span;
+    int64_t y;
+    span.job = job;
+    span.source = (const char *)job->source + b * job->source_strides[0] * size_of(type);
+    for (y = from; y < to; y++) {
+        span.result = (char *)job->result + (b * job->result_strides[0] + y * job->result_strides[2]) * size_of(type);
+        if (job->nodes) row_of_lattice(span, b, y, type, mode, layout);
+        else row_of_grid(span, b, y, type, mode, layout);
+    }
+}
+
+static int layout_of(const Job *job) {
+    const int64_t *from = job->source_strides, *to = job->result_strides;
+    if (from[3] == 1 && to[3] == 1) return PLANES;
+    if ((job->channels == 3 || job->channels == 4) && from[1] == 1 && to[1] == 1 && from[3] == job->channels &&
+        to[3] == job->channels)
+        return INTERLEAVED;
+    return SCATTERED;
+}
+
+typedef void (*Tile)(const Job *, int64_t, int64_t, int64_t);
+
+#define NAME(type, mode, layout) JOINED(JOINED(JOINED(tile, type), mode), layout)
+#define MADE(type, mode, layout)                                                                                       \
+    NOT_INLINE void NAME(type, mode, layout)(const Job *job, int64_t b, int64_t from, int64_t to) {                    \
+        tile(job, b, from, to, type, mode, layout);                                                                    \
+    }
+#define INTERPOLATED(type)                                                                                             \
+    MADE(type, BILINEAR, PLANES)                                                                                       \
+    MADE(type, BILINEAR, INTERLEAVED)                                                                                  \
+    MADE(type, BILINEAR, SCATTERED)                                                                                    \
+    MADE(type, BICUBIC, PLANES)                                                                                        \
+    MADE(type, BICUBIC, SCATTERED)
+INTERPOLATED(UINT8)
+INTERPOLATED(BOOL)
+INTERPOLATED(UINT16)
+INTERPOLATED(FLOAT32)
+MADE(BYTES1, NEAREST, SCATTERED)
+MADE(BYTES2, NEAREST, SCATTERED)
+MADE(BYTES4, NEAREST, SCATTERED)
+MADE(BYTES8, NEAREST, SCATTERED)
+
+#define WAYS(type)                                                                                                     \
+    {                                                                                                                  \
+        {NAME(type, BILINEAR, PLANES), NAME(type, BILINEAR, INTERLEAVED), NAME(type, BILINEAR, SCATTERED)}, {          \
+            NAME(type, BICUBIC, PLANES), NAME(type, BICUBIC, SCATTERED), NAME(type, BICUBIC, SCATTERED)                \
+        }                                                                                                              \
+    }
+static const Tile interpolated[][2][3] = {WAYS(UINT8), WAYS(BOOL), WAYS(UINT16), WAYS(FLOAT32)};
+static const Tile moved[] = {NAME(BYTES1, NEAREST, SCATTERED), NAME(BYTES2, NEAREST, SCATTERED),
+                             NAME(BYTES4, NEAREST, SCATTERED), NAME(BYTES8, NEAREST, SCATTERED)};
+
+/* Makes tiles until none is left that nobody has taken */
+void THIS(sample)(Job *job) {
+    const int64_t tiles = (job->height + job->tile_rows - 1) / job->tile_rows;
+    const Tile make = job->mode == NEAREST ? moved[job->type - BYTES1]
+                                           : interpolated[job->type][job->mode - BILINEAR][layout_of(job)];
+    for (;;) {
+#if defined(_MSC_VER)
+        const int64_t i = _InterlockedExchangeAdd64(&job->next, 1);
+#else
+        const int64_t i = __atomic_fetch_add(&job->next, 1, __ATOMIC_RELAXED);
+#endif
+        int64_t b, from;
+        if (i >= tiles * job->count) return;
+        /* one image after the other of the same rows: positions that they share are in the cache then */
+        b = i % job->count;
+        from = i / job->count * job->tile_rows;
+        make(job, b, from, from + job->tile_rows < job->height ? from + job->tile_rows : job->height);
+    }
+}
+
+/* -- which cells of a lattice want exact positions */
+
+static const float CUBIC = 3 / 128.0f;  /* a cubic through four even nodes misses its middle by this part of their fourth difference */
+static const float SAFETY = 3;          /* times that is assumed: at a step of the curvature, fourth differences tell less */
+static const float MARGIN = 0.05f;      /* of half an image: what lies beyond is not sampled */
+static const float OVERSHOOT = 0.5f;    /* of the range of its nodes by which a cubic may leave it: 0.27 along each axis */
+
+INLINE float greater(float a, float b) { return a > b ? a : b; }
+INLINE float lesser(float a, float b) { return a < b ? a : b; }
+INLINE float fourth(float a, float b, float c, float d, float e) { return fabsf(a - 4 * b + 6 * c - 4 * d + e); }
+
+/* The largest fourth differences at the corners of a row of cells; nodes: of the first of its six rows */
+static void misses(const float *nodes, int64_t width, int64_t n, float *by_column, float *across, float *down) {
+    const float *r0 = nodes, *r1 = r0 + width, *r2 = r1 + width, *r3 = r2 + width, *r4 = r3 + width, *r5 = r4 + width;
+    int64_t j;
+    for (j = 0; j < n + 1; j++)
+        by_column[j] = greater(fourth(r2[j], r2[j + 1], r2[j + 2], r2[j + 3], r2[j + 4]),
+                               fourth(r3[j], r3[j + 1], r3[j + 2], r3[j + 3], r3[j + 4]));
+    for (j = 0; j < n; j++) across[j] = greater(by_column[j], by_column[j + 1]);
+    for (j = 0; j < n + 1; j++) {
+        const int64_t k = j + 2;
+        by_column[j] = greater(fourth(r0[k], r1[k], r2[k], r3[k], r4[k]), fourth(r1[k], r2[k], r3[k], r4[k], r5[k]));
+    }
+    for (j = 0; j < n; j++) down[j] = greater(by_column[j], by_column[j + 1]);
+}
+
+/* The range of a cell's sixteen nodes; nodes: of the first of its four rows */
+static void ranges(const float *nodes, int64_t width, int64_t n, float *least, float *most, float *low, float *high) {
+    const float *r0 = nodes, *r1 = r0 + width, *r2 = r1 + width, *r3 = r2 + width;
+    int64_t j;
+    for (j = 0; j < n + 3; j++) {
+        least[j] = lesser(lesser(r0[j], r1[j]), lesser(r2[j], r3[j]));
+        most[j] = greater(greater(r0[j], r1[j]), greater(r2[j], r3[j]));
+    }
+    for (j = 0; j < n; j++) {
+        low[j] = lesser(lesser(least[j], least[j + 1]), lesser(least[j + 2], least[j + 3]));
+        high[j] = greater(greater(most[j], most[j + 1]), greater(most[j + 2], most[j + 3]));
+    }
+}
+
+void THIS(classify)(const Classification *given) {
+    const int64_t n = given->columns, width = n + 5, area = n + 8;
+    const float limit = (float)(given->tolerance * given->tolerance);
+    const float half[2] = {(float)(given->source_width / 2), (float)(given->source_height / 2)};
+    float *lines[10];
+    int64_t b, i, j, c, k;
+    for (k = 0; k < 10; k++) lines[k] = given->scratch + k * area;
+    for (b = 0; b < given->count; b++) {
+        int32_t *cells = given->cells + b * given->rows * n;
+        for (i = 0; i < given->rows; i++) {
+            const uint8_t *m = given->mapped + b * given->mapped_stride + (i + 1) * width + 1;
+            float *missed = lines[8], *near = lines[9];
+            for (j = 0; j < n; j++) missed[j] = 0, near[j] = 1;
+            for (c = 0; c < 2; c++) {
+                const float *nodes = given->nodes + b * given->node_strides[0] + c * given->node_strides[1] + i * width;
+                misses(nodes, width, n, lines[0], lines[1], lines[2]);
+                ranges(nodes + width + 1, width, n, lines[3], lines[4], lines[5], lines[6]);
+                for (j = 0; j < n; j++) {
+                    const float d = SAFETY * CUBIC * half[c] * (lines[1][j] + lines[2][j]);
+                    const float reach = MARGIN + OVERSHOOT * (lines[6][j] - lines[5][j]);
+                    missed[j] += d * d;
+                    near[j] = lines[6][j] + reach > -1 && lines[5][j] - reach < 1 ? near[j] : 0;
+                }
+            }
+            uint8_t *sums = (uint8_t *)lines[0];
+            for (j = 0; j < n + 3; j++) sums[j] = m[j] + m[j + width] + m[j + 2 * width] + m[j + 3 * width];
+            for (j = 0; j < n; j++) {
+                const int sum = sums[j] + sums[j + 1] + sums[j + 2] + sums[j + 3];
+                /* what is not a number is not below the limit */
+                const int exact = sum < 16 || (near[j] > 0 && !(missed[j] <= limit));
+                cells[i * n + j] = sum == 0 ? CELL_EMPTY : exact ? 0 : CELL_CUBIC;
+            }
+        }
+        /* a pixel at the rim may say that the nodes do not tell all */
+        const uint8_t *rim = given->rim + b * given->rim_stride;
+        const int64_t last_row = (given->rows - 1) * n, last = (given->width - 1) / STEP;
+#define LOOK(cell) \
+    do { \
+        int32_t *at = cells + (cell); \
+        if (*at != 0 && (*rim != 0) != (*at == CELL_CUBIC)) *at = 0; \
+        rim++; \
+    } while (0)
+        for (k = 0; k < given->width; k++) LOOK(k / STEP);
+        for (k = 0; k < given->width; k++) LOOK(last_row + k / STEP);
+        for (k = 0; k < given->height; k++) LOOK(k / STEP * n);
+        for (k = 0; k < given->height; k++) LOOK(k / STEP * n + last);
+    }
+}

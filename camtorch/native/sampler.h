@@ -1,0 +1,65 @@
+/* What Python hands to the sampler: plain pointers and sizes. `sampler.py` has the same fields in the same order. */
+#ifndef CAMTORCH_SAMPLER_H
+#define CAMTORCH_SAMPLER_H
+
+#include <stdint.h>
+
+#define CAMTORCH_ABI 1
+
+#if defined(_MSC_VER)
+#define EXPORTED __declspec(dllexport)
+#else
+#define EXPORTED __attribute__((visibility("default")))
+#endif
+
+/* NEAREST moves whole elements of 1, 2, 4 or 8 bytes; UINT8 and so on are computed with */
+enum { UINT8, BOOL, UINT16, FLOAT32, BYTES1, BYTES2, BYTES4, BYTES8, TYPES };
+enum { NEAREST, BILINEAR, BICUBIC };
+enum { ZEROS, BORDER, REFLECTION };
+
+enum { STEP = 8 };                      /* pixels between the nodes of a lattice */
+enum { CELL_EMPTY = -2, CELL_CUBIC = -1 }; /* cells that are neither: the index of their exact positions */
+
+typedef struct {
+    /* images (b, c, y, x) and results, in elements; a source image may serve all results (stride 0) */
+    const void *source;
+    void *result;
+    int64_t source_strides[4], result_strides[4];
+    int64_t count, channels, source_height, source_width, height, width;
+    /* the value of pixels that show nothing, one for each channel: to be blended, and as an element */
+    const float *fill;
+    const void *fill_elements;
+    /* positions as of grid_sample, one for each pixel, (b, y, x, component); or NULL */
+    const void *grid;
+    int64_t grid_strides[4];
+    int64_t grid_is_double;
+    const uint8_t *mapped; /* (b, y, x) without gaps in y, x: whether there is a position; NULL: read from positions */
+    int64_t mapped_stride;
+    /* or on a lattice: (b, component, rows + 5, columns + 5) nodes, (b, rows, columns) cells, (component, cell, 8, 8) */
+    const float *nodes;
+    int64_t node_strides[2];
+    const int32_t *cells;
+    int64_t cell_stride, rows, columns;
+    const float *exact;
+    int64_t exact_stride;
+    int32_t type, mode, padding;
+    int32_t tile_rows;
+    int64_t next; /* the tile that whoever is free takes */
+} Job;
+
+typedef struct {
+    /* positions as of grid_sample of nodes (b, component, rows + 5, columns + 5), whether they are mapped (b, same), */
+    const float *nodes;
+    int64_t node_strides[2];
+    const uint8_t *mapped;
+    int64_t mapped_stride;
+    /* and whether the pixels at the rim of the target are: (b, top row, bottom row, left column, right column) */
+    const uint8_t *rim;
+    int64_t rim_stride;
+    int64_t count, rows, columns, height, width;
+    double source_height, source_width, tolerance;
+    int32_t *cells; /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, or 0 where positions are to be exact */
+    float *scratch; /* 10 (columns + 8) */
+} Classification;
+
+#endif

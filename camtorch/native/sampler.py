@@ -1,0 +1,219 @@
+"""Calls of the compiled sampler: tensors to the pointers and sizes that it takes, and its tiles to threads."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import byref, c_double, c_int32, c_int64, c_void_p
+
+import torch
+from torch import Tensor
+
+from camtorch._threads import spread
+from camtorch.native.library import library
+
+EMPTY, CUBIC, TODO = -2, -1, 0
+"""Cells of a lattice: one that shows nothing, one between whose nodes lie cubics, one that wants exact positions."""
+
+_MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
+_PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
+_TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
+_BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
+_TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
+_HUGE = 1 << 22  # bytes of a result from which on it is asked for in large pages
+
+
+class _Job(ctypes.Structure):
+    """`Job` of sampler.h."""
+
+    _fields_ = (
+        ("source", c_void_p),
+        ("result", c_void_p),
+        ("source_strides", c_int64 * 4),
+        ("result_strides", c_int64 * 4),
+        ("count", c_int64),
+        ("channels", c_int64),
+        ("source_height", c_int64),
+        ("source_width", c_int64),
+        ("height", c_int64),
+        ("width", c_int64),
+        ("fill", c_void_p),
+        ("fill_elements", c_void_p),
+        ("grid", c_void_p),
+        ("grid_strides", c_int64 * 4),
+        ("grid_is_double", c_int64),
+        ("mapped", c_void_p),
+        ("mapped_stride", c_int64),
+        ("nodes", c_void_p),
+        ("node_strides", c_int64 * 2),
+        ("cells", c_void_p),
+        ("cell_stride", c_int64),
+        ("rows", c_int64),
+        ("columns", c_int64),
+        ("exact", c_void_p),
+        ("exact_stride", c_int64),
+        ("type", c_int32),
+        ("mode", c_int32),
+        ("padding", c_int32),
+        ("tile_rows", c_int32),
+        ("next", c_int64),
+    )
+
+
+class _Classification(ctypes.Structure):
+    """`Classification` of sampler.h."""
+
+    _fields_ = (
+        ("nodes", c_void_p),
+        ("node_strides", c_int64 * 2),
+        ("mapped", c_void_p),
+        ("mapped_stride", c_int64),
+        ("rim", c_void_p),
+        ("rim_stride", c_int64),
+        ("count", c_int64),
+        ("rows", c_int64),
+        ("columns", c_int64),
+        ("height", c_int64),
+        ("width", c_int64),
+        ("source_height", c_double),
+        ("source_width", c_double),
+        ("tolerance", c_double),
+        ("cells", c_void_p),
+        ("scratch", c_void_p),
+    )
+
+
+def takes(dtype: torch.dtype, mode: str) -> bool:
+    """Whether images of a dtype are sampled so, where there is a library."""
+    return mode == "nearest" or dtype in _TYPES
+
+
+def sample(
+    images: Tensor,
+    result: Tensor,
+    mode: str,
+    padding: str,
+    fill: Sequence[float],
+    *,
+    grid: Tensor | None = None,
+    mapped: Tensor | None = None,
+    nodes: Tensor | None = None,
+    cells: Tensor | None = None,
+    exact: Tensor | None = None,
+) -> None:
+    """Write the samples of images into `result`, at the positions of a grid or of a lattice.
+
+    All tensors are on the CPU and without a graph; images and results may have any strides.
+
+    Args:
+        images: (B, C, H, W), of a dtype that `takes` knows.
+        result: (B, C, h, w), of the same dtype.
+        mode: "nearest", "bilinear" or "bicubic".
+        padding: "zeros", "border" or "reflection".
+        fill: C values of pixels that show nothing, which "zeros" blends in; integers are those of integer images.
+        grid: (B or 1, h, w, 2) of float32 or float64: positions as of `grid_sample`.
+        mapped: (B or 1, h, w) bool: which of them there are; None where positions far outside say that there is none.
+        nodes: (B or 1, 2, n + 5, m + 5) of float32, the last two dims without gaps: positions at every eighth pixel,
+            from the one at (-16, -16) on.
+        cells: (B or 1, n, m) int32, contiguous: `EMPTY`, `CUBIC`, or the cell's place in `exact`.
+        exact: (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
+    """
+    native = library()
+    if native is None or not result.numel():
+        return
+    job = _Job()
+    count, channels, height, width = result.shape
+    job.source, job.source_strides = images.data_ptr(), images.stride()
+    job.result, job.result_strides = result.data_ptr(), result.stride()
+    job.count, job.channels, job.height, job.width = count, channels, height, width
+    job.source_height, job.source_width = images.shape[-2:]
+    elements = _elements(fill, images.dtype)
+    values = torch.tensor(fill, dtype=torch.float32)
+    job.fill, job.fill_elements = values.data_ptr(), elements.data_ptr()
+    if grid is not None:
+        job.grid, job.grid_is_double = grid.data_ptr(), grid.dtype == torch.float64
+        job.grid_strides = _shared(grid), *grid.stride()[1:]
+        if mapped is not None:
+            mapped = mapped.contiguous()
+            job.mapped, job.mapped_stride = mapped.data_ptr(), _shared(mapped)
+    if nodes is not None and cells is not None and exact is not None:
+        job.nodes, job.node_strides = nodes.data_ptr(), (_shared(nodes), nodes.stride(1))
+        job.cells, job.cell_stride = cells.data_ptr(), _shared(cells)
+        job.rows, job.columns = cells.shape[1:]
+        job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
+    job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
+    job.mode, job.padding = _MODES[mode], _PADDINGS[padding]
+    job.tile_rows = max(_TILE // width // 8, 1) * 8
+    tiles = -(-height // job.tile_rows) * count
+    pointer = byref(job)
+    spread(lambda: native.camtorch_sample(pointer), min(torch.get_num_threads(), tiles))
+
+
+def _shared(tensor: Tensor) -> int:
+    """The stride from one image's part to the next: none where there is one for all."""
+    return 0 if tensor.shape[0] == 1 else tensor.stride(0)
+
+
+def _elements(fill: Sequence[float], dtype: torch.dtype) -> Tensor:
+    """The values as pixels, (C,): rounded and in range, true from one half on."""
+    if dtype == torch.bool:
+        return torch.tensor([value >= 0.5 for value in fill])
+    if not dtype.is_floating_point:
+        low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
+        fill = [min(max(round(value), low), high) for value in fill]
+    return torch.tensor(fill, dtype=dtype)
+
+
+def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
+    """(count, C, *size) of the dtype of images (_, C, H, W) and with the channels last in memory if they have them."""
+    channels = images.shape[1]
+    last = channels > 1 and images.stride(1) == 1 and images.stride(3) == channels
+    layout = torch.channels_last if last else torch.contiguous_format
+    result = torch.empty(count, channels, *size, dtype=images.dtype, memory_format=layout)
+    native = library()
+    if native is not None and result.nbytes >= _HUGE:
+        # small pages, each new to the process, would take as long as all else
+        native.camtorch_large_pages(c_void_p(result.data_ptr()), c_int64(result.nbytes))
+    return result
+
+
+def classify(
+    nodes: Tensor, mapped: Tensor, rim: Tensor, size: tuple[int, int], source: tuple[int, int], tolerance: float
+) -> Tensor | None:
+    """(B, n, m) int32, contiguous: which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`; None without a library.
+
+    Args:
+        nodes: (B, 2, n + 5, m + 5) of float32, the last two dims without gaps.
+        mapped: (B, n + 5, m + 5) bool, likewise.
+        rim: (B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the
+            bottom row, the left column, the right column.
+        size: (h, w) of the target.
+        source: (height, width) of the source.
+        tolerance: in pixels of the source.
+    """
+    native = library()
+    if native is None:
+        return None
+    rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
+    cells = torch.empty(len(nodes), rows, columns, dtype=torch.int32)
+    scratch = torch.empty(10 * (columns + 8), dtype=torch.float32)
+    given = _Classification(
+        nodes.data_ptr(),
+        nodes.stride()[:2],
+        mapped.data_ptr(),
+        mapped.stride(0),
+        rim.data_ptr(),
+        rim.stride(0),
+        len(nodes),
+        rows,
+        columns,
+        *size,
+        *map(float, source),
+        tolerance,
+        cells.data_ptr(),
+        scratch.data_ptr(),
+    )
+    native.camtorch_classify(byref(given))
+    return cells
+
+
