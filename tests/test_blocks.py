@@ -142,6 +142,7 @@ def test_two_classes_of_one_name_keep_their_own_lens():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.uint8, torch.bool])
 def test_parts_of_images_change_nothing(threads, count, dtype, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    monkeypatch.setattr(sampling, "native_available", lambda: False)
     generator = torch.Generator().manual_seed(0)
     images = (255 * torch.rand(count, 3, 11, 13, generator=generator)).to(dtype)
     positions = 2.4 * torch.rand(count, 7, 5, 2, generator=generator) - 1.2

@@ -135,7 +135,7 @@ INLINE int taps_of(float x, int64_t side, int mode, int padding, int64_t *at, fl
 }
 
 /* One channel of one pixel; `plane` is that of the channel, u and v are not NaN */
-INLINE float sample_at(const Job *job, const char *plane, float u, float v, float fill, int type, int mode) {
+NOT_INLINE float sample_at(const Job *job, const char *plane, float u, float v, float fill, int type, int mode) {
     const int64_t *strides = job->source_strides;
     int64_t columns[4], rows[4];
     float across[4], down[4], sum = 0;
@@ -169,7 +169,7 @@ INLINE int64_t nearest_of(float x, int64_t side, int padding) {
     return i >= 0 && i <= (float)(side - 1) ? (int64_t)i : -1;
 }
 
-INLINE void show_nothing(const Span *span, int type) {
+NOT_INLINE void show_nothing(const Span *span, int type) {
     const Job *job = span->job;
     int64_t c, i;
     for (c = 0; c < job->channels; c++) {
@@ -204,15 +204,7 @@ NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mod
             for (c = 0; c < job->channels; c++) {
                 const char *plane = span->source + c * job->source_strides[1] * bytes;
                 const float fill = job->fill[c];
-                float value;
-                switch (type) {
-                case UINT8: value = mode == BILINEAR ? sample_at(job, plane, u, v, fill, UINT8, BILINEAR)
-                                                     : sample_at(job, plane, u, v, fill, UINT8, BICUBIC); break;
-                case BOOL: value = sample_at(job, plane, u, v, fill, BOOL, mode); break;
-                case UINT16: value = sample_at(job, plane, u, v, fill, UINT16, mode); break;
-                default: value = mode == BILINEAR ? sample_at(job, plane, u, v, fill, FLOAT32, BILINEAR)
-                                                  : sample_at(job, plane, u, v, fill, FLOAT32, BICUBIC);
-                }
+                const float value = sample_at(job, plane, u, v, fill, type, mode);
                 store(result, c * job->result_strides[1], value, type);
             }
         }
@@ -737,85 +729,113 @@ INLINE V8 between(const float *line) {
 #endif
 }
 
-INLINE void row_of_lattice(Span span, int64_t b, int64_t y, int type, int mode, int layout) {
-    const Job *job = span.job;
-    const int64_t i = y / STEP, part = y % STEP, width = job->columns + 5;
-    const float *nodes = job->nodes + b * job->node_strides[0] + (i + 1) * width + 1;
-    const int32_t *cells = job->cells + b * job->cell_stride + i * job->columns;
-    const int64_t step = STEP * job->result_strides[3] * size_of(type);
+/* A row of the target on the lattice: the lines through its columns of nodes, and its cells */
+typedef struct {
+    const float *nodes;
+    const int32_t *cells;
+    const float *exact;
+    int64_t part;
     float lines[2][CHUNK + 8];
-    int64_t first, j;
-    for (first = 0; first < job->columns; first += CHUNK) {
-        const int64_t n = job->columns - first < CHUNK ? job->columns - first : CHUNK;
-        lay_lines(nodes + first, width, n + 3, (int)part, (float)job->source_width, lines[0]);
-        lay_lines(nodes + first + job->node_strides[1], width, n + 3, (int)part, (float)job->source_height, lines[1]);
-        for (j = 0; j < n; j++, span.result += step) {
-            const int32_t cell = cells[first + j];
-            const int64_t left = job->width - (first + j) * STEP;
-            span.pixels = left < STEP ? left : STEP;
-            if (cell == CELL_EMPTY) {
-                show_nothing(&span, type);
-            } else if (cell == CELL_CUBIC) {
-                eight(&span, between(lines[0] + j), between(lines[1] + j), type, mode, layout);
-            } else {
-                const float *exact = job->exact + (int64_t)cell * STEP * STEP + part * STEP;
-                Positions at;
-                int k;
-                for (k = 0; k < STEP; k++) {
-                    at.u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
-                    at.v[k] = ((exact[k + job->exact_stride] + 1) * (float)job->source_height - 1) / 2;
-                }
-                eight(&span, load8(at.u), load8(at.v), type, mode, layout);
-            }
-        }
+} LatticeRow;
+
+INLINE void begin_row(const Job *job, int64_t b, int64_t y, LatticeRow *row) {
+    const int64_t i = y / STEP;
+    row->part = y % STEP;
+    row->nodes = job->nodes + b * job->node_strides[0] + (i + 1) * (job->columns + 5) + 1;
+    row->cells = job->cells + b * job->cell_stride + i * job->columns;
+    row->exact = job->exact + row->part * STEP;
+}
+
+NOT_INLINE void lay_chunk(const Job *job, LatticeRow *row, int64_t first) {
+    const int64_t left = job->columns - first, n = (left < CHUNK ? left : CHUNK) + 3, width = job->columns + 5;
+    const float *nodes = row->nodes + first;
+    lay_lines(nodes, width, n, (int)row->part, (float)job->source_width, row->lines[0]);
+    lay_lines(nodes + job->node_strides[1], width, n, (int)row->part, (float)job->source_height, row->lines[1]);
+}
+
+INLINE void exact_positions(const Job *job, const LatticeRow *row, int32_t cell, Positions *at) {
+    const float *exact = row->exact + (int64_t)cell * STEP * STEP;
+    int k;
+    for (k = 0; k < STEP; k++) {
+        at->u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
+        at->v[k] = ((exact[k + job->exact_stride] + 1) * (float)job->source_height - 1) / 2;
     }
 }
 
-INLINE void row_of_grid(Span span, int64_t b, int64_t y, int type, int mode, int layout) {
-    const Job *job = span.job;
+NOT_INLINE void grid_positions(const Job *job, int64_t b, int64_t y, int64_t x, Positions *at) {
     const int64_t across = job->grid_strides[2], to_v = job->grid_strides[3];
     const int64_t start = b * job->grid_strides[0] + y * job->grid_strides[1];
+    const int64_t n = job->width - x < STEP ? job->width - x : STEP;
     const float *grid = (const float *)job->grid + start;
-    const double *wide = job->grid_is_double ? (const double *)job->grid + start : NULL;
-    const uint8_t *mapped = job->mapped ? job->mapped + b * job->mapped_stride + y * job->width : NULL;
-    const int64_t step = STEP * job->result_strides[3] * size_of(type);
+    const double *wide = (const double *)job->grid + start;
+    int64_t k;
+    for (k = 0; k < STEP; k++) {
+        const int64_t i = (x + (k < n ? k : n - 1)) * across;
+        at->u[k] = job->grid_is_double ? (float)wide[i] : grid[i];
+        at->v[k] = job->grid_is_double ? (float)wide[i + to_v] : grid[i + to_v];
+    }
+}
+
+/* Eight positions of a grid of single precision, in a row of `left` */
+INLINE void read_grid(const Job *job, int64_t b, int64_t y, int64_t x, int64_t left, Positions *at) {
+    const int64_t across = job->grid_strides[2], to_v = job->grid_strides[3];
     const float half_u = (float)job->source_width / 2, half_v = (float)job->source_height / 2;
-    int64_t x;
-    for (x = 0; x < job->width; x += STEP, span.result += step) {
-        Positions at;
-        const int64_t n = job->width - x < STEP ? job->width - x : STEP;
-        int64_t k;
-        span.pixels = n;
-        if (wide) {
-            for (k = 0; k < STEP; k++) {
-                const int64_t i = (x + (k < n ? k : n - 1)) * across;
-                at.u[k] = (float)wide[i];
-                at.v[k] = (float)wide[i + to_v];
+    const float *grid = (const float *)job->grid + b * job->grid_strides[0] + y * job->grid_strides[1] + x * across;
+    int64_t k;
+    if (left < STEP || job->grid_is_double || !(across == 1 || (across == 2 && to_v == 1))) {
+        grid_positions(job, b, y, x, at);
+    } else if (across == 1) {
+        memcpy(at->u, grid, sizeof at->u);
+        memcpy(at->v, grid + to_v, sizeof at->v);
+    } else {
+        for (k = 0; k < STEP; k++) {
+            at->u[k] = grid[2 * k];
+            at->v[k] = grid[2 * k + 1];
+        }
+    }
+    /* as torch's grid_sample does: on noise every rounding shows */
+    for (k = 0; k < STEP; k++) {
+        at->u[k] = (at->u[k] + 1) * half_u - 0.5f;
+        at->v[k] = (at->v[k] + 1) * half_v - 0.5f;
+    }
+    if (job->mapped) {
+        const uint8_t *mapped = job->mapped + b * job->mapped_stride + y * job->width + x;
+        for (k = 0; k < STEP && k < left; k++)
+            if (!mapped[k]) at->u[k] = NAN;
+    }
+}
+
+INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout) {
+    const Job *job = span.job;
+    const int64_t step = STEP * job->result_strides[3] * size_of(type), columns = (job->width + STEP - 1) / STEP;
+    LatticeRow lattice;
+    int64_t j;
+    if (job->nodes) begin_row(job, b, y, &lattice);
+    for (j = 0; j < columns; j++, span.result += step) {
+        const int64_t left = job->width - j * STEP;
+        V8 u, v;
+        span.pixels = left < STEP ? left : STEP;
+        if (job->nodes) {
+            const int32_t cell = lattice.cells[j];
+            if (j % CHUNK == 0) lay_chunk(job, &lattice, j);
+            if (cell == CELL_EMPTY) {
+                show_nothing(&span, type);
+                continue;
             }
-        } else if (n == STEP && across == 1) {
-            memcpy(at.u, grid + x, sizeof at.u);
-            memcpy(at.v, grid + x + to_v, sizeof at.v);
-        } else if (n == STEP && across == 2 && to_v == 1) {
-            for (k = 0; k < STEP; k++) {
-                at.u[k] = grid[2 * (x + k)];
-                at.v[k] = grid[2 * (x + k) + 1];
+            if (cell == CELL_CUBIC) {
+                u = between(lattice.lines[0] + j % CHUNK);
+                v = between(lattice.lines[1] + j % CHUNK);
+            } else {
+                Positions at;
+                exact_positions(job, &lattice, cell, &at);
+                u = load8(at.u), v = load8(at.v);
             }
         } else {
-            for (k = 0; k < STEP; k++) {
-                const int64_t i = (x + (k < n ? k : n - 1)) * across;
-                at.u[k] = grid[i];
-                at.v[k] = grid[i + to_v];
-            }
+            Positions at;
+            read_grid(job, b, y, j * STEP, left, &at);
+            u = load8(at.u), v = load8(at.v);
         }
-        /* as torch's grid_sample does: on noise every rounding shows */
-        for (k = 0; k < STEP; k++) {
-            at.u[k] = (at.u[k] + 1) * half_u - 0.5f;
-            at.v[k] = (at.v[k] + 1) * half_v - 0.5f;
-        }
-        if (mapped)
-            for (k = 0; k < n; k++)
-                if (!mapped[x + k]) at.u[k] = NAN;
-        eight(&span, load8(at.u), load8(at.v), type, mode, layout);
+        eight(&span, u, v, type, mode, layout);
     }
 }
 
@@ -828,8 +848,7 @@ INLINE void tile(const Job *job, int64_t b, int64_t from, int64_t to, int type, 
     span.source = (const char *)job->source + b * job->source_strides[0] * size_of(type);
     for (y = from; y < to; y++) {
         span.result = (char *)job->result + (b * job->result_strides[0] + y * job->result_strides[2]) * size_of(type);
-        if (job->nodes) row_of_lattice(span, b, y, type, mode, layout);
-        else row_of_grid(span, b, y, type, mode, layout);
+        row(span, b, y, type, mode, layout);
     }
 }
 

@@ -215,5 +215,3 @@ def classify(
     )
     native.camtorch_classify(byref(given))
     return cells
-
-

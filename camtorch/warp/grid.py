@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from typing import NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
+from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
 from camtorch.rotations import turn
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
@@ -51,6 +52,49 @@ class Sampling(NamedTuple):
         return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale)
 
 
+class Lattice:
+    """Where every pixel of a target samples the source's image, by positions at every eighth pixel.
+
+    Between nodes a cubic is laid through four of them along each axis. Cells where that would not do have positions
+    for each of their pixels.
+
+    Args:
+        nodes: (B, 2, n + 5, m + 5), positions as of `grid_sample`, from pixel (-16, -16) on.
+        cells: (B, n, m) int32: `EMPTY`, `CUBIC`, or the cell's place in `exact`.
+        exact: (2, K, 8, 8), positions, NaN where none is mapped.
+        size: (h, w) of the target.
+    """
+
+    def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]):
+        self.nodes, self.cells, self.exact, self.size = nodes, cells, exact, size
+
+    @cached_property
+    def single(self) -> Lattice:
+        """In float32."""
+        if self.nodes.dtype == torch.float32:
+            return self
+        return Lattice(self.nodes.float(), self.cells, self.exact.float(), self.size)
+
+    @cached_property
+    def pixels(self) -> Sampling:
+        """Pixel by pixel."""
+        height, width = self.size
+        _, n, m = self.cells.shape
+        planes = _interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+        blocks = planes.unflatten(2, (n, _STEP)).unflatten(4, (m, _STEP))
+        some = self.cells != EMPTY
+        camera, i, j = (~some).nonzero(as_tuple=True)
+        blocks[camera, :, i, :, j] = OUTSIDE
+        seen = some[:, :, None, :, None].expand(-1, -1, _STEP, -1, _STEP).flatten(3, 4).flatten(1, 2)
+        camera, i, j = (self.cells >= 0).nonzero(as_tuple=True)
+        if len(camera):
+            exact = self.exact[:, self.cells[camera, i, j].long()].transpose(0, 1)  # (K, 2, 8, 8)
+            known = ~exact[:, 0].isnan()
+            blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
+            seen.unflatten(1, (n, _STEP)).unflatten(3, (m, _STEP))[camera, i, :, j] = known
+        return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
+
+
 def tabulate(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float = 0.0, rows: range | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -65,14 +109,14 @@ def tabulate(
     """
     height, width = target._size("Warp")
     rows = range(height) if rows is None else rows
-    like = target.intrinsics.new_empty(0, dtype=torch.promote_types(target.intrinsics.dtype, torch.float32))
+    like = _like(target)
     exact = partial(_positions, source, target, rotation)
     if in_transform() or not is_concrete(target.intrinsics):
         return exact(_pixels(rows, width, like))
     if tolerance and like.is_cpu:
-        found = on_lattice(exact, rows, width, source._size("Warp"), tolerance, like)
-        if found is not None:
-            return found
+        lattice = on_lattice(source, target, rotation, tolerance, rows)
+        if lattice is not None:
+            return lattice.pixels[:2]
     # by strips: memory for what is in between is used again
     count = max(math.prod(c.batch_shape) for c in (source, target))
     count = count if rotation is None else max(count, math.prod(rotation.shape[:-2]))
@@ -86,6 +130,11 @@ def tabulate(
         here = slice(i, i + step)
         grid[:, here], mapped[:, here] = exact(_pixels(rows[here], width, like))
     return grid, mapped
+
+
+def _like(target: Camera) -> Tensor:
+    """A tensor of the dtype and on the device to compute positions in."""
+    return target.intrinsics.new_empty(0, dtype=torch.promote_types(target.intrinsics.dtype, torch.float32))
 
 
 def _pixels(rows: range, width: int, like: Tensor) -> Tensor:
@@ -136,94 +185,94 @@ def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def on_lattice(
-    exact: Exact, rows: range, width: int, source: tuple[int, int], tolerance: float, like: Tensor
-) -> tuple[Tensor, Tensor] | None:
+    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, rows: range
+) -> Lattice | None:
     """Positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
-    Between nodes a cubic is laid through four of them along each axis. Cells where fourth differences say that this
-    misses by more than the tolerance, and cells at the limit of what is mapped and beside it, are computed pixel by
-    pixel. None if that would be most of the image. What is mapped, or is not, between four nodes alone and away from
-    that limit is not seen.
+    Cells where fourth differences say that cubics miss by more than the tolerance, and cells at the limit of what is
+    mapped and beside it, are computed pixel by pixel. None if that would be most of the image. What is mapped, or is
+    not, between four nodes alone and away from that limit is not seen.
 
     Args:
-        exact: see `Exact`.
+        source: the camera of the images.
+        target: the camera of the images to make.
+        rotation: see `tabulate`.
+        tolerance: positive, in pixels of the source.
         rows: of the target.
-        width: of the target.
-        source: (height, width) of the source, in whose pixels the tolerance is.
-        tolerance: positive, in pixels.
-        like: a tensor of the dtype and on the device to compute in.
     """
-    height, n, m = len(rows), math.ceil(len(rows) / _STEP), math.ceil(width / _STEP)  # n by m cells
+    like, (height, width) = _like(target), (len(rows), target._size("Warp")[1])
+    n, m = math.ceil(height / _STEP), math.ceil(width / _STEP)  # cells
     if min(n, m) < _FEWEST:
         return None
     # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
     v, u = ((torch.arange(k + 5, dtype=like.dtype, device=like.device) - 2) * _STEP for k in (n, m))
-    nodes, mapped = exact(torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"), -1))
-    nodes = nodes.movedim(-1, 1)  # (B, 2, n + 5, m + 5)
-    some, todo = _open_cells(nodes, mapped[:, 1:-1, 1:-1], source, tolerance)
-    _open_rim(exact, rows, width, some, todo, like)
+    nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"), -1)
+    # with the pixels at the rim of the target, which may tell what nodes do not
+    pixels = torch.cat((nodes.flatten(0, 1), _rim(rows, width, like)))
+    exact = partial(_positions, source, target, rotation)
+    positions, mapped = exact(pixels[None])  # (B, 1, N, 2)
+    counts = (n + 5) * (m + 5), len(pixels) - (n + 5) * (m + 5)
+    at_nodes, mapped_nodes = (t[:, 0].split(counts, 1)[0].unflatten(1, (n + 5, m + 5)) for t in (positions, mapped))
+    lattice, rim = at_nodes.movedim(-1, 1), mapped[:, 0].split(counts, 1)[1]
+    size = source._size("Warp")
+    cells = classify(lattice.float(), mapped_nodes, rim, (height, width), size, tolerance)
+    if cells is None:
+        cells = _classified(lattice, mapped_nodes, rim, (height, width), size, tolerance)
+    todo = cells == TODO
     if bool((todo.sum((1, 2)) > n * m / 2).any()):
         return None
-    planes = _interpolated(nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
-    blocks = planes.unflatten(2, (n, _STEP)).unflatten(4, (m, _STEP))
-    camera, i, j = (~some).nonzero(as_tuple=True)
-    blocks[camera, :, i, :, j] = OUTSIDE
-    seen = some[:, :, None, :, None].expand(-1, -1, _STEP, -1, _STEP).flatten(3, 4).flatten(1, 2)
-    cells = seen.unflatten(1, (n, _STEP)).unflatten(3, (m, _STEP))
-    done = torch.zeros_like(todo)
-    while bool(todo.any()):
-        _compute(exact, rows.start, todo, blocks, cells)
-        done |= todo
-        # the limit goes on where it is thinner than cells
-        limit = todo & cells.any(4).any(2) & ~cells.all(4).all(2)
-        todo = (F.max_pool2d(limit.to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0] > 0) & ~done
-    return planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width]
+    return Lattice(lattice, cells, _compute(exact, rows.start, cells, todo, like), (height, width))
 
 
-def _compute(exact: Exact, first: int, todo: Tensor, blocks: Tensor, seen: Tensor) -> None:
-    """Exact positions in the cells (B, n, m) of a lattice that starts at row `first`.
+def _rim(rows: range, width: int, like: Tensor) -> Tensor:
+    """(2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column."""
+    v, u = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (len(rows), width))
+    v += rows.start
+    sides = [(u, torch.full_like(u, end)) for end in (rows[0], rows[-1])]
+    sides += [(torch.full_like(v, end), v) for end in (0, width - 1)]
+    return torch.cat([torch.stack(side, -1) for side in sides])
+
+
+def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor) -> Tensor:
+    """Exact positions (2, K, 8, 8) of cells, whose places are written into `cells`.
 
     Args:
         exact: see `Exact`.
-        first: see above.
-        todo: the cells.
-        blocks: (B, 2, n, 8, m, 8), the positions.
-        seen: (B, n, 8, m, 8), which are mapped.
+        first: row of the target where the lattice begins.
+        cells: (B, n, m) int32.
+        todo: (B, n, m) bool, those to begin with: where what is mapped ends in one, its neighbours follow.
+        like: a tensor of the dtype to compute in.
     """
-    # as many cells of every camera as the one with the most has: more of them exact does no harm
-    most = int(todo.sum((1, 2)).max())
-    cells = todo.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
-    i, j = cells // todo.shape[2], cells % todo.shape[2]
-    offset = torch.arange(_STEP, dtype=blocks.dtype, device=blocks.device)
-    down, across = (i[..., None, None] * _STEP + offset[:, None]), (j[..., None, None] * _STEP + offset)
-    pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, cells, 8, 8, 2)
-    positions, known = exact(pixels.flatten(2, 3))
-    camera = torch.arange(len(cells), device=blocks.device)[:, None]
-    blocks[camera, :, i, :, j] = positions.unflatten(2, (_STEP, _STEP)).movedim(-1, 2)
-    seen[camera, i, :, j] = known.unflatten(2, (_STEP, _STEP))
+    parts, count = [like.new_empty(2, 0, _STEP, _STEP)], 0
+    done, places = torch.zeros_like(todo), cells.flatten(1)
+    offset = torch.arange(_STEP, dtype=like.dtype)
+    while bool(todo.any()):
+        # as many cells of every camera as the one with the most has: more of them computed does no harm
+        most = int(todo.sum((1, 2)).max())
+        chosen = todo.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
+        wanted = todo.flatten(1).gather(1, chosen)
+        i, j = chosen // todo.shape[2], chosen % todo.shape[2]
+        down, across = (i[..., None, None] * _STEP + offset[:, None]), (j[..., None, None] * _STEP + offset)
+        pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, most, 8, 8, 2)
+        positions, known = exact(pixels.flatten(2, 3))
+        part = torch.where(known, positions.movedim(-1, 0), torch.nan)
+        parts.append(part.flatten(1, 2).unflatten(-1, (_STEP, _STEP)))
+        place = torch.arange(count, count + chosen.numel(), dtype=cells.dtype).view_as(chosen)
+        places.scatter_(1, chosen, torch.where(wanted, place, places.gather(1, chosen)))
+        count += chosen.numel()
+        done |= todo
+        # the limit goes on where it is thinner than cells
+        limit = torch.zeros_like(todo).flatten(1).scatter_(1, chosen, wanted & known.any(-1) & ~known.all(-1))
+        around = F.max_pool2d(limit.view_as(todo).to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
+        todo = (around > 0) & ~done
+    return torch.cat(parts, 1)
 
 
-def _open_rim(exact: Exact, rows: range, width: int, some: Tensor, todo: Tensor, like: Tensor) -> None:
-    """Have cells (B, n, m) computed where a pixel at the rim of the image says that nodes do not tell all."""
-    v, u = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (len(rows), width))
-    sides = [(u, torch.full_like(u, end)) for end in (0, len(rows) - 1)]
-    sides += [(torch.full_like(v, end), v) for end in (0, width - 1)]
-    across, down = (torch.cat(parts) for parts in zip(*sides, strict=True))
-    _, mapped = exact(torch.stack((across, down + rows.start), -1).unsqueeze(0))
-    i, j = (down // _STEP).long(), (across // _STEP).long()
-    camera, pixel = (mapped[:, 0] != some[:, i, j]).nonzero(as_tuple=True)
-    todo[camera, i[pixel], j[pixel]] = True
-
-
-def _open_cells(nodes: Tensor, mapped: Tensor, source: tuple[int, int], tolerance: float) -> tuple[Tensor, Tensor]:
-    """Bool (B, n, m) each: some nodes of a cell are mapped; the cell wants exact positions.
-
-    Args:
-        nodes: (B, 2, n + 5, m + 5).
-        mapped: (B, n + 3, m + 3): without those that only fourth differences are made of.
-        source: see `on_lattice`.
-        tolerance: likewise.
-    """
+def _classified(
+    nodes: Tensor, mapped: Tensor, rim: Tensor, size: tuple[int, int], source: tuple[int, int], tolerance: float
+) -> Tensor:
+    """What `classify` finds, by torch."""
+    mapped = mapped[:, 1:-1, 1:-1]
     some, every = (
         _over_windows(_over_windows(mapped, -1, 4, pick), -2, 4, pick) for pick in (torch.logical_or, torch.logical_and)
     )
@@ -235,7 +284,15 @@ def _open_cells(nodes: Tensor, mapped: Tensor, source: tuple[int, int], toleranc
     )
     reach = _MARGIN + _OVERSHOOT * (high - low)
     sampled = ((high + reach > -1) & (low - reach < 1)).all(1)
-    return some, some & (~every | (sampled & (torch.hypot(*missed.unbind(1)) > tolerance)))
+    todo = some & (~every | (sampled & (torch.hypot(*missed.unbind(1)) > tolerance)))
+    # where a pixel at the rim says that nodes do not tell all
+    v, u = (torch.arange(side) // _STEP for side in size)
+    top, left = torch.zeros_like(u), torch.zeros_like(v)
+    i, j = torch.cat((top, top + v[-1], v, v)), torch.cat((u, u, left, left + u[-1]))
+    camera, pixel = (rim != some[:, i, j]).nonzero(as_tuple=True)
+    todo[camera, i[pixel], j[pixel]] = True
+    cells = torch.where(some, CUBIC, EMPTY)
+    return torch.where(todo, TODO, cells).to(torch.int32)
 
 
 def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:

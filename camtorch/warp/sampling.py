@@ -12,7 +12,9 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._tracing import in_graph, in_transform, is_concrete, may_look
-from camtorch.warp.grid import Sampling
+from camtorch.native import sampler
+from camtorch.native.library import native_available
+from camtorch.warp.grid import Lattice, Sampling
 
 Mode = Literal["nearest", "bilinear", "bicubic"]
 PaddingMode = Literal["zeros", "border", "reflection"]
@@ -33,11 +35,12 @@ _SIGNED = {4: torch.int32, 8: torch.int64}  # torch gathers no wide unsigned int
 
 def render(
     images: Tensor,
-    where: Sampling,
+    where: Sampling | Lattice,
     mode: Mode,
     padding_mode: PaddingMode,
     fill: tuple[float, ...],
     kept: dict[int, Pyramid] | None = None,
+    out: Tensor | None = None,
 ) -> Tensor:
     """The images that a warp makes.
 
@@ -50,23 +53,82 @@ def render(
         padding_mode: one of `PADDINGS`.
         fill: the value of pixels that show nothing, one or C.
         kept: holds the halves of the images from one call to the next.
+        out: where to write the result, if it has no graph.
 
     Returns:
         (B, C, h, W') of the dtype of the images. Half precision is sampled in float32; integers are rounded and stay
         in their range, bool is true from one half on; the nearest integers are those of the image.
     """
     dtype = images.dtype
-    count = images.shape[0] if where.grid.shape[0] == 1 else where.grid.shape[0]
+    cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
+    count = images.shape[0] if cameras == 1 else cameras
     images = images.expand(count, -1, -1, -1)
-    if mode == "nearest":
+    if isinstance(where, Sampling) and mode == "nearest":
         where = where._replace(scale=None)
     if not dtype.is_floating_point:
-        images, where = images.detach(), where._replace(grid=where.grid.detach())
-        if mode == "nearest" and dtype.itemsize > 2:
-            return _pick(images, where, padding_mode, fill)
-    where = where._replace(grid=where.grid.to(_wide(dtype)))
-    plain = images.is_cpu and not any(in_graph(t) for t in (images, where.grid)) and not in_transform()
+        images = images.detach()
+        where = where._replace(grid=where.grid.detach()) if isinstance(where, Sampling) else where
+    result = _natively(images, where, mode, padding_mode, fill, out)
+    if result is None:
+        result = _by_torch(images, where, mode, padding_mode, fill, kept)
+        result = result if out is None else out.copy_(result)
+    return result
+
+
+def _natively(
+    images: Tensor,
+    where: Sampling | Lattice,
+    mode: Mode,
+    padding_mode: PaddingMode,
+    fill: tuple[float, ...],
+    out: Tensor | None = None,
+) -> Tensor | None:
+    """What compiled code makes, or None: here is decided whether it does.
+
+    It wants the library, memory of the CPU, no graph and no transform, a dtype that it knows, and no antialiasing.
+    """
+    if torch.compiler.is_compiling():
+        return None
+    positions = where.nodes if isinstance(where, Lattice) else where.grid
+    if not (images.is_cpu and native_available() and sampler.takes(images.dtype, mode)) or in_transform():
+        return None
+    if (isinstance(where, Sampling) and where.scale is not None) or any(map(in_graph, (images, positions))):
+        return None
+    if not (is_concrete(images) and is_concrete(positions)):
+        return None
+    values = fill * images.shape[1] if len(fill) == 1 else fill
+    if isinstance(where, Lattice):
+        result = sampler.empty(images, len(images), where.size) if out is None else out
+        at = where.single
+        sampler.sample(images, result, mode, padding_mode, values, nodes=at.nodes, cells=at.cells, exact=at.exact)
+        return result
+    if positions.dtype not in (torch.float32, torch.float64):
+        return None
+    result = sampler.empty(images, len(images), (positions.shape[1], positions.shape[2])) if out is None else out
+    # in "zeros" positions far outside say that there is none
+    mapped = None if padding_mode == "zeros" else where.mapped
+    sampler.sample(images, result, mode, padding_mode, values, grid=positions, mapped=mapped)
+    return result
+
+
+def _by_torch(
+    images: Tensor,
+    where: Sampling | Lattice,
+    mode: Mode,
+    padding_mode: PaddingMode,
+    fill: tuple[float, ...],
+    kept: dict[int, Pyramid] | None,
+) -> Tensor:
+    """What `grid_sample` makes of B images."""
+    count, dtype = images.shape[0], images.dtype
+    plain = images.is_cpu and not in_graph(images) and not in_transform()
     wide, finite = dtype == _wide(dtype), not dtype.is_floating_point
+    if isinstance(where, Lattice):
+        where = where.pixels
+    if mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
+        return _pick(images, where, padding_mode, fill)
+    where = where._replace(grid=where.grid.to(_wide(dtype)))
+    plain = plain and not in_graph(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
     step = count if wide or not plain else 1 if large else torch.get_num_threads()
     if not large and count <= step:
@@ -76,7 +138,7 @@ def render(
     for i in range(0, count, step):
         part = slice(i, i + step)
         levels = _levels(kept, i, images[part], finite)
-        here = where if len(where.grid) == 1 else where.cameras(part)
+        here = where if where.grid.shape[0] == 1 else where.cameras(part)
         if large:
             _render_tiles(result[part], levels, here, mode, padding_mode, fill)
         else:
@@ -237,6 +299,9 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
 
 def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
     """On a CPU, with work for every thread, of which grid_sample gives one to each image."""
+    where = Sampling(grid[:1] if grid.stride(0) == 0 else grid, images.new_empty(0), None)
+    if padding_mode == "zeros" and (native := _natively(images, where, mode, padding_mode, (0.0,))) is not None:
+        return native
     threads = torch.get_num_threads()
     if len(images) >= threads:
         result = F.grid_sample(images, grid, mode, padding_mode, align_corners=False)

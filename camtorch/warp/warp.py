@@ -15,7 +15,7 @@ from camtorch._tracing import in_graph, in_transform, is_concrete
 from camtorch.camera import Camera
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import compiled
-from camtorch.warp.grid import Sampling, local_scale, tabulate
+from camtorch.warp.grid import Lattice, Sampling, local_scale, on_lattice, tabulate
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -77,7 +77,7 @@ class Warp(GeometryModule):
     source: Camera
     target: Camera
     rotation: Tensor | None
-    _pinned: Sampling | None
+    _pinned: Sampling | Lattice | None
 
     def __init__(
         self,
@@ -149,8 +149,10 @@ class Warp(GeometryModule):
         learns = images.is_floating_point() and self._learns(inputs)
         if self._is_long() and not (learns or in_graph(images)):
             result = images.new_empty(self._count(images), images.shape[1], *self.target._size("Warp"))
-            for rows, part, _ in self._strips(images, None, *sampled):
-                result[:, :, rows] = part
+            kept: dict[int, Pyramid] = {}
+            for rows in self._rows(None):
+                with torch.no_grad():
+                    render(images, self._strip(rows), *sampled, kept, result[:, :, rows.start : rows.stop])
             return result
         return render(images, self._learned() if learns else self._kept(inputs), *sampled)
 
@@ -255,7 +257,8 @@ class Warp(GeometryModule):
                 return torch.cat([self._on_image(self._strip(rows)) for rows in self._rows(None)], 2)
         return self._on_image(self._kept(self._inputs()))
 
-    def _on_image(self, where: Sampling) -> Tensor:
+    def _on_image(self, where: Sampling | Lattice) -> Tensor:
+        where = where.pixels if isinstance(where, Lattice) else where
         grid = where.grid.detach()
         pixels = (grid + 1) * grid.new_tensor(self.source._size("Warp")[::-1]) / 2 - 0.5
         return (where.mapped & self.source.contains(pixels)).unsqueeze(1)
@@ -264,7 +267,8 @@ class Warp(GeometryModule):
 
     def _sampling(self) -> Sampling:
         inputs = self._inputs()
-        return self._learned() if self._learns(inputs) else self._kept(inputs)
+        where = self._learned() if self._learns(inputs) else self._kept(inputs)
+        return where.pixels if isinstance(where, Lattice) else where
 
     def _learns(self, inputs: list[Tensor]) -> bool:
         """Whether there is to be a graph of the grid that is not there yet."""
@@ -274,27 +278,38 @@ class Warp(GeometryModule):
         """With a graph."""
         return self._with_scale(*tabulate(self.source, self.target, self.rotation))
 
-    def _kept(self, inputs: list[Tensor]) -> Sampling:
+    def _kept(self, inputs: list[Tensor]) -> Sampling | Lattice:
         """Without a graph, until something changes; or what is pinned."""
         if self._pinned is not None:
             return self._pinned
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
         options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
-        kept: Sampling = self._memo(inputs, options, self._whole)
+        kept: Sampling | Lattice = self._memo(inputs, options, self._whole)
         return kept
 
-    def _whole(self) -> Sampling:
+    def _whole(self) -> Sampling | Lattice:
         if torch.compiler.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu:
             return self._with_scale(*compiled.positions(self.source, self.target, self.rotation, self.tolerance))
-        return self._with_scale(*tabulate(self.source, self.target, self.rotation, self.tolerance))
+        return self._of_rows(range(self.target._size("Warp")[0]))
 
-    def _strip(self, rows: range) -> Sampling:
+    def _strip(self, rows: range) -> Sampling | Lattice:
         """Of some rows of the target."""
-        around = rows
-        if self.antialias:  # the scale is that between neighbours
-            around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
+        if not self.antialias:
+            return self._of_rows(rows)
+        # the scale is that between neighbours
+        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
         where = self._with_scale(*tabulate(self.source, self.target, self.rotation, self.tolerance, around))
         return where.part(slice(rows.start - around.start, rows.stop - around.start))
+
+    def _of_rows(self, rows: range) -> Sampling | Lattice:
+        """Of some rows, on a lattice if one does."""
+        plain = not in_transform() and is_concrete(self.target.intrinsics)
+        if self.tolerance and plain and self.target.intrinsics.is_cpu and not self.antialias:
+            lattice = on_lattice(self.source, self.target, self.rotation, self.tolerance, rows)
+            if lattice is not None:
+                return lattice
+        tolerance = self.tolerance if self.antialias else 0.0
+        return self._with_scale(*tabulate(self.source, self.target, self.rotation, tolerance, rows))
 
     def _rows(self, count: int | None) -> Iterator[range]:
         height, width = self.target._size("Warp")
@@ -311,7 +326,8 @@ class Warp(GeometryModule):
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
         # what a transform makes dies with it; what inference mode makes could not be used in a graph later
         if not in_transform() and not torch.is_inference_mode_enabled():
-            self._pinned = self._sampling()
+            inputs = self._inputs()
+            self._pinned = self._learned() if self._learns(inputs) else self._kept(inputs)
         return self
 
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
