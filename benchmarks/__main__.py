@@ -13,12 +13,12 @@ try:
     import cv2
     import torch
 
-    from benchmarks import augment, cameras, images, machine, points, scaling
+    from benchmarks import augment, cameras, images, load, machine, points, scaling
     from benchmarks.options import Options, progress
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
 
-SUBJECTS = {"points": points, "images": images, "augment": augment, "scaling": scaling}
+SUBJECTS = {"points": points, "images": images, "augment": augment, "load": load, "scaling": scaling}
 # torch keeps so many compiled versions of one function and then gives up; here every contestant is a version
 _COMPILED_VERSIONS = 64
 
@@ -38,12 +38,13 @@ def main(arguments: list[str] | None = None) -> None:
         device=torch.device(given.device),
         threads=given.threads,
         repeats=given.repeats or (3 if given.quick else 9),
+        seconds=given.seconds,
         compile=given.compile and not given.quick,
         quick=given.quick,
     )
     facts = machine.describe(options.device)
     print(", ".join(f"{name}: {fact}" for name, fact in facts.items()), flush=True)
-    print(f"Medians of {options.repeats} rounds, in which the contestants take turns.", flush=True)
+    print(f"Medians of at most {options.repeats} rounds, in which the contestants take turns.", flush=True)
     results = {}
     start = time.perf_counter()
     for name in SUBJECTS if given.subject == "all" else (given.subject,):
@@ -76,6 +77,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
     parser.add_argument("--threads", type=_positive, default=2, help="of torch and of OpenCV (default: 2)")
     parser.add_argument("--repeats", type=_positive, metavar="R", help="rounds that medians are taken of (default: 9)")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="for the rounds of one operation: slow contestants take fewer, three at least (default: 1)",
+    )
     parser.add_argument(
         "--no-compile",
         dest="compile",

@@ -3,47 +3,106 @@
 The error is the largest difference, in grey levels, to `grid_sample` in float64 with positions from a float64 camera,
 over the pixels whose interpolation stays inside the image. The images are noise, whose neighbours differ by up
 to 255: an error of a position of 0.01 px shows as some 2 grey levels. Results in uint8 are up to 0.5 off by rounding.
+
+What is required is judged by the fastest rounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
-import cv2
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 import camtorch as ct
-from benchmarks.image_peers import CACHED, CLONE, FRESH, GRID_SAMPLE, OPERATIONS, Task, contestants
+from benchmarks import footprint
+from benchmarks.image_peers import (
+    CACHED,
+    CLONE,
+    DEFAULT_TOLERANCE,
+    DELTACAMERA,
+    FRESH,
+    GRID_SAMPLE,
+    LATTICE,
+    OPENCV_MAPS,
+    OPERATIONS,
+    Task,
+    as_tensor,
+    contestants,
+)
 from benchmarks.options import Options, progress
-from benchmarks.point_peers import OPENCV, OURS
+from benchmarks.point_peers import KORNIA, OURS
 from benchmarks.tables import Record, only, relative, table
-from benchmarks.timing import Run, measure
+from benchmarks.timing import measure, threads
+from benchmarks.verdict import Requirement, figures, times_faster, verdict
 
 MODELS = ("kannala_brandt", "brown_conrady")
-SIZES = ((1, (480, 640)), (8, (480, 640)), (1, (720, 1280)), (8, (720, 1280)), (1, (2160, 3840)))
-QUICK_SIZES = ((1, (240, 320)), (8, (240, 320)))
-THREADS_SIZE = (720, 1280)
-_DTYPES = (torch.float32, torch.uint8)
+SMALL, LARGE, QUICK = (480, 640), (720, 1280), (120, 160)
+WITHIN = OURS if DEFAULT_TOLERANCE == 0.01 else LATTICE  # whose positions are off by a hundredth of a pixel at most
+_ONE_THREAD = ", 1 thread"
+_LEARNING = ((1, 3, LARGE), (8, 3, SMALL), (8, 3, QUICK))  # whose gradients are timed
+_JUDGED = 2  # images of a batch whose errors are looked at
 
 
 def run(options: Options) -> tuple[list[Record], list[str]]:
     """Measure; the records and the tables."""
-    keys = options.chosen(MODELS)
-    sizes = QUICK_SIZES if options.quick else SIZES
-    tasks = [Task(key, *size, dtype, options.device) for key in keys for size in sizes for dtype in _DTYPES]
-    records = [record for task in tasks for record in _task(task, options)]
+    found = [task for key in options.chosen(MODELS) for task in tasks(key, options)]
+    records = [record for task in found for record in _task(task, options)]
+    records += footprint.measured(found, options)
     seconds = only(records, "seconds")
-    every = _with(options.threads)
-    threads = [r for key in keys for r in _threads(key, options)]
+    title = f"Images: milliseconds on {options.threads} threads, where not on one (times camtorch)"
     tables = [
-        table("Images: milliseconds (times camtorch)", seconds, scale=1e3, beside=OURS),
+        table(title, seconds, scale=1e3, beside=OURS),
         table("Images: time in clones of the images", relative(seconds, CLONE)),
         table("Images: largest difference to float64, in grey levels", only(records, "error")),
-        table(f"Images: milliseconds by threads (times {every})", only(threads, "seconds"), scale=1e3, beside=every),
+        table("Images: memory at the peak of a warp, in sizes of its result", only(records, "peak")),
+        verdict(requirements(records)),
     ]
-    return records + threads, tables
+    return records, tables
+
+
+def tasks(key: str, options: Options) -> list[Task]:
+    """What is measured of a model."""
+    full, byte = torch.float32, torch.uint8
+    if options.quick:
+        asked = [(1, 3, QUICK, full, False), (8, 3, QUICK, full, False), (8, 1, QUICK, byte, False)]
+        asked += [(1, 3, QUICK, byte, True)]
+    else:
+        asked = [(batch, 3, LARGE, dtype, False) for batch in (1, 8) for dtype in (full, byte)]
+        asked += [(batch, 3, LARGE, byte, True) for batch in (1, 8)]
+        asked += [(8, 1, SMALL, byte, False), (8, 3, SMALL, byte, False), (8, 3, SMALL, full, False)]
+    return [Task(key, *shape, dtype, options.device, last) for *shape, dtype, last in asked]
+
+
+def requirements(records: Sequence[Record]) -> list[Requirement]:
+    """What has to hold of the times and of the memory."""
+    rows = figures(records, "fastest")
+    cached, fresh = (
+        {row: times for row, times in rows.items() if row[1].startswith(operation)} for operation in (CACHED, FRESH)
+    )
+    large = {row: times for row, times in cached.items() if " 8x" in row[0] and "x720x1280 float32" in row[0]}
+    byte = {row: times for row, times in cached.items() if "uint8" in row[0]}
+    found = []
+    for who in dict.fromkeys((OURS, WITHIN)):
+        found += [
+            Requirement(f"{who}: 8 float32, cached map: 1.5 times OpenCV", 1.5, times_faster(large, who, OPENCV_MAPS)),
+            Requirement(f"{who}: the same: 2.5 times grid_sample", 2.5, times_faster(large, who, [GRID_SAMPLE])),
+            Requirement(f"{who}: uint8, cached map: 1.25 times OpenCV", 1.25, times_faster(byte, who, OPENCV_MAPS)),
+        ]
+    for key, bound in (("brown_conrady", 2.0), ("kannala_brandt", 8.0)):
+        ours = {row: times for row, times in fresh.items() if row[0].startswith(key)}
+        text = f"{WITHIN}: {key}, fresh maps: {bound:g} times OpenCV"
+        found.append(Requirement(text, bound, times_faster(ours, WITHIN, OPENCV_MAPS)))
+    for peer in (OPENCV_MAPS, [KORNIA], [DELTACAMERA]):
+        ratios = {
+            **times_faster(cached, OURS, peer),
+            **times_faster(fresh, WITHIN, peer),
+        }
+        found.append(Requirement(f"every row: no slower than {peer[0].split(',')[0]}", 1.0, ratios))
+    peaks = {f"{r.case}, {r.operation}": r.value for r in only(records, "peak") if r.contestant in (OURS, WITHIN)}
+    return [*found, Requirement("memory of a warp: at most 1.1 times the result", 1.1, peaks, at_most=True)]
 
 
 def _task(task: Task, options: Options) -> Iterator[Record]:
@@ -53,20 +112,26 @@ def _task(task: Task, options: Options) -> Iterator[Record]:
     timed = []
     for operation in OPERATIONS:
         runs = {who: operations[operation] for who, operations in everyone.items() if operation in operations}
-        timed += measure(task.name, operation, runs, options)
+        if operation in (CACHED, FRESH):
+            timed += measure(task.name, operation, runs, options)
+            if options.threads > 1 and options.device.type == "cpu":
+                with threads(1):
+                    timed += measure(task.name, operation + _ONE_THREAD, runs, options)
+        elif (task.batch, task.channels, task.size) in _LEARNING:
+            timed += measure(task.name, operation, runs, options)
     order = list(everyone)
     yield from sorted(timed, key=lambda record: order.index(record.contestant))
     truths = {CACHED: ct.Warp(task.camera(dtype=torch.float64), _double(task.dewarp.target))}
-    truths[FRESH] = task.fresh(dtype=torch.float64)
+    first = replace(task, batch=min(task.batch, _JUDGED))
+    truths[FRESH] = first.fresh(dtype=torch.float64)
     for operation, warp in truths.items():
-        truth, inside = _truth(task.images, warp)
+        truth, inside = _truth(task.images[: first.batch], warp)
         for who, operations in everyone.items():
             if operation not in operations or who == CLONE:
                 continue
             progress(f"{task.name}, {operation}: errors of {who}")
-            result = operations[operation]()
-            if isinstance(result, Tensor):  # arrays are of OpenCV, whose result as a tensor has been judged
-                yield Record(task.name, who, operation, "error", (result - truth).abs()[inside].max().item())
+            result = as_tensor(operations[operation]())[: len(truth)]
+            yield Record(task.name, who, operation, "error", (result - truth).abs()[inside].max().item())
 
 
 def _double(camera: ct.Camera) -> ct.Camera:
@@ -89,37 +154,3 @@ def _truth(images: Tensor, warp: ct.Warp) -> tuple[Tensor, Tensor]:
         grid = grid.expand(len(images), *grid.shape[-3:])
         truth = F.grid_sample(images.double(), grid, align_corners=True)
     return truth, inside.expand(len(images), *inside.shape[-2:]).unsqueeze(1).expand_as(truth)
-
-
-def _threads(key: str, options: Options) -> Iterator[Record]:
-    """A single image on one thread and on all: who leaves cores idle? Nothing to ask on one thread or on a GPU."""
-    if options.threads == 1 or options.device.type != "cpu":
-        return
-    task = Task(key, 1, QUICK_SIZES[0][1] if options.quick else THREADS_SIZE, torch.float32, options.device)
-    everyone = contestants(task)
-    for who in (OURS, OPENCV, GRID_SAMPLE):
-        for operation, call in everyone[who].items():
-            runs = {_with(count): _on(count, call) for count in (1, options.threads)}
-            try:
-                yield from measure(f"{task.name} {who}", operation, runs, options)
-            finally:
-                _set_threads(options.threads)
-
-
-def _with(count: int) -> str:
-    return f"{count} thread{'s' * (count > 1)}"
-
-
-def _on(count: int, call: Run) -> Run:
-    """The call on so many threads; to set them takes microseconds."""
-
-    def run():
-        _set_threads(count)
-        return call()
-
-    return run
-
-
-def _set_threads(count: int) -> None:
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import platform
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import cv2
 import torch
 
 import camtorch
+from camtorch.native import library
 
 
 def describe(device: torch.device) -> dict[str, str | int]:
@@ -23,12 +24,21 @@ def describe(device: torch.device) -> dict[str, str | int]:
         "python": platform.python_version(),
         "torch": torch.__version__,
         "camtorch": camtorch.__version__,
+        "native sampler": library.state(),
         "kornia": version("kornia"),
         "OpenCV": cv2.__version__,
+        "deltacamera": _version("deltacamera"),
     }
     if device.type == "cuda":
         facts["gpu"] = torch.cuda.get_device_name(device)
     return facts
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def _cpu() -> str:

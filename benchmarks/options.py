@@ -18,6 +18,7 @@ class Options:
         device: where tensors live. OpenCV always works on the CPU.
         threads: for torch and OpenCV.
         repeats: rounds of which the median is taken.
+        seconds: for the rounds of one operation; slow contestants take fewer.
         compile: whether `torch.compile` competes.
         quick: small inputs, to see that everything works.
     """
@@ -27,6 +28,7 @@ class Options:
     device: torch.device
     threads: int
     repeats: int
+    seconds: float
     compile: bool
     quick: bool
 

@@ -1,0 +1,168 @@
+"""The benchmarks measure everyone in turns, judge what is required, and leave no busy process behind."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.busy import Busy
+from benchmarks.options import Options
+from benchmarks.tables import Record
+from benchmarks.timing import measure, threads
+from benchmarks.verdict import Requirement, figures, times_faster, verdict
+
+ROOT = Path(__file__).resolve().parents[1]
+OPTIONS = Options(
+    size=100,
+    models=(),
+    device=torch.device("cpu"),
+    threads=1,
+    repeats=7,
+    seconds=0.0,
+    compile=False,
+    quick=True,
+)
+linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in Linux's /proc")
+
+
+@pytest.mark.parametrize(
+    "subject",
+    [
+        "images",
+        "augment",
+        *(pytest.param(subject, marks=pytest.mark.slow) for subject in ("points", "load", "scaling")),
+    ],
+)
+def test_a_quick_run_measures_everyone_and_writes_every_figure(subject, tmp_path):
+    path = tmp_path / "figures.json"
+    command = [sys.executable, "-m", "benchmarks", subject, "--quick", "--threads", "1", "--repeats", "1"]
+    command += ["--seconds", "0", "--model", "kannala_brandt", "--json", str(path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "failed" not in done.stderr
+    assert ("### What is required" in done.stdout) == (subject not in ("points", "scaling"))
+    figures = json.loads(path.read_text())["results"][subject]
+    times = [figure["value"] for figure in figures if figure["quantity"] == "seconds"]
+    assert times
+    assert all(math.isfinite(value) and value > 0 for value in times)
+    assert {"camtorch", "OpenCV, float map" if subject == "images" else "OpenCV"} <= {f["contestant"] for f in figures}
+
+
+def test_slow_contestants_take_fewer_rounds_and_those_that_fail_are_left_out(capsys):
+    calls = {"quick": 0, "slow": 0}
+
+    def count(name, seconds):
+        calls[name] += 1
+        time.sleep(seconds)
+
+    def fail():
+        raise RuntimeError("no such thing")
+
+    runs = {"quick": lambda: count("quick", 2.5e-3), "slow": lambda: count("slow", 0.1), "fails": fail}
+    records = measure("case", "operation", runs, replace(OPTIONS, seconds=0.2))
+    assert calls == {"quick": 2 + 7, "slow": 2 + 3}  # two calls before the rounds
+    assert "fails failed: RuntimeError: ['no such thing']" in capsys.readouterr().err
+    by_name = {(r.contestant, r.quantity): r.value for r in records}
+    assert {who for who, _ in by_name} == {"quick", "slow"}
+    assert by_name["slow", "seconds"] >= by_name["slow", "fastest"] >= 0.1
+
+
+def test_threads_are_as_before_after_an_error():
+    before = torch.get_num_threads()
+
+    def fail():
+        with threads(before + 1):
+            assert torch.get_num_threads() == before + 1
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert torch.get_num_threads() == before
+
+
+def test_the_verdict_names_the_worst_row():
+    least = Requirement("at least 2", 2.0, {"a": 3.0, "b": 1.5, "c": 2.0})
+    most = Requirement("at most 2", 2.0, {"a": 3.0, "b": 2.5, "c": 2.0}, at_most=True)
+    unknown = Requirement("at most 1", 1.0, {"a": 0.5, "b": math.nan}, at_most=True)
+    assert (least.worst, most.worst, unknown.worst[0]) == (("b", 1.5), ("a", 3.0), "b")
+    lines = verdict([least, most, unknown, Requirement("of nothing", 1.0, {})]).splitlines()
+    judgements = [line.split("|")[-2].strip() for line in lines if line.startswith("| at")]
+    assert judgements == ["NOT in 1", "NOT in 2", "NOT in 1"]
+    assert "of nothing" not in "\n".join(lines)
+    assert verdict([Requirement("holds", 2.0, {"a": 2.0})]).splitlines()[-1].endswith("ok |")
+
+
+def test_times_faster_is_beside_the_fastest_of_the_others():
+    records = [Record("case", who, "op", "fastest", value) for who, value in (("us", 2.0), ("a", 6.0), ("b", 3.0))]
+    records.append(Record("case", "us", "other", "fastest", 1.0))
+    assert times_faster(figures(records, "fastest"), "us", ["a", "b"]) == {"case, op": 1.5}
+
+
+@linux
+def test_busy_processes_spin_when_told_and_are_gone_after_an_error():
+    ids = []
+
+    def fail():
+        with Busy(2) as busy:
+            ids.extend(busy.ids)
+            busy.spin(1)
+            before = [_seconds(pid) for pid in ids]
+            time.sleep(1.0)
+            spun = [_seconds(pid) - start for pid, start in zip(ids, before, strict=True)]
+            assert spun[0] > 0.1
+            assert spun[1] < 0.05
+            busy.spin(0)
+            resting = _seconds(ids[0])
+            time.sleep(0.3)
+            assert _seconds(ids[0]) - resting < 0.05
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert len(ids) == 2
+    assert not any(map(_runs, ids))
+
+
+@linux
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_busy_processes_end_with_whoever_started_them(ending):
+    code = """
+import time
+from benchmarks.busy import Busy
+with Busy(2) as busy:
+    busy.spin(1)
+    print(*busy.ids, flush=True)
+    time.sleep(60)
+"""
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as it:
+        ids = [int(pid) for pid in it.stdout.readline().split()]
+        assert len(ids) == 2
+        assert all(map(_runs, ids))
+        os.kill(it.pid, ending)
+        it.wait(30)
+    end = time.monotonic() + 10
+    while any(map(_runs, ids)) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not any(map(_runs, ids))
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def _seconds(pid: int) -> float:
+    """Of the processor's time."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
