@@ -12,7 +12,7 @@ import pytest
 import camtorch as ct
 from camtorch.native import build as building
 from camtorch.native import library
-from camtorch.native.build import LIBRARY, BuildError, build
+from camtorch.native.build import LIBRARY, REASON, BuildError, build
 
 ROOT = Path(__file__).parent.parent
 COMPILER = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), None)
@@ -181,7 +181,7 @@ def test_where_none_was_built_version_says_why(tmp_path):
     folder = copy(tmp_path)
     assert python(tmp_path, "-c", ASK) == "False"
     assert "native sampler: not built (" in python(tmp_path, "-m", "camtorch", "--version")
-    (folder / library.REASON).write_text("the compiler was on holiday\n")
+    (folder / REASON).write_text("the compiler was on holiday\n")
     assert "native sampler: not built (the compiler was on holiday)" in python(tmp_path, "-m", "camtorch", "--version")
 
 

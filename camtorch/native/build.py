@@ -26,6 +26,9 @@ _SUFFIX = {"win32": "dll", "darwin": "dylib"}.get(sys.platform, "so")
 # two dots in its name: what walks a package's modules would take _sampler.so for one, and import it
 LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
 
+# where installation says in one line why it built no library
+REASON = "_sampler.reason.txt"
+
 _FLAGS = ["-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden"]
 _FLAGS += ["-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
 _AVX2 = ("-mavx2", "-mfma", "-mf16c", "-mbmi2")

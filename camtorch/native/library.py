@@ -8,13 +8,10 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from camtorch.native.build import LIBRARY, switched_off
+from camtorch.native.build import LIBRARY, REASON, switched_off
 
 # of dispatch.c's functions and structs; both numbers change when a caller of them has to
 ABI = 1
-
-# where installation says in one line why it built no library
-REASON = "_sampler.reason.txt"
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"

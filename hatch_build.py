@@ -1,0 +1,75 @@
+"""What hatchling does for a wheel beside copying files: it compiles the sampler, if there is a C compiler.
+
+Where there is none, or it fails, the wheel is pure Python and holds the reason, which `camtorch --version` tells:
+installers show what a build says only when asked to (`pip install -v`). scikit-build-core can do the same, and brings
+CMake to a library of two files.
+"""
+
+import importlib.util
+import os
+import platform
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+
+class NativeSampler(BuildHookInterface):
+    """Puts the library into a wheel, or for an editable install beside its sources."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Compile, and say what else the wheel holds and what it runs on."""
+        native = Path(self.root, "camtorch", "native")
+        building = _module(native / "build.py")
+        # as an attribute: it is there until the wheel is written, and gone after
+        self.folder = tempfile.TemporaryDirectory()
+        folder = native if version == "editable" else Path(self.folder.name)
+        library, reason = folder / building.LIBRARY, folder / building.REASON
+        try:
+            if building.switched_off():
+                raise building.BuildError("CAMTORCH_NATIVE=0 when it was installed")
+            building.build(folder)
+            reason.unlink(missing_ok=True)
+        except (building.BuildError, OSError) as error:
+            why = _line(str(error))
+            self.app.display_warning(f"camtorch is installed without its native sampler: {why}")
+            library.unlink(missing_ok=True)
+            reason.write_text(why + "\n", "utf-8")
+        if version == "editable":  # a path and nothing else
+            return
+        held = library if library.exists() else reason
+        build_data["force_include"][str(held)] = f"camtorch/native/{held.name}"
+        if held == library:
+            build_data["pure_python"] = False
+            build_data["tag"] = f"py3-none-{_platform()}"
+
+
+def _module(path: Path) -> ModuleType:
+    """The module in this file; its package may not be importable here, and needs no import."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _line(text: str) -> str:
+    """The one that says most."""
+    lines = text.strip().splitlines()
+    return next((line for line in lines if "error" in line), lines[0])
+
+
+def _platform() -> str:
+    """As wheels name it. A library for Linux fits where the C library is no older, which auditwheel looks into."""
+    if sys.platform != "darwin":
+        return sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    # a universal Python compiles for the machine that it runs on; from macOS 11 on names have no minor version
+    target = os.environ.get("MACOSX_DEPLOYMENT_TARGET") or str(sysconfig.get_config_var("MACOSX_DEPLOYMENT_TARGET"))
+    major, minor = (int(part) for part in f"{target}.0".split(".")[:2])
+    major, minor = (max(major, 11), 0) if major > 10 or platform.machine() == "arm64" else (major, minor)
+    return f"macosx_{major}_{minor}_{platform.machine()}"
