@@ -82,7 +82,7 @@ class Change:
             moves = self.gate.to(target.intrinsics.device).unsqueeze(-1)
             intrinsics = torch.where(moves, target.intrinsics, source.intrinsics)
             distortion = torch.where(moves, target.distortion, source.distortion)
-            return camera_like(target, intrinsics, distortion, target.image_size)
+            return remade(target, intrinsics, distortion, target.image_size)
         return self._cameras(after)
 
     def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
@@ -267,19 +267,35 @@ def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Any) -> An
 
 def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same model with these numbers; nothing in it learns that is not part of a graph already."""
-    held = [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in (intrinsics, distortion)]
+    held = _held(intrinsics, distortion)
     model: type[Camera] = type_before_parametrizations(camera)
     return model(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
 
 
+def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
+    """`camera_like` of numbers that need no check: those of another camera, or what was made of them here."""
+    if torch.compiler.is_compiling():  # which follows a constructor, and nothing that does without
+        return camera_like(camera, intrinsics, distortion, image_size)
+    if not distortion.shape[-1]:
+        distortion = intrinsics[..., :0]
+    intrinsics, distortion = _held(intrinsics, distortion)
+    made = camera.with_tensors(intrinsics=intrinsics, distortion=distortion)
+    made.image_size = image_size
+    return made
+
+
+def _held(*numbers: Tensor) -> list[Tensor]:
+    return [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in numbers]
+
+
 def numbers_by(camera: Camera, change: Callable[[Tensor], Tensor]) -> Camera:
     """The camera with its intrinsics and its distortion changed, each by the same function."""
-    return camera_like(camera, change(camera.intrinsics), change(camera.distortion), camera.image_size)
+    return remade(camera, change(camera.intrinsics), change(camera.distortion), camera.image_size)
 
 
 def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same numbers that does not learn."""
-    return camera_like(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
+    return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
 
 
 def copied(camera: Camera) -> Camera:
@@ -326,7 +342,7 @@ def singles(camera: Camera) -> list[Camera]:
         t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)
     )
     rows = range(camera.batch_shape[0])
-    return [camera_like(camera, intrinsics[i], distortion[i], camera.image_size) for i in rows]
+    return [remade(camera, intrinsics[i], distortion[i], camera.image_size) for i in rows]
 
 
 def joined(cameras: Sequence[Camera], order: Tensor | None = None) -> Camera:
@@ -337,4 +353,4 @@ def joined(cameras: Sequence[Camera], order: Tensor | None = None) -> Camera:
         return whole if order is None else whole[order]
 
     intrinsics, distortion = together([c.intrinsics for c in cameras]), together([c.distortion for c in cameras])
-    return camera_like(cameras[0], intrinsics, distortion, cameras[0].image_size)
+    return remade(cameras[0], intrinsics, distortion, cameras[0].image_size)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
-from camtorch.augment.change import camera_like, frozen, size_of
+from camtorch.augment.change import frozen, remade, size_of
 from camtorch.camera import Camera, from_values
 from camtorch.rotations import rotation_matrix, rotation_vector
 from camtorch.warp.warp import Warp, along_edges
@@ -47,7 +47,7 @@ def scaled(camera: Camera, factor: Tensor) -> Camera:
     """The camera with focal lengths times a factor (*B,)."""
     one = torch.ones_like(factor)
     scale = torch.stack((factor, factor, one, one), -1)
-    return camera_like(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
+    return remade(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
 
 
 def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:

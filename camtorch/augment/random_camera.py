@@ -12,14 +12,16 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._module import Memo, same
-from camtorch._tracing import is_concrete
+from camtorch._tracing import in_graph, is_concrete
 from camtorch.augment.augmentation import Augmentation, as_range
-from camtorch.augment.change import camera_like, frozen, numbers_by, size_of
+from camtorch.augment.change import frozen, numbers_by, remade, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera, from_values
 from camtorch.models import MODELS
+from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.rays import field_of_view, image_lattice
+from camtorch.projection.unproject import shown
 from camtorch.rotations import mount_rotation
 from camtorch.warp.warp import Warp, along_edges
 
@@ -30,7 +32,7 @@ DRAWN = 16
 """How many coefficients have a draw of their own; more take turns."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
 _STEP = 1e-4
-_HALVINGS = 4
+_PARTS = -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step that is too long, in the order in which they are tried
 _SIDE = 9
 _EDGE_SAMPLES = 32
 _AZIMUTHS = 128
@@ -149,33 +151,47 @@ class RandomCamera(Augmentation):
     def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
         base = source if self.like is None else self.like
         size = self.image_size or size_of(source)
-        dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
-        base = numbers_by(base, lambda t: t.to(source.intrinsics.device, dtype))
-        intrinsics = usual = self._from_source(source, base, size) if self.fov == "source" else None
-        if intrinsics is None or usual is None:
-            middle = base.intrinsics.new_tensor(self.ranges["fov"].middle) if "fov" in values else None
-            intrinsics, usual = (_sized(base, size, fov) for fov in (values.get("fov"), middle))
+        dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
+        if any(t.dtype != dtype or t.device != device for t in (base.intrinsics, base.distortion)):
+            base = numbers_by(base, lambda t: t.to(device, dtype))
+        jitters = "distortion" in values and base.distortion.shape[-1] > 0
+        if self.fov == "source":
+            intrinsics = usual = self._from_source(source, base, size)
+        else:
+            intrinsics = _sized(base, size, values.get("fov"))
+            usual = self._usual(base, size) if jitters else intrinsics
         fx, fy, cx, cy = intrinsics.unbind(-1)
         for name in ("focal", "zoom"):
             if name in values:
                 fx, fy = fx * values[name], fy * values[name]
         if "centre" in values:
             cx, cy = cx + values["centre"][..., 0] * size[1], cy + values["centre"][..., 1] * size[0]
-        intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
-        target = camera_like(base, intrinsics, base.distortion, size)
-        if "distortion" in values and base.distortion.shape[-1]:
-            step = jittered(frozen(target, size), values["distortion"], usual) - base.distortion.detach()
-            target = camera_like(base, intrinsics, base.distortion + step, size)
+        distortion = base.distortion
+        if jitters:
+            intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
+            distortion = jittered(frozen(remade(base, intrinsics, distortion, size), size), values["distortion"], usual)
+            if in_graph(base.distortion):
+                distortion = base.distortion + (distortion - base.distortion.detach())
         if "crop" in values:
-            target = _cropped(target, values["crop"], values["place"])
-        return target
+            fx, fy, cx, cy = _cropped(fx, fy, cx, cy, size, values["crop"], values["place"])
+        return remade(base, torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1), distortion, size)
+
+    def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
+        """(*B, 4): intrinsics of the lens before anything was drawn; graph-free."""
+
+        def made() -> Tensor:
+            fov = base.intrinsics.new_tensor(self.ranges["fov"].middle) if "fov" in self.ranges else None
+            return _sized(base, size, fov).detach()
+
+        kept: Tensor = self._memo((base.intrinsics, base.distortion), (type(base), base.image_size, size), made)
+        return kept
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens at most as wide as its like and as images of the source fill all of."""
 
         def narrowed() -> Tensor:
             fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
-            whole = camera_like(base, _sized(base, size, fov), base.distortion, size)
+            whole = remade(base, _sized(base, size, fov), base.distortion, size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
         numbers = source.intrinsics, source.distortion, base.intrinsics, base.distortion
@@ -273,20 +289,20 @@ def _plane_width(base: Camera, fov: Tensor) -> Tensor:
     half = torch.deg2rad(fov) / 2
     right = torch.stack((half.sin(), torch.zeros_like(half), half.cos()), -1)
     rays = torch.stack((right * right.new_tensor([-1.0, 1.0, 1.0]), right), -2)
-    plane = camera_like(base, right.new_tensor([1.0, 1.0, 0.0, 0.0]), base.distortion, None)
+    plane = remade(base, right.new_tensor([1.0, 1.0, 0.0, 0.0]), base.distortion, None)
     ends, valid = plane.project(rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3))))
     if is_concrete(valid) and not bool(valid.all()):
         raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
     return ends[..., 1, 0] - ends[..., 0, 0]
 
 
-def _cropped(camera: Camera, share: Tensor, place: Tensor) -> Camera:
-    """The camera of a part of the image, `share` (*B,) of each side at `place` (*B, 2), enlarged to the full size."""
-    height, width = size_of(camera)
-    fx, fy, cx, cy = camera.intrinsics.unbind(-1)
+def _cropped(
+    fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor, size: tuple[int, int], share: Tensor, place: Tensor
+) -> tuple[Tensor, ...]:
+    """Intrinsics of a part of the image, `share` (*B,) of each side at `place` (*B, 2), enlarged to the full size."""
+    height, width = size
     left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
-    cx, cy = (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
-    return camera_like(camera, torch.stack((fx / share, fy / share, cx, cy), -1), camera.distortion, camera.image_size)
+    return fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
 
 
 def _light(camera: Camera, loss: Tensor) -> Tensor:
@@ -325,32 +341,33 @@ def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
 
 
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
-    base = camera.distortion.expand(*camera.batch_shape, -1)
-    count = base.shape[-1]
+    batch, count = amounts.shape[:-1], camera.distortion.shape[-1]
     if count == 0:
-        return base.expand(*amounts.shape[:-1], 0)
-    columns = torch.arange(count, device=amounts.device) % DRAWN
-    odd = camera.odd_in_x | camera.odd_in_y
-    lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=amounts.device)
-    share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
-    usual = camera_like(camera, nominal.detach(), camera.distortion.detach(), camera.image_size)
-    step = amounts[..., columns] * share * _kept(_sensitivity, usual, nominal, camera.distortion).to(amounts)
-    rim = _rim(camera)
-    unseen = ~camera.unproject(rim)[1]
-    # nothing is asked for there, and pixels without a ray are dear
-    rim = torch.where(unseen.unsqueeze(-1), camera.intrinsics[..., None, 2:], rim)
-    result = base.expand_as(step)
-    left = torch.ones(step.shape[:-1], dtype=torch.bool, device=step.device)
-    for part in (sign / 2**halving for halving in range(_HALVINGS) for sign in (1, -1)):
-        candidate, defined = _defined(camera, base + part * step, base)
-        lens = camera_like(camera, camera.intrinsics.expand(*step.shape[:-1], 4), candidate, camera.image_size)
-        seen = lens.unproject(rim.expand(*lens.batch_shape, *rim.shape[-2:]))[1]
-        invertible = (seen | unseen).all(-1) & defined
-        result = torch.where((left & invertible).unsqueeze(-1), candidate, result)
-        left = left & ~invertible
-        if not bool(left.any()):
-            break
-    return result
+        return camera.distortion.expand(*batch, 0)
+    amounts = amounts.reshape(-1, DRAWN)
+    if count != DRAWN:
+        amounts = amounts[:, :count] if count < DRAWN else amounts[:, torch.arange(count) % DRAWN]
+    steps = amounts * _kept(_sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
+    given = camera.distortion.reshape(-1, count)
+    p, q = (w.expand(len(steps), -1) for w in _rim(camera))
+    own = domain_of(camera._model, given, camera.optics)
+    seen = shown(own, *(w.reshape(len(given), -1) for w in (p, q))).view_as(p)
+    # nothing is asked for where the old lens shows nothing
+    p, q = torch.where(seen, p, 0.0), torch.where(seen, q, 0.0)
+    given = given.expand_as(steps)
+    candidate, defined = _defined(camera, given + steps, given)
+    fits = defined & shown(domain_of(camera._model, candidate, camera.optics), p, q).all(-1)
+    result = torch.where(fits.unsqueeze(-1), candidate, given)
+    (left,) = (~fits).nonzero(as_tuple=True)
+    if len(left):  # all that may come next at once: (parts, lenses left, n)
+        given, parts = given[left].expand(len(_PARTS), -1, -1), steps.new_tensor(_PARTS)[:, None, None]
+        candidate, defined = _defined(camera, given + parts * steps[left], given)
+        lenses = Domain(camera.optics, candidate.flatten(0, 1))
+        fits = shown(lenses, *(w[left].repeat(len(_PARTS), 1) for w in (p, q))).all(-1).view_as(defined) & defined
+        first = fits.to(torch.uint8).argmax(0)
+        found = candidate[first, torch.arange(len(left), device=left.device)]
+        result[left] = torch.where(fits.any(0).unsqueeze(-1), found, given[0])
+    return result.view(*batch, count)
 
 
 @torch.library.custom_op("camtorch::jittered", mutates_args=())
@@ -371,24 +388,32 @@ _KEPT = 8
 _known: list[tuple[tuple[object, ...], tuple[Tensor, ...], Tensor]] = []
 
 
-def _kept(measure: Callable[[Camera], Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
-    """`measure(camera)`, which depends on these tensors. The last results are kept: mostly the lens is the same one."""
+def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
+    """`measure(camera, *inputs)`, of which these tensors are all that counts. The last results are kept: mostly the
+    lens is the same one.
+    """
     options = (measure, type(camera), camera.image_size)
     for known_options, known_inputs, result in _known:
         if known_options == options and all(map(same, known_inputs, inputs)):
             return result
-    result = measure(camera)
+    result = measure(camera, *inputs)
     _known.insert(0, (options, tuple(t.detach().clone() for t in inputs), result))
     del _known[_KEPT:]
     return result
 
 
-def _sensitivity(camera: Camera) -> Tensor:
-    """(*B, n): by how much to change a coefficient to move the rim by the distance from the centre to the corner."""
+def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
+    """(*B, n): by how much to change a coefficient for an amount of 1, with these coefficients and intrinsics.
+
+    That moves the rim by its share of the distance from the centre to the corner.
+    """
+    camera = remade(camera, nominal.detach().double(), distortion.detach().double(), camera.image_size)
     pixels = image_lattice(camera, _SIDE, _SIDE).flatten(0, 1)
-    camera = numbers_by(camera, torch.Tensor.double)
     batch, count = camera.batch_shape, camera.distortion.shape[-1]
-    rays, seen = camera.unproject(pixels.double().expand(*batch, *pixels.shape))
+    odd = camera.odd_in_x | camera.odd_in_y
+    lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=pixels.device)
+    share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
+    rays, seen = camera.unproject(pixels.expand(*batch, *pixels.shape))
     rays = rays.unsqueeze(-3).expand(*batch, count, *pixels.shape[:-1], 3)
     ends = []
     for sign in (-1, 1):
@@ -396,13 +421,13 @@ def _sensitivity(camera: Camera) -> Tensor:
         given = camera.distortion.expand(*batch, count).unsqueeze(-2)
         distortion, _ = _defined(camera, given + change, given)
         intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, count, 4)
-        ends.append(camera_like(camera, intrinsics, distortion, camera.image_size).project(rays))
+        ends.append(remade(camera, intrinsics, distortion, camera.image_size).project(rays))
     (before, valid), (after, also) = ends
     moved = (after - before).norm(dim=-1) / (2 * _STEP)
     most = torch.where(valid & also & seen.unsqueeze(-2), moved, 0.0).amax(-1)
     height, width = size_of(camera)
     corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
-    return torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
+    return share * torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
 
 
 def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor]:
@@ -413,24 +438,29 @@ def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Ten
     return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
 
 
-def _rim(camera: Camera) -> Tensor:
-    """(*B, N, 2): the outline of what the lens shows of the image: of both, the image's edges and where the lens ends.
+def _rim(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Planes (C, N) of points of the sensor in focal lengths: the outline of what the lens shows of the image.
 
-    What is mapped has no holes: a lens that is invertible on the outline is so inside.
+    Of both: the image's edges, and where the lens ends. What is mapped has no holes: a lens that is invertible on the
+    outline is so inside.
     """
     height, width = size_of(camera)
     corners = camera.intrinsics.new_tensor([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-    edges = along_edges(corners, _EDGE_SAMPLES)
-    ends = _kept(_ends, camera, camera.distortion)
-    ends = ends.to(edges) * camera.intrinsics[..., None, :2] + camera.intrinsics[..., None, 2:]
-    inside = camera.contains(ends)
-    return torch.cat((edges.expand(*ends.shape[:-2], -1, -1), torch.where(inside.unsqueeze(-1), ends, edges[0])), -2)
+    intrinsics = camera.intrinsics.reshape(-1, 1, 4)
+    focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
+    edges = (along_edges(corners, _EDGE_SAMPLES) - centre) / focal
+    ends = _kept(_ends, camera, camera.distortion).to(edges).reshape(-1, _AZIMUTHS, 2)
+    inside = camera.contains(ends * focal + centre)
+    ends = torch.where(inside.unsqueeze(-1), ends, edges[:, :1])
+    count = max(len(ends), len(edges))
+    rim = torch.cat([w.expand(count, -1, -1) for w in (edges, ends)], 1)
+    return rim[..., 0], rim[..., 1]
 
 
-def _ends(camera: Camera) -> Tensor:
-    """(*B, K, 2): on the plane of unit focal length, the last point along every azimuth that the lens maps."""
-    ones = camera.distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
-    plane = camera_like(camera, ones, camera.distortion.detach().double(), None)
+def _ends(camera: Camera, distortion: Tensor) -> Tensor:
+    """(*B, K, 2): in focal lengths, the last point along every azimuth that the lens of these coefficients maps."""
+    ones = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
+    plane = remade(camera, ones, distortion.detach().double(), None)
     azimuth = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1, None]
     share = torch.linspace(0, 1, _ANGLES + 1, dtype=torch.float64, device=ones.device)
     low, width = share.new_zeros(()), math.pi

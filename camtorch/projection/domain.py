@@ -85,6 +85,14 @@ class Domain:
         return Azimuths(self.optics, self.k) if self.whole is None else self.whole.azimuths
 
     @_per_camera
+    def edge2(self) -> Tensor:
+        """(C, 1): the squared radius to which the radial factor of the first stage sends its fold, the furthest."""
+        _, lens = self.optics(columns(precise(self.k)))
+        assert lens.radial is not None
+        edge = self._fold * lens.radial(self._fold * self._fold)
+        return (edge * edge).to(self.k.dtype)
+
+    @_per_camera
     def circle2(self) -> Tensor:
         """(C, 1): the squared radius of a circle of the image beyond which there is nothing, infinite where unknown.
 
@@ -95,9 +103,8 @@ class Domain:
             return self.k.new_full((len(self.k), 1), torch.inf)
         k = precise(self.k)
         _, lens = self.optics(columns(k))
-        assert lens.radial is not None
         assert lens.rest is not None
-        edge = self._fold * lens.radial(self._fold * self._fold)
+        edge = self.edge2.to(k.dtype).sqrt()
         steps = torch.linspace(0, _WIDER, _BRIEF, dtype=k.dtype, device=k.device)
         least, furthest = lens.rest.lower_bound(edge * steps)
         # what changes less from radius to radius than it is large has no zero in between
@@ -183,8 +190,10 @@ class Domain:
         if self.looks > _LOOKS or "inner2" in self.__dict__ or (radial is not None and radial.fold is not None):
             return None
         radii = furthest2.sqrt() * torch.linspace(0, 1, _BRIEF, dtype=self.k.dtype, device=self.k.device)
-        radial_only = radial is not None and self.lens.is_radial
-        least = radial.orientation(radii) if radial_only else self.lens.lower_bound(radii)[0]
+        if radial is not None and self.lens.is_radial:
+            least = radial.orientation(radii)
+        else:
+            least, _ = self.lens.lower_bound(radii)
         certain = least.amin(-1) - least.diff(dim=-1).abs().amax(-1)
         end = self.chart.usual_end(self.k.dtype)
         certain = torch.minimum(certain.unsqueeze(-1), end - 1.01 * radii[..., -1:])
@@ -220,13 +229,16 @@ _domains: list[tuple[str, Tensor, Domain]] = []
 
 
 def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
-    """The domain of these values: one of the last ones, or a new one."""
-    for name, values, domain in _domains:
+    """The domain of these values: one of the last ones that were asked for, or a new one."""
+    global _domains
+    known = _domains
+    for i, (name, values, domain) in enumerate(known):
         if name == model and same(values, k):
+            if i:  # a list of its own: another thread may be looking at this one
+                _domains = [known[i], *known[:i], *known[i + 1 :]]
             return domain
     with torch.inference_mode(False), torch.no_grad():
         values = k.detach().clone()
         domain = Domain(optics, values)
-    _domains.insert(0, (model, values, domain))
-    del _domains[_KEPT:]
+    _domains = [(model, values, domain), *known[: _KEPT - 1]]
     return domain

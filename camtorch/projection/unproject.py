@@ -85,17 +85,22 @@ def _invert_staged(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
 
     Pixels beyond the image of every ray are never solved for.
     """
-    rest = domain.lens.rest
-    assert rest is not None
-    within = domain.circle2 - torch.addcmul(u * u, v, v)
-    mask = to_mask(within, looks)
-    u, v = replace(mask, u, 0.0, looks), replace(mask, v, 0.0, looks)
-    sent = _newton(rest, u, v, *rest.start(u, v), looks, near=True)
+    sent, within = _sent(domain, u, v, looks)
     found = _invert_radial(domain, sent.a, sent.b, looks)
     known = sent.solved > 0
     possible = torch.minimum(torch.where(known, found.possible, 1.0), within)
     solved = torch.where(known, torch.minimum(found.solved, within), -1.0)
     return found._replace(solved=solved, possible=possible)
+
+
+def _sent(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> tuple[Found, Tensor]:
+    """Where the first stage has to send what later ones send to (u, v); and positive within the circle of the image."""
+    rest = domain.lens.rest
+    assert rest is not None
+    within = domain.circle2 - torch.addcmul(u * u, v, v)
+    mask = to_mask(within, looks)
+    u, v = replace(mask, u, 0.0, looks), replace(mask, v, 0.0, looks)
+    return _newton(rest, u, v, *rest.start(u, v), looks, near=True), within
 
 
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
@@ -150,6 +155,29 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool,
                 break
     assert settled is not None  # there are more steps than those before the first look
     return Found(a, b, torch.minimum(settled, reciprocal.abs()), torch.ones_like(a))
+
+
+def shown(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
+    """Bool (C, N): whether points of the sensor in focal lengths, planes, have a ray; see `Unproject`.
+
+    Without that ray, and where the fold alone tells without the table to find it by. It looks at values.
+    """
+    if not domain.lens.stages:
+        return domain.chart.on_plane(p, q) > 0
+    within, known = torch.ones_like(p), True
+    if domain.all_staged:
+        sent, within = _sent(domain, p, q, True)
+        known = bool(sent.solved.amin() > 0)
+        p, q = (sent.a, sent.b) if known else (p, q)
+    if domain.lens.is_radial or (domain.all_staged and known):
+        most2 = domain.edge2 * (1 + 8 * torch.finfo(p.dtype).eps)
+        return (torch.addcmul(p * p, q, q) <= most2) & (within > 0)
+    found = invert(domain, p, q, True)
+    has_ray = found.solved > 0
+    camera, point = (~has_ray & (found.possible > 0)).nonzero(as_tuple=True)
+    if len(camera):
+        has_ray[camera, point] = search(domain, camera, p[camera, point], q[camera, point])[2]
+    return has_ray
 
 
 def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
