@@ -9,6 +9,8 @@ from torch.autograd import forward_ad
 FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE
 """The key of a FakeTensorMode among the modes that are under way."""
 
+_DENSE = torch._C._dispatch_keys(torch.empty(0, device="cpu"))
+
 
 def has_tangent(tensor: Tensor) -> bool:
     """Whether forward-mode derivatives pass through the tensor."""
@@ -42,6 +44,20 @@ def _is_fake(tensor: Tensor) -> bool:
         return True
     # not imported for its name alone: that takes a third of a second
     return type(tensor) is not Tensor and type(tensor).__name__ == "FakeTensor"
+
+
+def in_memory(tensor: Tensor) -> bool:
+    """Whether the values are what lies in the CPU's memory at `data_ptr`: of no subclass that has them elsewhere.
+
+    Nor are they to be negated first, or compressed, or zero by declaration.
+    """
+    mine: int = (torch._C._dispatch_keys(tensor) | _DENSE).raw_repr()
+    return mine == _DENSE.raw_repr()
+
+
+def is_recorded() -> bool:
+    """Whether torch's operators are recorded, or a mode changes what they do: what goes past them would be lost."""
+    return torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack() > 0
 
 
 def may_look(tensor: Tensor) -> bool:

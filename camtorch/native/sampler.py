@@ -128,7 +128,7 @@ def sample(
     job.count, job.channels, job.height, job.width = count, channels, height, width
     job.source_height, job.source_width = images.shape[-2:]
     elements = _elements(fill, images.dtype)
-    values = torch.tensor(fill, dtype=torch.float32)
+    values = torch.tensor(fill, dtype=torch.float32, device="cpu")
     job.fill, job.fill_elements = values.data_ptr(), elements.data_ptr()
     if grid is not None:
         job.grid, job.grid_is_double = grid.data_ptr(), grid.dtype == torch.float64
@@ -157,11 +157,11 @@ def _shared(tensor: Tensor) -> int:
 def _elements(fill: Sequence[float], dtype: torch.dtype) -> Tensor:
     """The values as pixels, (C,): rounded and in range, true from one half on."""
     if dtype == torch.bool:
-        return torch.tensor([value >= 0.5 for value in fill])
+        return torch.tensor([value >= 0.5 for value in fill], device="cpu")
     if not dtype.is_floating_point:
         low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
         fill = [min(max(round(value), low), high) for value in fill]
-    return torch.tensor(fill, dtype=dtype)
+    return torch.tensor(fill, dtype=dtype, device="cpu")
 
 
 def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
@@ -169,7 +169,7 @@ def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
     channels = images.shape[1]
     last = channels > 1 and images.stride(1) == 1 and images.stride(3) == channels
     layout = torch.channels_last if last else torch.contiguous_format
-    result = torch.empty(count, channels, *size, dtype=images.dtype, memory_format=layout)
+    result = torch.empty(count, channels, *size, dtype=images.dtype, device="cpu", memory_format=layout)
     native = library()
     if native is not None and result.nbytes >= _HUGE:
         # small pages, each new to the process, would take as long as all else
@@ -195,8 +195,8 @@ def classify(
     if native is None:
         return None
     rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
-    cells = torch.empty(len(nodes), rows, columns, dtype=torch.int32)
-    scratch = torch.empty(10 * (columns + 8), dtype=torch.float32)
+    cells = torch.empty(len(nodes), rows, columns, dtype=torch.int32, device="cpu")
+    scratch = torch.empty(10 * (columns + 8), dtype=torch.float32, device="cpu")
     given = _Classification(
         nodes.data_ptr(),
         nodes.stride()[:2],

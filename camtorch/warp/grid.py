@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._tracing import in_transform, is_concrete, may_look
+from camtorch._tracing import in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
 from camtorch.rotations import turn
@@ -215,7 +215,9 @@ def on_lattice(
     at_nodes, mapped_nodes = (t[:, 0].split(counts, 1)[0].unflatten(1, (n + 5, m + 5)) for t in (positions, mapped))
     lattice, rim = at_nodes.movedim(-1, 1), mapped[:, 0].split(counts, 1)[1]
     size = source._size("Warp")
-    cells = classify(lattice.float(), mapped_nodes, rim, (height, width), size, tolerance)
+    single, cells = lattice.float(), None
+    if in_memory(single) and not is_recorded():
+        cells = classify(single, mapped_nodes, rim, (height, width), size, tolerance)
     if cells is None:
         cells = _classified(lattice, mapped_nodes, rim, (height, width), size, tolerance)
     todo = cells == TODO
@@ -245,7 +247,7 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
     """
     parts, count = [like.new_empty(2, 0, _STEP, _STEP)], 0
     done, places = torch.zeros_like(todo), cells.flatten(1)
-    offset = torch.arange(_STEP, dtype=like.dtype)
+    offset = torch.arange(_STEP, dtype=like.dtype, device=like.device)
     while bool(todo.any()):
         # as many cells of every camera as the one with the most has: more of them computed does no harm
         most = int(todo.sum((1, 2)).max())
@@ -257,7 +259,7 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
         positions, known = exact(pixels.flatten(2, 3))
         part = torch.where(known, positions.movedim(-1, 0), torch.nan)
         parts.append(part.flatten(1, 2).unflatten(-1, (_STEP, _STEP)))
-        place = torch.arange(count, count + chosen.numel(), dtype=cells.dtype).view_as(chosen)
+        place = torch.arange(count, count + chosen.numel(), dtype=cells.dtype, device=cells.device).view_as(chosen)
         places.scatter_(1, chosen, torch.where(wanted, place, places.gather(1, chosen)))
         count += chosen.numel()
         done |= todo
@@ -286,7 +288,7 @@ def _classified(
     sampled = ((high + reach > -1) & (low - reach < 1)).all(1)
     todo = some & (~every | (sampled & (torch.hypot(*missed.unbind(1)) > tolerance)))
     # where a pixel at the rim says that nodes do not tell all
-    v, u = (torch.arange(side) // _STEP for side in size)
+    v, u = (torch.arange(side, device=nodes.device) // _STEP for side in size)
     top, left = torch.zeros_like(u), torch.zeros_like(v)
     i, j = torch.cat((top, top + v[-1], v, v)), torch.cat((u, u, left, left + u[-1]))
     camera, pixel = (rim != some[:, i, j]).nonzero(as_tuple=True)

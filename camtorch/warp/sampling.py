@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._tracing import in_graph, in_transform, is_concrete, may_look
+from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.warp.grid import Lattice, Sampling
@@ -85,16 +85,15 @@ def _natively(
 ) -> Tensor | None:
     """What compiled code makes, or None: here is decided whether it does.
 
-    It wants the library, memory of the CPU, no graph and no transform, a dtype that it knows, and no antialiasing.
+    It wants the library, memory of the CPU, no graph and no transform, nobody who records what torch does, a dtype that
+    it knows, and no antialiasing.
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or is_recorded() or in_transform():
         return None
     positions = where.nodes if isinstance(where, Lattice) else where.grid
-    if not (images.is_cpu and native_available() and sampler.takes(images.dtype, mode)) or in_transform():
+    if not (native_available() and sampler.takes(images.dtype, mode) and all(map(in_memory, (images, positions)))):
         return None
     if (isinstance(where, Sampling) and where.scale is not None) or any(map(in_graph, (images, positions))):
-        return None
-    if not (is_concrete(images) and is_concrete(positions)):
         return None
     values = fill * images.shape[1] if len(fill) == 1 else fill
     if isinstance(where, Lattice):
