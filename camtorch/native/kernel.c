@@ -441,10 +441,16 @@ INLINE V8 window_bytes(const uint8_t *plane, const Window *window, V8 v) {
 
 #endif
 
-INLINE void offsets_of(const Job *job, const Squares *at, int64_t *offsets) {
+/* Where eight pixels lie in memory, from the first one of the image on, in elements */
+INLINE void offsets_of(const Job *job, I8 x, I8 y, int64_t *offsets) {
+    const int64_t down = job->source_strides[2], across = job->source_strides[3];
     int i;
-    for (i = 0; i < STEP; i++)
-        offsets[i] = (int64_t)at->y[i] * job->source_strides[2] + (int64_t)at->x[i] * job->source_strides[3];
+    if (down * job->source_height + across * job->source_width < INT32_MAX) {
+        const I8 at = y * (int32_t)down + x * (int32_t)across;
+        for (i = 0; i < STEP; i++) offsets[i] = at[i];
+    } else {
+        for (i = 0; i < STEP; i++) offsets[i] = y[i] * down + x[i] * across;
+    }
 }
 
 INLINE void bilinear_planes(const Span *span, Squares at, int type) {
@@ -464,7 +470,7 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
         return;
     }
 #endif
-    offsets_of(job, &at, offsets);
+    offsets_of(job, at.x, at.y, offsets);
     for (c = 0; c < job->channels; c++, plane += from, result += to) {
         Pairs upper, lower;
         V8 value;
@@ -508,7 +514,7 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
     const int64_t right = channels * bytes, below = job->source_strides[2] * bytes;
     float values[STEP * MOST_INTERLEAVED + 4];
     int64_t offsets[STEP], i, n = span->pixels * channels;
-    offsets_of(job, &at, offsets);
+    offsets_of(job, at.x, at.y, offsets);
 #if defined(__AVX2__)
     if (type == UINT8) {
         /* two pixels at a time: their channels' pairs of neighbours, as 16 bits each */
@@ -588,7 +594,7 @@ INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
     int64_t offsets[STEP], c;
     float across[STEP][4], down[STEP][4];
     int i;
-    offsets_of(job, &at, offsets);
+    offsets_of(job, at.x, at.y, offsets);
     for (i = 0; i < STEP; i++) {
         cubic_weights(at.u[i], across[i]);
         cubic_weights(at.v[i], down[i]);
@@ -616,8 +622,7 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
     const Job *job = span->job;
     const I8 x = rounded8(u), y = rounded8(v);
     int64_t offsets[STEP], c, i;
-    for (i = 0; i < STEP; i++)
-        offsets[i] = (int64_t)y[i] * job->source_strides[2] + (int64_t)x[i] * job->source_strides[3];
+    offsets_of(job, x, y, offsets);
     for (c = 0; c < job->channels; c++) {
         const char *plane = span->source + c * job->source_strides[1] * size_of(type);
         char *result = span->result + c * job->result_strides[1] * size_of(type);
@@ -729,6 +734,235 @@ INLINE V8 between(const float *line) {
 #endif
 }
 
+/* -- sixteen pixels at a time, whose neighbours are picked out of whole registers */
+
+#if defined(__AVX512VBMI__) && defined(__AVX512VL__) && defined(__AVX512BW__) && defined(__AVX512DQ__)
+#define WIDE 1
+
+typedef struct {
+    __m512 u, v;
+} Wide;
+
+/* Squares that begin within a few rows and columns */
+typedef struct {
+    __m512i x, y; /* columns and rows from the first one on */
+    int64_t column, row;
+    __mmask16 second, third; /* which begin in the second row or below it, and in the third */
+} WideWindow;
+
+INLINE int32_t first_of(__m512i x) { return _mm_cvtsi128_si32(_mm512_castsi512_si128(x)); }
+INLINE int32_t last_of(__m512i x) { return _mm_extract_epi32(_mm512_extracti32x4_epi32(x, 3), 3); }
+
+INLINE int window_of_sixteen(__m512i x, __m512i y, int32_t columns, int32_t rows, WideWindow *window) {
+    const int32_t x0 = first_of(x), x15 = last_of(x), y0 = first_of(y), y15 = last_of(y);
+    window->column = x0 < x15 ? x0 : x15;
+    window->row = y0 < y15 ? y0 : y15;
+    window->x = _mm512_sub_epi32(x, _mm512_set1_epi32((int32_t)window->column));
+    window->y = _mm512_sub_epi32(y, _mm512_set1_epi32((int32_t)window->row));
+    window->second = _mm512_cmpgt_epi32_mask(window->y, _mm512_setzero_si512());
+    window->third = _mm512_cmpgt_epi32_mask(window->y, _mm512_set1_epi32(1));
+    /* as unsigned numbers, so not negative either */
+    return (_mm512_cmplt_epu32_mask(window->x, _mm512_set1_epi32(columns)) &
+            _mm512_cmplt_epu32_mask(window->y, _mm512_set1_epi32(rows))) == 0xffff;
+}
+
+/* Bytes of a row, of which `left` are the row's */
+INLINE __m512i row64(const char *from, int64_t left) {
+    if (left >= 64) return _mm512_loadu_si512(from);
+    return _mm512_maskz_loadu_epi8(((__mmask64)1 << left) - 1, from);
+}
+
+INLINE __m256i row32(const char *from, int64_t left) {
+    if (left >= 32) return _mm256_loadu_si256((const __m256i *)from);
+    return _mm256_maskz_loadu_epi8(((__mmask32)1 << left) - 1, from);
+}
+
+/* Four rows of 32 bytes, the last one of the image again where there are fewer */
+typedef struct {
+    __m512i upper, lower;
+} Rows;
+
+INLINE Rows rows_of(const Job *job, const char *plane, const WideWindow *window) {
+    const int64_t below = job->source_strides[2], left = job->source_width - window->column;
+    const int64_t more = job->source_height - 1 - window->row;
+    const char *from = plane + window->row * below + window->column;
+    Rows rows;
+    rows.upper = _mm512_inserti64x4(_mm512_castsi256_si512(row32(from, left)), row32(from + (more > 0 ? 1 : more) * below, left), 1);
+    rows.lower = _mm512_inserti64x4(_mm512_castsi256_si512(row32(from + (more > 1 ? 2 : more) * below, left)),
+                                    row32(from + (more > 2 ? 3 : more) * below, left), 1);
+    return rows;
+}
+
+#define NEIGHBOURS 0x5555555555555555u /* of 16 bits the lower byte each */
+
+/* Parts of the right neighbour, and of the left one below it, in 2^-14 */
+INLINE __m512i byte_weights(__m512 u) {
+    const __m512i right = _mm512_cvtps_epi32(_mm512_mul_ps(u, _mm512_set1_ps(16384)));
+    return _mm512_or_si512(_mm512_sub_epi32(_mm512_set1_epi32(16384), right), _mm512_slli_epi32(right, 16));
+}
+
+INLINE __m512i blended_bytes(__m512i upper, __m512i lower, __m512i weights, __m512 v) {
+    const __m512 above = _mm512_cvtepi32_ps(_mm512_madd_epi16(upper, weights));
+    const __m512 under = _mm512_cvtepi32_ps(_mm512_madd_epi16(lower, weights));
+    const __m512 down = _mm512_mul_ps(v, _mm512_set1_ps(1.0f / 16384)), up = _mm512_sub_ps(_mm512_set1_ps(1.0f / 16384), down);
+    return _mm512_cvtps_epi32(_mm512_fmadd_ps(above, up, _mm512_mul_ps(under, down)));
+}
+
+INLINE void bytes_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v, int rows) {
+    const Job *job = span->job;
+    const int64_t below = job->source_strides[2], left = job->source_width - window->column;
+    const char *from = span->source + window->row * below + window->column;
+    const __m512i weights = byte_weights(u);
+    const __m512i pick = _mm512_add_epi32(_mm512_or_si512(window->x, _mm512_slli_epi32(window->x, 16)), _mm512_set1_epi32(1 << 16));
+    int64_t c;
+#define ROW(k) _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, _mm512_castsi256_si512(row32(from + k * below, left)))
+    for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
+        __m512i upper = ROW(0), lower = ROW(1);
+        if (rows > 2) {
+            const __m512i third = ROW(2);
+            upper = _mm512_mask_mov_epi32(upper, window->second, lower);
+            lower = _mm512_mask_mov_epi32(lower, window->second, third);
+            if (rows > 3) {
+                upper = _mm512_mask_mov_epi32(upper, window->third, third);
+                lower = _mm512_mask_mov_epi32(lower, window->third, ROW(3));
+            }
+        }
+        _mm_storeu_si128((__m128i *)(span->result + c * job->result_strides[1]),
+                         _mm512_cvtepi32_epi8(blended_bytes(upper, lower, weights, v)));
+    }
+#undef ROW
+}
+
+/* Three channels next to each other */
+INLINE void colours_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v) {
+    const Job *job = span->job;
+    const int64_t below = job->source_strides[2], left = 3 * (job->source_width - window->column);
+    const char *from = span->source + window->row * below + 3 * window->column;
+    const __m512i weights = byte_weights(u), two = _mm512_add_epi32(window->x, window->x);
+    const __m512i at = _mm512_or_si512(_mm512_add_epi32(window->x, two), _mm512_slli_epi32(window->y, 6));
+    __m512i pick = _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(3 << 16));
+    const __m512i first = row64(from, left), second = row64(from + below, left);
+    const __m512i third = window->row + 2 < job->source_height ? row64(from + 2 * below, left) : second;
+    __m512i packed = _mm512_setzero_si512();
+    int c;
+    for (c = 0; c < 3; c++) {
+        const __m512i value = blended_bytes(_mm512_maskz_permutex2var_epi8(NEIGHBOURS, first, pick, second),
+                                            _mm512_maskz_permutex2var_epi8(NEIGHBOURS, second, pick, third), weights, v);
+        packed = _mm512_or_si512(packed, _mm512_sll_epi32(value, _mm_cvtsi32_si128(8 * c)));
+        pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
+    }
+    const __m512i dense = _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a,
+                                            0x24222120, 0x29282625, 0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0);
+    _mm512_mask_storeu_epi32(span->result, 0x0fff, _mm512_permutexvar_epi8(dense, packed));
+}
+
+INLINE void floats_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v, int rows) {
+    const Job *job = span->job;
+    const int64_t below = job->source_strides[2];
+    const float *from = (const float *)span->source + window->row * below + window->column;
+    const __m512 other_u = _mm512_sub_ps(_mm512_set1_ps(1), u), other_v = _mm512_sub_ps(_mm512_set1_ps(1), v);
+    const __m512i left = window->x, right = _mm512_add_epi32(left, _mm512_set1_epi32(1));
+    int64_t c;
+#define ROW(k)                                                                                                         \
+    const __m512 low##k = _mm512_loadu_ps(from + k * below), high##k = _mm512_loadu_ps(from + k * below + 16);         \
+    const __m512 row##k = _mm512_fmadd_ps(_mm512_permutex2var_ps(low##k, left, high##k), other_u,                      \
+                                          _mm512_mul_ps(_mm512_permutex2var_ps(low##k, right, high##k), u))
+    for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
+        ROW(0);
+        ROW(1);
+        __m512 above = row0, under = row1;
+        if (rows > 2) {
+            ROW(2);
+            above = _mm512_mask_mov_ps(above, window->second, row1);
+            under = _mm512_mask_mov_ps(under, window->second, row2);
+            if (rows > 3) {
+                ROW(3);
+                above = _mm512_mask_mov_ps(above, window->third, row2);
+                under = _mm512_mask_mov_ps(under, window->third, row3);
+            }
+        }
+        _mm512_storeu_ps((float *)span->result + c * job->result_strides[1],
+                         _mm512_fmadd_ps(above, other_v, _mm512_mul_ps(under, v)));
+    }
+#undef ROW
+}
+
+INLINE void nearest_of_sixteen(const Span *span, const WideWindow *window) {
+    const Job *job = span->job;
+    const __m512i at = _mm512_or_si512(window->x, _mm512_slli_epi32(window->y, 5));
+    int64_t c;
+    for (c = 0; c < job->channels; c++) {
+        const Rows rows = rows_of(job, span->source + c * job->source_strides[1], window);
+        _mm_storeu_si128((__m128i *)(span->result + c * job->result_strides[1]),
+                         _mm512_cvtepi32_epi8(_mm512_permutex2var_epi8(rows.upper, at, rows.lower)));
+    }
+}
+
+#define BY_ROWS(make)                                                                                                  \
+    if (!window.second) make(span, &window, u, v, 2);                                                                  \
+    else if (!window.third) make(span, &window, u, v, 3);                                                              \
+    else make(span, &window, u, v, 4)
+
+/* Whether there is such a way, and the pixels are made */
+INLINE int sixteen(const Span *span, Wide at, int type, int mode, int layout) {
+    const Job *job = span->job;
+    const __m512 zero = _mm512_setzero_ps();
+    const __m512 last_u = _mm512_set1_ps((float)(job->source_width - 1)), last_v = _mm512_set1_ps((float)(job->source_height - 1));
+    WideWindow window;
+    if ((_mm512_cmp_ps_mask(at.u, zero, _CMP_GE_OQ) & _mm512_cmp_ps_mask(at.u, last_u, _CMP_LE_OQ) &
+         _mm512_cmp_ps_mask(at.v, zero, _CMP_GE_OQ) & _mm512_cmp_ps_mask(at.v, last_v, _CMP_LE_OQ)) != 0xffff)
+        return 0;
+    if (mode == NEAREST) {
+        if (!window_of_sixteen(_mm512_cvtps_epi32(at.u), _mm512_cvtps_epi32(at.v), 32, 4, &window)) return 0;
+        nearest_of_sixteen(span, &window);
+        return 1;
+    }
+    const __m512i x = _mm512_min_epi32(_mm512_cvttps_epi32(at.u), _mm512_set1_epi32((int32_t)job->source_width - 2));
+    const __m512i y = _mm512_min_epi32(_mm512_cvttps_epi32(at.v), _mm512_set1_epi32((int32_t)job->source_height - 2));
+    const __m512 u = _mm512_sub_ps(at.u, _mm512_cvtepi32_ps(x)), v = _mm512_sub_ps(at.v, _mm512_cvtepi32_ps(y));
+    if (type == FLOAT32) {
+        if (!window_of_sixteen(x, y, 31, 3, &window) || window.column + 32 > job->source_width) return 0;
+        BY_ROWS(floats_of_sixteen);
+        return 1;
+    }
+    if (layout == INTERLEAVED) {
+        if (!window_of_sixteen(x, y, 20, 2, &window)) return 0;
+        colours_of_sixteen(span, &window, u, v);
+        return 1;
+    }
+    if (!window_of_sixteen(x, y, 31, 3, &window)) return 0;
+    BY_ROWS(bytes_of_sixteen);
+    return 1;
+}
+
+/* Whether `sixteen` knows a way for images of this kind */
+INLINE int is_wide(const Job *job, int type, int mode, int layout) {
+    if (job->source_width < 2 || job->source_height < 2) return 0;
+    if (mode == NEAREST) return type == BYTES1 && job->source_strides[3] == 1 && job->result_strides[3] == 1;
+    return mode == BILINEAR && ((type == UINT8 && (layout == PLANES || (layout == INTERLEAVED && job->channels == 3))) ||
+                                (type == FLOAT32 && layout == PLANES));
+}
+
+/* Sixteen pixels between neighbouring nodes */
+INLINE __m512 between_wide(const float *line) {
+    const __m512 nodes = _mm512_castps256_ps512(_mm256_loadu_ps(line));
+    __m512 sum = _mm512_setzero_ps();
+#define ADDED(k)                                                                                                       \
+    sum = _mm512_fmadd_ps(_mm512_broadcast_f32x8(_mm256_loadu_ps(WEIGHTS[k])),                                         \
+                          _mm512_permutexvar_ps(_mm512_setr_epi32(k, k, k, k, k, k, k, k, k + 1, k + 1, k + 1, k + 1,  \
+                                                                  k + 1, k + 1, k + 1, k + 1), nodes), sum)
+    ADDED(0);
+    ADDED(1);
+    ADDED(2);
+    ADDED(3);
+#undef ADDED
+    return sum;
+}
+
+#else
+#define WIDE 0
+#endif
+
 /* A row of the target on the lattice: the lines through its columns of nodes, and its cells */
 typedef struct {
     const float *nodes;
@@ -810,6 +1044,9 @@ INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout)
     const int64_t step = STEP * job->result_strides[3] * size_of(type), columns = (job->width + STEP - 1) / STEP;
     LatticeRow lattice;
     int64_t j;
+#if WIDE
+    const int wide = is_wide(job, type, mode, layout);
+#endif
     if (job->nodes) begin_row(job, b, y, &lattice);
     for (j = 0; j < columns; j++, span.result += step) {
         const int64_t left = job->width - j * STEP;
@@ -818,6 +1055,17 @@ INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout)
         if (job->nodes) {
             const int32_t cell = lattice.cells[j];
             if (j % CHUNK == 0) lay_chunk(job, &lattice, j);
+#if WIDE
+            if (wide && cell == CELL_CUBIC && left >= 2 * STEP && lattice.cells[j + 1] == CELL_CUBIC && (j + 1) % CHUNK) {
+                const float *lines = lattice.lines[0] + j % CHUNK;
+                const Wide at = {between_wide(lines), between_wide(lines + CHUNK + 8)};
+                if (sixteen(&span, at, type, mode, layout)) {
+                    span.result += step;
+                    j++;
+                    continue;
+                }
+            }
+#endif
             if (cell == CELL_EMPTY) {
                 show_nothing(&span, type);
                 continue;
@@ -833,6 +1081,19 @@ INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout)
         } else {
             Positions at;
             read_grid(job, b, y, j * STEP, left, &at);
+#if WIDE
+            if (wide && left >= 2 * STEP) {
+                Positions next;
+                read_grid(job, b, y, (j + 1) * STEP, left - STEP, &next);
+                const Wide both = {_mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(at.u)), _mm256_loadu_ps(next.u), 1),
+                                   _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(at.v)), _mm256_loadu_ps(next.v), 1)};
+                if (sixteen(&span, both, type, mode, layout)) {
+                    span.result += step;
+                    j++;
+                    continue;
+                }
+            }
+#endif
             u = load8(at.u), v = load8(at.v);
         }
         eight(&span, u, v, type, mode, layout);
