@@ -201,14 +201,15 @@ def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> 
             f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}, which has its channels first: "
             "np.moveaxis(image, 0, -1) puts them last"
         )
-    return _tensor(np.moveaxis(array, -1, 0) if len(shape) == 3 else array[None])[None]
+    tensor = _tensor(array)
+    return (tensor.permute(2, 0, 1) if len(shape) == 3 else tensor[None])[None]
 
 
 def as_array(image: Tensor, like: Array) -> Array:
-    """An image (C, H, W) in the layout and the dtype of an array."""
-    array = image.detach().cpu().numpy()
-    array = np.ascontiguousarray(np.moveaxis(array, 0, -1)) if like.ndim == 3 else array[0]
-    return array.astype(like.dtype, copy=False)
+    """An image (C, H, W) in the layout and the dtype of an array; of channels that come last in memory, without a copy."""
+    image = image.detach().cpu()
+    array = (image.permute(1, 2, 0).contiguous() if like.ndim == 3 else image[0]).numpy()
+    return np.ascontiguousarray(array, like.dtype)
 
 
 def _checked(name: str, value: object) -> Array:
@@ -218,8 +219,24 @@ def _checked(name: str, value: object) -> Array:
     return value
 
 
+class _Lent:
+    """The memory of a read-only array, as what may be written to: torch warns of all else, which it would only read."""
+
+    def __init__(self, array: Array):
+        self.array = array  # whose memory lasts as long as this
+        interface = array.__array_interface__
+        self.__array_interface__ = {**interface, "data": (interface["data"][0], False)}
+
+
 def _tensor(array: Array) -> Tensor:
-    # torch takes neither other byte orders nor negative strides, nor long doubles, and warns of read-only arrays
-    dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64
-    array = np.ascontiguousarray(array, dtype)
-    return torch.from_numpy(array if array.flags.writeable else array.copy())
+    """A tensor in the memory of an array, where torch can read it there; for reading alone."""
+    # torch takes neither other byte orders nor long doubles, nor strides that are negative or end within a number
+    dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.dtype(np.float64)
+    whole = array.flags.aligned and all(step % array.itemsize == 0 for step in array.strides)
+    backwards = [axis for axis, step in enumerate(array.strides) if step < 0]
+    turns = array.dtype.kind != "u" or array.itemsize == 1  # torch turns no wide unsigned integers round
+    if array.dtype != dtype or not whole or (backwards and not turns):
+        return torch.from_numpy(np.array(array, dtype, order="C"))
+    array = np.flip(array, backwards) if backwards else array
+    tensor = torch.from_numpy(array if array.flags.writeable else np.asarray(_Lent(array)))
+    return tensor.flip(backwards) if backwards else tensor
