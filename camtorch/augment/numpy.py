@@ -206,7 +206,7 @@ def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> 
 
 
 def as_array(image: Tensor, like: Array) -> Array:
-    """An image (C, H, W) in the layout and the dtype of an array; of channels that come last in memory, without a copy."""
+    """An image (C, H, W) in the layout and the dtype of an array: itself, if its channels come last in memory too."""
     image = image.detach().cpu()
     array = (image.permute(1, 2, 0).contiguous() if like.ndim == 3 else image[0]).numpy()
     return np.ascontiguousarray(array, like.dtype)

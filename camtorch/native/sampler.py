@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Sequence
 from ctypes import byref, c_double, c_int32, c_int64, c_void_p
 
@@ -20,6 +21,7 @@ _PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
 _TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
 _BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
+_WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
 _HUGE = 1 << 22  # bytes of a result from which on it is asked for in large pages
 
 
@@ -121,6 +123,14 @@ def sample(
     native = library()
     if native is None or not result.numel():
         return
+    if _is_slow(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
+        planes = torch.empty(result.shape, dtype=result.dtype)
+        source = images if images.stride(0) else images[:1]  # which all results show
+        source = source.contiguous().expand(images.shape)
+        where = {"grid": grid, "mapped": mapped, "nodes": nodes, "cells": cells, "exact": exact}
+        sample(source, planes, mode, padding, fill, **where)
+        result.copy_(planes)
+        return
     job = _Job()
     count, channels, height, width = result.shape
     job.source, job.source_strides = images.data_ptr(), images.stride()
@@ -149,6 +159,13 @@ def sample(
     spread(lambda: native.camtorch_sample(pointer), min(torch.get_num_threads(), tiles))
 
 
+def _is_slow(images: Tensor, result: Tensor, mode: str) -> bool:
+    """Whether pixels lie so that they are interpolated one by one: in no planes, nor three or four together."""
+    strides, channels = {images.stride()[1::2], result.stride()[1::2]}, images.shape[1]
+    together = mode == "bilinear" and channels in (3, 4) and strides == {(1, channels)}
+    return mode != "nearest" and not together and {across for _, across in strides} != {1}
+
+
 def _shared(tensor: Tensor) -> int:
     """The stride from one image's part to the next: none where there is one for all."""
     return 0 if tensor.shape[0] == 1 else tensor.stride(0)
@@ -164,12 +181,15 @@ def _elements(fill: Sequence[float], dtype: torch.dtype) -> Tensor:
     return torch.tensor(fill, dtype=dtype, device="cpu")
 
 
+def layout(images: Tensor) -> torch.memory_format:
+    """How images (B, C, H, W) lie in memory: their channels last, or plane by plane."""
+    last = images.shape[1] > 1 and 0 < images.stride(1) < images.stride(3)
+    return torch.channels_last if last else torch.contiguous_format
+
+
 def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
-    """(count, C, *size) of the dtype of images (_, C, H, W) and with the channels last in memory if they have them."""
-    channels = images.shape[1]
-    last = channels > 1 and images.stride(1) == 1 and images.stride(3) == channels
-    layout = torch.channels_last if last else torch.contiguous_format
-    result = torch.empty(count, channels, *size, dtype=images.dtype, device="cpu", memory_format=layout)
+    """(count, C, *size) of the dtype of images (_, C, H, W), and with the channels last in memory if they have them."""
+    result = torch.empty(count, images.shape[1], *size, dtype=images.dtype, memory_format=layout(images))
     native = library()
     if native is not None and result.nbytes >= _HUGE:
         # small pages, each new to the process, would take as long as all else

@@ -71,8 +71,15 @@ def render(
     result = _natively(images, where, mode, padding_mode, fill, out)
     if result is None:
         result = _by_torch(images, where, mode, padding_mode, fill, kept)
-        result = result if out is None else out.copy_(result)
+        result = _laid_as(images, result) if out is None else out.copy_(result)
     return result
+
+
+def _laid_as(images: Tensor, result: Tensor) -> Tensor:
+    """The result with its channels last in memory if the images have them there."""
+    if in_transform() or sampler.layout(images) == torch.contiguous_format:
+        return result
+    return result.contiguous(memory_format=torch.channels_last)
 
 
 def _natively(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,6 +14,7 @@ from camtorch._arguments import as_values, broadcast_shapes
 from camtorch._module import GeometryModule, Memo
 from camtorch._tracing import in_graph, in_transform, is_concrete
 from camtorch.camera import Camera
+from camtorch.native.sampler import empty
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, local_scale, on_lattice, tabulate
@@ -137,9 +139,10 @@ class Warp(GeometryModule):
             fill: likewise.
 
         Returns:
-            (B, C, H', W') of the target's image_size and of the same dtype. Half precision is sampled in float32;
-            integers are rounded and stay in their range, bool is true from one half on. The nearest integers are
-            exactly those of the image. Integers and bool have no gradient, and learning cameras cost them nothing.
+            (B, C, H', W') of the target's image_size and of the same dtype. Images whose channels come last in memory
+            give such results. Half precision is sampled in float32; integers are rounded and stay in their range, bool
+            is true from one half on. The nearest integers are exactly those of the image. Integers and bool have no
+            gradient, and learning cameras cost them nothing.
 
         Raises:
             ValueError: another shape or size. TypeError: no tensor, or a complex one.
@@ -148,7 +151,7 @@ class Warp(GeometryModule):
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
         if self._is_long() and not (learns or in_graph(images)):
-            result = images.new_empty(self._count(images), images.shape[1], *self.target._size("Warp"))
+            result = empty(images, self._count(images), self.target._size("Warp"))
             kept: dict[int, Pyramid] = {}
             for rows in self._rows(None):
                 with torch.no_grad():
@@ -212,9 +215,7 @@ class Warp(GeometryModule):
         """The options of one call, if they and the images are as they should be."""
         if not isinstance(images, Tensor) or images.is_complex():
             what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
-            hint = ""
-            if type(images).__name__ == "ndarray":
-                hint = ". An array (H, W, 3) goes in as torch.from_numpy(array).permute(2, 0, 1)[None]"
+            hint = _way_in(images, self.source._size("Warp")) if hasattr(images, "__array_interface__") else ""
             raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}{hint}")
         shape, expected = tuple(images.shape), self.source._size("Warp")
         if images.ndim in (3, 4) and shape[-3:-1] == expected and shape[-2:] != expected:
@@ -413,6 +414,33 @@ class Warp(GeometryModule):
         """The options."""
         options = ", ".join(f"{name}={value!r}" for name, value in self.options.items())
         return f"{options}, rotation={self.rotation is not None}"
+
+
+_WAYS = {
+    "(H, W)": ("[None, None]", "[0, 0]"),
+    "(H, W, C)": (".permute(2, 0, 1)[None]", "[0].permute(1, 2, 0)"),
+    "(C, H, W)": ("[None]", "[0]"),
+    "(B, H, W, C)": (".permute(0, 3, 1, 2)", ".permute(0, 2, 3, 1)"),
+    "(B, C, H, W)": ("", ""),
+}
+
+
+def _way_in(images: Any, size: tuple[int, int]) -> str:
+    """In words, how an array of images, or what numpy takes for one, becomes a tensor, and an array again."""
+    array = np.asarray(images)
+    taken = "np.array(image)" if array is not images else "array"
+    if any(step < 0 for step in array.strides):
+        taken = "array.copy()"  # torch takes no negative strides
+    last = array.shape[-2:] != size or array.shape[-3:-1] == size
+    shape = {2: "(H, W)", 3: "(H, W, C)" if last else "(C, H, W)", 4: "(B, H, W, C)" if last else "(B, C, H, W)"}
+    if array.ndim not in shape:
+        return ""
+    there, back = _WAYS[shape[array.ndim]]
+    name = "An array" if taken != "np.array(image)" else "An image"
+    return (
+        f". {name} {shape[array.ndim]} goes in as torch.from_numpy({taken}){there}, and what comes out becomes one by "
+        f"result{back}.numpy()"
+    )
 
 
 # -- outlines of boxes and polygons: enough points along the edges to follow them where a lens bends them

@@ -1,0 +1,259 @@
+"""Images whose channels come last in memory, as NumPy, OpenCV and Pillow have them: read and written where they lie."""
+
+import re
+import warnings
+
+import numpy as np
+import PIL.Image
+import pytest
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+import camtorch as ct
+import camtorch.augment.numpy
+from camtorch.augment.numpy import as_tensor
+
+SIZE = (50, 70)
+needs_native = pytest.mark.skipif(not ct.native_available(), reason="there is no compiled sampler")
+
+
+def camera(size=SIZE):
+    height, width = size
+    numbers = [0.7 * width, 0.7 * width, (width - 1) / 2, (height - 1) / 2]
+    return ct.BrownConrady(numbers, [-0.1, 0.02, 0.0, 0.001, 0.0], image_size=size).requires_grad_(False)
+
+
+def colours(channels=3, dtype=np.uint8, size=SIZE):
+    """(H, W, C) of random numbers."""
+    return np.random.default_rng(0).integers(0, 250, (*size, channels)).astype(dtype)
+
+
+def transform(**options):
+    mount = ct.augment.RandomMount(camera=camera(), min_filled=0, **options)
+    return ct.augment.numpy.Transform(mount)
+
+
+# -- arrays at the door of augmentations
+
+
+def _read_only(array):
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+WHERE_THEY_LIE = {
+    "plain": lambda: colours(),
+    "a crop": lambda: colours(size=(60, 90))[4:54, 7:77],
+    "RGB of RGBA": lambda: colours(4)[..., :3],
+    "every second pixel": lambda: colours(size=(100, 140))[::2, ::2],
+    "one channel": lambda: colours()[..., 1],
+    "planes": lambda: np.moveaxis(np.ascontiguousarray(np.moveaxis(colours(), -1, 0)), 0, -1),
+    "read-only": lambda: _read_only(colours()),
+    "of a file": lambda: np.frombuffer(colours().tobytes(), np.uint8).reshape(*SIZE, 3),
+    "repeated": lambda: np.broadcast_to(colours(1), (*SIZE, 3)),
+    "uint16": lambda: colours(dtype=np.uint16),
+    "float32": lambda: colours(dtype=np.float32),
+    "bool": lambda: colours(dtype=bool),
+}
+COPIED = {
+    "BGR": lambda: colours()[..., ::-1],
+    "mirrored": lambda: colours()[:, ::-1],
+    "upside down": lambda: colours()[::-1],
+    "turned round, of 16 bits": lambda: colours(dtype=np.uint16)[::-1, ::-1, ::-1],
+    "turned round, read-only": lambda: _read_only(colours())[::-1, ::-1],
+    "of another byte order": lambda: colours(dtype=">u2"),
+    "long doubles": lambda: colours(dtype=np.longdouble),
+    "between other fields": lambda: _field(np.uint8),
+    "between numbers": lambda: _field(np.float32),
+}
+
+
+def _field(dtype):
+    """Of a structured array, whose strides are no whole numbers of elements if those have several bytes."""
+    pixels = np.zeros((*SIZE, 3), np.dtype([("flag", np.uint8), ("value", dtype)]))
+    pixels["value"] = colours()
+    return pixels["value"]
+
+
+@pytest.mark.parametrize("name", WHERE_THEY_LIE)
+def test_arrays_are_taken_where_they_lie(name):
+    array = WHERE_THEY_LIE[name]()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tensor = as_tensor("image", array)
+    assert tensor.data_ptr() == array.__array_interface__["data"][0]
+    planes = array[None] if array.ndim == 2 else np.moveaxis(array, -1, 0)
+    np.testing.assert_array_equal(tensor[0].numpy(), planes)
+
+
+def test_lent_memory_lasts_as_long_as_the_tensor():
+    tensor = as_tensor("image", _read_only(np.full((*SIZE, 3), 77, np.uint8)))
+    rest = [np.zeros((*SIZE, 3), np.uint8) for _ in range(50)]
+    assert bool((tensor == 77).all())
+    assert len(rest) == 50
+
+
+@pytest.mark.parametrize("name", [*WHERE_THEY_LIE, *COPIED])
+@pytest.mark.parametrize("p", [0.0, 1.0])
+def test_arrays_of_any_strides_come_out_dense_and_alone(name, p):
+    array = {**WHERE_THEY_LIE, **COPIED}[name]()
+    before, dense = array.copy(), np.array(array, array.dtype.newbyteorder("="), order="C")
+    move, results = transform(p=p), []
+    draw = move.augmentation.draw(1, torch.Generator().manual_seed(1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for image in (array, dense):
+            mask = image if image.ndim == 2 else image[..., 0]
+            fields = {"images": [image, image]} | ({"mask": mask} if image.dtype.itemsize <= 8 else {})
+            results.append(move({"image": image, **fields}, draw=draw))
+    for name, out in results[0].items():
+        for one, other in [(out, results[1][name])] if name != "images" else zip(out, results[1][name], strict=True):
+            if name in ("image", "images", "mask"):
+                assert one.dtype == array.dtype
+                assert one.flags.c_contiguous
+                assert one.flags.writeable
+                assert not np.may_share_memory(one, array)
+                # planes are added up in another order; of uint8 a last bit decides about what is rounded
+                atol = 1e-4 if array.dtype.kind == "f" else array.dtype.kind == "u"
+                difference = np.abs(one.astype(np.float64) - other.astype(np.float64))
+                assert difference.max() <= atol
+                assert (difference > 1e-4).mean() < 0.01
+    np.testing.assert_array_equal(array, before)
+    if p == 0:
+        np.testing.assert_array_equal(results[0]["image"], array)
+
+
+def allocated(call, count):
+    """What `call` gives, and the operators in it that took memory of so many bytes or more."""
+    call()
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as seen:
+        result = call()
+    return result, [event.name for event in seen.events() if event.self_cpu_memory_usage >= count]
+
+
+LARGE = (360, 480)
+LARGE_ONES = {
+    "plain": lambda: colours(size=LARGE),
+    "a crop": lambda: colours(size=(400, 500))[4:364, 7:487],
+    "read-only": lambda: _read_only(colours(size=LARGE)),
+}
+
+
+@needs_native
+@pytest.mark.parametrize("name", LARGE_ONES)
+def test_nothing_as_large_as_an_image_is_made_but_the_result(name):
+    array = LARGE_ONES[name]()
+    move = ct.augment.numpy.Transform(ct.augment.RandomMount(camera=camera(LARGE)))
+    out, large = allocated(lambda: move(image=array), array.nbytes)
+    assert large == ["aten::empty"]
+    assert out["image"].shape == array.shape
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "CMYK", "I;16", "F", "I"])
+def test_pillow_images_become_arrays_of_their_own(mode):
+    image = PIL.Image.new(mode, SIZE[::-1], 7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        out = transform()(image=np.asarray(image))["image"]
+    assert (out.dtype, out.shape) == (np.asarray(image).dtype, np.asarray(image).shape)
+    assert out[25, 35].tolist() == np.asarray(image)[25, 35].tolist()
+
+
+# -- images at the door of warps
+
+
+LAYOUTS = {
+    "dense": lambda c: torch.from_numpy(colours(c))[None],
+    "a crop": lambda c: torch.from_numpy(colours(c, size=(60, 90)))[None, 4:54, 7:77],
+    "more channels": lambda c: torch.from_numpy(colours(c + 1))[None, ..., :c],
+    "every second pixel": lambda c: torch.from_numpy(colours(c, size=(100, 140)))[None, ::2, ::2],
+    "a batch": lambda c: torch.from_numpy(np.stack([colours(c), colours(c)])),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic", "nearest"])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float16])
+def test_channels_last_give_channels_last(name, channels, mode, dtype):
+    images = LAYOUTS[name](channels).to(dtype).permute(0, 3, 1, 2)
+    planes = images.contiguous()
+    for tolerance in (0.0, 0.01):
+        warp = ct.Dewarp(camera(), mode=mode, tolerance=tolerance)
+        moved, expected = warp(images), warp(planes)
+        assert moved.is_contiguous(memory_format=torch.channels_last)
+        assert expected.is_contiguous()
+        difference = (moved.double() - expected.double()).abs()
+        # of floats the last bits, of whole numbers what those decide
+        atol = 250 * 8 * torch.finfo(dtype).eps if dtype.is_floating_point else 1.0
+        assert float(difference.max()) <= atol
+        assert float((difference > 0.5).double().mean()) < 0.01
+
+
+def test_the_rule_holds_with_gradients_and_options():
+    images = torch.from_numpy(colours(dtype=np.float32))[None].permute(0, 3, 1, 2).requires_grad_()
+    for warp in (ct.Dewarp(camera()), ct.Dewarp(camera().requires_grad_()), ct.Dewarp(camera(), antialias=True)):
+        moved = warp(images)
+        assert moved.is_contiguous(memory_format=torch.channels_last)
+        (gradient,) = torch.autograd.grad(moved.sum(), images)
+        assert bool(torch.isfinite(gradient).all())
+    for option in ({"fill": (1.0, 2.0, 3.0)}, {"padding_mode": "border"}, {"padding_mode": "reflection"}):
+        assert ct.Dewarp(camera())(images, **option).is_contiguous(memory_format=torch.channels_last)
+
+
+def test_the_rule_holds_for_long_images(monkeypatch):
+    monkeypatch.setattr("camtorch.warp.warp._MOST_KEPT", 1000)
+    monkeypatch.setattr("camtorch.warp.warp._STRIP", 500)
+    images = torch.from_numpy(colours())[None].permute(0, 3, 1, 2)
+    moved = ct.Dewarp(camera())(images)
+    assert moved.is_contiguous(memory_format=torch.channels_last)
+
+
+# -- what people try first
+
+
+FIRST = {
+    "HWC": lambda: colours(),
+    "a crop": lambda: colours(size=(60, 90))[4:54, 7:77],
+    "BGR": lambda: colours()[..., ::-1],
+    "upside down": lambda: colours()[::-1],
+    "grey": lambda: colours()[..., 0],
+    "a batch": lambda: np.stack([colours(), colours()]),
+    "planes": lambda: np.moveaxis(colours(), -1, 0).copy(),
+    "a batch of planes": lambda: np.moveaxis(colours(), -1, 0).copy()[None],
+    "Pillow": lambda: PIL.Image.fromarray(colours()),
+}
+
+
+@pytest.mark.parametrize("name", FIRST)
+def test_the_error_for_an_array_says_lines_that_work(name):
+    array = FIRST[name]()
+    warp = ct.Dewarp(camera())
+    with pytest.raises(TypeError, match=r"Warp: images must be a tensor \(B, C, H, W\)") as error:
+        warp(array)
+    there, back = re.search(
+        r"goes in as (\S+(?: \S+)*), and what comes out becomes one by (.*)", str(error.value)
+    ).groups()
+    names = {"torch": torch, "np": np, "array": array, "image": array}
+    images = eval(there, names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = warp(images)
+    made = eval(back, {"result": result})
+    shape = np.asarray(array).shape
+    assert made.shape == shape
+    assert made.flags.c_contiguous
+    assert np.abs(made.astype(int)[..., :] - np.asarray(array).astype(int)).mean() < 80  # the same image, bent
+    if isinstance(array, np.ndarray) and all(step > 0 for step in array.strides):
+        assert images.data_ptr() == array.ctypes.data
+
+
+@needs_native
+@pytest.mark.parametrize("name", ["plain", "a crop"])
+def test_the_first_line_copies_nothing(name):
+    array = LARGE_ONES[name]()
+    warp = ct.Dewarp(camera(LARGE), tolerance=0.01)
+    result, large = allocated(lambda: warp(torch.from_numpy(array).permute(2, 0, 1)[None]), array.nbytes)
+    assert large == ["aten::empty"]
+    assert result[0].permute(1, 2, 0).numpy().flags.c_contiguous
