@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import Numbers, as_real, as_rows
-from camtorch._tracing import in_graph, is_concrete
+from camtorch._tracing import in_graph, is_concrete, may_look
 from camtorch.optics.special import cosc_root, sinc_root
 
 
@@ -40,9 +42,12 @@ def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, .
     A point that is not finite becomes NaN, which has no part in the gradient of the matrix.
     """
     x, y, z = planes
+    rows = [row.unsqueeze(-1).unbind(-2) for row in matrix.unbind(-2)]
+    # a sum shows what is not finite: the whole planes are looked at once
+    if may_look(x) and math.isfinite(x.detach().sum() + y.detach().sum() + z.detach().sum()):
+        return tuple(torch.addcmul(torch.addcmul(a * x, b, y), c, z) for a, b, c in rows)
     finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
     x, y, z = (torch.where(finite, plane, 0.0) for plane in planes)
-    rows = [[matrix[..., i, j, None] for j in range(3)] for i in range(3)]
     return tuple(torch.where(finite, a * x + b * y + c * z, torch.nan) for a, b, c in rows)
 
 
@@ -97,16 +102,14 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
         pitch: likewise.
         roll: likewise.
     """
-    a, b, c = (torch.deg2rad(angle) for angle in (yaw, pitch, roll))
-    zero, one = torch.zeros_like(a), torch.ones_like(a)
-
-    def matrix(*entries: Tensor) -> Tensor:
-        made: Tensor = torch.stack(entries, -1).unflatten(-1, (3, 3))
-        return made
-
-    turn = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
-    look = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
-    lean = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
-    # of the turned camera's axes as seen by the old one, transposed; sums, which autocast leaves in their precision
-    axes = (((turn[..., None] * look[..., None, :, :]).sum(-2))[..., None] * lean[..., None, :, :]).sum(-2)
-    return axes.mT
+    angles = torch.deg2rad(torch.stack(torch.broadcast_tensors(yaw, pitch, roll)))
+    (ca, cb, cc), (sa, sb, sc) = angles.cos().unbind(), angles.sin().unbind()
+    # the turn, the look and the lean multiplied out, each about the turned camera's axes, and transposed
+    right, ahead = sa * sb, ca * sb
+    rows = (
+        *(ca * cc + right * sc, cb * sc, ahead * sc - sa * cc),
+        *(right * cc - ca * sc, cb * cc, sa * sc + ahead * cc),
+        *(sa * cb, -sb, ca * cb),
+    )
+    matrix: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return matrix

@@ -304,8 +304,12 @@ class Augmentation(SampleTransform):
             shape = (count,) if interval.size is None else (count, interval.size)
             if tuple(values[name].shape) != shape:
                 raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(values[name].shape)}")
-            if may_look(values[name]) and not bool(torch.isfinite(values[name]).all()):
-                raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {values[name].tolist()}")
+        numbers = [values[name] for name in self.ranges]
+        # a sum tells of all at once
+        if numbers and all(map(may_look, numbers)) and not math.isfinite(sum(float(value.sum()) for value in numbers)):
+            for name in self.ranges:
+                if not bool(torch.isfinite(values[name]).all()):
+                    raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {values[name].tolist()}")
         return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
 
     def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:

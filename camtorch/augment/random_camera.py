@@ -101,7 +101,7 @@ class RandomCamera(Augmentation):
     ):
         super().__init__(**options)
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
-        self._memo = Memo()
+        self._memo, self._plane = Memo(), Memo()
         self.image_size = as_image_size(image_size, self._name)
         self.like = _as_like(like, self._name)
         if self.like is not None and self.like.image_size is None and fov is None:
@@ -158,7 +158,7 @@ class RandomCamera(Augmentation):
         if self.fov == "source":
             intrinsics = usual = self._from_source(source, base, size)
         else:
-            intrinsics = _sized(base, size, values.get("fov"))
+            intrinsics = self._sized(base, size, values.get("fov"))
             usual = self._usual(base, size) if jitters else intrinsics
         fx, fy, cx, cy = intrinsics.unbind(-1)
         for name in ("focal", "zoom"):
@@ -181,9 +181,50 @@ class RandomCamera(Augmentation):
 
         def made() -> Tensor:
             fov = base.intrinsics.new_tensor(self.ranges["fov"].middle) if "fov" in self.ranges else None
-            return _sized(base, size, fov).detach()
+            return self._sized(base, size, fov).detach()
 
         kept: Tensor = self._memo((base.intrinsics, base.distortion), (type(base), base.image_size, size), made)
+        return kept
+
+    def _sized(self, base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
+        """Intrinsics (*B, 4) of a lens before an image of another size, showing as much in width or a fov in degrees.
+
+        The old image is scaled to the new width, and cropped or padded evenly to the new height.
+        """
+        (height, width), (fx, fy, cx, cy) = size, base.intrinsics.unbind(-1)
+        if base.image_size is None:
+            cx, cy = cx + (width - 1) / 2, cy + (height - 1) / 2
+        elif base.image_size != size:
+            scale = width / base.image_size[1]
+            fx, fy, cx = fx * scale, fy * scale, (cx + 0.5) * scale - 0.5
+            cy = (cy - (base.image_size[0] - 1) / 2) * scale + (height - 1) / 2
+        if fov is not None:
+            focal = width / self._plane_width(base, fov)
+            fx, fy = focal, focal * fy / fx
+        return torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
+
+    def _plane_width(self, base: Camera, fov: Tensor) -> Tensor:
+        """(*B,): how wide a field of view in degrees is on the plane of unit focal length."""
+        half = torch.deg2rad(fov) / 2
+        across, ahead = half.sin(), half.cos()
+        rays = torch.stack((-across, torch.zeros_like(half), ahead, across, torch.zeros_like(half), ahead), -1)
+        plane, rays = self._plane_of(base), rays.unflatten(-1, (2, 3))
+        if plane.batch_shape:
+            rays = rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3)))
+        ends, valid = plane.project(rays)
+        if is_concrete(valid) and not bool(valid.all()):
+            raise ValueError(
+                f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees"
+            )
+        return ends[..., 1, 0] - ends[..., 0, 0]
+
+    def _plane_of(self, base: Camera) -> Camera:
+        """The lens with its image on the plane of unit focal length; the last one is kept, with what it tabulated."""
+        ones = base.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0])
+        if in_graph(base.distortion):
+            return remade(base, ones, base.distortion, None)
+        k = base.distortion
+        kept: Camera = self._plane((k,), (type(base),), lambda: remade(base, ones, k.clone(), None))
         return kept
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
@@ -191,7 +232,7 @@ class RandomCamera(Augmentation):
 
         def narrowed() -> Tensor:
             fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
-            whole = remade(base, _sized(base, size, fov), base.distortion, size)
+            whole = remade(base, self._sized(base, size, fov), base.distortion, size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
         numbers = source.intrinsics, source.distortion, base.intrinsics, base.distortion
@@ -264,36 +305,6 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
 def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
     """A single number of these means just that number."""
     return (value, value) if isinstance(value, (int, float)) else value
-
-
-def _sized(base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
-    """Intrinsics (*B, 4) of a lens before an image of another size, showing as much in width or a fov in degrees.
-
-    The old image is scaled to the new width, and cropped or padded evenly to the new height.
-    """
-    (height, width), (fx, fy, cx, cy) = size, base.intrinsics.unbind(-1)
-    if base.image_size is None:
-        cx, cy = cx + (width - 1) / 2, cy + (height - 1) / 2
-    elif base.image_size != size:
-        scale = width / base.image_size[1]
-        fx, fy, cx = fx * scale, fy * scale, (cx + 0.5) * scale - 0.5
-        cy = (cy - (base.image_size[0] - 1) / 2) * scale + (height - 1) / 2
-    if fov is not None:
-        focal = width / _plane_width(base, fov)
-        fx, fy = focal, focal * fy / fx
-    return torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
-
-
-def _plane_width(base: Camera, fov: Tensor) -> Tensor:
-    """(*B,): how wide a field of view in degrees is on the plane of unit focal length."""
-    half = torch.deg2rad(fov) / 2
-    right = torch.stack((half.sin(), torch.zeros_like(half), half.cos()), -1)
-    rays = torch.stack((right * right.new_tensor([-1.0, 1.0, 1.0]), right), -2)
-    plane = remade(base, right.new_tensor([1.0, 1.0, 0.0, 0.0]), base.distortion, None)
-    ends, valid = plane.project(rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3))))
-    if is_concrete(valid) and not bool(valid.all()):
-        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
-    return ends[..., 1, 0] - ends[..., 0, 0]
 
 
 def _cropped(
