@@ -1,16 +1,19 @@
-"""What compiled code calls instead of tracing it: the positions of a warp with a tolerance, as one operator."""
+"""What compiled code calls instead of tracing it: a warp of images, and the positions of one with a tolerance."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from threading import local
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
+from camtorch._module import Memo
 from camtorch.camera import Camera, from_values
-from camtorch.warp.grid import tabulate
+from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
+from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
 
 
 def positions(source: Camera, target: Camera, rotation: Tensor | None, tolerance: float) -> tuple[Tensor, Tensor]:
@@ -49,3 +52,100 @@ def _(_, source, source_distortion, __, target, target_distortion, rotation, siz
     dtype = dtype if rotation is None else torch.promote_types(dtype, rotation.dtype)
     planes = source.new_empty(count, 2, *sizes[2:], dtype=dtype)
     return planes, source.new_empty(count, *sizes[2:], dtype=torch.bool)
+
+
+# -- images
+
+_is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # newer than torch 2.6
+
+
+def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
+    """Whether the operator makes images: in compiled code, on the CPU and without a graph.
+
+    What is exported stays torch's own operators.
+
+    Args:
+        images: of the source.
+        inputs: all that the positions depend on.
+    """
+    if not torch.compiler.is_compiling() or _is_exporting():
+        return False
+    return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
+
+
+def warped(
+    images: Tensor,
+    source: Camera,
+    target: Camera,
+    rotation: Tensor | None,
+    tolerance: float,
+    antialias: bool,
+    mode: Mode,
+    padding_mode: PaddingMode,
+    fill: tuple[float, ...],
+) -> Tensor:
+    """The images (B, C, h, w) of a warp; arguments as of `Warp`."""
+    cameras = [n for c in (source, target) for n in (c._model, c.intrinsics.detach(), c.distortion.detach())]
+    sizes = [side for camera in (source, target) for side in camera._size("Warp")]
+    options = tolerance, antialias, mode, padding_mode, list(fill)
+    return _warp(images.detach(), *cameras, None if rotation is None else rotation.detach(), sizes, *options)
+
+
+class _Kept(local):
+    """The positions that a thread's last call used: masks are warped after their images, and cameras may be still."""
+
+    def __init__(self) -> None:
+        self.memo = Memo()
+
+
+_kept = _Kept()
+
+
+@torch.library.custom_op("camtorch::warp", mutates_args=())
+def _warp(
+    images: Tensor,
+    source_model: str,
+    source_intrinsics: Tensor,
+    source_distortion: Tensor,
+    target_model: str,
+    target_intrinsics: Tensor,
+    target_distortion: Tensor,
+    rotation: Tensor | None,
+    sizes: Sequence[int],
+    tolerance: float,
+    antialias: bool,
+    mode: str,
+    padding_mode: str,
+    fill: Sequence[int | float | bool],
+) -> Tensor:
+    """The images (B, C, h, w), contiguous."""
+    numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
+
+    def positions() -> Sampling | Lattice:
+        source = from_values(source_model, *numbers[:2], sizes[:2])
+        target = from_values(target_model, *numbers[2:], sizes[2:])
+        return locate(source, target, rotation, tolerance, antialias, range(sizes[2]))
+
+    inputs = [*numbers] if rotation is None else [*numbers, rotation]
+    what = source_model, target_model, tuple(sizes), tolerance, antialias, rotation is None
+    where = _kept.memo(inputs, what, positions)
+    options = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp"), tuple(fill)
+    return render(images, where, *options).contiguous()
+
+
+@_warp.register_fake
+def _(images, _, source, source_distortion, __, target, target_distortion, rotation, sizes, *options):
+    shapes = [t.shape[:-1] for t in (source, source_distortion, target, target_distortion)]
+    shapes += [] if rotation is None else [rotation.shape[:-2]]
+    count = math.prod(broadcast_shapes(*shapes))
+    return images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *sizes[2:])
+
+
+@_warp.register_vmap
+def _(info, in_dims, *arguments):
+    dims = (*in_dims, *[None] * (len(arguments) - len(in_dims)))
+    rows = (
+        [a if not isinstance(dim, int) else a.select(dim, i) for a, dim in zip(arguments, dims, strict=True)]
+        for i in range(info.batch_size)
+    )
+    return torch.stack([_warp(*row) for row in rows]), 0

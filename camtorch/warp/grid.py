@@ -95,6 +95,38 @@ class Lattice:
         return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
 
 
+def locate(
+    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, antialias: bool, rows: range
+) -> Sampling | Lattice:
+    """Where some rows of a target sample the source's image: on a lattice, if one does and nothing asks for pixels.
+
+    Args:
+        source: the camera of the images.
+        target: the camera of the images to make.
+        rotation: see `tabulate`.
+        tolerance: see `Warp`.
+        antialias: whether `Sampling.scale` is asked for.
+        rows: of the target.
+    """
+    plain = not in_transform() and is_concrete(target.intrinsics) and target.intrinsics.is_cpu
+    if not antialias:
+        if tolerance and plain:
+            lattice = on_lattice(source, target, rotation, tolerance, rows)
+            if lattice is not None:
+                return lattice
+            tolerance = 0.0
+        return Sampling(*tabulate(source, target, rotation, tolerance, rows), None)
+    # the scale is that between neighbours
+    around = range(max(rows.start - 1, 0), min(rows.stop + 1, target._size("Warp")[0]))
+    where = scaled(source, *tabulate(source, target, rotation, tolerance, around))
+    return where if around == rows else where.part(slice(rows.start - around.start, rows.stop - around.start))
+
+
+def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
+    """Positions with the scale by which antialiasing goes."""
+    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size("Warp")))
+
+
 def tabulate(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float = 0.0, rows: range | None = None
 ) -> tuple[Tensor, Tensor]:

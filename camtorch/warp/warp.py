@@ -17,7 +17,7 @@ from camtorch.camera import Camera
 from camtorch.native.sampler import empty
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import compiled
-from camtorch.warp.grid import Lattice, Sampling, local_scale, on_lattice, tabulate
+from camtorch.warp.grid import Lattice, Sampling, locate, scaled, tabulate
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -150,6 +150,9 @@ class Warp(GeometryModule):
         sampled = self._checked(images, mode, padding_mode, fill)
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
+        if not learns and compiled.takes(images, inputs):
+            options = self.tolerance, self.antialias, *sampled
+            return compiled.warped(images, self.source, self.target, self.rotation, *options)
         if self._is_long() and not (learns or in_graph(images)):
             result = empty(images, self._count(images), self.target._size("Warp"))
             kept: dict[int, Pyramid] = {}
@@ -279,6 +282,9 @@ class Warp(GeometryModule):
         """With a graph."""
         return self._with_scale(*tabulate(self.source, self.target, self.rotation))
 
+    def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
+        return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
+
     def _kept(self, inputs: list[Tensor]) -> Sampling | Lattice:
         """Without a graph, until something changes; or what is pinned."""
         if self._pinned is not None:
@@ -291,26 +297,11 @@ class Warp(GeometryModule):
     def _whole(self) -> Sampling | Lattice:
         if torch.compiler.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu:
             return self._with_scale(*compiled.positions(self.source, self.target, self.rotation, self.tolerance))
-        return self._of_rows(range(self.target._size("Warp")[0]))
+        return self._strip(range(self.target._size("Warp")[0]))
 
     def _strip(self, rows: range) -> Sampling | Lattice:
         """Of some rows of the target."""
-        if not self.antialias:
-            return self._of_rows(rows)
-        # the scale is that between neighbours
-        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
-        where = self._with_scale(*tabulate(self.source, self.target, self.rotation, self.tolerance, around))
-        return where.part(slice(rows.start - around.start, rows.stop - around.start))
-
-    def _of_rows(self, rows: range) -> Sampling | Lattice:
-        """Of some rows, on a lattice if one does."""
-        plain = not in_transform() and is_concrete(self.target.intrinsics)
-        if self.tolerance and plain and self.target.intrinsics.is_cpu and not self.antialias:
-            lattice = on_lattice(self.source, self.target, self.rotation, self.tolerance, rows)
-            if lattice is not None:
-                return lattice
-        tolerance = self.tolerance if self.antialias else 0.0
-        return self._with_scale(*tabulate(self.source, self.target, self.rotation, tolerance, rows))
+        return locate(self.source, self.target, self.rotation, self.tolerance, self.antialias, rows)
 
     def _rows(self, count: int | None) -> Iterator[range]:
         height, width = self.target._size("Warp")
@@ -325,15 +316,14 @@ class Warp(GeometryModule):
 
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
-        # what a transform makes dies with it; what inference mode makes could not be used in a graph later
+        # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the
+        # operator of compiled code keeps its own
+        if torch.compiler.is_compiling() and compiled.takes(self.target.intrinsics.detach(), self._inputs()):
+            return self
         if not in_transform() and not torch.is_inference_mode_enabled():
             inputs = self._inputs()
             self._pinned = self._learned() if self._learns(inputs) else self._kept(inputs)
         return self
-
-    def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
-        size = self.source._size("Warp")
-        return Sampling(grid, mapped, local_scale(grid.detach(), mapped, size) if self.antialias else None)
 
     def _inputs(self) -> list[Tensor]:
         s, t = self.source, self.target
