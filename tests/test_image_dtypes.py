@@ -7,7 +7,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 
 import camtorch as ct
 from camtorch.warp import sampling
-from camtorch.warp.grid import tabulate
+from camtorch.warp.grid import locate
 
 SIZE = (40, 50)
 MODES = ("nearest", "bilinear", "bicubic")
@@ -241,7 +241,7 @@ def test_masks_and_grids_may_be_changed():
 
 def test_a_loaded_calibration_makes_its_grid_once(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr("camtorch.warp.warp.tabulate", lambda *a: made.append(a) or tabulate(*a))
+    monkeypatch.setattr("camtorch.warp.warp.locate", lambda *a: made.append(a) or locate(*a))
     ct.save(fisheye(torch.float64), tmp_path / "camera.yaml", format="opencv")
     camera = ct.load(tmp_path / "camera.yaml").camera
     assert camera.intrinsics.dtype == torch.float64
