@@ -1,11 +1,23 @@
-"""Work that a few threads share: the caller, and workers of a pool that come to it while it lasts."""
+"""Work that threads share: a caller with the workers of a pool, and the threads of torch where they have free cores."""
 
 from __future__ import annotations
 
+import ctypes
+import math
 import os
+import sys
+import threading
+import time
 from collections.abc import Callable
+from functools import wraps
 from queue import SimpleQueue
 from threading import Lock, Thread
+from typing import ParamSpec, TypeVar
+
+import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def spread(work: Callable[[], object], threads: int) -> None:
@@ -116,3 +128,146 @@ def _forget() -> None:
 
 if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(after_in_child=_forget)
+
+
+# -- the threads of torch
+#
+# Each of its operations is split among them and waits until all have done their part: for milliseconds, where another
+# process has the core of one. To a chain of a hundred operations that happens a hundred times.
+
+ALONE = (1 << 15) - 1
+"""Elements up to which it is not worth while to split an operation."""
+_GLANCE = 2e-3  # seconds for which a look at the cores holds
+_SPIN = 1e-3  # seconds for which threads certainly go on running after an operation
+_LONGEST = 0.5  # seconds
+_CORES = os.cpu_count() or 1
+
+
+def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
+    """Let torch split the operations of a function, on the CPU, only where its threads have cores to run on.
+
+    That is looked at when it begins, and wherever it calls `split`. Results shall not depend on it: a single sum over
+    more than `ALONE` elements has to be `undivided`, and for atan2 there is `optics.special.atan2`. What autograd sums
+    does depend on it, as it does on the number of torch's threads.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if _mine.threads:  # of a function that called this one
+            return function(*args, **kwargs)
+        _mine.threads = torch.get_num_threads()
+        try:
+            split()
+            return function(*args, **kwargs)
+        finally:
+            _mine.set_alone(False)
+            _mine.threads = 0
+
+    return call
+
+
+def split(elements: int | None = None) -> None:
+    """Whether the next operations are to be split. elements: of each of them, if that is known."""
+    if _mine.threads > 1:
+        small = elements is not None and elements <= ALONE
+        _mine.set_alone(small or _crowd.meets(_mine.threads, not _mine.is_alone))
+
+
+def is_split() -> bool:
+    """Whether operations on large tensors are split, in a function that goes by free cores."""
+    return _mine.threads > 1 and not _mine.is_alone
+
+
+def undivided(operation: Callable[[], R]) -> R:
+    """The result of an operation that is not split: a single sum, which would be rounded otherwise."""
+    if not is_split():
+        return operation()
+    _mine.set_alone(True)
+    try:
+        return operation()
+    finally:
+        _mine.set_alone(False)
+
+
+class _Mine(threading.local):
+    """Among how many threads the operations of this thread are split, while a function goes by free cores."""
+
+    threads = 0
+    """Before and after it; 0 where there is none."""
+    is_alone = False
+    _of_mkl = 0
+
+    def set_alone(self, alone: bool) -> None:
+        """Split them, or not."""
+        if alone != self.is_alone and _limits is not None:
+            # not torch.set_num_threads: that reaches other threads as well
+            openmp, mkl = _limits
+            self.is_alone = alone
+            openmp(1 if alone else self.threads)
+            if mkl is not None:  # which splits what torch has not split
+                self._of_mkl = mkl(1 if alone else self._of_mkl)
+
+
+class _Crowd:
+    """Whether more threads, of all processes, want to run than there are cores.
+
+    Torch's own are among them while they are at work, and for a moment after, so that a look taken then tells what is
+    there beside them. While a thread computes alone, one other that is busy seems to leave room. So after a crowd was
+    seen no look is taken for a while, twice as long if there was one again as soon as all of torch's threads were back.
+    """
+
+    def __init__(self) -> None:
+        self.is_here = False
+        self._pause = _GLANCE
+        self._next_look = self._last_together = -math.inf
+
+    def meets(self, threads: int, together: bool) -> bool:
+        """Whether so many threads of torch would be in it. together: whether they have just been at work."""
+        now = time.perf_counter()
+        if together:
+            self._last_together = now
+        if now < self._next_look:
+            return self.is_here
+        self.is_here = _wanting() > max(_CORES, threads)
+        if self.is_here:
+            self._next_look, self._pause = now + self._pause, min(2 * self._pause, _LONGEST)
+        else:
+            self._next_look = now + _GLANCE
+            if now < self._last_together + _SPIN:
+                self._pause = _GLANCE
+        return self.is_here
+
+
+def _wanting() -> int:
+    """How many threads of all processes run or want to; 0 where there is nobody to ask."""
+    try:
+        file = os.open("/proc/loadavg", os.O_RDONLY)
+    except OSError:
+        return 0
+    try:
+        return int(os.read(file, 64).split()[3].partition(b"/")[0])
+    finally:
+        os.close(file)
+
+
+def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int] | None] | None:
+    """How OpenMP, and MKL where it is used, are told among how many threads to split the work of the calling one."""
+    if sys.platform == "win32":
+        return None
+    of_torch = ctypes.CDLL(torch._C.__file__)
+    threads = torch.get_num_threads()
+    for library in (ctypes.CDLL(None), of_torch):  # what was loaded before torch may take its place
+        openmp = getattr(library, "omp_set_num_threads", None)
+        if openmp is None:
+            continue
+        openmp(threads + 1)
+        is_it = torch.get_num_threads() == threads + 1
+        openmp(threads)
+        if is_it:
+            return openmp, getattr(of_torch, "MKL_Set_Num_Threads_Local", None)
+    return None
+
+
+_limits = _find_limits()
+_mine = _Mine()
+_crowd = _Crowd()

@@ -2,12 +2,17 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections import deque
 
 import pytest
+import torch
+from cameras import RARE_ARE_SLOW, one
 
+import camtorch as ct
 from camtorch import _threads
 from camtorch._threads import spread
 
@@ -162,3 +167,228 @@ def test_a_child_has_workers_of_its_own():
         spread(pieces, 2)
         os._exit(0 if len(pieces.by) == 2 and sorted(pieces.done) == list(range(20)) else 1)
     assert os.waitpid(child, 0)[1] == 0
+
+
+# -- the threads of torch
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that pass when the test says so, and how many threads want to run."""
+
+    class Clock:
+        now, wanting, looks = 100.0, 1, 0
+
+        def perf_counter(self):
+            return self.now
+
+        def look(self):
+            self.looks += 1
+            return self.wanting
+
+    clock = Clock()
+    monkeypatch.setattr(_threads, "time", clock)
+    monkeypatch.setattr(_threads, "_wanting", clock.look)
+    monkeypatch.setattr(_threads, "_CORES", 4)
+    monkeypatch.setattr(_threads, "_crowd", _threads._Crowd())
+    return clock
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_a_crowd_is_more_than_the_cores(clock):
+    crowd = _threads._Crowd()
+    for wanting, expected in ((1, False), (4, False), (5, True), (9, True), (4, False)):
+        clock.now, clock.wanting = clock.now + 1, wanting
+        assert crowd.meets(3, False) == expected
+    clock.now, clock.wanting = clock.now + 1, 7
+    assert not crowd.meets(7, False)  # they are all torch's own
+
+
+def test_a_look_holds_for_a_while(clock):
+    crowd = _threads._Crowd()
+    for _ in range(10):
+        clock.now += 1e-4
+        crowd.meets(3, False)
+    assert clock.looks == 1
+
+
+def test_who_computes_alone_beside_one_other_tries_ever_more_seldom(clock):
+    """Of four cores one is busy: with torch's four threads five want to run, without them two."""
+    crowd, together, tries = _threads._Crowd(), 0, 0
+    for _ in range(10_000):  # a second
+        clock.now += 1e-4
+        clock.wanting = 5 if together else 2
+        before, together = together, not crowd.meets(4, bool(together))
+        tries += together and not before
+    assert 3 <= tries <= 12
+    # and when that has gone
+    clock.now, clock.wanting = clock.now + 1, 1
+    for _ in range(100):
+        clock.now += 1e-4
+        assert not crowd.meets(4, True)
+    clock.now, clock.wanting = clock.now + 0.01, 5
+    assert crowd.meets(4, True)
+    clock.now, clock.wanting = clock.now + 0.01, 4
+    assert not crowd.meets(4, False)  # it is not held against what comes later
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/loadavg"), reason="nobody tells")
+def test_the_kernel_tells_who_wants_to_run():
+    busy, stop = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)], time.time() + 20
+    try:
+        while (seen := _threads._wanting()) < 4 and time.time() < stop:
+            time.sleep(0.01)
+        assert seen >= 4
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+def test_who_tells_nothing_sees_no_crowd(monkeypatch):
+    def missing(*_):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(os, "open", missing)
+    assert _threads._wanting() == 0
+
+
+can_limit = pytest.mark.skipif(_threads._limits is None, reason="torch's threads are not OpenMP's")
+
+
+@can_limit
+@pytest.mark.usefixtures("three_threads")
+def test_this_thread_alone_is_limited(clock):
+    seen = []
+
+    @_threads.as_cores_are_free
+    def function():
+        seen.append(torch.get_num_threads())
+        other = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+        other.start()
+        other.join()
+        _threads.split(1 << 20)
+        return seen.append(torch.get_num_threads())
+
+    clock.wanting = 9
+    function()
+    assert seen == [1, 3, 1]
+    assert torch.get_num_threads() == 3
+    clock.now, clock.wanting = clock.now + 1, 2
+    seen.clear()
+    function()
+    assert seen == [3, 3, 3]
+
+
+@can_limit
+@pytest.mark.usefixtures("three_threads", "clock")
+def test_small_operations_are_not_split():
+    seen = []
+
+    @_threads.as_cores_are_free
+    def function(*sizes):
+        for size in sizes:
+            _threads.split(size)
+            seen.append(torch.get_num_threads())
+
+    function(10, _threads.ALONE, _threads.ALONE + 1, 3)
+    assert seen == [1, 1, 3, 1]
+    assert torch.get_num_threads() == 3
+
+
+@can_limit
+@pytest.mark.usefixtures("three_threads")
+def test_limits_end_with_the_function(clock):
+    @_threads.as_cores_are_free
+    def inner():
+        assert torch.get_num_threads() == 1
+
+    @_threads.as_cores_are_free
+    def outer():
+        inner()
+        assert torch.get_num_threads() == 1
+        raise ZeroDivisionError
+
+    clock.wanting = 9
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            outer()
+        assert torch.get_num_threads() == 3
+    inner()
+    _threads.split(1)  # of no function
+    assert torch.get_num_threads() == 3
+
+
+NAMES = "result", "valid", "by_values", "by_intrinsics", "by_distortion"
+# Models of which no part leaves the cotangents of its parameters to autograd, whose sums torch rounds as it splits them
+WITHOUT_AUTOGRAD = {"brown_conrady", "fisheye62", "fisheye624", "kannala_brandt", "thin_prism_fisheye"}
+
+
+def everything(camera, method, values, weights):
+    values = values.clone().requires_grad_()
+    result, valid = getattr(camera, method)(values)
+    leaves = [values, *(p for p in camera.parameters() if p.numel())]
+    return result.detach(), valid, *torch.autograd.grad((result * weights).sum(), leaves)
+
+
+@can_limit
+@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@pytest.mark.parametrize("method", ["project", "unproject"])
+def test_results_do_not_depend_on_threads(key, method, clock):
+    camera, generator = one(key).float(), torch.Generator().manual_seed(0)
+    values = torch.randn(70_001, 3, generator=generator) + torch.tensor([0.0, 0, 1.5])
+    weights = torch.rand(70_001, 2 if method == "project" else 3, generator=generator)
+    if method == "unproject":
+        values = camera.project(values)[0].detach()
+    found, before = [], torch.get_num_threads()
+    try:
+        for threads, clock.wanting in ((1, 1), (2, 1), (3, 1), (3, 9)):
+            clock.now += 1
+            torch.set_num_threads(threads)
+            found.append(everything(camera, method, values, weights))
+    finally:
+        torch.set_num_threads(before)
+    for results in found[1:]:
+        for name, result, expected in zip(NAMES, results, found[0], strict=False):
+            if name == "by_distortion" and key not in WITHOUT_AUTOGRAD:
+                torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-4 * expected.abs().max().item())
+            else:
+                assert torch.equal(result, expected), name
+
+
+def test_several_threads_use_one_camera():
+    camera = one("fisheye624").float()
+    points = torch.randn(50_000, 3, generator=torch.Generator().manual_seed(0))
+    expected = ct.Fisheye624(camera.intrinsics.detach(), camera.distortion.detach()).project(points)
+    found = []
+    callers = [threading.Thread(target=lambda: found.append(camera.project(points))) for _ in range(4)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert len(found) == 4
+    assert all(torch.equal(a, b) for results in found for a, b in zip(results, expected, strict=True))
+
+
+class Points(torch.utils.data.Dataset):
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, index):
+        camera = one("kannala_brandt").float().requires_grad_(False)
+        points = torch.randn(150_000, 3, generator=torch.Generator().manual_seed(index))
+        return camera.project(points)[0], torch.get_num_threads()
+
+
+def test_workers_of_a_loader():
+    dataset = Points()
+    for index, (pixels, threads) in enumerate(torch.utils.data.DataLoader(dataset, None, num_workers=2)):
+        assert threads == 1
+        assert torch.equal(pixels, dataset[index][0])

@@ -13,6 +13,7 @@ from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Stage
 from camtorch.optics.lens import StageAt
+from camtorch.optics.radial import total
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -54,7 +55,7 @@ class ShearAt(StageAt):
 
     def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[tuple[Tensor, Tensor], list[Tensor]]:
         d, e = self.stage.parameters
-        sums = [(g * w).sum(-1, keepdim=True) for g, w in ((gv, self.a), (gu, self.b))] if want_parameters else []
+        sums = [total(g * w) for g, w in ((gv, self.a), (gu, self.b))] if want_parameters else []
         return (gu + d * gv, gv + e * gu), sums
 
 

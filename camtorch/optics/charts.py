@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from camtorch.optics.derivatives import vjp_of
-from camtorch.optics.special import angle_per_radius, cos_root, sinc_root, tanc_root
+from camtorch.optics.special import angle_per_radius, atan2, cos_root, sinc_root, tanc_root
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
@@ -185,7 +185,7 @@ class Equidistant(Chart):
         if order > 1:
             return angle_per_radius(rho2, z)
         rho = (rho2 + floor_of(z.dtype)).sqrt()
-        return torch.atan2(rho, z) / rho
+        return atan2(rho, z) / rho
 
     def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
         rho2 = torch.addcmul(x * x, y, y)
@@ -251,7 +251,7 @@ class CylinderChart(Chart):
         return Perspective().end(dtype) * nearest > extent
 
     def to_plane(self, x, y, z, order=2, scale=None):
-        return torch.atan2(x, z), y * (x * x + z * z).rsqrt()
+        return atan2(x, z), y * (x * x + z * z).rsqrt()
 
     def on_plane(self, a, b):
         return torch.minimum(_half_turn(a.dtype) - a.abs(), Perspective().end(b.dtype) - b.abs())
@@ -272,7 +272,7 @@ class SphereChart(Chart):
         return True
 
     def to_plane(self, x, y, z, order=2, scale=None):
-        return torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())
+        return atan2(x, z), atan2(y, (x * x + z * z).sqrt())
 
     def on_plane(self, a, b):
         return torch.minimum(_half_turn(a.dtype) - a.abs(), math.pi / 2 - b.abs())

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
+from camtorch._threads import ALONE, undivided
 from camtorch._tracing import register
 from camtorch.optics.derivatives import derivatives_of, vjp_of
 from camtorch.optics.special import angle_per_radius, root
@@ -19,8 +20,8 @@ FACTORS: dict[str, type[RadialFactor]] = {}
 
 
 def total(plane: Tensor) -> Tensor:
-    """(*B, N) -> (*B, 1)."""
-    return plane.sum(-1, keepdim=True)
+    """(*B, N) -> (*B, 1). Within `as_cores_are_free` it is rounded alike by any number of threads."""
+    return undivided(lambda: plane.sum(-1, keepdim=True)) if plane.numel() > ALONE else plane.sum(-1, keepdim=True)
 
 
 class RadialFactor:

@@ -12,6 +12,11 @@ import math
 import torch
 from torch import Tensor
 
+from camtorch._threads import ALONE, is_split
+
+# Parts of a block for up to four threads, more are never at it, of pairs of vectors of up to 64 bytes
+_EVEN_PARTS = 3 * 4 * 2 * 64 // 4
+
 # Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
 # them still has a first derivative good to 1e-13 of the function's own scale.
 _SMALL_ANGLE2 = 1e-2
@@ -68,6 +73,21 @@ def cosc_root(t: Tensor) -> Tensor:
     return _blend(t, _COSC, half_angle)
 
 
+def atan2(y: Tensor, x: Tensor) -> Tensor:
+    """torch.atan2 of planes of one shape; outside of compiled code it is rounded alike by any number of threads."""
+    if torch.compiler.is_compiling() or not is_split() or y.numel() <= ALONE:
+        return torch.atan2(y, x)
+    # of each thread's part it takes the last elements, fewer than two vectors, one by one, and rounds them otherwise
+    even = y.numel() // _EVEN_PARTS * _EVEN_PARTS
+    parts = zip(*(plane.reshape(-1).tensor_split((even,)) for plane in (y, x)), strict=True)
+    if torch.is_grad_enabled():
+        return torch.cat([torch.atan2(*part) for part in parts]).view_as(y)
+    result = y.new_empty(y.shape)
+    for part, its_result in zip(parts, result.view(-1).tensor_split((even,)), strict=True):
+        torch.atan2(*part, out=its_result)
+    return result
+
+
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
     """The ratio theta / rho with theta = atan2(rho, z) in [0, pi] and rho2 = rho^2; 1 / z on the axis.
 
@@ -75,12 +95,12 @@ def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
     """
     if order <= 1:
         rho = root(rho2)
-        return torch.atan2(rho, z) / rho
+        return atan2(rho, z) / rho
     small = (z > 0) & (rho2 < _SMALL_SLOPE2 * z * z)
     reciprocal = 1 / torch.where(small, z, 1.0)
     near = reciprocal * _series(torch.where(small, rho2, 0.0) * reciprocal * reciprocal, _ATAN)
     rho = torch.where(small, 1.0, rho2).sqrt()
-    return torch.where(small, near, torch.atan2(rho, z) / rho)
+    return torch.where(small, near, atan2(rho, z) / rho)
 
 
 def tanc_root(t: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch._arguments import columns
+from camtorch._threads import as_cores_are_free
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection.ops import positive, to_planes, without_keeping
 from camtorch.projection.rows import (
@@ -170,6 +171,7 @@ class Project(Function):
         return pixels, positive(mask)
 
     @staticmethod
+    @as_cores_are_free
     def forward(ctx, points, intrinsics, distortion, cameras: Cameras, model: type[Camera], keeps: bool):
         """keeps: whether there will be a backward."""
         shape = points.shape[:2]
@@ -202,6 +204,7 @@ class Project(Function):
         return pixels, valid
 
     @staticmethod
+    @as_cores_are_free
     def backward(ctx, by_pixels, _):
         """The cotangents of points and parameters; with a graph if that is asked for."""
         if by_pixels is None:

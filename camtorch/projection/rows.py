@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._threads import split
 from camtorch._tracing import may_look
+from camtorch.optics.radial import total
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
 
@@ -132,6 +134,8 @@ def blocks(given: Cameras, rows: Tensor) -> Iterator[Block]:
         return
     if not given.looks or count * length <= _BLOCK:  # elsewhere than on a CPU a kernel more costs more than memory
         everything = slice(0, count), slice(0, length)
+        if given.looks:
+            split(count * length)
         yield Block(*everything, (), given.columns, given.domain, given.usable)
         return
     if length > _BLOCK // 2:
@@ -147,6 +151,7 @@ def blocks(given: Cameras, rows: Tensor) -> Iterator[Block]:
             last = cameras
             shared = columns(given.intrinsics[cameras]), given.domain.part(cameras)
             usable = None if given.usable is None else given.usable[cameras]
+        split((cameras.stop - cameras.start) * (points.stop - points.start))
         yield Block(cameras, points, (cameras, points), *shared, usable)
 
 
@@ -216,12 +221,12 @@ class Sums:
         """gu, gv: the cotangents of pixels. x, y: the points on the plane of the lens."""
         if self.wants_intrinsics:
             for i, plane in enumerate((gu * x, gv * y, gu, gv)):
-                self.intrinsics[block.cameras, i] += plane.sum(-1)
+                self.intrinsics[block.cameras, i, None] += total(plane)
 
     def add_optics(self, block: Block, sums: list[Tensor]) -> None:
         """sums: those of the chart's parameters, then those of the lens."""
-        for total, part in zip(self.optics, sums, strict=True):
-            total[block.cameras] += part
+        for whole, part in zip(self.optics, sums, strict=True):
+            whole[block.cameras] += part
 
     def result(self) -> tuple[Tensor | None, Tensor | None]:
         """Those of the intrinsics and of the distortion, whose part in chart and lens is whatever the model says."""

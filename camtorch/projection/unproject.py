@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch._arguments import columns
+from camtorch._threads import as_cores_are_free
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, BriefTable, short, solve
 from camtorch.projection.ops import positive, search_in_place, search_open, to_planes, without_keeping
@@ -316,6 +317,7 @@ class Unproject(Function):
         return rays, positive(torch.ones_like(a) if mask is None else mask.expand_as(a))
 
     @staticmethod
+    @as_cores_are_free
     def forward(ctx, pixels, intrinsics, distortion, cameras: Cameras, model: type[Camera], keeps: bool):
         """keeps: whether there will be a backward."""
         shape, looks = pixels.shape[:2], cameras.looks
@@ -347,6 +349,7 @@ class Unproject(Function):
         return rays, valid
 
     @staticmethod
+    @as_cores_are_free
     def backward(ctx, by_rays, _):
         """The cotangents of pixels and parameters; with a graph if that is asked for."""
         if by_rays is None:
