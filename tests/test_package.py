@@ -137,7 +137,7 @@ def checkout(tmp_path):
         shutil.copy(ROOT / name, folder)
     native = folder / "camtorch" / "native"
     (native / "kernel.c").write_text("int VARIANT;\n")
-    (native / "dispatch.c").write_text("int camtorch_abi(void) { return 0; }\n")
+    (native / "dispatch.c").write_text("unsigned camtorch_sources(void) { return SOURCES; }\n")
     (native / LIBRARY).write_bytes(b"older")
     return folder
 
@@ -159,7 +159,7 @@ def test_a_wheel_has_the_sampler_and_is_for_this_machine(checkout, tmp_path, hat
     assert name.startswith("py3-none-")  # of any Python, on this
     assert name.endswith(f"_{platform.machine().lower()}.whl")
     assert list(found) == [LIBRARY]
-    assert b"camtorch_abi" in found[LIBRARY]
+    assert b"camtorch_sources" in found[LIBRARY]
     assert (checkout / "camtorch" / "native" / LIBRARY).read_bytes() == b"older"
 
 
@@ -189,6 +189,6 @@ def test_an_editable_install_has_it_in_place(checkout, tmp_path, hatchling):
     assert not (native / LIBRARY).exists()
     assert (native / REASON).read_text().startswith("no C compiler")
     hatchling(checkout, "-t", "wheel:editable", "-d", tmp_path)
-    assert b"camtorch_abi" in (native / LIBRARY).read_bytes()
+    assert b"camtorch_sources" in (native / LIBRARY).read_bytes()
     assert not (native / REASON).exists()
     assert held(tmp_path)[1] == {}

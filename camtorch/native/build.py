@@ -15,6 +15,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -52,6 +53,12 @@ def switched_off() -> bool:
     return os.environ.get("CAMTORCH_NATIVE", "").strip().lower() in ("0", "off", "false")
 
 
+def checksum(sources: str | os.PathLike[str] = _HERE) -> int | None:
+    """A number of what the C files in a folder say, or None if it has none; a library holds that of its sources."""
+    texts = [path.read_bytes() for path in sorted(Path(sources).glob("*.[ch]"))]
+    return zlib.crc32(b"\0".join(texts)) if texts else None
+
+
 def build(
     directory: str | os.PathLike[str] | None = None,
     *,
@@ -84,6 +91,7 @@ def build(
         tools = toolchain(command, Path(folder), tuple(extra))
         variants = {name: flags for name, flags in _VARIANTS.items() if tools.accepts(flags)}
         has = [f"HAS_{name.upper()}" for name in variants if name != "baseline"]
+        has.append(f"SOURCES={checksum(here)}u")
         units: list[tuple[str, str, tuple[str, ...], list[str]]] = [("dispatch.c", "dispatch", (), has)]
         units += [("kernel.c", name, flags, [f"VARIANT={name}"]) for name, flags in variants.items()]
         with ThreadPoolExecutor(os.cpu_count()) as pool:

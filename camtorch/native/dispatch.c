@@ -34,7 +34,7 @@ static int variant(void) {
     return BASELINE;
 }
 
-EXPORTED int camtorch_abi(void) { return CAMTORCH_ABI; }
+EXPORTED unsigned camtorch_sources(void) { return SOURCES; }
 
 EXPORTED const char *camtorch_variant(void) {
     static const char *const names[] = {"baseline", "avx2", "avx512"};

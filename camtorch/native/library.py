@@ -8,10 +8,7 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from camtorch.native.build import LIBRARY, REASON, switched_off
-
-# of dispatch.c's functions and structs; both numbers change when a caller of them has to
-ABI = 1
+from camtorch.native.build import LIBRARY, REASON, checksum, switched_off
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
@@ -34,23 +31,29 @@ def _find() -> _Found:
         return _Found(None, f"not built ({why}); with a C compiler `{_BUILD}` builds it")
     try:
         library = ctypes.CDLL(str(path))
-        library.camtorch_abi.restype = ctypes.c_int
-        library.camtorch_variant.restype = ctypes.c_char_p
-        abi = library.camtorch_abi()
-    except (OSError, AttributeError) as error:
+    except OSError as error:
         return _Found(None, f"not loaded ({error}); `{_BUILD}` builds it again")
-    if abi != ABI:
-        why = f"not used (built from sources of another version: {abi} is not {ABI})"
+    here = checksum()
+    if here is not None and here != _sources(library):  # None: packed into something that leaves sources out
+        why = "not used (built from other sources than those beside it)"
         return _Found(None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again", stale=True)
+    library.camtorch_variant.restype = ctypes.c_char_p
     return _Found(library, library.camtorch_variant().decode())
+
+
+def _sources(library: ctypes.CDLL) -> int | None:
+    if not hasattr(library, "camtorch_sources"):
+        return None
+    library.camtorch_sources.restype = ctypes.c_uint32
+    return int(library.camtorch_sources())
 
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
     """The library, loaded at first use; calls into it hold no lock of Python's.
 
-    None where it is turned off (`CAMTORCH_NATIVE=0`), was not built, does not load, or is of another version than these
-    files, which is a warning.
+    None where it is turned off (`CAMTORCH_NATIVE=0`), was not built, does not load, or was built from other sources
+    than lie here, as after a `git pull`, which is a warning: these files may call it otherwise than it expects.
     """
     found = _find()
     if found.stale:

@@ -4,8 +4,6 @@
 
 #include <stdint.h>
 
-#define CAMTORCH_ABI 1
-
 #if defined(_MSC_VER)
 #define EXPORTED __declspec(dllexport)
 #else
