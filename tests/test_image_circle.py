@@ -136,3 +136,17 @@ def test_corners_without_a_ray_are_searched_for_once(dtype, monkeypatch):
     lens = camera._cameras(camera.intrinsics[None], camera.distortion[None]).domain
     assert "azimuths" not in lens.__dict__
     assert torch.isfinite(rays).all()
+
+
+@pytest.mark.parametrize("key", LENSES)
+def test_what_inference_mode_tabulates_serves_a_graph_later(key):
+    camera = one(key).requires_grad_(False)
+    rays, pixels = fan(60, 6, 6), pixel_lattice(camera, 5, 5)
+    with torch.inference_mode():
+        camera.project(rays)
+        camera.unproject(pixels * 1.5 - 50)
+    for method, values in ((camera.project, rays), (camera.unproject, pixels * 1.5 - 50)):
+        values = values.clone().requires_grad_()
+        (first,) = torch.autograd.grad(method(values)[0].square().sum(), values, create_graph=True)
+        (second,) = torch.autograd.grad(first.square().sum(), values)
+        assert torch.isfinite(second).all()

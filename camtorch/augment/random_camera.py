@@ -19,7 +19,7 @@ from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera, from_values
 from camtorch.models import MODELS
-from camtorch.projection.domain import Domain, domain_of
+from camtorch.projection.domain import Domain, domain_of, keep
 from camtorch.projection.rays import field_of_view, image_lattice
 from camtorch.projection.unproject import shown
 from camtorch.rotations import mount_rotation
@@ -367,17 +367,20 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     p, q = torch.where(seen, p, 0.0), torch.where(seen, q, 0.0)
     given = given.expand_as(steps)
     candidate, defined = _defined(camera, given + steps, given)
-    fits = defined & shown(domain_of(camera._model, candidate, camera.optics), p, q).all(-1)
+    lenses = domain_of(camera._model, candidate, camera.optics)
+    fits = defined & shown(lenses, p, q).all(-1)
     result = torch.where(fits.unsqueeze(-1), candidate, given)
     (left,) = (~fits).nonzero(as_tuple=True)
     if len(left):  # all that may come next at once: (parts, lenses left, n)
         given, parts = given[left].expand(len(_PARTS), -1, -1), steps.new_tensor(_PARTS)[:, None, None]
         candidate, defined = _defined(camera, given + parts * steps[left], given)
-        lenses = Domain(camera.optics, candidate.flatten(0, 1))
-        fits = shown(lenses, *(w[left].repeat(len(_PARTS), 1) for w in (p, q))).all(-1).view_as(defined) & defined
-        first = fits.to(torch.uint8).argmax(0)
-        found = candidate[first, torch.arange(len(left), device=left.device)]
-        result[left] = torch.where(fits.any(0).unsqueeze(-1), found, given[0])
+        others = Domain(camera.optics, candidate.flatten(0, 1))
+        fits = shown(others, *(w[left].repeat(len(_PARTS), 1) for w in (p, q))).all(-1).view_as(defined) & defined
+        first = fits.to(torch.uint8).argmax(0) * len(left) + torch.arange(len(left), device=left.device)
+        some = fits.any(0)
+        result[left] = torch.where(some.unsqueeze(-1), others.k[first], given[0])
+        if bool(some.all()):  # what is known of their folds is asked for soon
+            keep(camera._model, lenses.replaced(left, others, first))
     return result.view(*batch, count)
 
 

@@ -33,7 +33,8 @@ def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property:
     def table(self: Domain) -> Tensor:
         if self.whole is not None:
             return getattr(self.whole, make.__name__)[self.cameras]
-        with torch.no_grad():
+        # what inference mode makes could not be used in a graph later
+        with torch.inference_mode(False), torch.no_grad():
             return make(self)
 
     table.__doc__ = make.__doc__
@@ -70,6 +71,19 @@ class Domain:
         k = self.k[0].unsqueeze(-1) if len(self.k) == 1 else self.k[camera].mT
         return self.optics(k.unbind(0))
 
+    def replaced(self, rows: Tensor, other: Domain, index: Tensor) -> Domain:
+        """The domain in which the cameras `rows` are those of another at `index`; what both know of folds is kept."""
+
+        def mixed(mine: Tensor, its: Tensor) -> Tensor:
+            return mine.index_copy(0, rows, its[index])
+
+        with torch.inference_mode(False), torch.no_grad():
+            made = Domain(self.optics, mixed(self.k, other.k))
+            for name in ("_fold", "edge2", "circle2"):
+                if name in self.__dict__ and name in other.__dict__:
+                    made.__dict__[name] = mixed(self.__dict__[name], other.__dict__[name])
+        return made
+
     def with_tables(self, inner2: Tensor, limits2: Tensor, table: Tensor) -> Domain:
         """The same domain with tables that were made elsewhere."""
         # set, not cached: a compiler cannot follow the lock of a cached property
@@ -82,7 +96,8 @@ class Domain:
     @cached_property
     def azimuths(self) -> Azimuths:
         """Of all cameras, also where this is a part."""
-        return Azimuths(self.optics, self.k) if self.whole is None else self.whole.azimuths
+        with torch.inference_mode(False):
+            return Azimuths(self.optics, self.k) if self.whole is None else self.whole.azimuths
 
     @_per_camera
     def edge2(self) -> Tensor:
@@ -238,7 +253,12 @@ def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
                 _domains = [known[i], *known[:i], *known[i + 1 :]]
             return domain
     with torch.inference_mode(False), torch.no_grad():
-        values = k.detach().clone()
-        domain = Domain(optics, values)
-    _domains = [(model, values, domain), *known[: _KEPT - 1]]
+        domain = Domain(optics, k.detach().clone())
+    keep(model, domain)
     return domain
+
+
+def keep(model: str, domain: Domain) -> None:
+    """Have `domain_of` know a domain, whose coefficients will not change."""
+    global _domains
+    _domains = [(model, domain.k, domain), *_domains[: _KEPT - 1]]
