@@ -233,7 +233,7 @@ def _tensor(array: Array) -> Tensor:
     # torch takes neither other byte orders nor long doubles, nor strides that are negative or end within a number
     dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.dtype(np.float64)
     whole = array.flags.aligned and all(step % array.itemsize == 0 for step in array.strides)
-    backwards = [axis for axis, step in enumerate(array.strides) if step < 0]
+    backwards = tuple(axis for axis, step in enumerate(array.strides) if step < 0)
     turns = array.dtype.kind != "u" or array.itemsize == 1  # torch turns no wide unsigned integers round
     if array.dtype != dtype or not whole or (backwards and not turns):
         return torch.from_numpy(np.array(array, dtype, order="C"))

@@ -197,7 +197,7 @@ def _pil(change: Change, image: PIL.Image.Image) -> PIL.Image.Image:
         )
     array = np.asarray(image)
     moved = as_array(change.images(as_tensor("image", array))[0], array)
-    return PIL.Image.frombytes(image.mode, moved.shape[1::-1], moved.tobytes())
+    return PIL.Image.frombuffer(image.mode, moved.shape[1::-1], moved, "raw", image.mode, 0, 1)
 
 
 def _labels(change: Change, masks: Tensor, fill: float) -> Tensor:
