@@ -137,6 +137,8 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 
 ALONE = (1 << 15) - 1
 """Elements up to which it is not worth while to split an operation."""
+EVEN = 3 * 4 * 2 * 16
+"""Multiples of so many elements are split between pairs of vectors, up to 64 bytes wide, by one to four threads."""
 _GLANCE = 2e-3  # seconds for which a look at the cores holds
 _SPIN = 1e-3  # seconds for which threads certainly go on running after an operation
 _LONGEST = 0.5  # seconds
@@ -155,7 +157,7 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if _mine.threads:  # of a function that called this one
             return function(*args, **kwargs)
-        _mine.threads = torch.get_num_threads()
+        _mine.threads = torch.get_num_threads() if _limits is not None else 1
         try:
             split()
             return function(*args, **kwargs)
@@ -199,7 +201,8 @@ class _Mine(threading.local):
 
     def set_alone(self, alone: bool) -> None:
         """Split them, or not."""
-        if alone != self.is_alone and _limits is not None:
+        if alone != self.is_alone:
+            assert _limits is not None  # there is but one thread otherwise
             # not torch.set_num_threads: that reaches other threads as well
             openmp, mkl = _limits
             self.is_alone = alone

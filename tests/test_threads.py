@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections import deque
+from itertools import pairwise
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from cameras import RARE_ARE_SLOW, one
 import camtorch as ct
 from camtorch import _threads
 from camtorch._threads import spread
+from camtorch.projection import rows
 
 
 class Pieces:
@@ -342,9 +344,9 @@ def everything(camera, method, values, weights):
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)
 @pytest.mark.parametrize("method", ["project", "unproject"])
 def test_results_do_not_depend_on_threads(key, method, clock):
-    camera, generator = one(key).float(), torch.Generator().manual_seed(0)
-    values = torch.randn(70_001, 3, generator=generator) + torch.tensor([0.0, 0, 1.5])
-    weights = torch.rand(70_001, 2 if method == "project" else 3, generator=generator)
+    camera, generator, count = one(key).float(), torch.Generator().manual_seed(0), 70_001
+    values = torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0, 1.5])
+    weights = torch.rand(count, 2 if method == "project" else 3, generator=generator)
     if method == "unproject":
         values = camera.project(values)[0].detach()
     found, before = [], torch.get_num_threads()
@@ -361,6 +363,19 @@ def test_results_do_not_depend_on_threads(key, method, clock):
                 torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-4 * expected.abs().max().item())
             else:
                 assert torch.equal(result, expected), name
+
+
+@pytest.mark.parametrize("length", [1, 1000, 65_537, 131_073, 150_001, 500_000, 1_000_000, 1_111_111])
+def test_blocks_are_split_evenly(length):
+    camera = one("kannala_brandt")
+    cameras = rows.Cameras.of(type(camera), camera.intrinsics[None].detach(), camera.distortion[None].detach())
+    edges = [block.points for block in rows.blocks(cameras, torch.empty(1, length, 3))]
+    assert (edges[0].start, edges[-1].stop) == (0, length)
+    assert all(before.stop == after.start for before, after in pairwise(edges))
+    sizes = [points.stop - points.start for points in edges]
+    assert max(sizes) <= 4 * 2**15  # torch gives no thread less than 2^15 elements
+    assert max(sizes) <= 1.1 * min(sizes)
+    assert all(size % _threads.EVEN == 0 for size in sizes[:-1])
 
 
 def test_several_threads_use_one_camera():

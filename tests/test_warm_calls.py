@@ -9,7 +9,7 @@ from cameras import one
 
 import camtorch as ct
 
-MOST = {"project": (8, 31), "unproject": (8, 35)}  # files, functions
+MOST = {"project": (8, 30), "unproject": (8, 35)}  # files, functions
 ROOT = Path(ct.__file__).parent
 
 

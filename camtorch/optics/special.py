@@ -12,10 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from camtorch._threads import ALONE, is_split
-
-# Parts of a block for up to four threads, more are never at it, of pairs of vectors of up to 64 bytes
-_EVEN_PARTS = 3 * 4 * 2 * 64 // 4
+from camtorch._threads import ALONE, EVEN, is_split
 
 # Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
 # them still has a first derivative good to 1e-13 of the function's own scale.
@@ -74,18 +71,17 @@ def cosc_root(t: Tensor) -> Tensor:
 
 
 def atan2(y: Tensor, x: Tensor) -> Tensor:
-    """torch.atan2 of planes of one shape; outside of compiled code it is rounded alike by any number of threads."""
+    """torch.atan2 of planes of one shape; outside of compiled code it is rounded alike by any number of threads.
+
+    It takes the last elements of each thread's part, fewer than two vectors, one by one, and rounds them otherwise.
+    """
     if torch.compiler.is_compiling() or not is_split() or y.numel() <= ALONE:
         return torch.atan2(y, x)
-    # of each thread's part it takes the last elements, fewer than two vectors, one by one, and rounds them otherwise
-    even = y.numel() // _EVEN_PARTS * _EVEN_PARTS
-    parts = zip(*(plane.reshape(-1).tensor_split((even,)) for plane in (y, x)), strict=True)
-    if torch.is_grad_enabled():
-        return torch.cat([torch.atan2(*part) for part in parts]).view_as(y)
-    result = y.new_empty(y.shape)
-    for part, its_result in zip(parts, result.view(-1).tensor_split((even,)), strict=True):
-        torch.atan2(*part, out=its_result)
-    return result
+    y, x, shape = y.reshape(-1), x.reshape(-1), y.shape
+    even = len(y) // EVEN * EVEN
+    if even == len(y):
+        return torch.atan2(y, x).view(shape)
+    return torch.cat((torch.atan2(y[:even], x[:even]), torch.atan2(y[even:], x[even:]))).view(shape)
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:

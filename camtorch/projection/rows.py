@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch._threads import split
+from camtorch._threads import ALONE, EVEN, split
 from camtorch._tracing import may_look
 from camtorch.optics.radial import total
 from camtorch.projection.domain import Domain, domain_of
@@ -25,7 +25,7 @@ Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
 Columns = tuple[Tensor, ...]
 
-_BLOCK = 1 << 17  # points
+_BLOCK = 341 * EVEN  # points, not quite 2^17: so that torch splits them among four threads at the most
 FEW = 1024
 """Points of one camera that are fewer than the nodes of its table."""
 
@@ -140,7 +140,8 @@ def blocks(given: Cameras, rows: Tensor) -> Iterator[Block]:
         return
     if length > _BLOCK // 2:
         parts = -(-length // _BLOCK)
-        edges = [length * i // parts for i in range(parts + 1)]
+        even = EVEN if length // parts > ALONE else 1
+        edges = [*(-(-length * i // (parts * even)) * even for i in range(parts)), length]
         spans = [(slice(c, c + 1), slice(*span)) for c in range(count) for span in pairwise(edges)]
     else:
         step = _BLOCK // length
