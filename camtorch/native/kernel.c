@@ -21,7 +21,7 @@
 #define JOINED(a, b) JOINED_(a, b)
 #define THIS(name) JOINED(name, VARIANT)
 
-#if defined(__GNUC__)
+#if defined(__GNUC__) && !defined(CAMTORCH_PLAIN)
 #define VECTORS 1
 #define INLINE static inline __attribute__((always_inline))
 #define NOT_INLINE static __attribute__((noinline))
@@ -84,7 +84,8 @@ INLINE void move(char *to, int64_t i, const char *from, int64_t j, int type) {
     }
 }
 
-static float clamped(float x, float last) { return x < 0 ? 0 : x > last ? last : x; }
+/* What is not a number, as the reflection of infinity, is the first */
+static float clamped(float x, float last) { return x > 0 ? x > last ? last : x : 0; }
 
 static float reflected(float x, float side) {
     float extra, distance = fabsf(x + 0.5f);
@@ -285,9 +286,10 @@ INLINE int inside(const Job *job, V8 u, V8 v, float before, float beyond) {
     return all8((u >= low) & (u <= right) & (v >= low) & (v <= below));
 }
 
-INLINE Squares squares_of(const Job *job, V8 u, V8 v) {
+/* None begins in the last `beyond` columns, nor in the last row */
+INLINE Squares squares_of(const Job *job, V8 u, V8 v, int32_t beyond) {
     Squares at;
-    at.x = least8(whole8(u), every8i((int32_t)job->source_width - 2));
+    at.x = least8(whole8(u), every8i((int32_t)job->source_width - 1 - beyond));
     at.y = least8(whole8(v), every8i((int32_t)job->source_height - 2));
     at.u = u - float8(at.x);
     at.v = v - float8(at.y);
@@ -362,6 +364,9 @@ INLINE Pairs word_pairs(const uint16_t *plane, const int64_t *at) {
 #endif
     return pairs;
 }
+
+/* True from one half on, as bytes */
+INLINE I8 truth8(V8 value) { return -(value >= every8(0.5f)); }
 
 INLINE I8 byte_pairs(const uint8_t *plane, const int64_t *at) {
     uint16_t p[STEP];
@@ -487,7 +492,7 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
         value = across8(upper, at.u) * (1 - at.v) + across8(lower, at.u) * at.v;
         if (type == FLOAT32) store_floats(result, value, span->pixels);
         else if (type == UINT16) store_words(result, rounded8(value), span->pixels);
-        else store_bytes(result, rounded8(value), span->pixels);
+        else store_bytes(result, type == BOOL ? truth8(value) : rounded8(value), span->pixels);
     }
 }
 
@@ -577,7 +582,7 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
         else memcpy(span->result, values, (size_t)n * sizeof(float));
     } else {
         for (i = 0; i < n; i += STEP) {
-            const I8 whole = rounded8(load8(values + i));
+            const I8 whole = type == BOOL ? truth8(load8(values + i)) : rounded8(load8(values + i));
             const int64_t left = n - i < STEP ? n - i : STEP;
             if (type == UINT16) store_words(span->result + 2 * i, whole, left);
             else store_bytes(span->result + i, whole, left);
@@ -590,7 +595,7 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
 INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
     const Job *job = span->job;
     const int64_t bytes = size_of(type), below = job->source_strides[2] * bytes;
-    const Squares at = squares_of(job, u, v);
+    const Squares at = squares_of(job, u, v, 1);
     int64_t offsets[STEP], c;
     float across[STEP][4], down[STEP][4];
     int i;
@@ -650,13 +655,13 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
         }
     } else if (mode == BILINEAR && layout == PLANES) {
         if (job->source_width > 1 && job->source_height > 1 && inside(job, u, v, 0, 0)) {
-            bilinear_planes(span, squares_of(job, u, v), type);
+            bilinear_planes(span, squares_of(job, u, v, 1), type);
             return;
         }
     } else if (mode == BILINEAR && layout == INTERLEAVED) {
         /* two pixels are read as eight elements, where six are theirs */
         if (job->source_width > 2 && job->source_height > 1 && inside(job, u, v, 0, 1)) {
-            bilinear_interleaved(span, squares_of(job, u, v), type);
+            bilinear_interleaved(span, squares_of(job, u, v, 2), type);
             return;
         }
     } else if (mode == BICUBIC && layout == PLANES) {

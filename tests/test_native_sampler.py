@@ -1,0 +1,340 @@
+"""Laws of the compiled sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
+
+import math
+import os
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+from cameras import KEYS, drawn
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import camtorch as ct
+from camtorch.native import sampler
+from camtorch.native.library import library
+from camtorch.warp import grid as positions
+from camtorch.warp import sampling
+from camtorch.warp.grid import Lattice, Sampling
+
+MODES = ("nearest", "bilinear", "bicubic")
+PADDINGS = ("zeros", "border", "reflection")
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+INTEGERS = (torch.bool, torch.uint8, torch.int8, torch.uint16, torch.int16, torch.int32, torch.int64)
+
+pytestmark = pytest.mark.skipif(not ct.native_available(), reason="the sampler is not compiled here, or turned off")
+
+
+@contextmanager
+def torch_alone():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampling, "native_available", lambda: False)
+        yield
+
+
+@contextmanager
+def counted():
+    """How often the compiled sampler was called."""
+    calls = []
+    with pytest.MonkeyPatch.context() as patch:
+        original = sampler.sample
+        patch.setattr(sampler, "sample", lambda *a, **k: calls.append(1) or original(*a, **k))
+        yield calls
+
+
+def generator(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def pixels(dtype, shape, seed=0):
+    """Noise over the whole range of a dtype, or of what float64 holds of it; floats from -1 to 1."""
+    if dtype.is_floating_point:
+        return (2 * torch.rand(shape, generator=generator(seed), dtype=torch.float64) - 1).to(dtype)
+    if dtype == torch.bool:
+        return torch.rand(shape, generator=generator(seed)) < 0.5
+    info = torch.iinfo(dtype)
+    low, high = max(info.min, -(2**52)), min(info.max, 2**52)
+    return torch.randint(low, high + 1, shape, generator=generator(seed)).to(dtype)
+
+
+def extent(dtype):
+    """From the least to the largest pixel of `pixels`."""
+    if dtype.is_floating_point or dtype == torch.bool:
+        return 2.0 if dtype.is_floating_point else 1.0
+    info = torch.iinfo(dtype)
+    return float(min(info.max, 2**52)) - float(max(info.min, -(2**52)))
+
+
+def spots(count, size, source, seed=0):
+    """(count, *size, 2): positions of which most are on the image, some beyond its rim and a few far off."""
+    grid = 2.4 * torch.rand(count, *size, 2, generator=generator(seed)) - 1.2
+    sides = torch.tensor(source[::-1], dtype=torch.float32)
+    places = grid.flatten(0, 2)
+    # exactly on pixels, between two of them, on the first and last ones, and just beyond
+    whole = torch.randint(-2, max(source) + 2, places.shape, generator=generator(seed + 1)) / 2
+    special = (2 * whole + 1) / sides - 1
+    pick = torch.rand(len(places), generator=generator(seed + 2))
+    places[pick < 0.15] = special[pick < 0.15]
+    places[pick > 0.98] = torch.tensor([-100.0, 100.0])
+    places[(pick > 0.96) & (pick < 0.97)] = -9.0
+    return grid
+
+
+def between(grid, source):
+    """(B, h, w): positions next to half-way between two pixels, where a rounding decides which is the nearest."""
+    pixel = ((grid.double() + 1) * torch.tensor(source[::-1]) - 1) / 2
+    return ((pixel - pixel.floor() - 0.5).abs() < 1e-4 * (1 + pixel.abs())).any(-1)
+
+
+def compare(result, expected, mode, unsure, span):
+    assert result.dtype == expected.dtype
+    assert result.shape == expected.shape
+    if not result.numel():
+        return
+    unsure = unsure.unsqueeze(1).expand_as(result)
+    if mode == "nearest":
+        same = result == expected
+        assert same[~unsure].all()
+    elif result.dtype == torch.bool:
+        # of two samples next to one half either may be true
+        assert (result != expected)[~unsure].count_nonzero() <= 0.01 * result.numel() + 2
+    elif result.dtype.is_floating_point:
+        lost = 1e-5 * span + torch.finfo(result.dtype).eps * (result.dtype.itemsize < 4) * span
+        assert (result.double() - expected.double()).abs().max() <= lost
+    else:
+        # float32 and float64 hold no larger whole numbers side by side
+        rounding = 1 if result.dtype.itemsize < 4 else span * 2e-7
+        off = (result.double() - expected.double()).abs()
+        assert off.max() <= rounding
+        if result.dtype.itemsize == 1:
+            assert off[~unsure].count_nonzero() <= 0.01 * off.numel() + 2
+
+
+def both(images, where, mode, padding, fill=(0.0,), span=None):
+    """What the compiled sampler makes, which is what torch makes."""
+    with counted() as calls:
+        result = sampling.render(images, where, mode, padding, fill)
+    # what is computed in float32 is sampled so too, if nothing is to be filled in afterwards
+    wide = padding == "zeros" and sampling.widen(images[:0]).dtype == torch.float32
+    assert bool(calls) == (sampler.takes(images.dtype, mode) or wide)
+    with torch_alone(), counted() as calls:
+        expected = sampling.render(images, where, mode, padding, fill)
+    assert not calls
+    grid = where.pixels.grid if isinstance(where, Lattice) else where.grid
+    compare(result, expected, mode, between(grid, images.shape[-2:]), span or extent(images.dtype))
+    return result
+
+
+# -- every dtype, mode and padding, wherever images lie in memory
+
+
+def hwc(images):
+    return images.contiguous(memory_format=torch.channels_last)
+
+
+def cropped(images):
+    larger = images.new_zeros(*images.shape[:-2], images.shape[-2] + 5, images.shape[-1] + 11)
+    here = larger[..., 2:-3, 7:-4]
+    return here.copy_(images)
+
+
+LAYOUTS = {
+    "contiguous": lambda images: images.contiguous(),
+    "channels last": hwc,
+    "cropped": cropped,
+    "cropped, channels last": lambda images: hwc(torch.cat((images, images), -1))[..., : images.shape[-1]],
+    "of an array": lambda images: torch.stack(list(images.movedim(1, -1))).movedim(-1, 1),
+    "transposed": lambda images: images.mT.contiguous().mT,
+    "every other pixel": lambda images: images.repeat_interleave(2, -1)[..., ::2],
+    "every other channel": lambda images: images.repeat_interleave(2, 1)[:, ::2],
+    "every other channel, channels last": lambda images: hwc(images.repeat_interleave(2, 1))[:, ::2],
+    "images last": lambda images: images.movedim(0, -1).contiguous().movedim(-1, 0),
+    "one column for all": lambda images: images[..., :1].expand(images.shape),
+    "one row for all": lambda images: images[..., :1, :].expand(images.shape),
+    "one row for all, channels last": lambda images: hwc(images)[..., :1, :].expand(images.shape),
+    "one channel for all": lambda images: images[:, :1].expand(images.shape),
+}
+
+
+def fills(dtype, channels):
+    if dtype == torch.bool:
+        return (0.0,), (1.0,), (0.4,)
+    # no further: what `1 - covered` is rounded by grows with it
+    outside = 1.5 * torch.iinfo(dtype).max if not dtype.is_floating_point and dtype.itemsize < 4 else 3.0
+    return (0.0,), (1.0,), (outside,), tuple(float(c) - 1.5 for c in range(channels))
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("dtype", INTEGERS + FLOATS)
+def test_every_image_is_sampled_as_torch_does(dtype, mode, padding):
+    count, source, target = 2, (23, 37), (13, 30)
+    where = Sampling(spots(count, target, source), torch.rand(count, *target, generator=generator(9)) < 0.9, None)
+    if padding == "zeros":
+        where.grid[~where.mapped] = positions.OUTSIDE
+    for i, (name, layout) in enumerate(LAYOUTS.items()):
+        channels = (1, 3, 4, 2, 5, 7)[i % 6] if "last" not in name else (3, 4)[i % 2]
+        images = pixels(dtype, (count, channels, *source), i)
+        values = fills(dtype, channels)
+        fill = values[i % len(values)]
+        span = extent(dtype)
+        if dtype.is_floating_point:
+            # fills have a part in the range, and half precision has an end
+            fill = tuple(max(min(value, 1.0), -1.0) for value in fill)
+        given = layout(images)
+        result = both(given, where, mode, padding, fill, span)
+        if given.stride(1) == 1 and given.stride(3) == channels > 1:
+            assert result.is_contiguous(memory_format=torch.channels_last) or not sampler.takes(dtype, mode)
+
+
+SIZES = [
+    (1, 1),
+    (1, 2),
+    (2, 1),
+    (2, 2),
+    (1, 9),
+    (9, 1),
+    (2, 3),
+    (3, 2),
+    (3, 3),
+    (4, 4),
+    (5, 7),
+    (8, 8),
+    (9, 17),
+    (17, 64),
+    (31, 33),
+]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.uint16, torch.bool])
+def test_every_size_is_sampled_as_torch_does(dtype, mode):
+    for i, source in enumerate(SIZES):
+        for j, target in enumerate(SIZES):
+            padding, channels = PADDINGS[(i + j) % 3], (1, 3, 4)[(i + j // 3) % 3]
+            where = Sampling(spots(1, target, source, i), torch.ones(1, *target, dtype=torch.bool), None)
+            images = pixels(dtype, (2, channels, *source), j)
+            both(hwc(images) if j % 2 else images, where, mode, padding)
+
+
+def gentle(count, size, source, zoom=1.0, turn=0.1):
+    """(count, *size, 2): neighbours that lie next to each other, as those of cameras do."""
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) - side / 2 for side in size), indexing="ij")
+    turns = turn * (1 + torch.arange(count, dtype=torch.float64))[:, None, None]
+    at = torch.stack((u * turns.cos() - v * turns.sin(), u * turns.sin() + v * turns.cos()), -1)
+    return (zoom * at * 2 / torch.tensor(source[::-1])).float()
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.uint16, torch.float32, torch.int32])
+def test_rows_that_read_rows_are_sampled_as_torch_does(dtype, mode, padding):
+    """What is read of neighbouring pixels at once is theirs, at every zoom and turn."""
+    for i, (source, zoom, turn) in enumerate(
+        (
+            (s, z, t)
+            for s in ((48, 64), (33, 95))
+            for z in (0.3217, 0.9113, 1.0, 1.7321)
+            for t in (0.0, 0.02, 0.3, 1.6, 3.14159)
+        )
+    ):
+        target = (50, (64, 71, 95)[i % 3])
+        grid = gentle(2, target, source, zoom, turn)
+        if turn == 0.0:  # the rim, and pixels themselves
+            grid = grid - grid[:, :1, :1] - (1 - 1 / torch.tensor(source[::-1], dtype=torch.float32))
+        where = Sampling(grid, torch.ones(2, *target, dtype=torch.bool), None)
+        for channels in (1, 3, 4):
+            images = pixels(dtype, (2, channels, *source), i)
+            both(images, where, mode, padding, (1.0,))
+            both(hwc(images), where, mode, padding, (1.0,))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_every_layout_of_a_grid(dtype):
+    source, target = (23, 37), (13, 30)
+    base = spots(3, target, source)
+    mapped = torch.ones(3, *target, dtype=torch.bool)
+    images = pixels(dtype, (3, 3, *source))
+    expected = both(images, Sampling(base, mapped, None), "bilinear", "zeros")
+    layouts = {
+        "planes": base.movedim(-1, 0).contiguous().movedim(0, -1),
+        "cropped": torch.nn.functional.pad(base, (0, 3, 2, 9, 1, 1))[:, 1:-1, 2:-9, :2],
+        "columns": base.transpose(1, 2).contiguous().transpose(1, 2),
+        "images last": base.movedim(0, -1).contiguous().movedim(-1, 0),
+        "float64": base.double(),
+        "float64 planes": base.double().movedim(-1, 0).contiguous().movedim(0, -1),
+    }
+    for grid in layouts.values():
+        assert torch.equal(both(images, Sampling(grid, mapped, None), "bilinear", "zeros"), expected)
+    for shared in (
+        base[:1],
+        base[:1].expand(3, -1, -1, -1),
+        base[:, :1].expand(base.shape),
+        base[:, :, :1].expand(base.shape),
+    ):
+        both(images, Sampling(shared, mapped[: len(shared)], None), "bilinear", "reflection")
+    one = both(images[:1], Sampling(base, mapped, None), "bilinear", "border")
+    assert torch.equal(one[1], both(images[:1], Sampling(base[1:2], mapped[:1], None), "bilinear", "border")[0])
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_positions_that_are_far_or_no_numbers(dtype, mode, padding):
+    source, size = (23, 37), (4, 40)
+    images = pixels(dtype, (1, 3, *source))
+    for strange in (math.nan, math.inf, -math.inf, 1e30, -1e30, 3.4e38, 2.0**31, -(2.0**63), 1e-45):
+        for both_axes in (False, True):
+            grid = torch.zeros(1, *size, 2)
+            grid[..., ::3, 0] = strange
+            if both_axes:
+                grid[..., 1] = strange
+            result = sampling.render(
+                images, Sampling(grid, torch.ones(1, *size, dtype=torch.bool), None), mode, padding, (1.0,)
+            )
+            assert result.shape == (1, 3, *size)
+            assert result.isfinite().all()
+            if math.isnan(strange) or (padding == "zeros" and abs(strange) > 2):
+                assert (result[..., ::3] == 1).all()
+            if padding == "border" and not math.isnan(strange) and not both_axes:
+                last = 36 if strange > 1 else 0
+                if abs(strange) > 2:
+                    # half-way between two rows
+                    assert (result[..., ::3] == result[..., :1, :1]).all()
+                    edge = images[:, :, 11, last].double()
+                    assert ((result[:, :, 0, 0].double() - edge).abs() <= 1e-6 * extent(dtype)).all()
+
+
+def test_half_is_true():
+    images = torch.tensor([[0, 1] * 8, [1, 0] * 8], dtype=torch.bool)[None, None]
+    for layout in (images, hwc(images.expand(1, 3, -1, -1)), images.mT.contiguous().mT):
+        grid = torch.zeros(1, 3, 24, 2)
+        grid[..., 0] = (torch.arange(24) % 8 + 4) / 8 - 1  # between two columns, and between both rows
+        where = Sampling(grid, torch.ones(1, 3, 24, dtype=torch.bool), None)
+        result = sampling.render(layout, where, "bilinear", "zeros", (0.0,))
+        with torch_alone():
+            assert torch.equal(result, sampling.render(layout, where, "bilinear", "zeros", (0.0,)))
+        assert result.all()
+
+
+def test_no_images_and_no_channels_are_none():
+    where = Sampling(spots(1, (5, 9), (7, 8)), torch.ones(1, 5, 9, dtype=torch.bool), None)
+    for shape in ((0, 3), (2, 0), (0, 0)):
+        for mode in MODES:
+            assert sampling.render(torch.zeros(*shape, 7, 8), where, mode, "zeros", (0.0,)).shape == (*shape, 5, 9)
+
+
+@pytest.mark.parametrize("source", [(3, 20000), (20000, 3), (1, 20000)])
+def test_wide_images(source):
+    """Twenty thousand pixels along a side, where float32 holds a thousandth of one."""
+    v, u = (torch.linspace(-1.001, 1.001, n) for n in ((11, 5000) if source[1] > source[0] else (5000, 11)))
+    grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)[None]
+    where = Sampling(grid, torch.ones(grid.shape[:3], dtype=torch.bool), None)
+    smooth = (torch.arange(math.prod(source)).view(1, 1, *source) / 400).sin().expand(1, 3, -1, -1)
+    both(smooth.contiguous(), where, "bilinear", "zeros")
+    both((100 + 100 * smooth).to(torch.uint8), where, "bilinear", "border")
+    both((100 + 100 * smooth).to(torch.uint8), where, "nearest", "reflection")
