@@ -1,22 +1,14 @@
 """Laws of the compiled sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
 
 import math
-import os
-import subprocess
-import sys
-import threading
 from contextlib import contextmanager
+from itertools import product
 
-import numpy as np
 import pytest
 import torch
-from cameras import KEYS, drawn
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import camtorch as ct
 from camtorch.native import sampler
-from camtorch.native.library import library
 from camtorch.warp import grid as positions
 from camtorch.warp import sampling
 from camtorch.warp.grid import Lattice, Sampling
@@ -234,14 +226,8 @@ def gentle(count, size, source, zoom=1.0, turn=0.1):
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.uint16, torch.float32, torch.int32])
 def test_rows_that_read_rows_are_sampled_as_torch_does(dtype, mode, padding):
     """What is read of neighbouring pixels at once is theirs, at every zoom and turn."""
-    for i, (source, zoom, turn) in enumerate(
-        (
-            (s, z, t)
-            for s in ((48, 64), (33, 95))
-            for z in (0.3217, 0.9113, 1.0, 1.7321)
-            for t in (0.0, 0.02, 0.3, 1.6, 3.14159)
-        )
-    ):
+    cases = product(((48, 64), (33, 95)), (0.3217, 0.9113, 1.0, 1.7321), (0.0, 0.02, 0.3, 1.6, 3.14159))
+    for i, (source, zoom, turn) in enumerate(cases):
         target = (50, (64, 71, 95)[i % 3])
         grid = gentle(2, target, source, zoom, turn)
         if turn == 0.0:  # the rim, and pixels themselves
