@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
 
-_LARGE = 1 << 24
-"""Pixels of an image from which on speed counts."""
+_TOLERANCE = 0.001
+"""Pixels that nobody sees, for a lattice of positions also where a calibration is in float64."""
 
 
 def add(commands: Commands) -> None:
@@ -62,14 +62,13 @@ def run(arguments: argparse.Namespace) -> None:
     image, orientation = images.read(arguments.image)
     rows, columns = image.shape[-2:]
     camera = cameras.read_camera_of(arguments.image, (rows, columns), arguments)
-    if rows * columns > _LARGE:
-        camera = camera.float()  # at twice the speed; positions are rounded to a thousandth of a pixel
     with torch.no_grad():
         warp = Dewarp(
             camera,
             projection=arguments.projection,
             fov=None if fov is None else math.radians(fov),
             image_size=arguments.size,
+            tolerance=_TOLERANCE,
         )
         result, filled = _warped(warp, image)
         del image

@@ -15,6 +15,13 @@ from camtorch.camera import Camera, from_values
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
 
+_is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # newer than torch 2.6
+
+
+def is_compiling() -> bool:
+    """Whether code is compiled, to be run where camtorch is; what is exported has torch's own operators alone."""
+    return torch.compiler.is_compiling() and not _is_exporting()
+
 
 def positions(source: Camera, target: Camera, rotation: Tensor | None, tolerance: float) -> tuple[Tensor, Tensor]:
     """`grid.tabulate` of all pixels, between cameras that do not learn."""
@@ -56,8 +63,6 @@ def _(_, source, source_distortion, __, target, target_distortion, rotation, siz
 
 # -- images
 
-_is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # newer than torch 2.6
-
 
 def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
     """Whether the operator makes images: in compiled code, on the CPU and without a graph.
@@ -68,9 +73,9 @@ def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
         images: of the source.
         inputs: all that the positions depend on.
     """
-    if not torch.compiler.is_compiling() or _is_exporting():
-        return False
-    return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
+    return is_compiling() and all(
+        t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs)
+    )
 
 
 def warped(

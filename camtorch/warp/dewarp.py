@@ -60,7 +60,7 @@ class Dewarp(Warp):
         padding_mode: PaddingMode = "zeros",
         fill: Fill = 0.0,
         antialias: bool = False,
-        tolerance: float = 0.0,
+        tolerance: float | None = None,
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")

@@ -432,23 +432,25 @@ class Options(TypedDict):
     padding_mode: PaddingMode
     fill: tuple[float, ...]
     antialias: bool
-    tolerance: float
+    tolerance: float | None
 
 
-def as_options(owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool, tolerance: float) -> Options:
+def as_options(
+    owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool, tolerance: float | None
+) -> Options:
     """The checked options of a `Warp`, by name.
 
     Raises:
         ValueError: a mode that does not exist, a fill or a tolerance that is none. TypeError: a fill that is no number.
     """
-    if not 0 <= tolerance < math.inf:
+    if tolerance is not None and not 0 <= tolerance < math.inf:
         raise ValueError(f"{owner}: tolerance must be a number of pixels, zero or more; got {tolerance!r}")
     return {
         "mode": one_of(mode, MODES, "mode", owner),
         "padding_mode": one_of(padding_mode, PADDINGS, "padding_mode", owner),
         "fill": as_fill(fill, owner),
         "antialias": bool(antialias),
-        "tolerance": float(tolerance),
+        "tolerance": None if tolerance is None else float(tolerance),
     }
 
 
