@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -10,8 +11,8 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch.augment.change import frozen, remade, size_of
 from camtorch.camera import Camera, from_values
-from camtorch.rotations import rotation_matrix, rotation_vector
-from camtorch.warp.warp import Warp, along_edges
+from camtorch.rotations import rotation_matrix, rotation_vector, turn
+from camtorch.warp.warp import along_edges
 
 _POINTS, _RIM = 1000, 16  # over the image, and along each of its edges
 _ROOT = 1.324717957244746
@@ -29,17 +30,35 @@ def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
     As told by points that are spread evenly without rows, which a rim might run along: multiples of the inverse powers
     of the root of x^3 = x + 1, modulo 1.
     """
-    height, width = size_of(target)
-    like = target.intrinsics
+    return _part_shown(source, target, _points(target), rotation)
+
+
+def _points(camera: Camera) -> Tensor:
+    """(N, 2): the pixels that `filled` looks at, those of the rim at the end."""
+    height, width = size_of(camera)
     steps = torch.arange(1, _POINTS + 1, dtype=torch.float64)[:, None]
     spread = (steps / torch.tensor([_ROOT, _ROOT**2], dtype=torch.float64)).frac()
     corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
     # half a pixel in, at the centres of the outermost pixels
     rim = along_edges(corners * spread.new_tensor([width - 1, height - 1]), _RIM)
-    pixels = torch.cat((spread * spread.new_tensor([width, height]) - 0.5, rim)).to(like)
-    back = Warp(target, source, None if rotation is None else rotation.mT)
-    shown = back.transform_points(pixels.expand(*(back.batch_shape or ()), -1, -1))[1]
-    part = shown[..., :_POINTS].to(like.dtype).mean(-1)
+    return torch.cat((spread * spread.new_tensor([width, height]) - 0.5, rim)).to(camera.intrinsics)
+
+
+def _part_shown(
+    source: Camera, target: Camera, pixels: Tensor, rotation: Tensor | None, zoom: Tensor | None = None
+) -> Tensor:
+    """`filled`, as told by the pixels, of a target whose focal lengths are times a zoom (*B,)."""
+    shapes = [camera.batch_shape for camera in (source, target)]
+    if rotation is not None:
+        shapes.append(rotation.shape[:-2])
+    if zoom is not None:  # where the camera sees them as it is
+        shapes.append(zoom.shape)
+        centre = target.intrinsics[..., None, 2:]
+        pixels = centre + (pixels - centre) / zoom[..., None, None]
+    rays, has_ray = target.unproject(pixels.expand(*broadcast_shapes(*shapes), *pixels.shape[-2:]))
+    seen, mapped = source.project(turn(None if rotation is None else rotation.mT, rays, "rays"))
+    shown = has_ray & mapped & source.contains(seen)
+    part = shown[..., :_POINTS].to(pixels.dtype).mean(-1)
     return torch.where(shown[..., _POINTS:].all(-1), part, part.clamp(max=_NEARLY))
 
 
@@ -75,7 +94,8 @@ def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float
 
 
 def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor]:
-    found = filled(source, target, rotation)
+    part_shown = partial(_part_shown, source, target, _points(target))
+    found = part_shown(rotation)
     factor = torch.ones_like(found)
     done = found >= share
     drawn = turned = rotation.expand(*found.shape, 3, 3)
@@ -85,8 +105,8 @@ def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> t
             break
         if part != 1:
             turned = rotation_matrix(part * rotation_vector(drawn))
-        zoom = _least_zoom(source, target, turned, share, _ZOOM if part else _FAR_ZOOM)
-        now = filled(source, scaled(target, zoom), turned)
+        at_first = found if part == 1 or straight else part_shown(turned)
+        zoom, now = _least_zoom(partial(part_shown, turned), at_first, share, _ZOOM if part else _FAR_ZOOM)
         better = ~done & (now > found)
         factor, found = torch.where(better, zoom, factor), torch.where(better, now, found)
         rotation = torch.where(better[..., None, None], turned, rotation)
@@ -94,16 +114,24 @@ def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> t
     return factor, rotation.expand(*found.shape, 3, 3), found
 
 
-def _least_zoom(source: Camera, target: Camera, rotation: Tensor, share: float, most: float) -> Tensor:
-    """(*B,): the least factor of at least 1, or `most`."""
-    batch = filled(source, target, rotation)
-    low, high = torch.ones_like(batch), torch.full_like(batch, most)
-    high = torch.where(batch >= share, low, high)
+def _least_zoom(
+    part_shown: Callable[[Tensor], Tensor], at_first: Tensor, share: float, most: float
+) -> tuple[Tensor, Tensor]:
+    """(*B,) each: the least factor of at least 1, or `most`, and the part of the image that is shown with it.
+
+    part_shown: of a zoom. at_first: without one.
+    """
+    low, high = torch.ones_like(at_first), torch.full_like(at_first, most)
+    high, at_high = torch.where(at_first >= share, low, high), at_first
     for _ in range(_HALVINGS):
         middle = (low * high).sqrt()
-        is_enough = filled(source, scaled(target, middle), rotation) >= share
+        at_middle = part_shown(middle)
+        is_enough = at_middle >= share
         low, high = torch.where(is_enough, low, middle), torch.where(is_enough, middle, high)
-    return high
+        at_high = torch.where(is_enough, at_middle, at_high)
+    if bool((high == most).any()):  # not looked at yet
+        at_high = torch.where(high == most, part_shown(high), at_high)
+    return high, at_high
 
 
 @torch.library.custom_op("camtorch::enough", mutates_args=())
