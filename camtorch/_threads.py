@@ -162,8 +162,10 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
             split()
             return function(*args, **kwargs)
         finally:
+            if _mine.was_split:
+                _crowd.last_together = time.perf_counter()
             _mine.set_alone(False)
-            _mine.threads = 0
+            _mine.threads, _mine.was_split = 0, False
 
     return call
 
@@ -172,7 +174,8 @@ def split(elements: int | None = None) -> None:
     """Whether the next operations are to be split. elements: of each of them, if that is known."""
     if _mine.threads > 1:
         small = elements is not None and elements <= ALONE
-        _mine.set_alone(small or _crowd.meets(_mine.threads, not _mine.is_alone))
+        _mine.set_alone(small or _crowd.meets(_mine.threads, _mine.was_split))
+        _mine.was_split = elements is not None and not _mine.is_alone
 
 
 def is_split() -> bool:
@@ -197,6 +200,8 @@ class _Mine(threading.local):
     threads = 0
     """Before and after it; 0 where there is none."""
     is_alone = False
+    was_split = False
+    """Whether the last operations were."""
     _of_mkl = 0
 
     def set_alone(self, alone: bool) -> None:
@@ -222,13 +227,15 @@ class _Crowd:
     def __init__(self) -> None:
         self.is_here = False
         self._pause = _GLANCE
-        self._next_look = self._last_together = -math.inf
+        self._next_look = -math.inf
+        self.last_together = -math.inf
+        """When torch's threads were last at work."""
 
     def meets(self, threads: int, together: bool) -> bool:
         """Whether so many threads of torch would be in it. together: whether they have just been at work."""
         now = time.perf_counter()
         if together:
-            self._last_together = now
+            self.last_together = now
         if now < self._next_look:
             return self.is_here
         self.is_here = _wanting() > max(_CORES, threads)
@@ -236,7 +243,7 @@ class _Crowd:
             self._next_look, self._pause = now + self._pause, min(2 * self._pause, _LONGEST)
         else:
             self._next_look = now + _GLANCE
-            if now < self._last_together + _SPIN:
+            if now < self.last_together + _SPIN:
                 self._pause = _GLANCE
         return self.is_here
 

@@ -290,6 +290,28 @@ def test_this_thread_alone_is_limited(clock):
 
 
 @can_limit
+@pytest.mark.usefixtures("three_threads")
+@pytest.mark.parametrize("blocks", [1, 5])
+def test_calls_beside_one_other_are_split_ever_more_seldom(blocks, clock):
+    """Of three cores one is busy; calls come one after the other, and torch's threads are not seen before them."""
+    seen = []
+
+    @_threads.as_cores_are_free
+    def function():
+        for _ in range(blocks):
+            _threads.split(1 << 17)
+            seen.append(torch.get_num_threads())
+            clock.now += 5e-4
+            clock.wanting = 5 if seen[-1] == 3 else 2
+
+    for _ in range(2000 // blocks):
+        function()
+        clock.now += 1e-4
+    assert seen.count(3) < 0.1 * len(seen)
+    assert 3 in seen[1000:]  # it tries
+
+
+@can_limit
 @pytest.mark.usefixtures("three_threads", "clock")
 def test_small_operations_are_not_split():
     seen = []
