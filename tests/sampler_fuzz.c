@@ -21,7 +21,9 @@ typedef struct {
     void classify_##variant(const Classification *);
 #define LISTED(variant) {#variant, sample_##variant, classify_##variant}
 DECLARED(plain)
+#ifdef HAS_BASELINE
 DECLARED(baseline)
+#endif
 #ifdef HAS_AVX2
 DECLARED(avx2)
 #endif
@@ -32,7 +34,9 @@ DECLARED(avx512)
 static int variants(Variant *all) {
     int n = 0;
     all[n++] = (Variant)LISTED(plain);
+#ifdef HAS_BASELINE
     all[n++] = (Variant)LISTED(baseline);
+#endif
 #ifdef HAS_AVX2
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
         all[n++] = (Variant)LISTED(avx2);

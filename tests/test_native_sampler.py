@@ -1,14 +1,21 @@
 """Laws of the compiled sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
 
 import math
+import subprocess
 from contextlib import contextmanager
 from itertools import product
+from pathlib import Path
 
 import pytest
 import torch
+from cameras import KEYS, drawn
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import camtorch as ct
+from camtorch.native import build as building
 from camtorch.native import sampler
+from camtorch.native.library import library
 from camtorch.warp import grid as positions
 from camtorch.warp import sampling
 from camtorch.warp.grid import Lattice, Sampling
@@ -324,3 +331,176 @@ def test_wide_images(source):
     both(smooth.contiguous(), where, "bilinear", "zeros")
     both((100 + 100 * smooth).to(torch.uint8), where, "bilinear", "border")
     both((100 + 100 * smooth).to(torch.uint8), where, "nearest", "reflection")
+
+
+# -- no read outside
+
+FUZZ = Path(__file__).parent / "sampler_fuzz.c"
+# the way without vectors is what the others are compared with
+PLAIN = ("-DCAMTORCH_PLAIN",)
+
+
+def fuzz(folder, names, sanitizers, optimized, first, count):
+    """Build some variants of the sampler with sanitizers, and give them jobs by chance."""
+    try:
+        command = [*building._compiler(None), "-std=gnu11", "-g", "-Wno-psabi", f"-I{building._HERE}", *sanitizers]
+    except building.BuildError as error:
+        pytest.skip(str(error))
+    (folder / "empty.c").write_text("int main(void) { return 0; }\n")
+    if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=folder, capture_output=True).returncode:
+        pytest.skip(f"{command[0]} has no sanitizers: {' '.join(sanitizers)}")
+    flags = {"plain": PLAIN, **{name: building._VARIANTS[name] for name in names}}
+    has = [f"-DHAS_{name.upper()}" for name in names]
+    units = [["-O1", str(FUZZ), "-c", "-o", "driver.o", *has]]
+    for name, options in flags.items():
+        units.append([*building._FLAGS, optimized, *options, f"-DVARIANT={name}"])
+        units[-1] += [str(building._HERE / "kernel.c"), "-c", "-o", f"{name}.o"]
+    compilers = [subprocess.Popen([*command, *unit], cwd=folder) for unit in units]
+    assert all(compiler.wait() == 0 for compiler in compilers)
+    subprocess.run(
+        [*command, *(f"{name}.o" for name in ("driver", *flags)), "-lm", "-o", "fuzz"], cwd=folder, check=True
+    )
+    done = subprocess.run([folder / "fuzz", str(first), str(count)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.split()[::2] == list(names)
+
+
+def runs_here():
+    """The variants that this CPU runs, the best one last."""
+    names = list(building._VARIANTS)
+    return names[: names.index(library().camtorch_variant().decode()) + 1]
+
+
+def test_no_read_outside(tmp_path):
+    fuzz(tmp_path, runs_here()[-1:], ["-fsanitize=address"], "-O1", 0, 1500)
+
+
+@pytest.mark.slow
+def test_no_read_outside_and_nothing_undefined_in_any_variant(tmp_path):
+    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+    fuzz(tmp_path, runs_here(), sanitizers, "-O3", 10_000, 10_000)
+
+
+# -- positions from a lattice
+
+
+def ramp(size):
+    """(1, 2, *size): every pixel's own position, so that a bilinear sample is the position that it is taken at."""
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float32) for side in size), indexing="ij")
+    return torch.stack((u, v))[None]
+
+
+def measured(warp, exact):
+    """The largest error of positions on the image, in pixels, and how many there are.
+
+    What is mapped is shown, and nothing else.
+    """
+    height, width = warp.source.image_size
+    shown = sampling.render(ramp((height, width)), warp._kept(warp._inputs()), "bilinear", "border", (-1e6,))
+    assert torch.equal((shown != -1e6).all(1), exact.mapped)
+    assert torch.equal((shown != -1e6).any(1), exact.mapped)
+    sides = torch.tensor([width, height], dtype=exact.grid.dtype)
+    at = ((exact.grid + 1) * sides - 1) / 2
+    on_image = exact.mapped & (at >= 0).all(-1) & (at <= sides - 1).all(-1)
+    error = (shown.movedim(1, -1).to(at.dtype) - at).norm(dim=-1)[on_image]
+    return (float(error.max()) if error.numel() else 0.0), error.numel()
+
+
+@contextmanager
+def classified():
+    """The cells of every lattice: how many there are, and how many of them torch finds to be others."""
+    counts = [0, 0]
+    with pytest.MonkeyPatch.context() as patch:
+        native = positions.classify
+
+        def checked(nodes, *others):
+            cells, expected = native(nodes, *others), positions._classified(nodes, *others)
+            off = cells != expected
+            # of what is to be exact roundings may decide, not of what there is
+            assert torch.equal(cells == sampler.EMPTY, expected == sampler.EMPTY)
+            counts[0] += cells.numel()
+            counts[1] += int(off.sum())
+            return cells
+
+        patch.setattr(positions, "classify", checked)
+        yield counts
+
+
+errors: dict[float, list[float]] = {}
+
+
+def check_lattice(source, target, turned):
+    exact = ct.Warp(source, target, turned)._sampling()
+    for tolerance in (0.1, 0.03, 0.01, 0.003, 0.001):
+        warp = ct.Warp(source, target, turned, tolerance=tolerance)
+        with classified() as counts:
+            where = warp._kept(warp._inputs())
+        if not isinstance(where, Lattice):
+            continue
+        assert counts[1] <= 2 + counts[0] / 500
+        error, count = measured(warp, exact)
+        if not count:
+            continue
+        # what single precision leaves of a position, in the grid, in the nodes and in the ramp itself
+        rounding = 8 * torch.finfo(torch.float32).eps * max(source.image_size)
+        assert error <= tolerance + rounding
+        errors.setdefault(tolerance, []).append(error / tolerance)
+
+
+SIDES = st.integers(64, 260)
+
+
+@st.composite
+def pairs(draw):
+    """Two cameras of any models, plausible or wild, of any zoom between them, and a rotation."""
+    cameras = []
+    for wild in (draw(st.booleans()), draw(st.booleans())):
+        camera = draw(drawn(draw(st.sampled_from(KEYS)), wild=wild)).float().requires_grad_(False)
+        cameras.append(camera.resize(draw(SIDES), draw(SIDES)))
+    if draw(st.booleans()):
+        height, width = cameras[0].image_size
+        cameras[0] = cameras[0].resize(4 * height, 4 * width)
+    if draw(st.booleans()):
+        cameras[1] = ct.Dewarp(cameras[0]).target.resize(draw(SIDES), draw(SIDES))
+    angles = [torch.tensor(draw(st.floats(-180, 180, width=32))) for _ in range(3)]
+    return *cameras, draw(st.sampled_from([None, ct.augment.mount_rotation(*angles)]))
+
+
+@given(pairs())
+@settings(max_examples=40)
+def test_positions_of_lattices_keep_their_tolerance(pair):
+    check_lattice(*pair)
+
+
+@pytest.mark.slow
+@given(pairs())
+@settings(max_examples=600)
+def test_positions_of_more_lattices_keep_their_tolerance(pair):
+    check_lattice(*pair)
+
+
+def test_the_largest_error_of_positions_is_told(capsys):
+    if not errors:
+        pytest.skip("the tests that measure it did not run in this process")
+    with capsys.disabled():
+        told = ", ".join(f"{max(parts):.2f} of {tolerance} px ({len(parts)})" for tolerance, parts in errors.items())
+        print(f"\nlargest errors of positions from lattices (of so many): {told}")
+
+
+def test_lattices_of_a_batch_of_cameras_and_images():
+    rotations = ct.augment.mount_rotation(torch.tensor([0.0, 20.0, 70.0]), torch.tensor(0.0), torch.tensor(5.0))
+    source = ct.KannalaBrandt([100.0, 100, 80, 60], [0.02, -0.01, 0.004, -0.001], image_size=(120, 160))
+    target = ct.Pinhole([80.0, 80, 80, 60], image_size=(101, 163))
+    source, target = (camera.requires_grad_(False) for camera in (source, target))
+    for dtype, mode, padding in product((torch.uint8, torch.float32), MODES, PADDINGS):
+        images = pixels(dtype, (3, 3, 120, 160))
+        batch = ct.Warp(source, target, rotations, tolerance=0.01, mode=mode, padding_mode=padding, fill=1)
+        assert isinstance(batch._kept(batch._inputs()), Lattice)
+        result = batch(images)
+        assert torch.equal(batch(images[:1])[0], result[0])
+        for i in range(3):
+            alone = ct.Warp(source, target, rotations[i], tolerance=0.01, mode=mode, padding_mode=padding, fill=1)
+            assert torch.equal(alone(images)[i], result[i])
+            off = (alone(hwc(images))[i].double() - result[i].double()).abs().max()
+            assert off <= (0 if mode == "nearest" else 1e-4 if dtype == torch.float32 else 1)
+        both(hwc(images), batch._kept(batch._inputs()), "nearest", padding, (1.0,))
