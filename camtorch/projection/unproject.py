@@ -163,7 +163,7 @@ def shown(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
 
     Without that ray, and where the fold alone tells without the table to find it by. It looks at values.
     """
-    if not domain.lens.stages:
+    if not domain.lens.stages or not p.numel():
         return domain.chart.on_plane(p, q) > 0
     within, known = torch.ones_like(p), True
     if domain.all_staged:
