@@ -100,6 +100,8 @@ def draw(
         # in float64, so that what is drawn is what every precision sees
         share = torch.rand(shape, generator=generator, dtype=torch.float64, device=device)
         values[name] = interval.low + (interval.high - interval.low) * share
+    if rows == count:
+        return values
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
 
 
@@ -255,7 +257,9 @@ class Augmentation(SampleTransform):
         camera = self.camera if camera is None else camera
         if camera is None:
             raise ValueError(f"{self._name}: no camera; give one here, in the sample, or as {self._name}(camera=...)")
-        draw = self._checked_draw(draw)
+        return self._change(camera, self._checked_draw(draw))
+
+    def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
         applied = draw["apply"]
         count = len(applied)
         cameras = [alone(camera)] if isinstance(camera, Camera) else list(camera)
@@ -398,8 +402,7 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
-        drawn = self.draw(count, generator) if draw is None else draw
-        change = self.change(camera, drawn)
+        change = self._change(camera, self.draw(count, generator)) if draw is None else self.change(camera, draw)
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
@@ -448,4 +451,4 @@ def _one_for_all(values: Mapping[str, Tensor]) -> bool:
     """Whether all samples draw the same. Of none, nothing can be said."""
     if not all(may_look(value) for value in values.values()):
         return False
-    return all(bool((value == value[:1]).all()) for value in values.values())
+    return all(len(value) == 1 or bool((value == value[:1]).all()) for value in values.values())
