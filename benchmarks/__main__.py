@@ -80,9 +80,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seconds",
         type=float,
-        default=1.0,
+        default=0.6,
         metavar="S",
-        help="for the rounds of one operation: slow contestants take fewer, three at least (default: 1)",
+        help="for the rounds of one operation: slow contestants take fewer, three at least (default: 0.6)",
     )
     parser.add_argument(
         "--no-compile",
