@@ -6,7 +6,6 @@ give lists of such: nothing is converted for them, nor for the others, which hav
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -34,8 +33,6 @@ OPERATIONS = (CACHED, FRESH, TO_IMAGES, TO_CAMERAS)
 EXACT, LATTICE = "camtorch, tolerance=0", "camtorch, tolerance=0.01"
 OPENCV_FLOAT, OPENCV_FIXED = OPENCV_MAPS = ("OpenCV, float map", "OpenCV, fixed-point map")
 DELTACAMERA, GRID_SAMPLE, CLONE = "deltacamera", "grid_sample alone", "clone"
-DEFAULT_TOLERANCE: float = inspect.signature(ct.Warp).parameters["tolerance"].default
-"""Of `ct.Warp`; OURS has it, and of the other two tolerances those that differ have contestants of their own."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ class Task:
         return cameras.camera(self.key, self.device, dtype, size=self.size, batch=batch)
 
     def fresh(
-        self, *, learns: bool = False, dtype: torch.dtype = torch.float32, tolerance: float = DEFAULT_TOLERANCE
+        self, *, learns: bool = False, dtype: torch.dtype = torch.float32, tolerance: float | None = None
     ) -> ct.Warp:
         """The warp of different cameras to pinhole cameras of the same K."""
         source = self.camera(self.batch, dtype).requires_grad_(learns)
@@ -108,8 +105,8 @@ def contestants(task: Task) -> dict[str, dict[str, Run]]:
     """
     makers = {
         OURS: camtorch,
-        EXACT: partial(camtorch_within, tolerance=0.0),
-        LATTICE: partial(camtorch_within, tolerance=0.01),
+        EXACT: partial(camtorch_forward, tolerance=0.0),
+        LATTICE: partial(camtorch_forward, tolerance=0.01),
         OPENCV_FLOAT: partial(opencv, kind=cv2.CV_32FC1),
         OPENCV_FIXED: partial(opencv, kind=cv2.CV_16SC2),
         KORNIA: kornia,
@@ -129,7 +126,7 @@ def as_tensor(result: object) -> Tensor:
 
 def camtorch(task: Task) -> dict[str, Run]:
     """As a user writes it; uint8 in, uint8 out."""
-    forward = _forward(task, DEFAULT_TOLERANCE)
+    forward = camtorch_forward(task, None)
     if not task.dtype.is_floating_point:
         return forward
     learning = task.fresh(learns=True)
@@ -141,12 +138,8 @@ def camtorch(task: Task) -> dict[str, Run]:
     }
 
 
-def camtorch_within(task: Task, tolerance: float) -> dict[str, Run]:
-    """With a tolerance that is not the default."""
-    return _forward(task, tolerance) if tolerance != DEFAULT_TOLERANCE else {}
-
-
-def _forward(task: Task, tolerance: float) -> dict[str, Run]:
+def camtorch_forward(task: Task, tolerance: float | None) -> dict[str, Run]:
+    """Without gradients, of a tolerance, or of that which `ct.Warp` has by default."""
     given = task.camera(task.batch).requires_grad_(False)
     cached = ct.Warp(task.dewarp.source, task.dewarp.target, tolerance=tolerance)
 
@@ -252,8 +245,8 @@ def grid_sample(task: Task) -> dict[str, Run]:
     """torch's sampling in one call, of a grid that is there already."""
     if not task.dtype.is_floating_point:
         return {}
-    still = task.dewarp.grid().expand(task.batch, -1, -1, -1)
-    grid = task.fresh().grid().requires_grad_()
+    still = ct.Warp(task.dewarp.source, task.dewarp.target, tolerance=0.0).grid().expand(task.batch, -1, -1, -1)
+    grid = task.fresh(tolerance=0.0).grid().requires_grad_()
     sample = lambda x, where: F.grid_sample(x, where, align_corners=False)
     return {
         CACHED: lambda: sample(task.images, still),
