@@ -66,12 +66,17 @@ def test_a_library_is_built_and_nothing_else_is_left(tmp_path):
 @compiles
 def test_every_variant_that_the_compiler_knows_is_in_it(tmp_path, monkeypatch):
     write(tmp_path)
-    monkeypatch.setattr(building, "_VARIANTS", {"baseline": (), "avx2": ("-O1",), "avx512": ("-mno-such-cpu",)})
-    loaded = ctypes.CDLL(str(build(tmp_path, sources=tmp_path)))
-    assert loaded.twice_fast(21) == 42
-    monkeypatch.setattr(building, "_VARIANTS", {"baseline": (), "avx2": ("-mno-such-cpu",)})
-    (tmp_path / "other").mkdir()
-    assert not hasattr(ctypes.CDLL(str(build(tmp_path / "other", sources=tmp_path))), "twice_fast")
+
+    def fast(name, variants):
+        (tmp_path / name).mkdir()
+        loaded = ctypes.CDLL(str(build(tmp_path / name, sources=tmp_path, variants=variants)))
+        return hasattr(loaded, "twice_fast") and loaded.twice_fast(21) == 42
+
+    monkeypatch.setattr(building, "VARIANTS", {"baseline": (), "avx2": ("-O1",), "avx512": ("-mno-such-cpu",)})
+    assert fast("all", building.VARIANTS)
+    assert not fast("one", ["baseline"])
+    monkeypatch.setattr(building, "VARIANTS", {"baseline": (), "avx2": ("-mno-such-cpu",)})
+    assert not fast("older", building.VARIANTS)
 
 
 @compiles

@@ -66,8 +66,8 @@ def test_antialias_follows_the_local_scale():
     shrinks = (scale > 1.3).unsqueeze(1) & seen
     assert grows.any()
     assert shrinks.any()
-    # but for the rim, where coverage is taken apart
-    torch.testing.assert_close(plain(noise)[grows], smooth(noise)[grows], atol=1e-6, rtol=0)
+    # but for the rim, where coverage is taken apart; two ways to positions of up to 160 pixels in float32
+    torch.testing.assert_close(plain(noise)[grows], smooth(noise)[grows], atol=2e-5, rtol=0)
     assert smooth(noise)[shrinks].var() < 0.9 * plain(noise)[shrinks].var()
     labels = (noise * 9).long()
     assert torch.equal(plain(labels, mode="nearest"), smooth(labels, mode="nearest"))

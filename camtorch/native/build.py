@@ -16,7 +16,7 @@ import sys
 import sysconfig
 import tempfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -34,9 +34,10 @@ _FLAGS = ["-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden"]
 _FLAGS += ["-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
 _AVX2 = ("-mavx2", "-mfma", "-mf16c", "-mbmi2")
 _AVX512 = ("-mavx512f", "-mavx512vl", "-mavx512bw", "-mavx512dq", "-mavx512vbmi")
-_VARIANTS: dict[str, tuple[str, ...]] = {"baseline": ()}
+# for which CPUs there is code, and by which options; every library has the first
+VARIANTS: dict[str, tuple[str, ...]] = {"baseline": ()}
 if _MACHINE in ("x86_64", "amd64"):
-    _VARIANTS |= {"avx2": _AVX2, "avx512": (*_AVX512, *_AVX2, "-mprefer-vector-width=256")}
+    VARIANTS |= {"avx2": _AVX2, "avx512": (*_AVX512, *_AVX2, "-mprefer-vector-width=256")}
 
 # the oldest macOS that this Python runs on, as a wheel's name says; compilers take their own machine's
 _ENVIRONMENT: dict[str, str] = {}
@@ -65,6 +66,7 @@ def build(
     sources: str | os.PathLike[str] | None = None,
     extra: Sequence[str] = (),
     compiler: str | None = None,
+    variants: Collection[str] = VARIANTS,
 ) -> Path:
     """Compile the library, and put it in its place when it is whole: processes may be running the one that is there.
 
@@ -74,6 +76,7 @@ def build(
         extra: more words for the compiler, which compiles and links with them.
         compiler: its command; by default the environment's CC, else the first of cc, gcc and clang that is there
             (on Windows, where nobody has tried it yet: of gcc, clang and cl).
+        variants: for which CPUs, of `VARIANTS`; less those that the compiler does not know.
 
     Returns:
         The path of the library.
@@ -89,11 +92,11 @@ def build(
     # beside the target: a file is renamed in one step on one file system only
     with tempfile.TemporaryDirectory(prefix="_building", dir=target.parent) as folder:
         tools = toolchain(command, Path(folder), tuple(extra))
-        variants = {name: flags for name, flags in _VARIANTS.items() if tools.accepts(flags)}
-        has = [f"HAS_{name.upper()}" for name in variants if name != "baseline"]
+        known = {name: flags for name, flags in VARIANTS.items() if name in variants and tools.accepts(flags)}
+        has = [f"HAS_{name.upper()}" for name in known if name != "baseline"]
         has.append(f"SOURCES={checksum(here)}u")
         units: list[tuple[str, str, tuple[str, ...], list[str]]] = [("dispatch.c", "dispatch", (), has)]
-        units += [("kernel.c", name, flags, [f"VARIANT={name}"]) for name, flags in variants.items()]
+        units += [("kernel.c", name, flags, [f"VARIANT={name}"]) for name, flags in known.items()]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(lambda unit: tools.compile(here / unit[0], *unit[1:]), units))
         os.replace(tools.link(objects), target)
