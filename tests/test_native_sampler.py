@@ -504,3 +504,142 @@ def test_lattices_of_a_batch_of_cameras_and_images():
             off = (alone(hwc(images))[i].double() - result[i].double()).abs().max()
             assert off <= (0 if mode == "nearest" else 1e-4 if dtype == torch.float32 else 1)
         both(hwc(images), batch._kept(batch._inputs()), "nearest", padding, (1.0,))
+
+
+# -- what is no plain memory of the CPU, and who watches
+
+
+def warps():
+    lens = [0.02, -0.01, 0.004, -0.001]
+    source = ct.KannalaBrandt([100.0, 100, 80, 60], lens, image_size=(120, 160)).requires_grad_(False)
+    target = ct.Pinhole([80.0, 80, 80, 60], image_size=(120, 160)).requires_grad_(False)
+    return [ct.Warp(source, target, tolerance=tolerance) for tolerance in (0.0, 0.01)]
+
+
+def images_of_floats():
+    return torch.rand(2, 3, 120, 160, generator=generator(0))
+
+
+class Watching(torch.utils._python_dispatch.TorchDispatchMode):
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.seen.append(function)
+        return function(*args, **(kwargs or {}))
+
+
+class Wrapped(torch.Tensor):
+    """Whose values are elsewhere."""
+
+    @staticmethod
+    def __new__(cls, inner):
+        return torch.Tensor._make_wrapper_subclass(cls, inner.shape, dtype=inner.dtype, strides=inner.stride())
+
+    def __init__(self, inner):
+        self.inner = inner
+
+    @classmethod
+    def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
+        def bare(value):
+            return value.inner if isinstance(value, cls) else value
+
+        return function(*torch.utils._pytree.tree_map(bare, args), **torch.utils._pytree.tree_map(bare, kwargs or {}))
+
+
+def negated(images):
+    view = torch.complex(images, -images).conj().imag
+    assert view.is_neg()
+    return view
+
+
+STRANGE = {
+    "a subclass": lambda images: images.as_subclass(type("Image", (torch.Tensor,), {})),
+    "a parameter": lambda images: torch.nn.Parameter(images, requires_grad=False),
+    "wanting a gradient": lambda images: images.requires_grad_(),
+    "to be negated": negated,
+    "elsewhere": Wrapped,
+    "of inference": lambda images: torch.inference_mode()(images.clone)(),
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+@pytest.mark.parametrize("mode", MODES)
+def test_strange_tensors_are_images(kind, mode):
+    for warp in warps():
+        expected = warp(images_of_floats(), mode=mode)
+        for again in range(2):
+            fresh = warp if again else ct.Warp(warp.source, warp.target, tolerance=warp.tolerance)
+            with torch.no_grad():
+                result = fresh(STRANGE[kind](images_of_floats()), mode=mode)
+            torch.testing.assert_close(result.detach().as_subclass(torch.Tensor), expected, atol=1e-4, rtol=0)
+
+
+def test_zeros_by_declaration_are_zeros():
+    for warp in warps():
+        assert not warp(torch._efficientzerotensor((2, 3, 120, 160))).any()
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float16])
+def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
+    images = pixels(dtype, (2, 3, 120, 160))
+    for warp, layout in product(warps(), ("contiguous", "channels last", "every other channel")):
+        images = LAYOUTS[layout](images)
+        expected = warp(images, mode=mode)
+
+        def fresh(warp=warp):
+            return ct.Warp(warp.source, warp.target, tolerance=warp.tolerance, mode=mode)
+
+        with torch.device("meta"):
+            assert torch.equal(fresh()(images), expected)
+            assert torch.equal(warp(images, mode=mode), expected)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            assert torch.equal(fresh()(images), expected)
+        torch.set_default_dtype(torch.float64)
+        try:
+            assert torch.equal(fresh()(images), expected)
+        finally:
+            torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.filterwarnings("ignore")  # a trace keeps sizes
+def test_what_is_recorded_holds_the_images():
+    images = images_of_floats()
+    for warp in warps():
+        expected = warp(images)
+        fresh = ct.Warp(warp.source, warp.target, tolerance=warp.tolerance)
+        traced = torch.jit.trace(fresh, images, check_trace=False)
+        junk = [torch.rand(2, 3, 120, 160) for _ in range(5)]  # lies where the trace's own results lay
+        torch.testing.assert_close(traced(images), expected, atol=1e-4, rtol=0)
+        torch.testing.assert_close(traced(2 * images), 2 * expected, atol=2e-4, rtol=0)
+        del junk
+        with Watching() as watching, counted() as calls:
+            torch.testing.assert_close(warp(images), expected, atol=1e-4, rtol=0)
+        assert any("grid_sampler" in str(function) for function in watching.seen)
+        assert not calls
+
+
+@pytest.mark.parametrize("warp", warps())
+def test_transforms_and_derivatives_take_their_own_way(warp):
+    images = images_of_floats()
+    expected = warp(images)
+    mapped = torch.func.vmap(lambda image: warp(image[None])[0])(images)
+    value, tangent = torch.func.jvp(warp, (images,), (images,))
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.unpack_dual(warp(torch.autograd.forward_ad.make_dual(images, images)))
+    for result in (mapped, value, tangent, dual.primal, dual.tangent):
+        torch.testing.assert_close(result, expected, atol=0.02, rtol=0)
+    gradient = torch.func.grad(lambda one: warp(one).sum())(images)
+    learning = images.clone().requires_grad_()
+    warp(learning).sum().backward()
+    torch.testing.assert_close(gradient, learning.grad)
+
+
+@pytest.mark.parametrize("fill", [2**70, -(2**70), 2**63, 1e300])
+def test_fills_of_any_size(fill):
+    for warp in warps():
+        for dtype in (torch.uint8, torch.int64, torch.float32, torch.float16, torch.bool):
+            for mode in ("nearest", "bilinear"):
+                assert warp(torch.zeros(1, 1, 120, 160, dtype=dtype), fill=fill, mode=mode).dtype == dtype

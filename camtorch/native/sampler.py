@@ -124,7 +124,7 @@ def sample(
     if native is None or not result.numel():
         return
     if _is_slow(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
-        planes = torch.empty(result.shape, dtype=result.dtype)
+        planes = torch.empty(result.shape, dtype=result.dtype, device="cpu")
         source = images if images.stride(0) else images[:1]  # which all results show
         source = source.contiguous().expand(images.shape)
         where = {"grid": grid, "mapped": mapped, "nodes": nodes, "cells": cells, "exact": exact}
@@ -189,7 +189,8 @@ def layout(images: Tensor) -> torch.memory_format:
 
 def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
     """(count, C, *size) of the dtype of images (_, C, H, W), and with the channels last in memory if they have them."""
-    result = torch.empty(count, images.shape[1], *size, dtype=images.dtype, memory_format=layout(images))
+    shape = (count, images.shape[1], *size)
+    result = torch.empty(shape, dtype=images.dtype, device="cpu", memory_format=layout(images))
     native = library()
     if native is not None and result.nbytes >= _HUGE:
         # small pages, each new to the process, would take as long as all else
