@@ -124,12 +124,15 @@ def sample(
     if native is None or not result.numel():
         return
     if _is_slow(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
-        planes = torch.empty(result.shape, dtype=result.dtype, device="cpu")
-        source = images if images.stride(0) else images[:1]  # which all results show
-        source = source.contiguous().expand(images.shape)
         where = {"grid": grid, "mapped": mapped, "nodes": nodes, "cells": cells, "exact": exact}
-        sample(source, planes, mode, padding, fill, **where)
-        result.copy_(planes)
+        together = _is_together(result, mode)
+        fits = together or result.stride(3) == 1
+        made = result if fits else torch.empty(result.shape, dtype=result.dtype, device="cpu")
+        source = images if images.stride(0) else images[:1]  # which all results show
+        source = source.clone(memory_format=torch.channels_last if together else torch.contiguous_format)
+        sample(source.expand(images.shape), made, mode, padding, fill, **where)
+        if not fits:
+            result.copy_(made)
         return
     job = _Job()
     count, channels, height, width = result.shape
@@ -160,10 +163,16 @@ def sample(
 
 
 def _is_slow(images: Tensor, result: Tensor, mode: str) -> bool:
-    """Whether pixels lie so that they are interpolated one by one: in no planes, nor three or four together."""
-    strides, channels = {images.stride()[1::2], result.stride()[1::2]}, images.shape[1]
-    together = mode == "bilinear" and channels in (3, 4) and strides == {(1, channels)}
-    return mode != "nearest" and not together and {across for _, across in strides} != {1}
+    """Whether pixels lie so that they are interpolated one by one: neither in planes nor together."""
+    if mode == "nearest" or images.stride(3) == result.stride(3) == 1:
+        return False
+    return not (_is_together(images, mode) and _is_together(result, mode))
+
+
+def _is_together(images: Tensor, mode: str) -> bool:
+    """Whether the channels of a pixel lie side by side and are interpolated together, three or four."""
+    channels = images.shape[1]
+    return mode == "bilinear" and channels in (3, 4) and images.stride()[1::2] == (1, channels)
 
 
 def _shared(tensor: Tensor) -> int:
