@@ -506,10 +506,15 @@ INLINE V4 channels4(const char *at, int type) {
         memcpy(&words, at, sizeof words);
         return __builtin_convertvector(words, V4);
     } else {
-        typedef uint8_t B4 __attribute__((vector_size(4)));
-        B4 packed;
+#if defined(__AVX2__)
+        int32_t packed;
         memcpy(&packed, at, sizeof packed);
-        return float4(__builtin_convertvector(packed, I4));
+        return (V4)_mm_cvtepi32_ps(_mm_cvtepu8_epi32(_mm_cvtsi32_si128(packed)));
+#else
+        uint8_t packed[4];
+        memcpy(packed, at, sizeof packed);
+        return (V4){packed[0], packed[1], packed[2], packed[3]};
+#endif
     }
 }
 
@@ -592,33 +597,66 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
 
 /* -- eight pixels of one channel, sixteen neighbours each */
 
+INLINE void cubic_weights8(V8 t, V8 *w) {
+    const V8 s = 1 - t;
+    w[0] = -0.75f * t * s * s;
+    w[1] = (1.25f * t - 2.25f) * t * t + 1;
+    w[2] = (1.25f * s - 2.25f) * s * s + 1;
+    w[3] = -0.75f * s * t * t;
+}
+
+/* Columns of a table of eight rows */
+INLINE void transpose(const V4 *rows, V8 *columns) {
+#if defined(__AVX2__)
+#define TWO_ROWS(i) _mm256_insertf128_ps(_mm256_castps128_ps256((__m128)rows[i]), (__m128)rows[(i) + 4], 1)
+    const __m256 a = TWO_ROWS(0), b = TWO_ROWS(1), c = TWO_ROWS(2), d = TWO_ROWS(3);
+#undef TWO_ROWS
+    const __m256 low_ab = _mm256_unpacklo_ps(a, b), high_ab = _mm256_unpackhi_ps(a, b);
+    const __m256 low_cd = _mm256_unpacklo_ps(c, d), high_cd = _mm256_unpackhi_ps(c, d);
+    columns[0] = (V8)_mm256_shuffle_ps(low_ab, low_cd, 0x44);
+    columns[1] = (V8)_mm256_shuffle_ps(low_ab, low_cd, 0xee);
+    columns[2] = (V8)_mm256_shuffle_ps(high_ab, high_cd, 0x44);
+    columns[3] = (V8)_mm256_shuffle_ps(high_ab, high_cd, 0xee);
+#else
+    int i, k;
+    for (k = 0; k < 4; k++)
+        for (i = 0; i < STEP; i++) columns[k][i] = rows[i][k];
+#endif
+}
+
 INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
     const Job *job = span->job;
     const int64_t bytes = size_of(type), below = job->source_strides[2] * bytes;
     const Squares at = squares_of(job, u, v, 1);
+    V8 across[4], down[4];
     int64_t offsets[STEP], c;
-    float across[STEP][4], down[STEP][4];
     int i;
     offsets_of(job, at.x, at.y, offsets);
-    for (i = 0; i < STEP; i++) {
-        cubic_weights(at.u[i], across[i]);
-        cubic_weights(at.v[i], down[i]);
-    }
+    cubic_weights8(at.u, across);
+    cubic_weights8(at.v, down);
     for (c = 0; c < job->channels; c++) {
         const char *plane = span->source + c * job->source_strides[1] * bytes;
         char *result = span->result + c * job->result_strides[1] * bytes;
-        for (i = 0; i < span->pixels; i++) {
+        V4 rows[STEP];
+        V8 columns[4], value;
+        for (i = 0; i < STEP; i++) {
             const char *row = plane + (offsets[i] - 1) * bytes - below;
-            V4 sum = channels4(row, type) * every4(down[i][0]);
-            float value;
-            sum += channels4(row + below, type) * every4(down[i][1]);
-            sum += channels4(row + 2 * below, type) * every4(down[i][2]);
-            sum += channels4(row + 3 * below, type) * every4(down[i][3]);
-            sum *= load4(across[i]);
-            value = (sum[0] + sum[1]) + (sum[2] + sum[3]);
-            if (type == FLOAT32 && !(fabsf(value) <= 3.4028235e38f))
-                value = sample_at(job, plane, u[i], v[i], 0, FLOAT32, BICUBIC);
-            store(result, i, value, type);
+            rows[i] = channels4(row, type) * every4(down[0][i]) + channels4(row + below, type) * every4(down[1][i]) +
+                      channels4(row + 2 * below, type) * every4(down[2][i]) +
+                      channels4(row + 3 * below, type) * every4(down[3][i]);
+        }
+        transpose(rows, columns);
+        value = columns[0] * across[0] + columns[1] * across[1] + columns[2] * across[2] + columns[3] * across[3];
+        if (type == FLOAT32) {
+            if (!all8((value >= every8(-3.4028235e38f)) & (value <= every8(3.4028235e38f))))
+                for (i = 0; i < STEP; i++) value[i] = sample_at(job, plane, u[i], v[i], 0, FLOAT32, BICUBIC);
+            store_floats(result, value, span->pixels);
+        } else if (type == BOOL) {
+            store_bytes(result, truth8(value), span->pixels);
+        } else {
+            value = clamped8(value, type == UINT16 ? 65535 : 255);
+            if (type == UINT16) store_words(result, rounded8(value), span->pixels);
+            else store_bytes(result, rounded8(value), span->pixels);
         }
     }
 }
