@@ -155,7 +155,7 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if _mine.threads:  # of a function that called this one
+        if torch.compiler.is_compiling() or _mine.threads:  # of a function that called this one
             return function(*args, **kwargs)
         _mine.threads = torch.get_num_threads() if _limits is not None else 1
         try:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_whole
+from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, kind, rows_of, size_of
 from camtorch.augment.filling import enough, filled, scaled
@@ -376,6 +377,7 @@ class Augmentation(SampleTransform):
 
     # -- applying
 
+    @as_cores_are_free
     @without_graph_in_workers
     def forward(
         self,
@@ -411,6 +413,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
+    @as_cores_are_free
     @without_graph_in_workers
     def inverse(
         self,

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch._threads import as_cores_are_free
 from camtorch._tracing import in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
@@ -95,6 +96,7 @@ class Lattice:
         return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
 
 
+@as_cores_are_free
 def locate(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, antialias: bool, rows: range
 ) -> Sampling | Lattice:
@@ -127,6 +129,7 @@ def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
     return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size("Warp")))
 
 
+@as_cores_are_free
 def tabulate(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float = 0.0, rows: range | None = None
 ) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch._threads import as_cores_are_free
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
@@ -117,6 +118,7 @@ def _natively(
     return result
 
 
+@as_cores_are_free
 def _by_torch(
     images: Tensor,
     where: Sampling | Lattice,
