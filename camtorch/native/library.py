@@ -66,6 +66,7 @@ def state() -> str:
     return _find().state
 
 
+@functools.cache
 def native_available() -> bool:
     """Whether images are sampled by compiled code; else torch samples them, slower and to the same results.
 

@@ -15,12 +15,8 @@ from camtorch.camera import Camera, from_values
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
 
-_is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # newer than torch 2.6
-
-
-def is_compiling() -> bool:
-    """Whether code is compiled, to be run where camtorch is; what is exported has torch's own operators alone."""
-    return torch.compiler.is_compiling() and not _is_exporting()
+# what is exported has torch's own operators alone; newer than torch 2.6
+is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
 
 
 def positions(source: Camera, target: Camera, rotation: Tensor | None, tolerance: float) -> tuple[Tensor, Tensor]:
@@ -65,15 +61,13 @@ def _(_, source, source_distortion, __, target, target_distortion, rotation, siz
 
 
 def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
-    """Whether the operator makes images: in compiled code, on the CPU and without a graph.
-
-    What is exported stays torch's own operators.
+    """Whether the operator makes the images of compiled code: on the CPU and without a graph.
 
     Args:
         images: of the source.
         inputs: all that the positions depend on.
     """
-    return is_compiling() and all(
+    return not is_exporting() and all(
         t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs)
     )
 

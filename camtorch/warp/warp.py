@@ -161,7 +161,7 @@ class Warp(GeometryModule):
         sampled = self._checked(images, mode, padding_mode, fill)
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
-        if not learns and compiled.takes(images, inputs):
+        if torch.compiler.is_compiling() and not learns and compiled.takes(images, inputs):
             options = self.tolerance, self.antialias, *sampled
             return compiled.warped(images, self.source, self.target, self.rotation, *options)
         if self._is_long() and not (learns or in_graph(images)):
@@ -306,7 +306,8 @@ class Warp(GeometryModule):
         return kept
 
     def _whole(self) -> Sampling | Lattice:
-        if compiled.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu:
+        may = torch.compiler.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu
+        if may and not compiled.is_exporting():
             return self._with_scale(*compiled.positions(self.source, self.target, self.rotation, self.tolerance))
         return self._strip(range(self.target._size("Warp")[0]))
 
