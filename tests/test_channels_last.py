@@ -11,6 +11,7 @@ from torch.profiler import ProfilerActivity, profile
 
 import camtorch as ct
 import camtorch.augment.numpy
+from camtorch.augment.kornia import RandomCamera
 from camtorch.augment.numpy import as_tensor
 
 SIZE = (50, 70)
@@ -158,6 +159,16 @@ def test_pillow_images_become_arrays_of_their_own(mode):
         out = transform()(image=np.asarray(image))["image"]
     assert (out.dtype, out.shape) == (np.asarray(image).dtype, np.asarray(image).shape)
     assert out[25, 35].tolist() == np.asarray(image)[25, 35].tolist()
+
+
+@needs_native
+@pytest.mark.parametrize("form", [torch.contiguous_format, torch.channels_last])
+def test_batches_of_kornia_stay_as_they_lie(form):
+    images = torch.rand(4, 3, *LARGE).to(memory_format=form)
+    module = RandomCamera(camera(LARGE), min_filled=0)
+    out, large = allocated(lambda: module(images), images.nbytes // len(images))
+    assert large == ["aten::empty"]
+    assert out.is_contiguous(memory_format=form)
 
 
 # -- images at the door of warps
