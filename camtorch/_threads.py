@@ -155,8 +155,14 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or _mine.threads:  # of a function that called this one
+        if torch.compiler.is_compiling():
             return function(*args, **kwargs)
+        if _mine.threads:  # of a function that called this one, and goes on as before
+            was_alone = _mine.is_alone
+            try:
+                return function(*args, **kwargs)
+            finally:
+                _mine.set_alone(was_alone)
         _mine.threads = torch.get_num_threads() if _limits is not None else 1
         try:
             split()
@@ -176,6 +182,11 @@ def split(elements: int | None = None) -> None:
         small = elements is not None and elements <= ALONE
         _mine.set_alone(small or _crowd.meets(_mine.threads, _mine.was_split))
         _mine.was_split = elements is not None and not _mine.is_alone
+
+
+def thread_count() -> int:
+    """Of torch on this thread: `torch.get_num_threads()`, also while a function that goes by free cores has but one."""
+    return max(_mine.threads, torch.get_num_threads())
 
 
 def is_split() -> bool:

@@ -328,6 +328,23 @@ def test_small_operations_are_not_split():
 
 
 @can_limit
+@pytest.mark.usefixtures("three_threads", "clock")
+def test_a_function_goes_on_as_before_one_that_it_called():
+    @_threads.as_cores_are_free
+    def inner(size):
+        _threads.split(size)
+        return torch.get_num_threads(), _threads.thread_count()
+
+    @_threads.as_cores_are_free
+    def outer(size):
+        _threads.split(size)
+        return [(inner(10), torch.get_num_threads()), (inner(1 << 20), torch.get_num_threads())]
+
+    assert outer(1 << 20) == [((1, 3), 3), ((3, 3), 3)]
+    assert outer(10) == [((1, 3), 1), ((3, 3), 1)]
+
+
+@can_limit
 @pytest.mark.usefixtures("three_threads")
 def test_limits_end_with_the_function(clock):
     @_threads.as_cores_are_free

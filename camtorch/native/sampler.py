@@ -10,7 +10,7 @@ from ctypes import byref, c_double, c_int32, c_int64, c_void_p
 import torch
 from torch import Tensor
 
-from camtorch._threads import spread
+from camtorch._threads import spread, thread_count
 from camtorch.native.library import library
 
 EMPTY, CUBIC, TODO = -2, -1, 0
@@ -159,7 +159,7 @@ def sample(
     job.tile_rows = max(_TILE // width // 8, 1) * 8
     tiles = -(-height // job.tile_rows) * count
     pointer = byref(job)
-    spread(lambda: native.camtorch_sample(pointer), min(torch.get_num_threads(), tiles))
+    spread(lambda: native.camtorch_sample(pointer), min(thread_count(), tiles))
 
 
 def _is_slow(images: Tensor, result: Tensor, mode: str) -> bool:
