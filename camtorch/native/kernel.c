@@ -391,14 +391,14 @@ INLINE V8 across8(Pairs p, V8 u) { return p.left * (1 - u) + p.right * u; }
 
 #if defined(__AVX2__)
 
-/* Bytes of eight neighbouring squares that lie within sixteen columns and three rows: read as a whole, then picked */
+/* Bytes of eight neighbouring squares that lie within sixteen columns and four rows: read as a whole, then picked */
 typedef struct {
-    int64_t at;          /* of the first byte of the first row */
-    int64_t below, last; /* from it to the second and to the third row */
-    __m256i pick;        /* of a row, the two neighbours of every square as 16 bits each */
-    __m256i lower;       /* which squares begin in the second row */
-    __m256i weights;     /* of the neighbours, in 2^-14 */
-    int one_row;         /* none does */
+    int64_t at;            /* of the first byte of the first row */
+    int64_t below;         /* from it to the second row */
+    __m256i pick;          /* of a row, the two neighbours of every square as 16 bits each */
+    __m256i second, third; /* which squares begin in the second row or below it, and in the third */
+    __m256i weights;       /* of the neighbours, in 2^-14 */
+    int rows;              /* two, three or four */
 } Window;
 
 INLINE int window_of(const Job *job, const Squares *at, Window *window) {
@@ -407,16 +407,16 @@ INLINE int window_of(const Job *job, const Squares *at, Window *window) {
     const __m256i dx = _mm256_sub_epi32((__m256i)at->x, _mm256_set1_epi32(x));
     const __m256i dy = _mm256_sub_epi32((__m256i)at->y, _mm256_set1_epi32(y));
     const __m256i one = _mm256_set1_epi32(1), fifteen = _mm256_set1_epi32(-16);
-    /* none of 0 ... 14 columns and 0, 1 rows */
-    const __m256i far = _mm256_or_si256(_mm256_and_si256(dy, _mm256_set1_epi32(-2)),
-                                        _mm256_or_si256(_mm256_and_si256(dx, fifteen),
-                                                        _mm256_and_si256(_mm256_add_epi32(dx, one), fifteen)));
+    /* none of 0 ... 14 columns and 0, 1, 2 rows */
+    const __m256i far_down = _mm256_and_si256(_mm256_or_si256(dy, _mm256_add_epi32(dy, one)), _mm256_set1_epi32(-4));
+    const __m256i far_across = _mm256_and_si256(_mm256_or_si256(dx, _mm256_add_epi32(dx, one)), fifteen);
+    const __m256i far = _mm256_or_si256(far_down, far_across);
     if (!_mm256_testz_si256(far, far) || x + 16 > job->source_width) return 0;
-    window->lower = _mm256_sub_epi32(_mm256_setzero_si256(), dy);
-    window->one_row = _mm256_testz_si256(dy, dy);
+    window->second = _mm256_cmpgt_epi32(dy, _mm256_setzero_si256());
+    window->third = _mm256_cmpgt_epi32(dy, one);
+    window->rows = _mm256_testz_si256(dy, dy) ? 2 : _mm256_testz_si256(window->third, window->third) ? 3 : 4;
     window->at = (int64_t)y * job->source_strides[2] + x;
     window->below = job->source_strides[2];
-    window->last = window->one_row ? window->below : 2 * window->below;
     /* bytes d, none, d + 1, none */
     window->pick = _mm256_add_epi32(_mm256_or_si256(dx, _mm256_slli_epi32(dx, 16)), _mm256_set1_epi32((int32_t)0x80018000));
     const __m256i right = _mm256_cvtps_epi32(_mm256_mul_ps((__m256)at->u, _mm256_set1_ps(16384)));
@@ -434,10 +434,15 @@ INLINE V8 window_bytes(const uint8_t *plane, const Window *window, V8 v) {
     const uint8_t *from = plane + window->at;
     __m256i upper = _mm256_shuffle_epi8(row16(from), window->pick);
     __m256i lower = _mm256_shuffle_epi8(row16(from + window->below), window->pick);
-    if (!window->one_row) {
-        const __m256i third = _mm256_shuffle_epi8(row16(from + window->last), window->pick);
-        upper = _mm256_blendv_epi8(upper, lower, window->lower);
-        lower = _mm256_blendv_epi8(lower, third, window->lower);
+    if (window->rows > 2) {
+        const __m256i third = _mm256_shuffle_epi8(row16(from + 2 * window->below), window->pick);
+        upper = _mm256_blendv_epi8(upper, lower, window->second);
+        lower = _mm256_blendv_epi8(lower, third, window->second);
+        if (window->rows > 3) {
+            const __m256i fourth = _mm256_shuffle_epi8(row16(from + 3 * window->below), window->pick);
+            upper = _mm256_blendv_epi8(upper, third, window->third);
+            lower = _mm256_blendv_epi8(lower, fourth, window->third);
+        }
     }
     const V8 above = (V8)_mm256_cvtepi32_ps(_mm256_madd_epi16(upper, window->weights));
     const V8 below = (V8)_mm256_cvtepi32_ps(_mm256_madd_epi16(lower, window->weights));
@@ -790,7 +795,8 @@ typedef struct {
 typedef struct {
     __m512i x, y; /* columns and rows from the first one on */
     int64_t column, row;
-    __mmask16 second, third; /* which begin in the second row or below it, and in the third */
+    int rows;           /* that they take, two at least */
+    __mmask16 from[5];  /* which begin in a row or below it */
 } WideWindow;
 
 INLINE int32_t first_of(__m512i x) { return _mm_cvtsi128_si32(_mm512_castsi512_si128(x)); }
@@ -798,12 +804,16 @@ INLINE int32_t last_of(__m512i x) { return _mm_extract_epi32(_mm512_extracti32x4
 
 INLINE int window_of_sixteen(__m512i x, __m512i y, int32_t columns, int32_t rows, WideWindow *window) {
     const int32_t x0 = first_of(x), x15 = last_of(x), y0 = first_of(y), y15 = last_of(y);
+    int k;
     window->column = x0 < x15 ? x0 : x15;
     window->row = y0 < y15 ? y0 : y15;
     window->x = _mm512_sub_epi32(x, _mm512_set1_epi32((int32_t)window->column));
     window->y = _mm512_sub_epi32(y, _mm512_set1_epi32((int32_t)window->row));
-    window->second = _mm512_cmpgt_epi32_mask(window->y, _mm512_setzero_si512());
-    window->third = _mm512_cmpgt_epi32_mask(window->y, _mm512_set1_epi32(1));
+    window->rows = 2;
+    for (k = 1; k < 5; k++) {
+        window->from[k] = _mm512_cmpge_epi32_mask(window->y, _mm512_set1_epi32(k));
+        window->rows += window->from[k] != 0;
+    }
     /* as unsigned numbers, so not negative either */
     return (_mm512_cmplt_epu32_mask(window->x, _mm512_set1_epi32(columns)) &
             _mm512_cmplt_epu32_mask(window->y, _mm512_set1_epi32(rows))) == 0xffff;
@@ -858,17 +868,15 @@ INLINE void bytes_of_sixteen(const Span *span, const WideWindow *window, __m512 
     const __m512i weights = byte_weights(u);
     const __m512i pick = _mm512_add_epi32(_mm512_or_si512(window->x, _mm512_slli_epi32(window->x, 16)), _mm512_set1_epi32(1 << 16));
     int64_t c;
-#define ROW(k) _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, _mm512_castsi256_si512(row32(from + k * below, left)))
+    int k;
+#define ROW(k) _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, _mm512_castsi256_si512(row32(from + (k) * below, left)))
     for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
-        __m512i upper = ROW(0), lower = ROW(1);
-        if (rows > 2) {
-            const __m512i third = ROW(2);
-            upper = _mm512_mask_mov_epi32(upper, window->second, lower);
-            lower = _mm512_mask_mov_epi32(lower, window->second, third);
-            if (rows > 3) {
-                upper = _mm512_mask_mov_epi32(upper, window->third, third);
-                lower = _mm512_mask_mov_epi32(lower, window->third, ROW(3));
-            }
+        __m512i upper = ROW(0), last = ROW(1), lower = last;
+        for (k = 2; k < rows; k++) {
+            const __m512i next = ROW(k);
+            upper = _mm512_mask_mov_epi32(upper, window->from[k - 1], last);
+            lower = _mm512_mask_mov_epi32(lower, window->from[k - 1], next);
+            last = next;
         }
         _mm_storeu_si128((__m128i *)(span->result + c * job->result_strides[1]),
                          _mm512_cvtepi32_epi8(blended_bytes(upper, lower, weights, v)));
@@ -876,7 +884,14 @@ INLINE void bytes_of_sixteen(const Span *span, const WideWindow *window, __m512 
 #undef ROW
 }
 
-/* Three channels next to each other */
+/* Sixteen pixels of three channels, of 32 bits each, next to each other */
+INLINE void store_colours(char *to, __m512i packed) {
+    const __m512i dense = _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a,
+                                            0x24222120, 0x29282625, 0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0);
+    _mm512_mask_storeu_epi32(to, 0x0fff, _mm512_permutexvar_epi8(dense, packed));
+}
+
+/* Three channels next to each other, of squares within three rows and 20 columns */
 INLINE void colours_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v) {
     const Job *job = span->job;
     const int64_t below = job->source_strides[2], left = 3 * (job->source_width - window->column);
@@ -894,9 +909,44 @@ INLINE void colours_of_sixteen(const Span *span, const WideWindow *window, __m51
         packed = _mm512_or_si512(packed, _mm512_sll_epi32(value, _mm_cvtsi32_si128(8 * c)));
         pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
     }
-    const __m512i dense = _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a,
-                                            0x24222120, 0x29282625, 0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0);
-    _mm512_mask_storeu_epi32(span->result, 0x0fff, _mm512_permutexvar_epi8(dense, packed));
+    store_colours(span->result, packed);
+}
+
+/* The same within six rows and 41 columns */
+INLINE void far_colours_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v) {
+    const Job *job = span->job;
+    const int64_t below = job->source_strides[2], left = 3 * (job->source_width - window->column);
+    const char *from = span->source + window->row * below + 3 * window->column;
+    const __m512i weights = byte_weights(u), at = _mm512_add_epi32(window->x, _mm512_add_epi32(window->x, window->x));
+    __m512i pick = _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(3 << 16));
+    __m512i low[6], high[6], packed = _mm512_setzero_si512();
+    int c, k;
+    for (k = 0; k < window->rows; k++, from += below) {
+        low[k] = row64(from, left);
+        high[k] = left > 64 ? row64(from + 64, left - 64) : _mm512_setzero_si512();
+    }
+    for (c = 0; c < 3; c++) {
+#define ROW(k) _mm512_maskz_permutex2var_epi8(NEIGHBOURS, low[k], pick, high[k])
+        __m512i upper = ROW(0), last = ROW(1), lower = last;
+        for (k = 2; k < window->rows; k++) {
+            const __m512i next = ROW(k);
+            upper = _mm512_mask_mov_epi32(upper, window->from[k - 1], last);
+            lower = _mm512_mask_mov_epi32(lower, window->from[k - 1], next);
+            last = next;
+        }
+#undef ROW
+        const __m512i value = blended_bytes(upper, lower, weights, v);
+        packed = _mm512_or_si512(packed, _mm512_sll_epi32(value, _mm_cvtsi32_si128(8 * c)));
+        pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
+    }
+    store_colours(span->result, packed);
+}
+
+/* Between neighbours of a row */
+INLINE __m512 across_sixteen(const float *from, __m512i left, __m512i right, __m512 other_u, __m512 u) {
+    const __m512 low = _mm512_loadu_ps(from), high = _mm512_loadu_ps(from + 16);
+    return _mm512_fmadd_ps(_mm512_permutex2var_ps(low, left, high), other_u,
+                           _mm512_mul_ps(_mm512_permutex2var_ps(low, right, high), u));
 }
 
 INLINE void floats_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v, int rows) {
@@ -906,28 +956,19 @@ INLINE void floats_of_sixteen(const Span *span, const WideWindow *window, __m512
     const __m512 other_u = _mm512_sub_ps(_mm512_set1_ps(1), u), other_v = _mm512_sub_ps(_mm512_set1_ps(1), v);
     const __m512i left = window->x, right = _mm512_add_epi32(left, _mm512_set1_epi32(1));
     int64_t c;
-#define ROW(k)                                                                                                         \
-    const __m512 low##k = _mm512_loadu_ps(from + k * below), high##k = _mm512_loadu_ps(from + k * below + 16);         \
-    const __m512 row##k = _mm512_fmadd_ps(_mm512_permutex2var_ps(low##k, left, high##k), other_u,                      \
-                                          _mm512_mul_ps(_mm512_permutex2var_ps(low##k, right, high##k), u))
+    int k;
     for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
-        ROW(0);
-        ROW(1);
-        __m512 above = row0, under = row1;
-        if (rows > 2) {
-            ROW(2);
-            above = _mm512_mask_mov_ps(above, window->second, row1);
-            under = _mm512_mask_mov_ps(under, window->second, row2);
-            if (rows > 3) {
-                ROW(3);
-                above = _mm512_mask_mov_ps(above, window->third, row2);
-                under = _mm512_mask_mov_ps(under, window->third, row3);
-            }
+        __m512 above = across_sixteen(from, left, right, other_u, u), last = across_sixteen(from + below, left, right, other_u, u);
+        __m512 under = last;
+        for (k = 2; k < rows; k++) {
+            const __m512 next = across_sixteen(from + k * below, left, right, other_u, u);
+            above = _mm512_mask_mov_ps(above, window->from[k - 1], last);
+            under = _mm512_mask_mov_ps(under, window->from[k - 1], next);
+            last = next;
         }
         _mm512_storeu_ps((float *)span->result + c * job->result_strides[1],
                          _mm512_fmadd_ps(above, other_v, _mm512_mul_ps(under, v)));
     }
-#undef ROW
 }
 
 INLINE void nearest_of_sixteen(const Span *span, const WideWindow *window) {
@@ -942,9 +983,9 @@ INLINE void nearest_of_sixteen(const Span *span, const WideWindow *window) {
 }
 
 #define BY_ROWS(make)                                                                                                  \
-    if (!window.second) make(span, &window, u, v, 2);                                                                  \
-    else if (!window.third) make(span, &window, u, v, 3);                                                              \
-    else make(span, &window, u, v, 4)
+    if (window.rows == 2) make(span, &window, u, v, 2);                                                                \
+    else if (window.rows == 3) make(span, &window, u, v, 3);                                                           \
+    else make(span, &window, u, v, window.rows)
 
 /* Whether there is such a way, and the pixels are made */
 INLINE int sixteen(const Span *span, Wide at, int type, int mode, int layout) {
@@ -964,16 +1005,19 @@ INLINE int sixteen(const Span *span, Wide at, int type, int mode, int layout) {
     const __m512i y = _mm512_min_epi32(_mm512_cvttps_epi32(at.v), _mm512_set1_epi32((int32_t)job->source_height - 2));
     const __m512 u = _mm512_sub_ps(at.u, _mm512_cvtepi32_ps(x)), v = _mm512_sub_ps(at.v, _mm512_cvtepi32_ps(y));
     if (type == FLOAT32) {
-        if (!window_of_sixteen(x, y, 31, 3, &window) || window.column + 32 > job->source_width) return 0;
+        if (!window_of_sixteen(x, y, 31, 5, &window) || window.column + 32 > job->source_width) return 0;
         BY_ROWS(floats_of_sixteen);
         return 1;
     }
     if (layout == INTERLEAVED) {
-        if (!window_of_sixteen(x, y, 20, 2, &window)) return 0;
-        colours_of_sixteen(span, &window, u, v);
+        if (!window_of_sixteen(x, y, 41, 5, &window)) return 0;
+        if (window.rows <= 3 && _mm512_cmplt_epi32_mask(window.x, _mm512_set1_epi32(20)) == 0xffff)
+            colours_of_sixteen(span, &window, u, v);
+        else
+            far_colours_of_sixteen(span, &window, u, v);
         return 1;
     }
-    if (!window_of_sixteen(x, y, 31, 3, &window)) return 0;
+    if (!window_of_sixteen(x, y, 31, 5, &window)) return 0;
     BY_ROWS(bytes_of_sixteen);
     return 1;
 }
