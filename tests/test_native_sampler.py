@@ -349,7 +349,7 @@ def fuzz(folder, names, sanitizers, optimized, first, count):
     (folder / "empty.c").write_text("int main(void) { return 0; }\n")
     if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=folder, capture_output=True).returncode:
         pytest.skip(f"{command[0]} has no sanitizers: {' '.join(sanitizers)}")
-    flags = {"plain": PLAIN, **{name: building._VARIANTS[name] for name in names}}
+    flags = {"plain": PLAIN, **{name: building.VARIANTS[name] for name in names}}
     has = [f"-DHAS_{name.upper()}" for name in names]
     units = [["-O1", str(FUZZ), "-c", "-o", "driver.o", *has]]
     for name, options in flags.items():
@@ -367,7 +367,7 @@ def fuzz(folder, names, sanitizers, optimized, first, count):
 
 def runs_here():
     """The variants that this CPU runs, the best one last."""
-    names = list(building._VARIANTS)
+    names = list(building.VARIANTS)
     return names[: names.index(library().camtorch_variant().decode()) + 1]
 
 
