@@ -1,11 +1,13 @@
 """Laws of the compiled sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
 
+import gc
 import math
 import os
 import signal
 import subprocess
 import sys
 import threading
+import weakref
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
@@ -802,6 +804,20 @@ for last in (False, True):
         check("kept", 8, (720, 1280), dtype, 0.0, last, True)
     check("fresh", 1, SIZE, torch.uint8, 0.01, last, False)
 """
+
+
+def test_positions_of_strips_go_with_them():
+    """What waits for the garbage collector is memory that a warp of a large image takes."""
+    warp = larger(0.01)
+    gc.disable()
+    try:
+        where = positions.on_lattice(warp.source, warp.target, None, 0.01, range(480))
+        sampling.render(samples(1), where, "bilinear", "zeros", (0.0,))
+        seen = weakref.ref(where)
+        del where
+        assert seen() is None
+    finally:
+        gc.enable()
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="the system does not tell how much was used")

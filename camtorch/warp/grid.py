@@ -69,11 +69,14 @@ class Lattice:
     def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]):
         self.nodes, self.cells, self.exact, self.size = nodes, cells, exact, size
 
-    @cached_property
+    @property
     def single(self) -> Lattice:
         """In float32."""
-        if self.nodes.dtype == torch.float32:
-            return self
+        # kept, it would keep itself, until the garbage collector comes
+        return self if self.nodes.dtype == torch.float32 else self._narrowed
+
+    @cached_property
+    def _narrowed(self) -> Lattice:
         return Lattice(self.nodes.float(), self.cells, self.exact.float(), self.size)
 
     @cached_property
