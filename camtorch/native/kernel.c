@@ -523,12 +523,70 @@ INLINE V4 channels4(const char *at, int type) {
     }
 }
 
+#if defined(__AVX512VBMI__) && defined(__AVX512VL__) && defined(__AVX512BW__) && defined(__AVX512DQ__)
+#define WIDE 1
+
+/* Eight pixels of three floats, if their squares begin within nine columns and two rows, and two more columns follow */
+INLINE int colours_of_eight(const Span *span, const Squares *at) {
+    const Job *job = span->job;
+    const int64_t below = job->source_strides[2];
+    const int32_t x0 = at->x[0], x7 = at->x[7], y0 = at->y[0], y7 = at->y[7];
+    const int32_t column = x0 < x7 ? x0 : x7, first = y0 < y7 ? y0 : y7;
+    const __m256i dx = _mm256_sub_epi32((__m256i)at->x, _mm256_set1_epi32(column));
+    const __m256i dy = _mm256_sub_epi32((__m256i)at->y, _mm256_set1_epi32(first));
+    if ((_mm256_cmplt_epu32_mask(dx, _mm256_set1_epi32(9)) & _mm256_cmplt_epu32_mask(dy, _mm256_set1_epi32(2))) != 0xff ||
+        column + 11 > job->source_width || span->pixels < STEP)
+        return 0;
+    /* sixteen and eight elements of the result: of which pixel each is, and which of its channels */
+    const __m512i pixel[2] = {_mm512_setr_epi32(0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5),
+                              _mm512_setr_epi32(5, 5, 6, 6, 6, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7)};
+    const __m512i channel[2] = {_mm512_setr_epi32(0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0),
+                                _mm512_setr_epi32(1, 2, 0, 1, 2, 0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 2)};
+    const __m512i three = _mm512_castsi256_si512(_mm256_add_epi32(dx, _mm256_add_epi32(dx, dx)));
+    const __m512i rows = _mm512_castsi256_si512(dy);
+    const __m512 parts_u = _mm512_castps256_ps512((__m256)at->u), parts_v = _mm512_castps256_ps512((__m256)at->v);
+    const float *from = (const float *)span->source + first * below + 3 * column;
+    __m512 made[2];
+    int k;
+    for (k = 0; k < 2; k++) {
+        const __m512i left = _mm512_add_epi32(_mm512_permutexvar_epi32(pixel[k], three), channel[k]);
+        const __m512i right = _mm512_add_epi32(left, _mm512_set1_epi32(3));
+        const __m512 u = _mm512_permutexvar_ps(pixel[k], parts_u), v = _mm512_permutexvar_ps(pixel[k], parts_v);
+        const __m512 other_u = _mm512_sub_ps(_mm512_set1_ps(1), u), other_v = _mm512_sub_ps(_mm512_set1_ps(1), v);
+        const __mmask16 second = _mm512_test_epi32_mask(_mm512_permutexvar_epi32(pixel[k], rows), _mm512_set1_epi32(1));
+#define ROW(i)                                                                                                         \
+    const __m512 low##i = _mm512_loadu_ps(from + i * below), high##i = _mm512_loadu_ps(from + i * below + 16);         \
+    const __m512 row##i = _mm512_fmadd_ps(_mm512_permutex2var_ps(low##i, left, high##i), other_u,                      \
+                                          _mm512_mul_ps(_mm512_permutex2var_ps(low##i, right, high##i), u))
+        ROW(0);
+        ROW(1);
+        __m512 above = row0, under = row1;
+        if (second) {
+            ROW(2);
+            above = _mm512_mask_mov_ps(row0, second, row1);
+            under = _mm512_mask_mov_ps(row1, second, row2);
+        }
+#undef ROW
+        made[k] = _mm512_fmadd_ps(above, other_v, _mm512_mul_ps(under, v));
+    }
+    _mm512_storeu_ps((float *)span->result, made[0]);
+    _mm256_storeu_ps((float *)span->result + 16, _mm512_castps512_ps256(made[1]));
+    return 1;
+}
+
+#else
+#define WIDE 0
+#endif
+
 INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
     const Job *job = span->job;
     const int64_t bytes = size_of(type), channels = job->channels;
     const int64_t right = channels * bytes, below = job->source_strides[2] * bytes;
     float values[STEP * MOST_INTERLEAVED + 4];
     int64_t offsets[STEP], i, n = span->pixels * channels;
+#if WIDE
+    if (type == FLOAT32 && channels == 3 && colours_of_eight(span, &at)) return;
+#endif
     offsets_of(job, at.x, at.y, offsets);
 #if defined(__AVX2__)
     if (type == UINT8) {
@@ -728,6 +786,7 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
 }
 
 #else
+#define WIDE 0
 
 typedef struct { float lane[STEP]; } V8;
 
@@ -784,8 +843,7 @@ INLINE V8 between(const float *line) {
 
 /* -- sixteen pixels at a time, whose neighbours are picked out of whole registers */
 
-#if defined(__AVX512VBMI__) && defined(__AVX512VL__) && defined(__AVX512BW__) && defined(__AVX512DQ__)
-#define WIDE 1
+#if WIDE
 
 typedef struct {
     __m512 u, v;
@@ -1046,8 +1104,6 @@ INLINE __m512 between_wide(const float *line) {
     return sum;
 }
 
-#else
-#define WIDE 0
 #endif
 
 /* A row of the target on the lattice: the lines through its columns of nodes, and its cells */
