@@ -139,7 +139,7 @@ ALONE = (1 << 15) - 1
 """Elements up to which it is not worth while to split an operation."""
 EVEN = 3 * 4 * 2 * 16
 """Multiples of so many elements are split between pairs of vectors, up to 64 bytes wide, by one to four threads."""
-_GLANCE = 2e-3  # seconds for which a look at the cores holds
+_GLANCE = 1e-3  # seconds for which a look at the cores holds
 _SPIN = 1e-3  # seconds for which threads certainly go on running after an operation
 _LONGEST = 0.5  # seconds
 _CORES = os.cpu_count() or 1
@@ -231,16 +231,16 @@ class _Crowd:
     """Whether more threads, of all processes, want to run than there are cores.
 
     Torch's own are among them while they are at work, and for a moment after, so that a look taken then tells what is
-    there beside them. While a thread computes alone, one other that is busy seems to leave room. So after a crowd was
-    seen no look is taken for a while, twice as long if there was one again as soon as all of torch's threads were back.
+    there beside them. Who computes alone does not know whether there is room for them as well, unless he is the only
+    one. So after a crowd they stay away for a while, twice as long if there was one again as soon as they were back.
     """
 
     def __init__(self) -> None:
         self.is_here = False
-        self._pause = _GLANCE
-        self._next_look = -math.inf
         self.last_together = -math.inf
         """When torch's threads were last at work."""
+        self._pause = _GLANCE
+        self._next_look = self._doubt_ends = -math.inf
 
     def meets(self, threads: int, together: bool) -> bool:
         """Whether so many threads of torch would be in it. together: whether they have just been at work."""
@@ -249,13 +249,17 @@ class _Crowd:
             self.last_together = now
         if now < self._next_look:
             return self.is_here
-        self.is_here = _wanting() > max(_CORES, threads)
-        if self.is_here:
-            self._next_look, self._pause = now + self._pause, min(2 * self._pause, _LONGEST)
-        else:
-            self._next_look = now + _GLANCE
-            if now < self.last_together + _SPIN:
+        wanting, room = _wanting(), max(_CORES, threads)
+        beside_them = now < self.last_together + _SPIN
+        if wanting > room:
+            if beside_them:
+                self._doubt_ends, self._pause = now + self._pause, min(2 * self._pause, _LONGEST)
+            self.is_here = True
+        elif wanting - 1 + threads <= room or now >= self._doubt_ends:
+            if beside_them:
                 self._pause = _GLANCE
+            self.is_here = False
+        self._next_look = now + _GLANCE
         return self.is_here
 
 
