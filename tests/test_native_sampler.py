@@ -422,13 +422,14 @@ def classified():
         native = positions.classify
 
         def checked(nodes, *others):
-            cells, expected = native(nodes, *others), positions._classified(nodes, *others)
+            (cells, most), (expected, _) = native(nodes, *others), positions._classified(nodes, *others)
             off = cells != expected
+            assert most == int((cells == sampler.TODO).sum((1, 2)).amax())
             # of what is to be exact roundings may decide, not of what there is
             assert torch.equal(cells == sampler.EMPTY, expected == sampler.EMPTY)
             counts[0] += cells.numel()
             counts[1] += int(off.sum())
-            return cells
+            return cells, most
 
         patch.setattr(positions, "classify", checked)
         yield counts

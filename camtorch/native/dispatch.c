@@ -7,8 +7,8 @@
 #include "sampler.h"
 
 #define DECLARED(variant)                                                                                              \
-    void sample_##variant(Job *);                                                                                      \
-    void classify_##variant(const Classification *);
+    int32_t sample_##variant(Job *);                                                                                      \
+    int32_t classify_##variant(const Classification *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
 DECLARED(avx2)
@@ -43,9 +43,9 @@ EXPORTED const char *camtorch_variant(void) {
 
 #define CALLED(name, ...)                                                                                              \
     switch (variant()) {                                                                                               \
-        IF_AVX512(case AVX512: name##_avx512(__VA_ARGS__); break;)                                                     \
-        IF_AVX2(case AVX2: name##_avx2(__VA_ARGS__); break;)                                                           \
-    default: name##_baseline(__VA_ARGS__);                                                                             \
+        IF_AVX512(case AVX512: return name##_avx512(__VA_ARGS__);)                                                     \
+        IF_AVX2(case AVX2: return name##_avx2(__VA_ARGS__);)                                                           \
+    default: return name##_baseline(__VA_ARGS__);                                                                      \
     }
 #ifdef HAS_AVX512
 #define IF_AVX512(code) code
@@ -58,9 +58,9 @@ EXPORTED const char *camtorch_variant(void) {
 #define IF_AVX2(code)
 #endif
 
-EXPORTED void camtorch_sample(Job *job) { CALLED(sample, job) }
+EXPORTED int32_t camtorch_sample(Job *job) { CALLED(sample, job) }
 
-EXPORTED void camtorch_classify(const Classification *given) { CALLED(classify, given) }
+EXPORTED int32_t camtorch_classify(const Classification *given) { CALLED(classify, given) }
 
 /* Asks for a part of memory that nobody has written to in large pages, if the system has them for those who ask */
 EXPORTED void camtorch_large_pages(void *from, int64_t bytes) {

@@ -1297,19 +1297,20 @@ static const Tile interpolated[][2][3] = {WAYS(UINT8), WAYS(BOOL), WAYS(UINT16),
 static const Tile moved[] = {NAME(BYTES1, NEAREST, SCATTERED), NAME(BYTES2, NEAREST, SCATTERED),
                              NAME(BYTES4, NEAREST, SCATTERED), NAME(BYTES8, NEAREST, SCATTERED)};
 
-/* Makes tiles until none is left that nobody has taken */
-void THIS(sample)(Job *job) {
+/* Makes tiles until none is left that nobody has taken; how many it made */
+int32_t THIS(sample)(Job *job) {
     const int64_t tiles = (job->height + job->tile_rows - 1) / job->tile_rows;
     const Tile make = job->mode == NEAREST ? moved[job->type - BYTES1]
                                            : interpolated[job->type][job->mode - BILINEAR][layout_of(job)];
-    for (;;) {
+    int32_t made;
+    for (made = 0;; made++) {
 #if defined(_MSC_VER)
         const int64_t i = _InterlockedExchangeAdd64(&job->next, 1);
 #else
         const int64_t i = __atomic_fetch_add(&job->next, 1, __ATOMIC_RELAXED);
 #endif
         int64_t b, from;
-        if (i >= tiles * job->count) return;
+        if (i >= tiles * job->count) return made;
         /* one image after the other of the same rows: positions that they share are in the cache then */
         b = i % job->count;
         from = i / job->count * job->tile_rows;
@@ -1357,12 +1358,14 @@ static void ranges(const float *nodes, int64_t width, int64_t n, float *least, f
     }
 }
 
-void THIS(classify)(const Classification *given) {
+/* The cells; how many want exact positions in the image with the most of them */
+int32_t THIS(classify)(const Classification *given) {
     const int64_t n = given->columns, width = n + 5, area = n + 8;
     const float limit = (float)(given->tolerance * given->tolerance);
     const float half[2] = {(float)(given->source_width / 2), (float)(given->source_height / 2)};
     float *lines[10];
     int64_t b, i, j, c, k;
+    int32_t most = 0;
     for (k = 0; k < 10; k++) lines[k] = given->scratch + k * area;
     for (b = 0; b < given->count; b++) {
         int32_t *cells = given->cells + b * given->rows * n;
@@ -1403,5 +1406,9 @@ void THIS(classify)(const Classification *given) {
         for (k = 0; k < given->width; k++) LOOK(last_row + k / STEP);
         for (k = 0; k < given->height; k++) LOOK(k / STEP * n);
         for (k = 0; k < given->height; k++) LOOK(k / STEP * n + last);
+        int32_t todo = 0;
+        for (k = 0; k < given->rows * n; k++) todo += cells[k] == 0;
+        most = todo > most ? todo : most;
     }
+    return most;
 }

@@ -209,8 +209,8 @@ def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
 
 def classify(
     nodes: Tensor, mapped: Tensor, rim: Tensor, size: tuple[int, int], source: tuple[int, int], tolerance: float
-) -> Tensor | None:
-    """(B, n, m) int32, contiguous: which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`; None without a library.
+) -> tuple[Tensor, int] | None:
+    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`, or None without a library.
 
     Args:
         nodes: (B, 2, n + 5, m + 5) of float32, the last two dims without gaps.
@@ -220,6 +220,9 @@ def classify(
         size: (h, w) of the target.
         source: (height, width) of the source.
         tolerance: in pixels of the source.
+
+    Returns:
+        (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
     """
     native = library()
     if native is None:
@@ -243,5 +246,4 @@ def classify(
         cells.data_ptr(),
         scratch.data_ptr(),
     )
-    native.camtorch_classify(byref(given))
-    return cells
+    return cells, native.camtorch_classify(byref(given))

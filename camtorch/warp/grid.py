@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cached_property, partial, reduce
+from functools import cached_property, lru_cache, partial, reduce
 from typing import NamedTuple
 
 import torch
@@ -24,6 +24,7 @@ _FEWEST = 8  # cells along a side from which on a lattice pays
 _STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
 _MARGIN = 0.05  # of half an image: what lies beyond is not sampled
+_MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
 _OVERSHOOT = 0.5  # of the range of its nodes by which a cubic may leave it: 0.27 along each axis
 _CUBIC = 3 / 128  # a cubic through four even nodes misses its middle by this part of their fourth difference
 _SAFETY = 3.0  # times that is assumed: at a step of the curvature, fourth differences tell less; 0.6 of it is then used
@@ -242,26 +243,39 @@ def on_lattice(
     n, m = math.ceil(height / _STEP), math.ceil(width / _STEP)  # cells
     if min(n, m) < _FEWEST:
         return None
-    # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
-    v, u = ((torch.arange(k + 5, dtype=like.dtype, device=like.device) - 2) * _STEP for k in (n, m))
-    nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"), -1)
-    # with the pixels at the rim of the target, which may tell what nodes do not
-    pixels = torch.cat((nodes.flatten(0, 1), _rim(rows, width, like)))
+    known = in_memory(like) and (n + 5) * (m + 5) <= _MOST_KEPT
+    pixels = _kept_looks(rows, width, like.dtype) if known else _looks(rows, width, like)
     exact = partial(_positions, source, target, rotation)
     positions, mapped = exact(pixels[None])  # (B, 1, N, 2)
     counts = (n + 5) * (m + 5), len(pixels) - (n + 5) * (m + 5)
     at_nodes, mapped_nodes = (t[:, 0].split(counts, 1)[0].unflatten(1, (n + 5, m + 5)) for t in (positions, mapped))
     lattice, rim = at_nodes.movedim(-1, 1), mapped[:, 0].split(counts, 1)[1]
     size = source._size("Warp")
-    single, cells = lattice.float(), None
+    single, classes = lattice.float(), None
     if in_memory(single) and not is_recorded():
-        cells = classify(single, mapped_nodes, rim, (height, width), size, tolerance)
-    if cells is None:
-        cells = _classified(lattice, mapped_nodes, rim, (height, width), size, tolerance)
-    todo = cells == TODO
-    if bool((todo.sum((1, 2)) > n * m / 2).any()):
+        classes = classify(single, mapped_nodes, rim, (height, width), size, tolerance)
+    cells, most = classes or _classified(lattice, mapped_nodes, rim, (height, width), size, tolerance)
+    if most > n * m / 2:
         return None
-    return Lattice(lattice, cells, _compute(exact, rows.start, cells, todo, like), (height, width))
+    none = like.new_empty(2, 0, _STEP, _STEP)
+    return Lattice(lattice, cells, _compute(exact, rows.start, cells, like) if most else none, (height, width))
+
+
+def _looks(rows: range, width: int, like: Tensor) -> Tensor:
+    """(N, 2): the nodes of a lattice, and the pixels at the rim of the target, which may tell what nodes do not."""
+    # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
+    v, u = (
+        (torch.arange(math.ceil(side / _STEP) + 5, dtype=like.dtype, device=like.device) - 2) * _STEP
+        for side in (len(rows), width)
+    )
+    nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
+    return torch.cat((nodes.flatten(1), _rim(rows, width, like).mT), 1).mT
+
+
+@lru_cache(maxsize=8)
+def _kept_looks(rows: range, width: int, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):
+        return _looks(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
 
 
 def _rim(rows: range, width: int, like: Tensor) -> Tensor:
@@ -273,18 +287,18 @@ def _rim(rows: range, width: int, like: Tensor) -> Tensor:
     return torch.cat([torch.stack(side, -1) for side in sides])
 
 
-def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor) -> Tensor:
+def _compute(exact: Exact, first: int, cells: Tensor, like: Tensor) -> Tensor:
     """Exact positions (2, K, 8, 8) of cells, whose places are written into `cells`.
 
     Args:
         exact: see `Exact`.
         first: row of the target where the lattice begins.
-        cells: (B, n, m) int32.
-        todo: (B, n, m) bool, those to begin with: where what is mapped ends in one, its neighbours follow.
+        cells: (B, n, m) int32. Where what is mapped ends in one that is `TODO`, its neighbours follow.
         like: a tensor of the dtype to compute in.
     """
     parts, count = [like.new_empty(2, 0, _STEP, _STEP)], 0
-    done, places = torch.zeros_like(todo), cells.flatten(1)
+    todo, places = cells == TODO, cells.flatten(1)
+    done = torch.zeros_like(todo)
     offset = torch.arange(_STEP, dtype=like.dtype, device=like.device)
     while bool(todo.any()):
         # as many cells of every camera as the one with the most has: more of them computed does no harm
@@ -310,7 +324,7 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
 
 def _classified(
     nodes: Tensor, mapped: Tensor, rim: Tensor, size: tuple[int, int], source: tuple[int, int], tolerance: float
-) -> Tensor:
+) -> tuple[Tensor, int]:
     """What `classify` finds, by torch."""
     mapped = mapped[:, 1:-1, 1:-1]
     some, every = (
@@ -332,7 +346,7 @@ def _classified(
     camera, pixel = (rim != some[:, i, j]).nonzero(as_tuple=True)
     todo[camera, i[pixel], j[pixel]] = True
     cells = torch.where(some, CUBIC, EMPTY)
-    return torch.where(todo, TODO, cells).to(torch.int32)
+    return torch.where(todo, TODO, cells).to(torch.int32), int(todo.sum((1, 2)).amax())
 
 
 def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
