@@ -246,8 +246,8 @@ def on_lattice(
     n, m = math.ceil(height / _STEP), math.ceil(width / _STEP)  # cells
     if min(n, m) < _FEWEST:
         return None
-    known = in_memory(like) and (n + 5) * (m + 5) <= _MOST_KEPT
-    pixels = _kept_looks(rows, width, like.dtype) if known else _looks(rows, width, like)
+    keeps = in_memory(like) and (n + 5) * (m + 5) <= _MOST_KEPT
+    pixels = _kept_looks(rows, width, like.dtype) if keeps else _looks(rows, width, like)
     exact = partial(_positions, source, target, rotation)
     positions, mapped = exact(pixels[None])  # (B, 1, N, 2)
     counts = (n + 5) * (m + 5), len(pixels) - (n + 5) * (m + 5)
