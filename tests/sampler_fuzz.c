@@ -407,6 +407,7 @@ static void classify_any(const Variant *all, int n) {
     given.rows = (given.height + STEP - 1) / STEP, given.columns = (given.width + STEP - 1) / STEP;
     job.height = given.height, job.width = given.width, job.source_height = side(), job.source_width = side();
     given.source_height = (double)job.source_height, given.source_width = (double)job.source_width;
+    given.padding = (int32_t)below(3);
     given.tolerance = one_in(9) ? 1e30 : exp(uniform(-9, 1));
     width = given.columns + 5, area = (given.rows + 5) * width, rim_size = 2 * (given.height + given.width);
     nodes = allocated(given.count * 2 * area * 4);

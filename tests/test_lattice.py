@@ -21,6 +21,32 @@ def check(source, target, rotation):
         assert error.numel() == 0 or error.max() <= tolerance
 
 
+def check_padded(source, target, rotation, padding):
+    """An image of its own positions, shown beyond its rim too, shows them within the tolerance."""
+    height, width = source.image_size
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float32) for side in (height, width)), indexing="ij")
+    image = torch.stack((u, v))[None]
+    exact = ct.Warp(source, target, rotation, padding_mode=padding, tolerance=0.0)(image)
+    # a corner of a reflection is not where a float32 says, and far out the less so
+    rounding = 1e-3 if padding == "border" else 2e-2
+    for tolerance in (10.0, 0.1, 0.01):
+        close = ct.Warp(source, target, rotation, padding_mode=padding, tolerance=tolerance)
+        called = ct.Warp(source, target, rotation, tolerance=tolerance)
+        called(image)
+        for shown in (close(image), called(image, padding_mode=padding), called.pin()(image, padding_mode=padding)):
+            assert (shown - exact).norm(dim=1).max() <= tolerance + rounding
+
+
+@pytest.mark.parametrize("padding", ["border", "reflection"])
+@pytest.mark.parametrize("key", ["eucm", "division", "brown_conrady", "cylindrical"])
+def test_tolerances_hold_beyond_the_rim(key, padding):
+    camera = next(iter(real(key).values())).float().requires_grad_(False).resize(240, 320)
+    wide = ct.KannalaBrandt(torch.tensor([50.0, 50.0, 159.5, 119.5]), torch.zeros(4), image_size=(240, 320))
+    rotation = ct.augment.mount_rotation(*(torch.tensor(angle) for angle in (20.0, -10.0, 30.0)))
+    check_padded(camera, wide.requires_grad_(False), rotation, padding)
+    check_padded(camera, wide, None, padding)
+
+
 @pytest.mark.parametrize(("key", "name"), REAL)
 def test_real_lenses_keep_their_tolerance(key, name):
     camera = real(key)[name].float().requires_grad_(False).resize(240, 320)

@@ -812,7 +812,7 @@ def test_positions_of_strips_go_with_them():
     warp = larger(0.01)
     gc.disable()
     try:
-        where = positions.on_lattice(warp.source, warp.target, None, 0.01, range(480))
+        where = positions.on_lattice(warp.source, warp.target, None, 0.01, range(480), "zeros")
         sampling.render(samples(1), where, "bilinear", "zeros", (0.0,))
         seen = weakref.ref(where)
         del where

@@ -261,6 +261,15 @@ INLINE V8 clamped8(V8 x, float last) {
     return (V8)(((I8)x & ~low & ~high) | ((I8)every8(last) & high));
 }
 
+/* See `reflected`; of numbers whose size is below 2^21 */
+INLINE V8 reflected8(V8 x, float side) {
+    V8 distance = (V8)((I8)(x + 0.5f) & 0x7fffffff), sides = distance / side, extra;
+    const I8 whole = whole8(sides);
+    extra = distance - float8(whole) * side;
+    extra = (V8)(((I8)(side - extra) & -(whole & 1)) | ((I8)extra & ~-(whole & 1)));
+    return clamped8(extra - 0.5f, side - 1);
+}
+
 /* To the nearest whole number, of numbers whose size is below 2^22 */
 INLINE I8 rounded8(V8 value) {
 #if defined(__AVX2__)
@@ -742,12 +751,36 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
 /* How pixels lie in memory, in source and result */
 enum { PLANES, INTERLEAVED, SCATTERED };
 
+/* Of channels that lie anywhere, and so of the last columns and rows of those that lie together */
+NOT_INLINE void bilinear_scattered(const Span *span, Squares at, int type) {
+    const Job *job = span->job;
+    const int64_t *strides = job->source_strides;
+    int64_t i, c;
+    for (i = 0; i < span->pixels; i++) {
+        const float u = at.u[i], v = at.v[i];
+        const int64_t corner = at.y[i] * strides[2] + at.x[i] * strides[3];
+        for (c = 0; c < job->channels; c++) {
+            const int64_t upper = corner + c * strides[1], lower = upper + strides[2];
+            const float above = load(span->source, upper, type) * (1 - u) + load(span->source, upper + strides[3], type) * u;
+            const float below = load(span->source, lower, type) * (1 - u) + load(span->source, lower + strides[3], type) * u;
+            store(span->result, i * job->result_strides[3] + c * job->result_strides[1], above * (1 - v) + below * v, type);
+        }
+    }
+}
+
 INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
     const Job *job = span->job;
     Positions at;
     if (job->padding == BORDER && mode != BICUBIC) {
         u = clamped8(u, (float)(job->source_width - 1));
         v = clamped8(v, (float)(job->source_height - 1));
+    }
+    if (job->padding == REFLECTION && mode != BICUBIC && !inside(job, u, v, 0, 0)) {
+        const V8 far = every8(2097152.0f);
+        if (all8((u > -far) & (u < far) & (v > -far) & (v < far))) {
+            u = reflected8(u, (float)job->source_width);
+            v = reflected8(v, (float)job->source_height);
+        }
     }
     if (mode == NEAREST) {
         if (inside(job, u, v, 0, 0)) {
@@ -770,6 +803,10 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
             bicubic_planes(span, u, v, type);
             return;
         }
+    }
+    if (mode == BILINEAR && layout != PLANES && job->source_width > 1 && job->source_height > 1 && inside(job, u, v, 0, 0)) {
+        bilinear_scattered(span, squares_of(job, u, v, 1), type);
+        return;
     }
     if (job->padding == ZEROS) {
         const float reach = mode == BICUBIC ? 2 : 1;
@@ -1380,8 +1417,10 @@ int32_t THIS(classify)(const Classification *given) {
                 for (j = 0; j < n; j++) {
                     const float d = SAFETY * CUBIC * half[c] * (lines[1][j] + lines[2][j]);
                     const float reach = MARGIN + OVERSHOOT * (lines[6][j] - lines[5][j]);
-                    missed[j] += d * d;
-                    near[j] = lines[6][j] + reach > -1 && lines[5][j] - reach < 1 ? near[j] : 0;
+                    const int is_near = lines[6][j] + reach > -1 && lines[5][j] - reach < 1;
+                    /* beyond the border, one coordinate does not matter, but the other one does */
+                    missed[j] += is_near || given->padding != BORDER ? d * d : 0;
+                    near[j] = is_near || given->padding != ZEROS ? near[j] : 0;
                 }
             }
             uint8_t *sums = (uint8_t *)lines[0];

@@ -56,6 +56,7 @@ typedef struct {
     int64_t rim_stride;
     int64_t count, rows, columns, height, width;
     double source_height, source_width, tolerance;
+    int32_t padding; /* that is to be sampled with: what lies off the image then matters, or does not */
     int32_t *cells; /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, or 0 where positions are to be exact */
     float *scratch; /* 10 (columns + 8) */
 } Classification;

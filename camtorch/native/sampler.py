@@ -80,6 +80,7 @@ class _Classification(ctypes.Structure):
         ("source_height", c_double),
         ("source_width", c_double),
         ("tolerance", c_double),
+        ("padding", c_int32),
         ("cells", c_void_p),
         ("scratch", c_void_p),
     )
@@ -208,7 +209,13 @@ def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
 
 
 def classify(
-    nodes: Tensor, mapped: Tensor, rim: Tensor, size: tuple[int, int], source: tuple[int, int], tolerance: float
+    nodes: Tensor,
+    mapped: Tensor,
+    rim: Tensor,
+    size: tuple[int, int],
+    source: tuple[int, int],
+    tolerance: float,
+    padding: str,
 ) -> tuple[Tensor, int] | None:
     """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`, or None without a library.
 
@@ -220,6 +227,7 @@ def classify(
         size: (h, w) of the target.
         source: (height, width) of the source.
         tolerance: in pixels of the source.
+        padding: "zeros", "border" or "reflection", of what is to be sampled.
 
     Returns:
         (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
@@ -243,6 +251,7 @@ def classify(
         *size,
         *map(float, source),
         tolerance,
+        _PADDINGS[padding],
         cells.data_ptr(),
         scratch.data_ptr(),
     )

@@ -19,11 +19,13 @@ from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, r
 is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
 
 
-def positions(source: Camera, target: Camera, rotation: Tensor | None, tolerance: float) -> tuple[Tensor, Tensor]:
+def positions(
+    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
+) -> tuple[Tensor, Tensor]:
     """`grid.tabulate` of all pixels, between cameras that do not learn."""
     cameras = [n for c in (source, target) for n in (c._model, c.intrinsics, c.distortion)]
     sizes = [side for camera in (source, target) for side in camera._size("Warp")]
-    planes, mapped = _positions(*cameras, rotation, sizes, tolerance)
+    planes, mapped = _positions(*cameras, rotation, sizes, tolerance, padding)
     return planes.movedim(1, -1), mapped
 
 
@@ -38,16 +40,17 @@ def _positions(
     rotation: Tensor | None,
     sizes: Sequence[int],
     tolerance: float,
+    padding: str,
 ) -> tuple[Tensor, Tensor]:
     """The positions: planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
     source = from_values(source_model, source_intrinsics, source_distortion, sizes[:2])
     target = from_values(target_model, target_intrinsics, target_distortion, sizes[2:])
-    grid, mapped = tabulate(source, target, rotation, tolerance)
+    grid, mapped = tabulate(source, target, rotation, tolerance, padding=padding)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
 @_positions.register_fake
-def _(_, source, source_distortion, __, target, target_distortion, rotation, sizes, tolerance):
+def _(_, source, source_distortion, __, target, target_distortion, rotation, sizes, *_options):
     shapes = [t.shape[:-1] for t in (source, source_distortion, target, target_distortion)]
     shapes += [] if rotation is None else [rotation.shape[:-2]]
     count = math.prod(broadcast_shapes(*shapes))
@@ -79,14 +82,15 @@ def warped(
     rotation: Tensor | None,
     tolerance: float,
     antialias: bool,
+    padding: str,
     mode: Mode,
     padding_mode: PaddingMode,
     fill: tuple[float, ...],
 ) -> Tensor:
-    """The images (B, C, h, w) of a warp; arguments as of `Warp`."""
+    """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`."""
     cameras = [n for c in (source, target) for n in (c._model, c.intrinsics.detach(), c.distortion.detach())]
     sizes = [side for camera in (source, target) for side in camera._size("Warp")]
-    options = tolerance, antialias, mode, padding_mode, list(fill)
+    options = tolerance, antialias, padding, mode, padding_mode, list(fill)
     return _warp(images.detach(), *cameras, None if rotation is None else rotation.detach(), sizes, *options)
 
 
@@ -113,6 +117,7 @@ def _warp(
     sizes: Sequence[int],
     tolerance: float,
     antialias: bool,
+    padding: str,
     mode: str,
     padding_mode: str,
     fill: Sequence[int | float | bool],
@@ -123,10 +128,10 @@ def _warp(
     def positions() -> Sampling | Lattice:
         source = from_values(source_model, *numbers[:2], sizes[:2])
         target = from_values(target_model, *numbers[2:], sizes[2:])
-        return locate(source, target, rotation, tolerance, antialias, range(sizes[2]))
+        return locate(source, target, rotation, tolerance, antialias, range(sizes[2]), padding)
 
     inputs = [*numbers] if rotation is None else [*numbers, rotation]
-    what = source_model, target_model, tuple(sizes), tolerance, antialias, rotation is None
+    what = source_model, target_model, tuple(sizes), tolerance, antialias, padding, rotation is None
     where = _kept.memo(inputs, what, positions)
     options = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp"), tuple(fill)
     return render(images, where, *options).contiguous()

@@ -104,7 +104,13 @@ class Lattice:
 
 @as_cores_are_free
 def locate(
-    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, antialias: bool, rows: range
+    source: Camera,
+    target: Camera,
+    rotation: Tensor | None,
+    tolerance: float,
+    antialias: bool,
+    rows: range,
+    padding: str,
 ) -> Sampling | Lattice:
     """Where some rows of a target sample the source's image: on a lattice, if one does and nothing asks for pixels.
 
@@ -115,18 +121,19 @@ def locate(
         tolerance: see `Warp`.
         antialias: whether `Sampling.scale` is asked for.
         rows: of the target.
+        padding: see `on_lattice`.
     """
     plain = not in_transform() and is_concrete(target.intrinsics) and target.intrinsics.is_cpu
     if not antialias:
         if tolerance and plain:
-            lattice = on_lattice(source, target, rotation, tolerance, rows)
+            lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
             if lattice is not None:
                 return lattice
             tolerance = 0.0
-        return Sampling(*tabulate(source, target, rotation, tolerance, rows), None)
+        return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None)
     # the scale is that between neighbours
     around = range(max(rows.start - 1, 0), min(rows.stop + 1, target._size("Warp")[0]))
-    where = scaled(source, *tabulate(source, target, rotation, tolerance, around))
+    where = scaled(source, *tabulate(source, target, rotation, tolerance, around, padding))
     return where if around == rows else where.part(slice(rows.start - around.start, rows.stop - around.start))
 
 
@@ -137,7 +144,12 @@ def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
 
 @as_cores_are_free
 def tabulate(
-    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float = 0.0, rows: range | None = None
+    source: Camera,
+    target: Camera,
+    rotation: Tensor | None,
+    tolerance: float = 0.0,
+    rows: range | None = None,
+    padding: str = "zeros",
 ) -> tuple[Tensor, Tensor]:
     """The sampling positions of a target's pixels, and which of them are mapped: see `Exact`.
 
@@ -147,6 +159,7 @@ def tabulate(
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`, or None.
         tolerance: see `Warp`; above zero the CPU may take `on_lattice`.
         rows: of the target; all by default.
+        padding: see `on_lattice`.
     """
     height, width = target._size("Warp")
     rows = range(height) if rows is None else rows
@@ -155,7 +168,7 @@ def tabulate(
     if in_transform() or not is_concrete(target.intrinsics):
         return exact(_pixels(rows, width, like))
     if tolerance and like.is_cpu:
-        lattice = on_lattice(source, target, rotation, tolerance, rows)
+        lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
         if lattice is not None:
             return lattice.pixels[:2]
     # by strips: memory for what is in between is used again
@@ -226,7 +239,7 @@ def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def on_lattice(
-    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, rows: range
+    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, rows: range, padding: str
 ) -> Lattice | None:
     """Positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
@@ -241,6 +254,8 @@ def on_lattice(
         rotation: see `tabulate`.
         tolerance: positive, in pixels of the source.
         rows: of the target.
+        padding: that the positions are for. Those that "zeros" shows nothing of, and coordinates beyond the rim, which
+            "border" draws in, keep no tolerance. For "reflection" all do, and so serve every padding.
     """
     like, (height, width) = _like(target), (len(rows), target._size("Warp")[1])
     n, m = math.ceil(height / _STEP), math.ceil(width / _STEP)  # cells
@@ -256,8 +271,8 @@ def on_lattice(
     size = source._size("Warp")
     single, classes = lattice.float(), None
     if in_memory(single) and not is_recorded():
-        classes = classify(single, mapped_nodes, rim, (height, width), size, tolerance)
-    cells, most = classes or _classified(lattice, mapped_nodes, rim, (height, width), size, tolerance)
+        classes = classify(single, mapped_nodes, rim, (height, width), size, tolerance, padding)
+    cells, most = classes or _classified(lattice, mapped_nodes, rim, (height, width), size, tolerance, padding)
     if not most:
         return Lattice(lattice, cells, like.new_empty(2, 0, _STEP, _STEP), (height, width))
     todo = cells == TODO
@@ -338,7 +353,13 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
 
 
 def _classified(
-    nodes: Tensor, mapped: Tensor, rim: Tensor, size: tuple[int, int], source: tuple[int, int], tolerance: float
+    nodes: Tensor,
+    mapped: Tensor,
+    rim: Tensor,
+    size: tuple[int, int],
+    source: tuple[int, int],
+    tolerance: float,
+    padding: str,
 ) -> tuple[Tensor, int]:
     """What `classify` finds, by torch."""
     mapped = mapped[:, 1:-1, 1:-1]
@@ -347,12 +368,15 @@ def _classified(
     )
     half = nodes.new_tensor([source[1] / 2, source[0] / 2])[:, None, None]
     missed = _SAFETY * _CUBIC * half * (_fourth_difference(nodes, -1) + _fourth_difference(nodes, -2))
-    near = nodes[:, :, 1:-1, 1:-1]
+    inner = nodes[:, :, 1:-1, 1:-1]
     high, low = (
-        _over_windows(_over_windows(near, -1, 4, pick), -2, 4, pick) for pick in (torch.maximum, torch.minimum)
+        _over_windows(_over_windows(inner, -1, 4, pick), -2, 4, pick) for pick in (torch.maximum, torch.minimum)
     )
     reach = _MARGIN + _OVERSHOOT * (high - low)
-    sampled = ((high + reach > -1) & (low - reach < 1)).all(1)
+    near = (high + reach > -1) & (low - reach < 1)
+    if padding == "border":  # where one coordinate does not matter, the other one does
+        missed = missed * near
+    sampled = near.all(1) if padding == "zeros" else every
     todo = some & (~every | (sampled & (torch.hypot(*missed.unbind(1)) > tolerance)))
     # where a pixel at the rim says that nodes do not tell all
     v, u = (torch.arange(side, device=nodes.device) // _STEP for side in size)

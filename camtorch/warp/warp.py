@@ -162,16 +162,16 @@ class Warp(GeometryModule):
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
         if torch.compiler.is_compiling() and not learns and compiled.takes(images, inputs):
-            options = self.tolerance, self.antialias, *sampled
+            options = self.tolerance, self.antialias, self._reach(sampled[1]), *sampled
             return compiled.warped(images, self.source, self.target, self.rotation, *options)
         if self._is_long() and not (learns or in_graph(images)):
             result = empty(images, self._count(images), self.target._size("Warp"))
             kept: dict[int, Pyramid] = {}
             for rows in self._rows(None):
                 with torch.no_grad():
-                    render(images, self._strip(rows), *sampled, kept, result[:, :, rows.start : rows.stop])
+                    render(images, self._strip(rows, sampled[1]), *sampled, kept, result[:, :, rows.start : rows.stop])
             return result
-        return render(images, self._learned() if learns else self._kept(inputs), *sampled)
+        return render(images, self._learned() if learns else self._kept(inputs, sampled[1]), *sampled)
 
     if TYPE_CHECKING:
         __call__ = forward  # whose types nn.Module does not tell
@@ -219,7 +219,7 @@ class Warp(GeometryModule):
         kept: dict[int, Pyramid] = {}
         for rows in self._rows(count):
             with torch.no_grad():
-                where = self._strip(rows)
+                where = self._strip(rows, padding_mode)
                 part, valid = render(images, where, mode, padding_mode, fill, kept), self._on_image(where)
             yield slice(rows.start, rows.stop), part, valid
 
@@ -296,24 +296,31 @@ class Warp(GeometryModule):
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
         return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
 
-    def _kept(self, inputs: list[Tensor]) -> Sampling | Lattice:
+    def _reach(self, padding: PaddingMode | None) -> PaddingMode:
+        """The padding that positions are for which serve the warp's own, and this one."""
+        return max(self.padding_mode, padding or "zeros", key=PADDINGS.index)
+
+    def _kept(self, inputs: list[Tensor], padding: PaddingMode | None = None) -> Sampling | Lattice:
         """Without a graph, until something changes; or what is pinned."""
-        if self._pinned is not None:
+        reach = self._reach(padding)
+        if self._pinned is not None and (reach == self.padding_mode or isinstance(self._pinned, Sampling)):
             return self._pinned
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
-        options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
-        kept: Sampling | Lattice = self._memo(inputs, options, self._whole)
+        options = (*cameras, self.rotation is None, self.antialias, self.tolerance, reach)
+        kept: Sampling | Lattice = self._memo(inputs, options, lambda: self._whole(reach))
         return kept
 
-    def _whole(self) -> Sampling | Lattice:
+    def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
         may = torch.compiler.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu
         if may and not compiled.is_exporting():
-            return self._with_scale(*compiled.positions(self.source, self.target, self.rotation, self.tolerance))
-        return self._strip(range(self.target._size("Warp")[0]))
+            where = self.source, self.target, self.rotation
+            return self._with_scale(*compiled.positions(*where, self.tolerance, padding))
+        return self._strip(range(self.target._size("Warp")[0]), padding)
 
-    def _strip(self, rows: range) -> Sampling | Lattice:
+    def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
         """Of some rows of the target."""
-        return locate(self.source, self.target, self.rotation, self.tolerance, self.antialias, rows)
+        reach = self._reach(padding)
+        return locate(self.source, self.target, self.rotation, self.tolerance, self.antialias, rows, reach)
 
     def _rows(self, count: int | None) -> Iterator[range]:
         height, width = self.target._size("Warp")
