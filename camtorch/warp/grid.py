@@ -12,7 +12,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._threads import as_cores_are_free
-from camtorch._tracing import in_memory, in_transform, is_concrete, is_recorded, may_look
+from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
 from camtorch.rotations import turn
@@ -206,16 +206,21 @@ def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: 
     if rays.ndim == 3:
         rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
     seen, mapped = source.project(turn(None if rotation is None else rotation.mT, rays, "rays"))
+    del rays
     mapped = mapped & has_ray
+    if may_look(seen) and not in_graph(seen) and not in_transform():  # in the memory that is there
+        for plane, size in zip(seen.unbind(-1), source._size("Warp")[::-1], strict=True):
+            plane.mul_(2 / size).add_(1 / size - 1).clamp_(-_FAR, _FAR)
+        if not bool(mapped.all()):
+            seen.masked_fill_(~mapped.unsqueeze(-1), OUTSIDE)
+        return seen, mapped
     position = torch.stack(
         [
             (plane * (2 / size) + (1 / size - 1)).clamp(-_FAR, _FAR)
             for plane, size in zip(seen.unbind(-1), source._size("Warp")[::-1], strict=True)
         ]
     )
-    if not (may_look(mapped) and bool(mapped.all())):
-        position = torch.where(mapped, position, OUTSIDE)
-    return position.movedim(0, -1), mapped
+    return torch.where(mapped, position, OUTSIDE).movedim(0, -1), mapped
 
 
 def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
