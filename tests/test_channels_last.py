@@ -280,3 +280,17 @@ def test_the_first_line_copies_nothing(name):
     result, large = allocated(lambda: warp(torch.from_numpy(array).permute(2, 0, 1)[None]), array.nbytes)
     assert large == ["aten::empty"]
     assert result[0].permute(1, 2, 0).numpy().flags.c_contiguous
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # inductor imports what still uses it
+@pytest.mark.parametrize("antialias", [False, True])
+def test_compiled_code_gives_them_back_as_they_lie(antialias):
+    batch = torch.from_numpy(np.stack([colours(), colours()])).permute(0, 3, 1, 2)
+    warp = ct.Warp(camera(), ct.Pinhole.from_fov(60, image_size=(40, 60)), antialias=antialias).requires_grad_(False)
+    torch.compiler.reset()
+    compiled = torch.compile(warp, fullgraph=True)
+    repeated = batch[:, :1].expand(-1, 3, -1, -1)
+    for images in (batch, batch.contiguous(), batch.float(), batch[:1], batch[:, :1], repeated):
+        expected, result = warp(images), compiled(images)
+        assert result.stride() == expected.stride()
+        assert (result.float() - expected.float()).abs().max() <= (1 if images.dtype == torch.uint8 else 2e-3)

@@ -12,6 +12,7 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import Memo
 from camtorch.camera import Camera, from_values
+from camtorch.native.sampler import layout
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
 
@@ -90,8 +91,13 @@ def warped(
     """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`."""
     cameras = [n for c in (source, target) for n in (c._model, c.intrinsics.detach(), c.distortion.detach())]
     sizes = [side for camera in (source, target) for side in camera._size("Warp")]
-    options = tolerance, antialias, padding, mode, padding_mode, list(fill)
+    last = layout(images) == torch.channels_last
+    options = tolerance, antialias, padding, mode, padding_mode, list(fill), last
     return _warp(images.detach(), *cameras, None if rotation is None else rotation.detach(), sizes, *options)
+
+
+def _layout(channels_last: bool) -> torch.memory_format:
+    return torch.channels_last if channels_last else torch.contiguous_format
 
 
 class _Kept(local):
@@ -121,8 +127,9 @@ def _warp(
     mode: str,
     padding_mode: str,
     fill: Sequence[int | float | bool],
+    channels_last: bool,
 ) -> Tensor:
-    """The images (B, C, h, w), contiguous."""
+    """The images (B, C, h, w), plane by plane or with their channels last in memory."""
     numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
 
     def positions() -> Sampling | Lattice:
@@ -134,7 +141,7 @@ def _warp(
     what = source_model, target_model, tuple(sizes), tolerance, antialias, padding, rotation is None
     where = _kept.memo(inputs, what, positions)
     options = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp"), tuple(fill)
-    return render(images, where, *options).contiguous()
+    return render(images, where, *options).contiguous(memory_format=_layout(channels_last))
 
 
 @_warp.register_fake
@@ -142,7 +149,8 @@ def _(images, _, source, source_distortion, __, target, target_distortion, rotat
     shapes = [t.shape[:-1] for t in (source, source_distortion, target, target_distortion)]
     shapes += [] if rotation is None else [rotation.shape[:-2]]
     count = math.prod(broadcast_shapes(*shapes))
-    return images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *sizes[2:])
+    result = images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *sizes[2:])
+    return result.contiguous(memory_format=_layout(options[-1]))
 
 
 @_warp.register_vmap
