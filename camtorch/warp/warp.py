@@ -243,7 +243,8 @@ class Warp(GeometryModule):
             raise ValueError(f"Warp: images must be (B, C, H, W); got shape {shape}. {hint}")
         if shape[-2:] != expected:
             raise ValueError(
-                f"Warp: images are {shape[-2:]} (height, width), but the source camera's image_size is {expected}"
+                f"Warp: images are {shape[-2:]} (height, width), but the source camera's image_size is {expected}; "
+                "camera.crop makes that of a part of it, camera.resize that of another resolution"
             )
         cameras = math.prod(self.batch_shape)
         if cameras != 1 and images.shape[0] not in (1, cameras):
