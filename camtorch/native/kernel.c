@@ -109,8 +109,8 @@ INLINE void cubic_weights(float t, float *w) {
     w[3] = -0.75f * s * t * t;
 }
 
-/* The taps of one axis: the pixels, -1 where there are none, and their weights; 1, 2 or 4 of them */
-INLINE int taps_of(float x, int64_t side, int mode, int padding, int64_t *at, float *weight) {
+/* The taps of one axis: the pixels, -1 where there are none, and their weights; 2 or 4 of them */
+INLINE void taps_of(float x, int64_t side, int mode, int padding, int64_t *at, float *weight) {
     int k, n = mode == BILINEAR ? 2 : 4;
     int64_t cell;
     if (mode == BILINEAR) x = padded(x, side, padding);
@@ -127,27 +127,49 @@ INLINE int taps_of(float x, int64_t side, int mode, int padding, int64_t *at, fl
     }
     for (k = 0; k < n; k++) {
         int64_t i = cell + k;
-        if (mode == BICUBIC && padding != ZEROS) i = (int64_t)padded((float)i, side, padding);
+        if (mode == BICUBIC && padding != ZEROS && (i < 0 || i >= side)) i = (int64_t)padded((float)i, side, padding);
         /* what lies beyond by rounding alone has no weight */
-        if (mode == BILINEAR && padding != ZEROS && i >= side) i = side - 1;
+        if (padding != ZEROS && i >= side) i = side - 1;
         at[k] = i >= 0 && i < side ? i : -1;
     }
-    return n;
 }
 
-/* One channel of one pixel; `plane` is that of the channel, u and v are not NaN */
-NOT_INLINE float sample_at(const Job *job, const char *plane, float u, float v, float fill, int type, int mode) {
-    const int64_t *strides = job->source_strides;
+/* Those of both axes */
+typedef struct {
     int64_t columns[4], rows[4];
-    float across[4], down[4], sum = 0;
-    const int n = taps_of(u, job->source_width, mode, job->padding, columns, across);
+    float across[4], down[4];
+} Taps;
+
+/* u and v are not NaN */
+NOT_INLINE Taps taps_at(const Job *job, float u, float v, int mode) {
+    Taps taps;
+    taps_of(u, job->source_width, mode, job->padding, taps.columns, taps.across);
+    taps_of(v, job->source_height, mode, job->padding, taps.rows, taps.down);
+    return taps;
+}
+
+/* One channel of one pixel; `plane` is that of the channel */
+INLINE float sample_at(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode) {
+    const int64_t *strides = job->source_strides, *columns = taps->columns, *rows = taps->rows;
+    const float *across = taps->across, *down = taps->down;
+    const int n = mode == BILINEAR ? 2 : 4;
+    float sum = 0;
     int i, j;
-    taps_of(v, job->source_height, mode, job->padding, rows, down);
-    for (j = 0; j < n; j++)
-        for (i = 0; i < n; i++)
-            sum += down[j] * across[i] *
-                   (rows[j] < 0 || columns[i] < 0 ? fill
-                                                  : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
+    if (job->padding != ZEROS) {
+        for (j = 0; j < n; j++) {
+            const int64_t row = rows[j] * strides[2];
+            float line = 0;
+            for (i = 0; i < n; i++) line += across[i] * load(plane, row + columns[i] * strides[3], type);
+            sum += down[j] * line;
+        }
+    } else {
+        for (j = 0; j < n; j++)
+            for (i = 0; i < n; i++)
+                sum += down[j] * across[i] *
+                       (rows[j] < 0 || columns[i] < 0
+                            ? fill
+                            : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
+    }
     if (mode == BICUBIC && type == FLOAT32 && !(fabsf(sum) <= 3.4028235e38f)) {
         /* a pixel that is not finite has no part where its weight is but a rounding error */
         const float lost_u = 4 * (float)job->source_width * 1.1920929e-7f;
@@ -202,10 +224,10 @@ NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mod
                     move(result, c * job->result_strides[1], span->source,
                          c * job->source_strides[1] + y * job->source_strides[2] + x * job->source_strides[3], type);
         } else if (shows) {
+            const Taps taps = taps_at(job, u, v, mode);
             for (c = 0; c < job->channels; c++) {
                 const char *plane = span->source + c * job->source_strides[1] * bytes;
-                const float fill = job->fill[c];
-                const float value = sample_at(job, plane, u, v, fill, type, mode);
+                const float value = sample_at(job, plane, &taps, job->fill[c], type, mode);
                 store(result, c * job->result_strides[1], value, type);
             }
         }
@@ -721,7 +743,10 @@ INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
         value = columns[0] * across[0] + columns[1] * across[1] + columns[2] * across[2] + columns[3] * across[3];
         if (type == FLOAT32) {
             if (!all8((value >= every8(-3.4028235e38f)) & (value <= every8(3.4028235e38f))))
-                for (i = 0; i < STEP; i++) value[i] = sample_at(job, plane, u[i], v[i], 0, FLOAT32, BICUBIC);
+                for (i = 0; i < STEP; i++) {
+                    const Taps taps = taps_at(job, u[i], v[i], BICUBIC);
+                    value[i] = sample_at(job, plane, &taps, 0, FLOAT32, BICUBIC);
+                }
             store_floats(result, value, span->pixels);
         } else if (type == BOOL) {
             store_bytes(result, truth8(value), span->pixels);
