@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import camtorch as ct
+from camtorch.warp.grid import locate
 
 SIZE = (48, 64)
 
@@ -396,3 +397,16 @@ def test_the_largest_class_id_survives(mode):
     for dtype in (torch.int32, torch.int64):
         labels = torch.full((1, 1, *SIZE), torch.iinfo(dtype).max, dtype=dtype)
         assert ct.Warp(pinhole(), pinhole())(labels, mode=mode)[..., 5:-5, 5:-5].min() > 0
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.01])
+def test_images_and_masks_with_paddings_of_their_own_keep_their_positions(tolerance, monkeypatch):
+    made = []
+    monkeypatch.setattr("camtorch.warp.warp.locate", lambda *a: made.append(a) or locate(*a))
+    source = ct.Pinhole([90.0, 90, 79.5, 59.5], image_size=(120, 160)).requires_grad_(False)
+    warp = ct.Warp(source, ct.Pinhole([70.0, 70, 79.5, 59.5], image_size=(120, 160)), tolerance=tolerance)
+    warp.requires_grad_(False)
+    for _ in range(3):
+        warp(torch.rand(1, 3, 120, 160), padding_mode="border")
+        warp(torch.zeros(1, 1, 120, 160), mode="nearest")
+    assert len(made) == (2 if tolerance else 1)

@@ -16,7 +16,7 @@ from camtorch.native.sampler import layout
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
 
-# what is exported has torch's own operators alone; newer than torch 2.6
+# an exported program is not bound to this operator, nor to the CPU; newer than torch 2.6
 is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
 
 

@@ -115,7 +115,7 @@ class Warp(GeometryModule):
                 f"got {', '.join(map(str, shapes))}"
             )
         self.batch_shape = torch.Size(batch)
-        self._memo, self._pinned = Memo(), None
+        self._memos, self._pinned = {padding: Memo() for padding in PADDINGS}, None
 
     @property
     def tolerance(self) -> float:
@@ -307,8 +307,9 @@ class Warp(GeometryModule):
         if self._pinned is not None and (reach == self.padding_mode or isinstance(self._pinned, Sampling)):
             return self._pinned
         cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
-        options = (*cameras, self.rotation is None, self.antialias, self.tolerance, reach)
-        kept: Sampling | Lattice = self._memo(inputs, options, lambda: self._whole(reach))
+        options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
+        memo = self._memos[reach if self.tolerance else "zeros"]  # what is exact serves all
+        kept: Sampling | Lattice = memo(inputs, options, lambda: self._whole(reach))
         return kept
 
     def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
