@@ -20,7 +20,7 @@ def drawn(source, like, seed, count=4):
 
 def positions(warp, tolerance):
     rows = range(warp.target.image_size[0])
-    lattice = grid.on_lattice(warp.source, warp.target, warp.rotation, tolerance, rows)
+    lattice = grid.on_lattice(warp.source, warp.target, warp.rotation, tolerance, rows, "zeros")
     exact, mapped = grid.tabulate(warp.source, warp.target, warp.rotation)
     return lattice, exact, mapped
 
@@ -54,6 +54,6 @@ def test_few_pixels_are_the_cameras_own(like, most, monkeypatch):
     source = ct.Pinhole([280.0, 280.0, 319.5, 239.5], image_size=(480, 640)).requires_grad_(False)
     change = RandomCamera(like, yaw=10, pitch=10, roll=10, min_filled=0)
     warp = change.change(source, change.draw(8, torch.Generator().manual_seed(3))).parts[0].warp
-    lattice = grid.on_lattice(warp.source, warp.target, warp.rotation, TOLERANCE, range(480))
+    lattice = grid.on_lattice(warp.source, warp.target, warp.rotation, TOLERANCE, range(480), "zeros")
     assert lattice is not None
     assert sum(asked[1:]) < most * 8 * 480 * 640
