@@ -1,5 +1,7 @@
+import sys
 import warnings
 
+import pytest
 import torch
 from hypothesis import settings
 
@@ -14,3 +16,13 @@ torch.set_num_threads(1)
 # the same examples on every machine and in every run; speed is not what these tests are about
 settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=20, database=None)
 settings.load_profile("camtorch")
+
+
+@pytest.fixture(autouse=True)
+def _compiled_code_is_forgotten():
+    """Programs of one function are counted, and refused from the ninth on, also where tests of their own made them."""
+    yield
+    dynamo = sys.modules.get("torch._dynamo")
+    if dynamo is not None and dynamo.utils.counters["frames"]:
+        dynamo.reset()
+        dynamo.utils.counters.clear()

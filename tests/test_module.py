@@ -52,7 +52,6 @@ distinct_models = pytest.mark.parametrize("key", RARE_ARE_SLOW)
 @distinct_models
 @both_directions
 def test_compile_without_graph_breaks(key, method):
-    torch._dynamo.reset()
     module, values = module_and_input(key, method)
     compiled = torch.compile(module, fullgraph=True, backend="aot_eager" if key in DISTINCT else "eager")
     gradients = []
@@ -66,7 +65,6 @@ def test_compile_without_graph_breaks(key, method):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # inductor imports what still uses it
 def test_compile_to_machine_code():
-    torch._dynamo.reset()
     camera = one("pinhole")  # the smallest graph: inductor takes its time
     points = fan(100, 5, 7)
     compiled = torch.compile(camera, fullgraph=True)
