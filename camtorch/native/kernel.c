@@ -33,6 +33,7 @@
 
 enum { CHUNK = 256 };         /* cells whose lines of nodes are made at a time */
 enum { MOST_INTERLEAVED = 4 }; /* channels */
+enum { ROWS_AHEAD = 8 };       /* of the source */
 
 typedef struct {
     float u[STEP], v[STEP];
@@ -237,6 +238,12 @@ NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mod
 }
 
 #if VECTORS
+
+/* Asks for what lies some rows below: rows are too short for a CPU to see by itself that they are read on and on.
+ * An address alone, which need not be one of the image. */
+INLINE void ask_below(const void *from, int64_t below) {
+    __builtin_prefetch((const char *)((uintptr_t)from + (uintptr_t)(ROWS_AHEAD * below)));
+}
 
 typedef float V8 __attribute__((vector_size(32)));
 typedef int32_t I8 __attribute__((vector_size(32)));
@@ -506,6 +513,7 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
     if (type == UINT8 && window_of(job, &at, &window)) {
         for (c = 0; c < job->channels; c++, plane += from, result += to) {
             const V8 value = window_bytes((const uint8_t *)plane, &window, at.v);
+            ask_below(plane + window.at, below);
             store_bytes(result, rounded8(value * every8(1.0f / 16384)), span->pixels);
         }
         return;
@@ -515,6 +523,7 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
     for (c = 0; c < job->channels; c++, plane += from, result += to) {
         Pairs upper, lower;
         V8 value;
+        ask_below(plane + offsets[0] * bytes, below * bytes);
         if (type == FLOAT32) {
             upper = float_pairs((const float *)plane, offsets);
             lower = float_pairs((const float *)plane + below, offsets);
@@ -577,6 +586,8 @@ INLINE int colours_of_eight(const Span *span, const Squares *at) {
     const __m512i rows = _mm512_castsi256_si512(dy);
     const __m512 parts_u = _mm512_castps256_ps512((__m256)at->u), parts_v = _mm512_castps256_ps512((__m256)at->v);
     const float *from = (const float *)span->source + first * below + 3 * column;
+    ask_below(from, below * (int64_t)sizeof(float));
+    ask_below(from + 16, below * (int64_t)sizeof(float));
     __m512 made[2];
     int k;
     for (k = 0; k < 2; k++) {
@@ -619,6 +630,8 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
     if (type == FLOAT32 && channels == 3 && colours_of_eight(span, &at)) return;
 #endif
     offsets_of(job, at.x, at.y, offsets);
+    ask_below(span->source + offsets[0] * bytes, below);
+    ask_below(span->source + offsets[STEP - 1] * bytes, below);
 #if defined(__AVX2__)
     if (type == UINT8) {
         /* two pixels at a time: their channels' pairs of neighbours, as 16 bits each */
@@ -733,6 +746,7 @@ INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
         char *result = span->result + c * job->result_strides[1] * bytes;
         V4 rows[STEP];
         V8 columns[4], value;
+        ask_below(plane + offsets[0] * bytes, below);
         for (i = 0; i < STEP; i++) {
             const char *row = plane + (offsets[i] - 1) * bytes - below;
             rows[i] = channels4(row, type) * every4(down[0][i]) + channels4(row + below, type) * every4(down[1][i]) +
@@ -766,6 +780,7 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
     for (c = 0; c < job->channels; c++) {
         const char *plane = span->source + c * job->source_strides[1] * size_of(type);
         char *result = span->result + c * job->result_strides[1] * size_of(type);
+        ask_below(plane + offsets[0] * size_of(type), job->source_strides[2] * size_of(type));
         if (span->pixels == STEP && job->result_strides[3] == 1)
             for (i = 0; i < STEP; i++) move(result, i, plane, offsets[i], type);
         else
@@ -992,6 +1007,7 @@ INLINE void bytes_of_sixteen(const Span *span, const WideWindow *window, __m512 
 #define ROW(k) _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, _mm512_castsi256_si512(row32(from + (k) * below, left)))
     for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
         __m512i upper = ROW(0), last = ROW(1), lower = last;
+        ask_below(from, below);
         for (k = 2; k < rows; k++) {
             const __m512i next = ROW(k);
             upper = _mm512_mask_mov_epi32(upper, window->from[k - 1], last);
@@ -1020,6 +1036,7 @@ INLINE void colours_of_sixteen(const Span *span, const WideWindow *window, __m51
     const __m512i at = _mm512_or_si512(_mm512_add_epi32(window->x, two), _mm512_slli_epi32(window->y, 6));
     __m512i pick = _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(3 << 16));
     const __m512i first = row64(from, left), second = row64(from + below, left);
+    ask_below(from, below);
     const __m512i third = window->row + 2 < job->source_height ? row64(from + 2 * below, left) : second;
     __m512i packed = _mm512_setzero_si512();
     int c;
@@ -1041,6 +1058,7 @@ INLINE void far_colours_of_sixteen(const Span *span, const WideWindow *window, _
     __m512i pick = _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(3 << 16));
     __m512i low[6], high[6], packed = _mm512_setzero_si512();
     int c, k;
+    ask_below(from, below);
     for (k = 0; k < window->rows; k++, from += below) {
         low[k] = row64(from, left);
         high[k] = left > 64 ? row64(from + 64, left - 64) : _mm512_setzero_si512();
@@ -1048,6 +1066,7 @@ INLINE void far_colours_of_sixteen(const Span *span, const WideWindow *window, _
     for (c = 0; c < 3; c++) {
 #define ROW(k) _mm512_maskz_permutex2var_epi8(NEIGHBOURS, low[k], pick, high[k])
         __m512i upper = ROW(0), last = ROW(1), lower = last;
+        ask_below(from, below);
         for (k = 2; k < window->rows; k++) {
             const __m512i next = ROW(k);
             upper = _mm512_mask_mov_epi32(upper, window->from[k - 1], last);
@@ -1080,6 +1099,7 @@ INLINE void floats_of_sixteen(const Span *span, const WideWindow *window, __m512
     for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
         __m512 above = across_sixteen(from, left, right, other_u, u), last = across_sixteen(from + below, left, right, other_u, u);
         __m512 under = last;
+        ask_below(from, below * (int64_t)sizeof(float));
         for (k = 2; k < rows; k++) {
             const __m512 next = across_sixteen(from + k * below, left, right, other_u, u);
             above = _mm512_mask_mov_ps(above, window->from[k - 1], last);
@@ -1096,7 +1116,9 @@ INLINE void nearest_of_sixteen(const Span *span, const WideWindow *window) {
     const __m512i at = _mm512_or_si512(window->x, _mm512_slli_epi32(window->y, 5));
     int64_t c;
     for (c = 0; c < job->channels; c++) {
-        const Rows rows = rows_of(job, span->source + c * job->source_strides[1], window);
+        const char *plane = span->source + c * job->source_strides[1];
+        const Rows rows = rows_of(job, plane, window);
+        ask_below(plane + window->row * job->source_strides[2] + window->column, job->source_strides[2]);
         _mm_storeu_si128((__m128i *)(span->result + c * job->result_strides[1]),
                          _mm512_cvtepi32_epi8(_mm512_permutex2var_epi8(rows.upper, at, rows.lower)));
     }
