@@ -67,8 +67,8 @@ class Warp(GeometryModule):
         antialias: where the image shrinks, a pixel takes the mean of what it covers, as wide in all directions as in
             the widest; compiled down to a sixteenth. "nearest" does not.
         tolerance: pixels of the source by which sampling positions may be off at most. Above zero they come from a
-            lattice of every eighth pixel, which takes a tenth of the time where cameras are new, and what it does not
-            reach is computed. By default 0.001 between cameras in float32, whose rounding costs as much, and zero in
+            lattice of every eighth pixel, several times as fast where cameras are new, and what it does not reach is
+            computed. By default 0.001 between cameras in float32, whose rounding costs as much, and zero in
             float64. Zero is exact; so are points, boxes and rays always, warps with a graph, and those on a GPU.
 
     The sampling grid is kept while nothing that it depends on can learn or has changed.
