@@ -23,6 +23,5 @@ def _compiled_code_is_forgotten():
     """Programs of one function are counted, and refused from the ninth on, also where tests of their own made them."""
     yield
     dynamo = sys.modules.get("torch._dynamo")
-    if dynamo is not None and dynamo.utils.counters["frames"]:
+    if dynamo is not None and dynamo.convert_frame.FRAME_COUNTER:
         dynamo.reset()
-        dynamo.utils.counters.clear()

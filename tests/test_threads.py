@@ -128,8 +128,12 @@ def test_an_interruption_waits_for_workers():
         time.sleep(0.05)
         ended.append(1)
 
-    with pytest.raises(KeyboardInterrupt):
-        spread(work, 2)
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            spread(work, 2)
+    finally:
+        signal.signal(signal.SIGINT, usual)
     assert ended == [1]
 
 
