@@ -390,7 +390,8 @@ def _classified(
     camera, pixel = (rim != some[:, i, j]).nonzero(as_tuple=True)
     todo[camera, i[pixel], j[pixel]] = True
     cells = torch.where(some, CUBIC, EMPTY)
-    return torch.where(todo, TODO, cells).to(torch.int32), int(todo.sum((1, 2)).amax())
+    most = max(todo.sum((1, 2)).tolist(), default=0)
+    return torch.where(todo, TODO, cells).to(torch.int32), most
 
 
 def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
