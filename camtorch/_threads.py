@@ -155,7 +155,7 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_compiling() or torch.jit.is_tracing():  # a trace's sizes are tensors
             return function(*args, **kwargs)
         if _mine.threads:  # of a function that called this one, and goes on as before
             was_alone = _mine.is_alone

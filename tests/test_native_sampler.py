@@ -631,9 +631,10 @@ for warp in warps():
 """
 
 
-def test_a_trace_holds_the_images():
-    # on its own: after other tests torch's tracer may fail by an assertion of its own about aten::ne
-    done = subprocess.run([sys.executable, "-c", TRACE], cwd=Path(__file__).parent, capture_output=True, text=True)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_trace_holds_the_images(threads):
+    command, environment = [sys.executable, "-c", TRACE], {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    done = subprocess.run(command, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
