@@ -1,10 +1,9 @@
-"""Plots of cameras, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and returns them."""
+"""Plots of cameras: distortion, radius over angle, the difference of two."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,19 +11,31 @@ import torch
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.analysis import difference as differences
+from camtorch.plot.axes import (
+    COLOURS,
+    GREY,
+    INK,
+    NO_RAYS,
+    PALE,
+    axes_or_new,
+    check_single,
+    cycle,
+    draw_frame,
+    magnification,
+    require_pyplot,
+    size_of,
+    without_palest,
+)
 from camtorch.projection.rays import angles_from_axis, followed, ideal, image_lattice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from torch import Tensor
 
     from camtorch.camera import Camera
 
-_INK, _GREY, _PALE = "#2b2a2e", "#8a8378", "#efe9dd"
-_COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
 _AZIMUTHS, _ANGLES = 32, 721
 _NOTHING = 1e-6  # px: what is less is rounding, and shown as none
 _FAINT = 1e-3  # px: no colours are spent on what is less, where there is more
@@ -46,26 +57,26 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
     Raises:
         ValueError: a batch, or a camera without image size. ImportError: no matplotlib.
     """
-    height, width = _size(camera)
-    ax = _axes(ax)
+    height, width = size_of(camera)
+    ax = axes_or_new(ax)
     step = max(width, height) / count
     inner = image_lattice(camera, max(2, round(height / step)) + 1, max(2, round(width / step)) + 1)
     pixels = (inner[1:, 1:] + inner[:-1, :-1]) / 2
     rays, valid = camera.unproject(pixels)
     undistorted, covered = ideal(camera).project(rays)
     moved = (pixels - undistorted).double()
-    _frame(ax, height, width)
+    draw_frame(ax, height, width)
     _shade_without_rays(ax, camera)
     both, lost = valid & covered, valid & ~covered
     if bool(lost.any()):
         u, v = pixels[lost].double().T.tolist()
-        ax.plot(u, v, color=_GREY, marker="x", markersize=4, linestyle="none", label="beyond the ideal lens")
+        ax.plot(u, v, color=GREY, marker="x", markersize=4, linestyle="none", label="beyond the ideal lens")
         ax.legend(loc="lower right", framealpha=0.8)
     longer = 1
     if bool(both.any()):
         end, along = pixels[both].double(), moved[both]
         length = torch.linalg.vector_norm(along, dim=-1)
-        longer = _magnification(0.7 * step / max(float(length.quantile(0.9)), _NOTHING))
+        longer = magnification(0.7 * step / max(float(length.quantile(0.9)), _NOTHING))
         if float(length.max()) < _NOTHING:
             along, length, longer = 0 * along, 0 * length, 1
         arrows = ax.quiver(
@@ -76,13 +87,13 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
             width=0.0024,
             headwidth=4,
             headlength=5,
-            cmap=_without_palest("viridis_r"),
+            cmap=without_palest("viridis_r"),
             zorder=3,
         )
         extend = _limit(arrows, length)
         ax.figure.colorbar(arrows, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
     cx, cy = camera.intrinsics[2:].tolist()
-    ax.plot([cx], [cy], "+", color=_COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
+    ax.plot([cx], [cy], "+", color=COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
     times = f", {longer} times as long" if longer > 1 else ""
     none = bool(both.any()) and not bool(length.any())
     ax.set_title("no distortion" if none else f"distortion, from the ideal pixel to the actual one{times}")
@@ -108,10 +119,10 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
     labels = labels or [camera.key for camera in cameras]
     if len(labels) != len(cameras):
         raise ValueError(f"{len(cameras)} cameras, and labels for {len(labels)}")
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     shown = seen = 0.0
-    for i, (camera, label, colour) in enumerate(zip(cameras, labels, _cycle(len(cameras)), strict=True)):
-        _single(camera)
+    for i, (camera, label, colour) in enumerate(zip(cameras, labels, cycle(len(cameras)), strict=True)):
+        check_single(camera)
         angles, low, high = _radii(camera)
         ax.fill_between(np.degrees(angles), low, high, color=colour, alpha=0.25, linewidth=0, zorder=2)
         middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
@@ -122,13 +133,13 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
         ax.plot(np.degrees(angles[-1:]), middle[-1:], "o", color=colour, markersize=5, zorder=3)
         if i == 0 and camera.distortion_names:
             angles, low, _ = _radii(ideal(camera))
-            ax.plot(np.degrees(angles), low, "--", color=_GREY, linewidth=1, label="ideal", zorder=1)
+            ax.plot(np.degrees(angles), low, "--", color=GREY, linewidth=1, label="ideal", zorder=1)
         if camera.image_size is not None:
             rays, valid = camera.unproject(image_lattice(camera, 65, 65))
             far = float(angles_from_axis(rays)[valid].max()) if bool(valid.any()) else 0.0
             seen = max(seen, math.degrees(far))
             if i == 0:
-                ax.axvspan(0, seen, color=_PALE, zorder=0)
+                ax.axvspan(0, seen, color=PALE, zorder=0)
             corners = image_lattice(camera, 2, 2).flatten(0, 1) - camera.intrinsics[2:]
             shown = max(shown, float(torch.linalg.vector_norm(corners, dim=-1).max()))
     if shown:
@@ -159,10 +170,10 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     """
     compared = differences.difference(a, b, remove_rotation=remove_rotation)
     height, width = a._size("a difference")
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
-    _frame(ax, height, width)
-    ax.set_facecolor("#d9d4ca")
+    draw_frame(ax, height, width)
+    ax.set_facecolor(NO_RAYS)
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
     image = ax.imshow(values, extent=edges, cmap="magma_r", interpolation="nearest")
     extend = _limit(image, compared.apart[compared.both])
@@ -176,10 +187,10 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
 
 def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") -> Figure:
     """What `camtorch show -o` draws: the distortion field, the radius curve, and the difference to another camera."""
-    _pyplot()
+    require_pyplot()
     from matplotlib.figure import Figure
 
-    height, width = _size(camera)
+    height, width = size_of(camera)
     panels = 2 if other is None else 3
     panel = min(6.0, max(3.2, 6.2 * height / width))
     figure = Figure(figsize=(7.4 * panels, panel + 1.3), dpi=120, layout="constrained")
@@ -190,45 +201,12 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
     if other is not None:
         difference(camera, other, axes[2])
     figure.suptitle(
-        title or f"{type_before_parametrizations(camera).__name__}, {width} x {height}", color=_INK, fontsize=15
+        title or f"{type_before_parametrizations(camera).__name__}, {width} x {height}", color=INK, fontsize=15
     )
     return figure
 
 
-# -- what they share
-
-
-def _pyplot() -> ModuleType:
-    try:
-        from matplotlib import pyplot
-    except ImportError:
-        raise ImportError("plots need matplotlib: pip install 'camtorch[plot]'") from None
-    return pyplot
-
-
-def _axes(ax: Axes | None) -> Axes:
-    if ax is not None:
-        return ax
-    new: Axes = _pyplot().subplots(layout="constrained")[1]
-    return new
-
-
-def _single(camera: Camera) -> None:
-    if camera.batch_shape:
-        raise ValueError(f"a plot shows single cameras; got batch dims {tuple(camera.batch_shape)}")
-
-
-def _size(camera: Camera) -> tuple[int, int]:
-    _single(camera)
-    return camera._size("a plot")
-
-
-def _frame(ax: Axes, height: int, width: int) -> None:
-    margin = 0.02 * max(height, width)
-    ax.set_xlim(-0.5 - margin, width - 0.5 + margin)
-    ax.set_ylim(height - 0.5 + margin, -0.5 - margin)
-    ax.set_aspect("equal")
-    ax.plot([-0.5, width - 0.5, width - 0.5, -0.5, -0.5], [-0.5, -0.5, height - 0.5, height - 0.5, -0.5], color=_INK)
+# -- parts of plots
 
 
 def _shade_without_rays(ax: Axes, camera: Camera) -> None:
@@ -237,21 +215,6 @@ def _shade_without_rays(ax: Axes, camera: Camera) -> None:
     shade = np.ma.masked_array(np.ones((200, 200)), valid.numpy(force=True))
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
     ax.imshow(shade, extent=edges, cmap="Greys", vmin=0, vmax=5, interpolation="nearest", zorder=0)
-
-
-def _magnification(most: float) -> int:
-    """1, 2, 5, 10, ... up to a number."""
-    if not 1 < most < 1e9:
-        return 1
-    power = int(10 ** math.floor(math.log10(most)))
-    return power * max(n for n in (1, 2, 5) if n * power <= most)
-
-
-def _without_palest(name: str) -> Colormap:
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
-
-    return ListedColormap(colormaps[name](np.linspace(0.15, 1, 256)))
 
 
 def _limit(mappable: ScalarMappable, values: Tensor) -> str:
@@ -273,7 +236,3 @@ def _radii(camera: Camera) -> tuple[np.ndarray, list[float], list[float]]:
     some = valid.any(-1)
     low, high = (torch.where(valid, radius, end) for end in (torch.inf, -torch.inf))
     return angles[some].numpy(force=True), low.amin(-1)[some].tolist(), high.amax(-1)[some].tolist()
-
-
-def _cycle(count: int) -> list[str]:
-    return [_COLOURS[i % len(_COLOURS)] for i in range(count)]

@@ -1,0 +1,80 @@
+"""What the plots share: the palette, new Axes, the frame of an image."""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+
+    from camtorch.camera import Camera
+
+INK, GREY, PALE = "#2b2a2e", "#8a8378", "#efe9dd"
+COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
+"""Of what is told apart by its name, as cameras are; the second one is also that of marks."""
+NO_RAYS = "#d9d4ca"
+"""Of pixels without a value."""
+
+
+def require_pyplot() -> ModuleType:
+    """The module, or an ImportError that says how to install it."""
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        raise ImportError("plots need matplotlib: pip install 'camtorch[plot]'") from None
+    return pyplot
+
+
+def axes_or_new(ax: Axes | None) -> Axes:
+    """The Axes, or new ones in a figure of their own."""
+    if ax is not None:
+        return ax
+    new: Axes = require_pyplot().subplots(layout="constrained")[1]
+    return new
+
+
+def check_single(camera: Camera) -> None:
+    """Refuse a batch."""
+    if camera.batch_shape:
+        raise ValueError(f"a plot shows single cameras; got batch dims {tuple(camera.batch_shape)}")
+
+
+def size_of(camera: Camera) -> tuple[int, int]:
+    """(height, width) of a single camera that must have them."""
+    check_single(camera)
+    return camera._size("a plot")
+
+
+def draw_frame(ax: Axes, height: int, width: int) -> None:
+    """The outer edges of an image, rows downwards."""
+    margin = 0.02 * max(height, width)
+    ax.set_xlim(-0.5 - margin, width - 0.5 + margin)
+    ax.set_ylim(height - 0.5 + margin, -0.5 - margin)
+    ax.set_aspect("equal")
+    ax.plot([-0.5, width - 0.5, width - 0.5, -0.5, -0.5], [-0.5, -0.5, height - 0.5, height - 0.5, -0.5], color=INK)
+
+
+def magnification(most: float) -> int:
+    """1, 2, 5, 10, ... up to a number."""
+    if not 1 < most < 1e9:
+        return 1
+    power = int(10 ** math.floor(math.log10(most)))
+    return power * max(n for n in (1, 2, 5) if n * power <= most)
+
+
+def without_palest(name: str) -> Colormap:
+    """A colour map of matplotlib, but for what is hard to see on white."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colormaps[name](np.linspace(0.15, 1, 256)))
+
+
+def cycle(count: int) -> list[str]:
+    """As many colours."""
+    return [COLOURS[i % len(COLOURS)] for i in range(count)]
