@@ -1,0 +1,509 @@
+"""Bundle adjustment: the cameras, their mounts and the poses of boards under which least is left of what was seen.
+
+Each view is reduced to a triangle by QR before it meets the others: its own six numbers are eliminated, as by a Schur
+complement, without the squares of a normal equation. Time and memory grow with the number of views, not faster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.camera import Camera
+from camtorch.least_squares.jacobians import sensor_jacobians
+from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise
+from camtorch.rotations import rotation_matrix
+
+LOSSES = ("huber", "cauchy")
+_SETTLED = 1e-10  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
+_NOTHING = 1e-11  # px
+_LOST = 1e3  # px, that a point counts as which was seen and has no pixel
+
+
+class Sight(NamedTuple):
+    """What one camera sees, of B problems, V views and N points each; leading dims may be 1.
+
+    points: (B, V, N, 3) in the board's frame. pixels: (B, V, N, 2). weights: (B, V, N) of the squares, 0 for unseen,
+    where the others are any finite numbers. model: the class, or a camera of it.
+    """
+
+    model: type[Camera] | Camera
+    points: Tensor
+    pixels: Tensor
+    weights: Tensor
+
+
+class Poses(NamedTuple):
+    """Rotations (B, P, 3, 3) and translations (B, P, 3)."""
+
+    rotations: Tensor
+    translations: Tensor
+
+    def moved(self, points: Tensor) -> Tensor:
+        """(B, P, N, 3)."""
+        return points @ self.rotations.mT + self.translations.unsqueeze(-2)
+
+    @classmethod
+    def none(cls, batch: int, count: int, like: Tensor) -> Poses:
+        """That leave points where they are."""
+        eye = torch.eye(3, dtype=like.dtype, device=like.device)
+        return cls(eye.repeat(batch, count, 1, 1), like.new_zeros(batch, count, 3))
+
+
+class State(NamedTuple):
+    """What is looked for. A point of a board is at `mount(board(point))` for a camera.
+
+    parameters: of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients. mounts: a pose for each camera, from the
+    frame of the first one, whose own it leaves as it is. boards: for each view. bend: (B, 2), how far the middle of a
+    board's edges lies behind the plane, see `bent`.
+    """
+
+    parameters: tuple[Tensor, ...]
+    mounts: Poses
+    boards: Poses
+    bend: Tensor
+
+
+class Free(NamedTuple):
+    """What learns.
+
+    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: the poses of boards; "positions" for their
+    translations alone. bend: the shape of the board.
+    """
+
+    parameters: tuple[Tensor, ...]
+    mounts: tuple[bool, ...]
+    boards: str = "poses"
+    bend: bool = False
+
+
+class Equations(NamedTuple):
+    """Triangles of the linearised problem; the unknowns are six numbers a view, and G that all views share.
+
+    A row of `view`, (B, V, L, L + G + 1), says: view[:L] * step of the view + view[L:-1] * shared step = -view[-1], and
+    one of `shared`, (B, G + 1, G + 1), what is left of all views. `columns`: (G,) names of the shared unknowns, pairs
+    of the camera (-1 for the board's bend) and the index of a parameter, 4 + n and on for its mount.
+    """
+
+    view: Tensor
+    shared: Tensor
+    columns: tuple[tuple[int, int], ...]
+
+    @property
+    def decrement(self) -> Tensor:
+        """(B,) by how much the cost would fall if the problem were linear."""
+        return self.view[..., -1].square().sum((-1, -2)) + self.shared[:, :-1, -1].square().sum(-1)
+
+
+class Adjusted(NamedTuple):
+    """An optimum, or where the search ended.
+
+    residuals: of each camera (B, V, N, 2), projected minus observed. valid: (B, V, N) bool, of the points of any weight
+    that have a pixel. weights: (B, V, N) those of the squares at the end, of a robust loss too. cost: (B,).
+    """
+
+    state: State
+    cost: Tensor
+    converged: Tensor
+    residuals: tuple[Tensor, ...]
+    valid: tuple[Tensor, ...]
+    weights: tuple[Tensor, ...]
+    equations: Equations
+
+
+@torch.no_grad()
+def adjust(
+    sights: Sequence[Sight],
+    state: State,
+    free: Free,
+    *,
+    loss: str | None = None,
+    loss_scale: float = 1.0,
+    steps: int = 60,
+    damping: float = FIRST_DAMPING,
+    progress: Callable[[int, Tensor], None] | None = None,
+) -> Adjusted:
+    """The state of least squares near a given one, for each of B problems.
+
+    A point that was seen and has no pixel, because the camera's field of view ends before it, counts as far away: no
+    step is taken that loses points.
+
+    Args:
+        sights: what each camera sees; all of the same views.
+        state: where to start.
+        free: what learns.
+        loss: None, "huber" or "cauchy", of the length of each residual; see `robust`.
+        loss_scale: in px.
+        steps: at most.
+        damping: the first one.
+        progress: called after each step with its number and the costs (B,).
+    """
+    problem = Bundle(sights, state, free, loss, loss_scale)
+    counts = sum((s.weights > 0).sum((-1, -2)) for s in sights)
+    spare = (2 * counts - problem.unknowns).clamp(min=1)
+    found = minimise(
+        problem,
+        problem.flat(state),
+        tolerance=_SETTLED / spare,
+        tiny=_NOTHING**2 * counts,
+        steps=steps,
+        damping=damping,
+        progress=progress,
+    )
+    looks = [problem.look(c, found.state) for c in range(len(sights))]
+    return Adjusted(
+        problem.state(found.state),
+        found.cost,
+        found.converged,
+        tuple(look.residuals for look in looks),
+        tuple(look.valid for look in looks),
+        tuple(look.weights for look in looks),
+        problem.equations(found.state),
+    )
+
+
+def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:
+    """The cost of residuals of squared lengths, and its derivative by them: the weight of the square.
+
+    huber: s where s <= c^2, else 2 c sqrt(s) - c^2. cauchy: c^2 log(1 + s / c^2).
+    """
+    c2 = scale * scale
+    if loss == "huber":
+        root = squares.clamp(min=c2).sqrt()
+        return torch.where(squares <= c2, squares, 2 * scale * root - c2), scale / root
+    if loss == "cauchy":
+        return c2 * torch.log1p(squares / c2), 1 / (1 + squares / c2)
+    return squares, torch.ones_like(squares)
+
+
+def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
+    """Points of boards that are bent, and the two slopes of their z, (..., N, 2).
+
+    z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points of the board: mrcal's
+    paraboloid.
+
+    Args:
+        points: (..., N, 3), the board about its middle.
+        bend: (B, 2), in the units of the points.
+    """
+    plane = points[..., :2]
+    reach = plane.abs().amax(tuple(range(plane.ndim - 1)), keepdim=True)
+    slopes = 1 - (plane / torch.where(reach > 0, reach, 1.0)).square()
+    depth = (slopes * bend[:, None, None]).sum(-1, keepdim=True)
+    flat = torch.cat((torch.zeros_like(plane), torch.ones_like(depth)), -1)
+    return points + flat * depth, slopes
+
+
+class _Look(NamedTuple):
+    """What a camera makes of a state: residuals (B, V, N, 2), valid, weights of the squares and cost (B, V, N)."""
+
+    residuals: Tensor
+    valid: Tensor
+    weights: Tensor
+    cost: Tensor
+
+
+class Bundle:
+    """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
+
+    def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
+        self.free, self.loss, self.loss_scale = free, loss, loss_scale
+        batch = state.boards.translations.shape[0]
+        self.sights = [
+            s._replace(**{name: getattr(s, name).expand(batch, *getattr(s, name).shape[1:]) for name in s._fields[1:]})
+            for s in sights
+        ]
+        self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
+        # a camera that does not learn, and is that of all problems, sees them in one row
+        self.are_shared = [len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)]
+        self.fixed = [
+            camera.with_tensors(intrinsics=p[0, :4], distortion=p[0, 4:]) if shared else None
+            for camera, p, shared in zip(self.cameras, state.parameters, self.are_shared, strict=True)
+        ]
+        self.learns_bend = free.bend
+        self.columns = tuple(
+            [(c, int(i)) for c, f in enumerate(free.parameters) for i in f.nonzero()[:, 0]]
+            + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
+            + [(-1, i) for i in range(2) if free.bend]
+        )
+        self.local = slice(0, 6) if free.boards == "poses" else slice(3, 6) if free.boards == "positions" else slice(0, 0)
+        views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
+        self.unknowns = len(self.columns) + (self.local.stop - self.local.start) * int(views)
+        self._bounds = [_bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)]
+
+    # -- the state, flat
+
+    def flat(self, state: State) -> tuple[Tensor, ...]:
+        """As tensors (B, ...)."""
+        batch = len(state.boards.translations)
+        parameters = [p.expand(batch, -1) for p in state.parameters]
+        return (*state.boards, *state.mounts, state.bend, *parameters)
+
+    def state(self, flat: Sequence[Tensor]) -> State:
+        """The other way."""
+        return State(tuple(flat[5:]), Poses(*flat[2:4]), Poses(*flat[:2]), flat[4])
+
+    # -- what is seen
+
+    def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
+        points = bent(sight.points, state.bend)[0] if self.learns_bend or bool((state.bend != 0).any()) else sight.points
+        turned = points @ state.boards.rotations.mT
+        first = turned + state.boards.translations[:, :, None]
+        if c == 0:
+            return turned, first, first
+        return turned, first, first @ state.mounts.rotations[:, c, None].mT + state.mounts.translations[:, c, None, None]
+
+    def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
+        """What a camera makes of a state."""
+        state, sight = self.state(flat), self.sight(c, rows)
+        points = self.points(c, state, sight)[2]
+        camera = self.fixed[c]
+        if camera is not None:
+            pixels, valid = camera.project(points)
+        else:
+            parameters = state.parameters[c]
+            camera = self.cameras[c].with_tensors(intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
+            pixels, valid = camera.project(points)
+        seen = sight.weights > 0
+        residuals = torch.where((valid & seen)[..., None], pixels - sight.pixels, 0.0)
+        cost, slope = robust(self.loss, self.loss_scale, residuals.square().sum(-1))
+        lost = robust(self.loss, self.loss_scale, torch.full_like(cost, _LOST**2))[0]
+        cost = torch.where(valid, cost, lost) * sight.weights
+        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
+
+    def sight(self, c: int, rows: Tensor | None) -> Sight:
+        """Of some problems."""
+        sight = self.sights[c]
+        if rows is None or len(rows) == len(sight.points):
+            return sight
+        return Sight(sight.model, *(t[rows] for t in sight[1:]))
+
+    def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
+        """(R,)."""
+        total = torch.zeros((), dtype=flat[1].dtype, device=flat[1].device)
+        for c in range(len(self.sights)):
+            total = total + self.look(c, flat, rows).cost.sum((-1, -2))
+        return torch.where(torch.isfinite(total), total, torch.inf)
+
+    # -- the linear problem
+
+    def linearised(self, flat: Sequence[Tensor], rows: Tensor) -> _System:
+        """At a state."""
+        low, high = (torch.cat([t[rows] if len(t) > 1 else t.expand(len(rows), -1) for t in side], -1) for side in zip(*self._bounds))
+        held = torch.zeros(len(rows), len(self.columns), dtype=torch.bool, device=flat[1].device)
+        equations = self.equations(flat, rows)
+        if self.columns and not bool(torch.isinf(low).all() & torch.isinf(high).all()):
+            # what would leave its bounds stays there, so that the others can move on
+            values = torch.cat(flat[5:], -1)
+            starts = [0]
+            for p in flat[5:]:
+                starts.append(starts[-1] + p.shape[-1])
+            sizes = [p.shape[-1] for p in flat[5:]]
+            of = [(g, starts[c] + i) for g, (c, i) in enumerate(self.columns) if c >= 0 and i < sizes[c]]
+            g, at = (torch.tensor(t, device=values.device) for t in zip(*of)) if of else (None, None)
+            if of:
+                by_view = (equations.view[..., self._width : -1] * equations.view[..., -1:]).sum((1, 2))
+                slope = by_view + (equations.shared[..., :-1] * equations.shared[..., -1:]).sum(1)
+                low, high, values = low[:, at], high[:, at], values[:, at]
+                held[:, g] = (values <= low) & (slope[:, g] > 0) | (values >= high) & (slope[:, g] < 0)
+        return _System(equations, self._width, held)
+
+    @property
+    def _width(self) -> int:
+        return self.local.stop - self.local.start
+
+    def equations(self, flat: Sequence[Tensor], rows: Tensor | None = None) -> Equations:
+        """The triangles of a state."""
+        state, width, total = self.state(flat), self._width, len(self.columns)
+        parts = []
+        for c in range(len(self.sights)):
+            block, at = self._rows_of(c, flat, state, rows)
+            if total == 0:
+                parts.append(block)
+                continue
+            if len(self.sights) > 1:  # a triangle has less rows to spread over the columns of all cameras
+                block = torch.linalg.qr(block, mode="r").R
+                whole = block.new_zeros(*block.shape[:-1], width + total + 1)
+                whole[..., [*range(width), *(width + g for g in at), width + total]] = block
+                block = whole
+            parts.append(block)
+        block = torch.cat(parts, -2)
+        if total == 0:  # no more than six columns, which squares do no harm
+            return Equations(_triangle(block), block.new_zeros(len(block), 1, 1), ())
+        triangle = torch.linalg.qr(_padded(block), mode="r").R
+        left = triangle[..., width:, width:].flatten(1, 2)
+        shared = torch.linalg.qr(_padded(left), mode="r").R
+        return Equations(triangle[..., :width, :], shared, self.columns)
+
+    def _rows_of(self, c: int, flat: Sequence[Tensor], state: State, rows: Tensor | None) -> tuple[Tensor, list[int]]:
+        """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
+        sight, look = self.sight(c, rows), self.look(c, flat, rows)
+        turned, first, points = self.points(c, state, sight)
+        batch, views, count = points.shape[:3]
+        parameters = state.parameters[c]
+        lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
+        k = parameters[: lead[0], 4:]
+        found = sensor_jacobians(self.cameras[c], k, points.reshape(*lead, 3))
+        a, b = (p.view(batch, views, count) for p in found.points[:2])
+        focal = parameters[:, :2].view(batch, 1, 1, 2, 1)
+        by_point = found.by_ray.permute(0, 3, 1, 2).reshape(batch, views, count, 2, 3) * focal
+        by_first = by_point if c == 0 else by_point @ state.mounts.rotations[:, c, None, None]
+        columns = []
+        if self.local.start < 3 < self.local.stop:
+            columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
+        if self.local.stop:
+            columns.append(by_first)
+        at = []
+        zero, one = torch.zeros_like(a), torch.ones_like(a)
+        usual = ((a, zero), (zero, b), (one, zero), (zero, one))
+        by_k = found.by_k.permute(0, 3, 1, 2).reshape(batch, views, count, 2, -1) * focal if k.shape[-1] else None
+        for g, (camera, i) in enumerate(self.columns):
+            if camera == c and i < parameters.shape[-1]:
+                at.append(g)
+                columns.append(torch.stack(usual[i], -1)[..., None] if i < 4 else by_k[..., i - 4, None])
+        mine = [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= parameters.shape[-1]]
+        if mine:
+            at += mine
+            turned = first @ state.mounts.rotations[:, c, None].mT
+            columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
+        if self.learns_bend:
+            at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
+            along = (by_first @ state.boards.rotations[:, :, None, :, 2:])
+            columns.append(along * bent(sight.points, state.bend)[1][..., None, :])
+        columns.append(look.residuals[..., None])
+        weight = look.weights.sqrt()[..., None, None]
+        return (torch.cat(columns, -1) * weight).flatten(2, 3), at
+
+    def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
+        """The state a step further; step: of the views (R, V, L), and of what they share (R, G)."""
+        state = self.state(flat)
+        of_views, shared = step
+        boards, mounts, bend = state.boards, state.mounts, state.bend
+        if self._width == 6:
+            boards = Poses(rotation_matrix(of_views[..., :3]) @ boards.rotations, boards.translations + of_views[..., 3:])
+        elif self._width == 3:
+            boards = boards._replace(translations=boards.translations + of_views)
+        parameters = [p.clone() for p in state.parameters]
+        turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
+        for g, (c, i) in enumerate(self.columns):
+            if c < 0:
+                bend = bend.clone()
+                bend[:, i] += shared[:, g]
+            elif i < parameters[c].shape[-1]:
+                parameters[c][:, i] += shared[:, g]
+            else:
+                i -= parameters[c].shape[-1]
+                (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
+        if any(self.free.mounts):
+            mounts = Poses(rotation_matrix(turn) @ mounts.rotations, mounts.translations + shift)
+        for c, (low, high) in enumerate(self._bounds):
+            if bool(self.free.parameters[c].any()):
+                low, high = (t[rows] if len(t) > 1 else t for t in (low, high))
+                parameters[c] = parameters[c].clamp(low, high)
+        return self.flat(State(tuple(parameters), mounts, boards, bend))
+
+
+class _System:
+    """A bundle linearised: `levenberg_marquardt.System`."""
+
+    def __init__(self, equations: Equations, width: int, held: Tensor):
+        self.width = width
+        if bool(held.any()):
+            keep = torch.nn.functional.pad(~held, (width, 1), value=True)
+            equations = Equations(
+                torch.where(keep[:, None, None], equations.view, 0.0),
+                torch.where(keep[:, None, width:], equations.shared, 0.0),
+                equations.columns,
+            )
+            # without a column the rest is no triangle any more
+            equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
+        self.equations, self.decrement = equations, equations.decrement
+
+    def step(self, damping: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the views (R, V, L), and of what they share (R, G)."""
+        view, shared, width = self.equations.view, self.equations.shared, self.width
+        squares = view[..., :-1].square().sum(-2)
+        root = damping.sqrt()
+        rest = shared.shape[-1] - 1
+        if width:
+            scale = squares[..., :width].sqrt()
+            scale = torch.where(scale > 0, scale, 1.0) * root[:, None, None]
+            damped = torch.cat((torch.diag_embed(scale), view.new_zeros(*scale.shape, rest + 1)), -1)
+            if rest:
+                view = torch.linalg.qr(torch.cat((view, damped), -2), mode="r").R
+                left = view[..., width:, width:].flatten(1, 2)
+                view = view[..., :width, :]
+            else:
+                view = _triangle(torch.cat((view, damped), -2))
+                left = view.new_zeros(len(view), 0, 1)
+        else:
+            left = view.new_zeros(len(view), 0, rest + 1)
+        if rest:
+            scale = (squares[..., width:].sum(1) + shared[:, :-1, :-1].square().sum(-2)).sqrt()
+            scale = torch.where(scale > 0, scale, 1.0)
+            damped = torch.nn.functional.pad(torch.diag_embed(root[:, None].expand_as(scale)), (0, 1))
+            # columns differ by many orders of magnitude
+            by = torch.nn.functional.pad(scale, (0, 1), value=1.0)[:, None]
+            triangle = torch.linalg.qr(torch.cat((shared / by, left / by, damped), 1), mode="r").R
+            whole = -_solved(triangle[:, :rest, :rest], triangle[:, :rest, -1:])[..., 0] / scale
+        else:
+            whole = shared.new_zeros(len(shared), 0)
+        if width:
+            right = view[..., -1:] + view[..., width:-1] @ whole[:, None, :, None]
+            of_views = -_solved(view[..., :width], right)[..., 0]
+        else:
+            of_views = view.new_zeros(*view.shape[:2], 0)
+        fine = torch.isfinite(whole).all(-1) & torch.isfinite(of_views).all(-1).all(-1)
+        return torch.where(fine[:, None, None], of_views, 0.0), torch.where(fine[:, None], whole, 0.0)
+
+
+def _triangle(rows: Tensor) -> Tensor:
+    """(..., L, L + 1): a triangle of rows (..., M, L + 1), of few columns that are well apart."""
+    matrix, right = rows[..., :-1], rows[..., -1:]
+    squares = matrix.mT @ matrix
+    scale = squares.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where(scale > 0, scale, 1.0).rsqrt()
+    scaled = squares * scale[..., None] * scale[..., None, :]
+    # a view in which nothing is seen, or too little, stays where it is
+    scaled = scaled + torch.diag_embed(torch.full_like(scale, 1e-14))
+    lower, _ = torch.linalg.cholesky_ex(scaled)
+    turned = torch.linalg.solve_triangular(lower, scale[..., None] * (matrix.mT @ right), upper=False)
+    return torch.cat((lower.mT / scale[..., None, :], turned), -1)
+
+
+def _solved(triangle: Tensor, right: Tensor) -> Tensor:
+    """Where the triangle is zero, nothing."""
+    diagonal = triangle.diagonal(dim1=-2, dim2=-1)
+    empty = diagonal == 0
+    triangle = triangle + torch.diag_embed(empty.to(triangle.dtype))
+    return torch.linalg.solve_triangular(triangle, torch.where(empty[..., None], 0.0, right), upper=True)
+
+
+def _padded(rows: Tensor) -> Tensor:
+    """Rows (..., M, K), at least K of them."""
+    missing = rows.shape[-1] - rows.shape[-2]
+    return torch.nn.functional.pad(rows, (0, 0, 0, missing)) if missing > 0 else rows
+
+
+def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
+    """A frozen camera of the model, for others that have its number of coefficients."""
+    if isinstance(model, Camera):
+        return model
+    count = parameters.shape[-1] - 4
+    usual = parameters.new_tensor([1.0, 1.0, 0.0, 0.0])
+    arguments = (usual, parameters.new_tensor(model.ideal(count))) if count else (usual,)
+    return model(*arguments).requires_grad_(False)
+
+
+def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the greatest parameters (B, 4 + n); a focal length stays within a factor of 1000."""
+    low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
+    low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
+    for i, name in enumerate(camera.distortion_names, 4):
+        if name in camera.fit_bounds:
+            low[:, i], high[:, i] = camera.fit_bounds[name] or (parameters[:, i], parameters[:, i])
+    return low, high

@@ -1,0 +1,103 @@
+"""Where rays lie on the plane of a camera's sensor, beyond folds too, and how that depends on ray and coefficients."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from camtorch._arguments import columns
+from camtorch.optics.backprojection import Inverted
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+FURTHEST = 20.0
+"""The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
+
+
+class SensorPoints(NamedTuple):
+    """Planes (C, N): points on the plane of the sensor, the centre where there is none, and whether there is one."""
+
+    a: Tensor
+    b: Tensor
+    covered: Tensor
+
+
+class SensorJacobians(NamedTuple):
+    """`SensorPoints`, and their derivatives, 0 where there is none: by rays (C, 2, 3, N), by coefficients (C, 2, n, N)."""
+
+    points: SensorPoints
+    by_ray: Tensor
+    by_k: Tensor
+
+
+def to_sensor(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorPoints:
+    """Rays (C, N, 3) through the chart and the lens of coefficients (C, n), whether or not they lie before a fold."""
+    return _to_sensor(camera, columns(k), rays.unbind(-1))
+
+
+def _to_sensor(camera: Camera | type[Camera], k: Sequence[Tensor], rays: Sequence[Tensor]) -> SensorPoints:
+    chart, lens = camera.optics(k)
+    x, y, z = rays
+    covered = (chart.margin(x, y, z) > 0).expand_as(x)
+    x, y, z = torch.where(covered, x, 0.0), torch.where(covered, y, 0.0), torch.where(covered, z, 1.0)
+    a, b = chart.to_plane(x, y, z, order=1)
+    covered = covered & (torch.maximum(a.abs(), b.abs()) <= FURTHEST)
+    if lens.stages:
+        a, b = lens(a, b)
+    covered = covered & torch.isfinite(a) & torch.isfinite(b)
+    return SensorPoints(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
+
+
+def sensor_jacobians(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
+    """`to_sensor` with its exact derivatives by the rays (C, N, 3), at their length, and the coefficients (C, n)."""
+    chart, _ = camera.optics(columns(k))
+    # a table for each point would be dear: where the other direction is searched, derivatives go forward
+    jacobians = _forward(camera, k, rays) if isinstance(chart, Inverted) else _backward(camera, k, rays)
+    # where a derivative is no number, as at the end of a chart, a step goes without it
+    return jacobians._replace(
+        by_ray=jacobians.by_ray.nan_to_num(0.0, 0.0, 0.0), by_k=jacobians.by_k.nan_to_num(0.0, 0.0, 0.0)
+    )
+
+
+def _backward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
+    """Twice backward, whatever the number of coefficients, of which each point has its own."""
+    with torch.enable_grad():
+        shape = rays.shape[:-1]
+        # contiguous planes, or torch's operations take several times as long
+        planes = [w.contiguous().requires_grad_() for w in rays.detach().unbind(-1)]
+        own = [c.expand(shape).contiguous().requires_grad_() for c in columns(k.detach())]
+        points = _to_sensor(camera, own, planes)
+        one, leaves = torch.ones(shape, dtype=rays.dtype, device=rays.device), [*planes, *own]
+        slopes = [
+            torch.autograd.grad(plane, leaves, one, retain_graph=True, allow_unused=True, materialize_grads=True)
+            for plane in points[:2]
+        ]
+    by_all = torch.stack([torch.stack(row, 1) for row in slopes], 1)
+    points = SensorPoints(points.a.detach(), points.b.detach(), points.covered)
+    return SensorJacobians(points, by_all[:, :, :3], by_all[:, :, 3:])
+
+
+def _forward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
+    """Once forward, on a row more for each direction: vmap would take Python's word for many operations."""
+    count = k.shape[-1] + 3
+    directions = torch.eye(count, dtype=k.dtype, device=k.device)
+    with warnings.catch_warnings(), forward_ad.dual_level():
+        # on its first use forward mode loads what calls the deprecated torch.jit.script
+        warnings.simplefilter("ignore", DeprecationWarning)
+        along = directions[:, None, :3].expand(-1, rays.shape[1], -1).repeat(len(rays), 1, 1)
+        dual_rays = forward_ad.make_dual(rays.repeat_interleave(count, 0), along)
+        dual_k = forward_ad.make_dual(k.repeat_interleave(count, 0), directions[:, 3:].repeat(len(k), 1))
+        seen = to_sensor(camera, dual_k, dual_rays)
+        parts = [forward_ad.unpack_dual(plane) for plane in seen[:2]]
+    values = [part.primal[::count] for part in parts]
+    tangents = [torch.zeros_like(part.primal) if part.tangent is None else part.tangent for part in parts]
+    by_all = torch.stack(tangents, 1).unflatten(0, (len(k), count)).transpose(1, 2)
+    return SensorJacobians(
+        SensorPoints(values[0], values[1], seen.covered[::count]), by_all[:, :, :3], by_all[:, :, 3:]
+    )
