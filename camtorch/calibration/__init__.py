@@ -1,1 +1,1 @@
-"""Cameras and poses from what was seen: calibration, of rigs too, the pose of an object, points from several cameras."""
+"""Cameras, poses and points from what was seen: calibration, also of rigs, the pose of an object, triangulation."""

@@ -70,8 +70,8 @@ class State(NamedTuple):
 class Free(NamedTuple):
     """What learns.
 
-    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: the poses of boards; "positions" for their
-    translations alone. bend: the shape of the board.
+    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: "poses", "positions" for their
+    translations alone, or "" for neither. bend: the shape of the board.
     """
 
     parameters: tuple[Tensor, ...]
@@ -142,7 +142,7 @@ def adjust(
         progress: called after each step with its number and the costs (B,).
     """
     problem = Bundle(sights, state, free, loss, loss_scale)
-    counts = sum((s.weights > 0).sum((-1, -2)) for s in sights)
+    counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.sights]).sum(0)
     spare = (2 * counts - problem.unknowns).clamp(min=1)
     found = minimise(
         problem,
@@ -172,8 +172,8 @@ def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Ten
     """
     c2 = scale * scale
     if loss == "huber":
-        root = squares.clamp(min=c2).sqrt()
-        return torch.where(squares <= c2, squares, 2 * scale * root - c2), scale / root
+        length = squares.clamp(min=c2).sqrt()
+        return torch.where(squares <= c2, squares, 2 * scale * length - c2), scale / length
     if loss == "cauchy":
         return c2 * torch.log1p(squares / c2), 1 / (1 + squares / c2)
     return squares, torch.ones_like(squares)
@@ -218,7 +218,9 @@ class Bundle:
         ]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
         # a camera that does not learn, and is that of all problems, sees them in one row
-        self.are_shared = [len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)]
+        self.are_shared = [
+            len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
+        ]
         self.fixed = [
             camera.with_tensors(intrinsics=p[0, :4], distortion=p[0, 4:]) if shared else None
             for camera, p, shared in zip(self.cameras, state.parameters, self.are_shared, strict=True)
@@ -229,10 +231,21 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
-        self.local = slice(0, 6) if free.boards == "poses" else slice(3, 6) if free.boards == "positions" else slice(0, 0)
+        self.local = (
+            slice(0, 6) if free.boards == "poses" else slice(3, 6) if free.boards == "positions" else slice(0, 0)
+        )
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
         self.unknowns = len(self.columns) + (self.local.stop - self.local.start) * int(views)
-        self._bounds = [_bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)]
+        sides = zip(
+            *(_bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)), strict=True
+        )
+        self.low, self.high = (
+            self._of_columns(side, end) for side, end in zip(sides, (-torch.inf, torch.inf), strict=True)
+        )
+        # that of a focal length is for what goes wrong
+        self.is_bounded = any(
+            i >= 4 and camera.fit_bounds for c, i in self.columns for camera in self.cameras[c : c + 1]
+        )
 
     # -- the state, flat
 
@@ -246,16 +259,34 @@ class Bundle:
         """The other way."""
         return State(tuple(flat[5:]), Poses(*flat[2:4]), Poses(*flat[:2]), flat[4])
 
+    def _of_columns(self, parameters: Sequence[Tensor], other: float) -> Tensor:
+        """(B, G): those of the shared unknowns that are parameters, and another number for the others."""
+        like = parameters[0]
+        batch = max(map(len, parameters))
+        columns = [
+            parameters[c][:, i].expand(batch)
+            if c >= 0 and i < parameters[c].shape[-1]
+            else like.new_full((batch,), other)
+            for c, i in self.columns
+        ]
+        return torch.stack(columns, -1) if columns else like.new_zeros(batch, 0)
+
     # -- what is seen
 
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
         """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
-        points = bent(sight.points, state.bend)[0] if self.learns_bend or bool((state.bend != 0).any()) else sight.points
+        points = (
+            bent(sight.points, state.bend)[0] if self.learns_bend or bool((state.bend != 0).any()) else sight.points
+        )
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
         if c == 0:
             return turned, first, first
-        return turned, first, first @ state.mounts.rotations[:, c, None].mT + state.mounts.translations[:, c, None, None]
+        return (
+            turned,
+            first,
+            first @ state.mounts.rotations[:, c, None].mT + state.mounts.translations[:, c, None, None],
+        )
 
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
         """What a camera makes of a state."""
@@ -284,32 +315,21 @@ class Bundle:
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
-        total = torch.zeros((), dtype=flat[1].dtype, device=flat[1].device)
-        for c in range(len(self.sights)):
-            total = total + self.look(c, flat, rows).cost.sum((-1, -2))
+        total = torch.stack([self.look(c, flat, rows).cost.sum((-1, -2)) for c in range(len(self.sights))]).sum(0)
         return torch.where(torch.isfinite(total), total, torch.inf)
 
     # -- the linear problem
 
     def linearised(self, flat: Sequence[Tensor], rows: Tensor) -> _System:
         """At a state."""
-        low, high = (torch.cat([t[rows] if len(t) > 1 else t.expand(len(rows), -1) for t in side], -1) for side in zip(*self._bounds))
-        held = torch.zeros(len(rows), len(self.columns), dtype=torch.bool, device=flat[1].device)
         equations = self.equations(flat, rows)
-        if self.columns and not bool(torch.isinf(low).all() & torch.isinf(high).all()):
+        held = torch.zeros(len(rows), len(self.columns), dtype=torch.bool, device=flat[1].device)
+        if self.is_bounded:
             # what would leave its bounds stays there, so that the others can move on
-            values = torch.cat(flat[5:], -1)
-            starts = [0]
-            for p in flat[5:]:
-                starts.append(starts[-1] + p.shape[-1])
-            sizes = [p.shape[-1] for p in flat[5:]]
-            of = [(g, starts[c] + i) for g, (c, i) in enumerate(self.columns) if c >= 0 and i < sizes[c]]
-            g, at = (torch.tensor(t, device=values.device) for t in zip(*of)) if of else (None, None)
-            if of:
-                by_view = (equations.view[..., self._width : -1] * equations.view[..., -1:]).sum((1, 2))
-                slope = by_view + (equations.shared[..., :-1] * equations.shared[..., -1:]).sum(1)
-                low, high, values = low[:, at], high[:, at], values[:, at]
-                held[:, g] = (values <= low) & (slope[:, g] > 0) | (values >= high) & (slope[:, g] < 0)
+            view, shared = equations.view[..., self._width :], equations.shared
+            slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
+            values, low, high = self._of_columns(flat[5:], 0.0), self.low[rows], self.high[rows]
+            held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
         return _System(equations, self._width, held)
 
     @property
@@ -360,7 +380,7 @@ class Bundle:
         at = []
         zero, one = torch.zeros_like(a), torch.ones_like(a)
         usual = ((a, zero), (zero, b), (one, zero), (zero, one))
-        by_k = found.by_k.permute(0, 3, 1, 2).reshape(batch, views, count, 2, -1) * focal if k.shape[-1] else None
+        by_k = found.by_k.permute(0, 3, 1, 2).reshape(batch, views, count, 2, k.shape[-1]) * focal
         for g, (camera, i) in enumerate(self.columns):
             if camera == c and i < parameters.shape[-1]:
                 at.append(g)
@@ -372,7 +392,7 @@ class Bundle:
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
         if self.learns_bend:
             at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
-            along = (by_first @ state.boards.rotations[:, :, None, :, 2:])
+            along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bent(sight.points, state.bend)[1][..., None, :])
         columns.append(look.residuals[..., None])
         weight = look.weights.sqrt()[..., None, None]
@@ -384,7 +404,9 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self._width == 6:
-            boards = Poses(rotation_matrix(of_views[..., :3]) @ boards.rotations, boards.translations + of_views[..., 3:])
+            boards = Poses(
+                rotation_matrix(of_views[..., :3]) @ boards.rotations, boards.translations + of_views[..., 3:]
+            )
         elif self._width == 3:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = [p.clone() for p in state.parameters]
@@ -394,16 +416,12 @@ class Bundle:
                 bend = bend.clone()
                 bend[:, i] += shared[:, g]
             elif i < parameters[c].shape[-1]:
-                parameters[c][:, i] += shared[:, g]
+                parameters[c][:, i] = (parameters[c][:, i] + shared[:, g]).clamp(self.low[rows, g], self.high[rows, g])
             else:
                 i -= parameters[c].shape[-1]
                 (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
         if any(self.free.mounts):
             mounts = Poses(rotation_matrix(turn) @ mounts.rotations, mounts.translations + shift)
-        for c, (low, high) in enumerate(self._bounds):
-            if bool(self.free.parameters[c].any()):
-                low, high = (t[rows] if len(t) > 1 else t for t in (low, high))
-                parameters[c] = parameters[c].clamp(low, high)
         return self.flat(State(tuple(parameters), mounts, boards, bend))
 
 
@@ -423,8 +441,8 @@ class _System:
             equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
         self.equations, self.decrement = equations, equations.decrement
 
-    def step(self, damping: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the views (R, V, L), and of what they share (R, G)."""
+    def step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Of the views (R, V, L), and of what they share (R, G); and by how much the linear problem's cost falls."""
         view, shared, width = self.equations.view, self.equations.shared, self.width
         squares = view[..., :-1].square().sum(-2)
         root = damping.sqrt()
@@ -458,7 +476,17 @@ class _System:
         else:
             of_views = view.new_zeros(*view.shape[:2], 0)
         fine = torch.isfinite(whole).all(-1) & torch.isfinite(of_views).all(-1).all(-1)
-        return torch.where(fine[:, None, None], of_views, 0.0), torch.where(fine[:, None], whole, 0.0)
+        of_views, whole = torch.where(fine[:, None, None], of_views, 0.0), torch.where(fine[:, None], whole, 0.0)
+        return (of_views, whole), self.decrement - self._left(of_views, whole)
+
+    def _left(self, of_views: Tensor, whole: Tensor) -> Tensor:
+        """(R,) what of the decrement a step leaves."""
+        view, shared = self.equations.view, self.equations.shared[:, :-1]
+        mine = (view[..., :-1] @ torch.cat((of_views, whole[:, None].expand(-1, view.shape[1], -1)), -1)[..., None])[
+            ..., 0
+        ]
+        ours = (shared[..., :-1] @ whole[..., None])[..., 0]
+        return (mine + view[..., -1]).square().sum((-1, -2)) + (ours + shared[..., -1]).square().sum(-1)
 
 
 def _triangle(rows: Tensor) -> Tensor:

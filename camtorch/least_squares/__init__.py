@@ -1,1 +1,1 @@
-"""Nonlinear least squares: the method of Levenberg and Marquardt, and the Jacobians of charts and lenses that it needs."""
+"""Nonlinear least squares: the method of Levenberg and Marquardt, and the Jacobians of charts and lenses for it."""

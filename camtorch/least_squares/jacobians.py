@@ -29,7 +29,7 @@ class SensorPoints(NamedTuple):
 
 
 class SensorJacobians(NamedTuple):
-    """`SensorPoints`, and their derivatives, 0 where there is none: by rays (C, 2, 3, N), by coefficients (C, 2, n, N)."""
+    """`SensorPoints`, and their derivatives by rays (C, 2, 3, N) and by coefficients (C, 2, n, N), 0 where none are."""
 
     points: SensorPoints
     by_ray: Tensor

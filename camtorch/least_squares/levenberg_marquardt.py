@@ -12,6 +12,7 @@ State = tuple[Tensor, ...]
 """What is looked for: tensors (B, ...), a row for each problem."""
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-15, 1e8
+_GOOD, _FAIR = 0.75, 0.25  # parts of what a step promised that were kept
 
 
 class System(Protocol):
@@ -20,8 +21,11 @@ class System(Protocol):
     decrement: Tensor
     """(R,) by how much their costs would fall, were they linear."""
 
-    def step(self, damping: Tensor) -> State:
-        """The damped step of Gauss and Newton, zero where there is none. damping: (R,), in units of squared columns."""
+    def step(self, damping: Tensor) -> tuple[State, Tensor]:
+        """The damped step of Gauss and Newton, zero where there is none, and (R,) by how much the linear costs fall.
+
+        damping: (R,), in units of squared columns.
+        """
         ...
 
 
@@ -77,7 +81,7 @@ def minimise(
     rows = torch.arange(len(state[0]), device=state[0].device)
     cost = problem.cost(state, rows)
     state = tuple([t.clone() for t in state])
-    tolerance, tiny = (torch.as_tensor(t, dtype=cost.dtype, device=cost.device).expand_as(cost) for t in (tolerance, tiny))
+    tolerance, tiny = (torch.as_tensor(t).to(cost).expand_as(cost) for t in (tolerance, tiny))
     weights = torch.full_like(cost, damping)
     growth = torch.full_like(cost, 4.0)
     converged = cost <= tiny
@@ -92,8 +96,10 @@ def minimise(
             system = problem.linearised(old, rows)
             before = cost[rows]
         weight = weights[rows]
-        new = problem.moved(old, system.step(weight), rows)
+        step, promised = system.step(weight)
+        new = problem.moved(old, step, rows)
         after = problem.cost(new, rows)
+        kept = (before - after) / promised.clamp(min=torch.finfo(cost.dtype).tiny)
         # where nothing is left to gain, rounding decides which of the two is less
         last = system.decrement <= tolerance[rows] * before
         better = (after < before) | (last & (after <= before * (1 + 1e-12)))
@@ -101,7 +107,8 @@ def minimise(
         for whole, part in zip(state, new, strict=True):
             whole[rows[better]] = part[better]
         cost[rows] = torch.where(better, after, before)
-        weights[rows] = torch.where(better, weight / 10, weight * growth[rows]).clamp(LEAST_DAMPING, MOST_DAMPING)
+        factor = torch.where(kept > _GOOD, 0.1, torch.where(kept > _FAIR, 1.0, 2.0))
+        weights[rows] = (weight * torch.where(better, factor, growth[rows])).clamp(LEAST_DAMPING, MOST_DAMPING)
         growth[rows] = torch.where(better, 4.0, growth[rows] * 2).clamp(max=64.0)
         settled = last | (cost[rows] <= tiny[rows])
         converged[rows] = settled
