@@ -1,0 +1,252 @@
+"""Poses of known points from the rays that see them, in closed form, at any angle from the optical axis."""
+
+from __future__ import annotations
+
+import math
+from itertools import permutations
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from camtorch.rotations import rotation_matrix
+
+_FLAT = 1e-6  # of the points' extent: less counts as none
+_STARTS, _STEPS = 6, 8  # of the search for rotations
+_LEAST, _TINY = 1e-15, 1e-300  # added to what is divided by
+
+
+class RayPoses(NamedTuple):
+    """Alternatives (B, S), best first: rotations (B, S, 3, 3), translations (B, S, 3), and whether there is one."""
+
+    rotations: Tensor
+    translations: Tensor
+    valid: Tensor
+
+
+def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
+    """The poses, camera from object, in which known points lie on rays; the least angles first.
+
+    With the best translation put in, the sum of the points' squared distances from their rays is a quadratic form of
+    the rotation's entries (C.-P. Lu, G. Hager and E. Mjolsness, TPAMI 2000). Its minima are descended to in a fixed
+    number of steps, whose cost does not grow with the points. Points on a plane, whichever it is, have up to two, whose
+    normals mirror each other at the line of sight: the starts are the two rotations that the homography between plane
+    and rays leaves (T. Collins and A. Bartoli, Infinitesimal Plane-Based Pose Estimation, IJCV 2014, here on rays).
+    Points in space have one as a rule: the starts are the linear solution, the view from afar, and right-angled turns.
+
+    Nothing is divided by z, so that rays may have any angle from the optical axis.
+
+    Args:
+        points: (B, N, 3) in any unit, float64.
+        rays: (B, N, 3) of unit length.
+        weights: (B, N), not negative; 0 for what is not seen, whose points and rays do not matter.
+
+    Returns:
+        Two poses a row, S = 2; of points in space the second is the first again where no other was met. A pose is valid
+        if four points or more are seen that are not on a line, everything is finite, and most of what is seen lies
+        ahead on its rays. Others are finite and mean nothing.
+    """
+    points, rays, weights = _cleaned(points, rays, weights)
+    total = weights.sum(-1).clamp(min=_TINY)
+    weights = weights / total[:, None]
+    centre = (weights[..., None] * points).sum(-2)
+    centred = torch.where(weights[..., None] > 0, points - centre[:, None], 0.0)
+    variances, axes = torch.linalg.eigh(torch.einsum("bn,bni,bnj->bij", weights, centred, centred))
+    extent = variances.clamp(min=0.0).sqrt()
+    size = extent[:, 2].clamp(min=_TINY)
+    # from the plane's frame, or that of the points' main axes, in units of their extent
+    axes = axes.flip(-1)
+    axes = torch.cat((axes[..., :2], torch.linalg.cross(axes[..., 0], axes[..., 1])[..., None]), -1)
+    local = centred @ axes / size[:, None, None]
+    enough = ((weights > 0).sum(-1) >= 4) & (extent[:, 1] > _FLAT * size)
+
+    distances = _Distances.between(local, rays, weights)
+    rotations = points.new_empty(len(points), 2, 3, 3)
+    flat = extent[:, 0] <= _FLAT * size
+    for chosen, solve in ((flat, _planar_rotations), (~flat, _rotations_in_space)):
+        (rows,) = chosen.nonzero(as_tuple=True)
+        if len(rows):
+            rotations[rows] = solve(local[rows], rays[rows], weights[rows], distances.of(rows))
+    translations = distances.translations(rotations)
+    seen = local[:, None] @ rotations.mT + translations[:, :, None]
+    cosines = (normalize(seen, dim=-1) * rays[:, None]).sum(-1)
+    # a plane behind its rays is as near to them as the plane ahead that it is by a point reflection
+    side = torch.where(flat[:, None] & ((weights[:, None] * cosines.sign()).sum(-1) < 0), -1.0, 1.0).to(cosines)
+    rotations = rotations * torch.stack((side, side, torch.ones_like(side)), -1)[:, :, None]
+    translations, cosines = translations * side[..., None], cosines * side[..., None]
+    ahead = (weights[:, None] * cosines.sign()).sum(-1) > 0
+    # monotonous in the angles up to the half turn
+    score = (weights[:, None] * (1 - cosines)).sum(-1).nan_to_num(torch.inf)
+    order = score.argsort(-1)
+    rotations, translations, ahead = (_taken(t, order) for t in (rotations, translations, ahead))
+    rotations = rotations @ axes.mT[:, None]
+    translations = translations * size[:, None, None] - (rotations @ centre[:, None, :, None])[..., 0]
+    finite = torch.isfinite(rotations).all(-1).all(-1) & torch.isfinite(translations).all(-1)
+    valid = finite & ahead & enough[:, None]
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    return RayPoses(
+        torch.where(finite[..., None, None], rotations, eye), torch.where(finite[..., None], translations, 0.0), valid
+    )
+
+
+def _cleaned(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """With weight 0 and zeros for what is not finite, and zeros for what has no weight."""
+    finite = torch.isfinite(points).all(-1) & torch.isfinite(rays).all(-1) & torch.isfinite(weights)
+    seen = finite & (weights > 0)
+    return (
+        torch.where(seen[..., None], points, 0.0),
+        torch.where(seen[..., None], rays, 0.0),
+        torch.where(seen, weights, 0.0),
+    )
+
+
+def _frame(direction: Tensor) -> Tensor:
+    """(..., 3, 3) rotations whose third column is the direction (..., 3), of unit length."""
+    sign = torch.where(direction[..., 2] < 0, -1.0, 1.0)
+    mirror = torch.cat((direction[..., :2], (direction[..., 2] + sign)[..., None]), -1)
+    scale = 2 / mirror.square().sum(-1).clamp(min=_TINY)
+    first = -(scale * mirror[..., 0])[..., None] * mirror
+    first = torch.cat((1 + first[..., :1], first[..., 1:]), -1)
+    return torch.stack((first, torch.linalg.cross(direction, first), direction), -1)
+
+
+def _off_rays(rays: Tensor) -> Tensor:
+    """(B, N, 3, 3): to the part of a vector that is across the ray."""
+    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
+    return eye - rays[..., :, None] * rays[..., None, :]
+
+
+def _homography(local: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
+    """(B, 3, 3): of the plane's points (x, y, 1) to their rays, by the least algebraic error."""
+    # as pixels are, by R. Hartley, rays are brought apart: those of a narrow view are nearly the same
+    moment = torch.einsum("bn,bni,bnj->bij", weights, rays, rays)
+    trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1)
+    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
+    spread, _ = torch.linalg.cholesky_ex(moment + _LEAST * trace.clamp(min=_TINY)[:, None, None] * eye)
+    apart = torch.linalg.solve_triangular(spread, rays.mT, upper=False).mT
+    apart = normalize(apart, dim=-1)
+    plane = torch.cat((local[..., :2], torch.ones_like(local[..., :1])), -1)
+    pairs = (plane[..., :, None] * plane[..., None, :]).flatten(2) * weights[..., None]
+    normal = (pairs.mT @ _off_rays(apart).flatten(2)).view(-1, 3, 3, 3, 3).permute(0, 3, 1, 4, 2).reshape(-1, 9, 9)
+    _, vectors = torch.linalg.eigh(normal)
+    homography = spread @ vectors[..., 0].view(-1, 3, 3)
+    ahead = (weights * (rays * (plane @ homography.mT)).sum(-1).sign()).sum(-1)
+    return torch.where(ahead[:, None, None] < 0, -homography, homography)
+
+
+class _Distances(NamedTuple):
+    """The weighted sum of the squared distances of points from rays, a quadratic form of the rotation's entries."""
+
+    form: Tensor  # (B, 9, 9)
+    to_translation: Tensor  # (B, 3, 9)
+
+    @classmethod
+    def between(cls, local: Tensor, rays: Tensor, weights: Tensor) -> _Distances:
+        """Of points and rays (B, N, 3)."""
+        off = (_off_rays(rays) * weights[..., None, None]).flatten(2)
+        pairs = (local[..., :, None] * local[..., None, :]).flatten(2)
+        form = (off.mT @ pairs).view(-1, 3, 3, 3, 3).transpose(2, 3).reshape(-1, 9, 9)
+        moved = (off.mT @ local).view(-1, 3, 9)
+        total = off.sum(1).view(-1, 3, 3)
+        # rays that are all the same do not tell the distance
+        total = total + _LEAST * torch.eye(3, dtype=rays.dtype, device=rays.device)
+        solution = torch.linalg.solve_ex(total, moved)[0]
+        return cls(form - moved.mT @ solution, -solution)
+
+    def of(self, rows: Tensor) -> _Distances:
+        """Those of some rows."""
+        return _Distances(*(t[rows] for t in self))
+
+    def translations(self, rotations: Tensor) -> Tensor:
+        """(B, S, 3): the best to rotations (B, S, 3, 3)."""
+        return rotations.flatten(2) @ self.to_translation.mT
+
+    def of_rotations(self, rotations: Tensor) -> Tensor:
+        """(B, S)."""
+        entries = rotations.flatten(2)
+        return ((entries @ self.form) * entries).sum(-1)
+
+    def descended(self, rotations: Tensor) -> Tensor:
+        """Rotations (B, S, 3, 3) after some steps of Levenberg and Marquardt: three unknowns each, and no points."""
+        costs = self.of_rotations(rotations)
+        damping = torch.full_like(costs, 1e-2)
+        eye = torch.eye(3, dtype=costs.dtype, device=costs.device)
+        turns = torch.linalg.cross(eye[:, None], eye[None]).mT
+        for _ in range(_STEPS):
+            slopes = (turns @ rotations[:, :, None]).flatten(3)
+            mapped = (slopes.flatten(1, 2) @ self.form).view_as(slopes)
+            gradient = mapped @ rotations.flatten(2)[..., None]
+            normal = mapped @ slopes.mT
+            scale = normal.diagonal(dim1=-2, dim2=-1).sum(-1)
+            normal = normal + (damping * scale + _TINY)[..., None, None] * eye
+            turned = rotation_matrix(-torch.linalg.solve_ex(normal, gradient)[0][..., 0]) @ rotations
+            turned_costs = self.of_rotations(turned)
+            better = turned_costs < costs
+            rotations = torch.where(better[..., None, None], turned, rotations)
+            costs = torch.where(better, turned_costs, costs)
+            damping = torch.where(better, damping / 10, damping * 10).clamp(1e-9, 1e3)
+        return rotations
+
+
+def _planar_rotations(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
+    """(B, 2, 3, 3): of points in the plane z = 0 around its origin."""
+    homography = _homography(local, rays, weights)
+    frame = _frame(normalize(homography[..., 2], dim=-1))
+    # across the line of sight the columns of the rotation are known up to the distance, and the larger singular value
+    # of that part of a rotation is one
+    across = frame[..., :2].mT @ homography[..., :2]
+    (a, b), (c, d) = ((across[:, i, 0], across[:, i, 1]) for i in range(2))
+    largest = (torch.hypot(a + d, b - c) + torch.hypot(a - d, b + c)) / 2
+    across = across / largest.clamp(min=_TINY)[:, None, None]
+    rest = -across.mT @ across
+    along_x, along_y = (1 + rest[:, 0, 0]).clamp(min=0.0).sqrt(), (1 + rest[:, 1, 1]).clamp(min=0.0).sqrt()
+    along = torch.stack((along_x, torch.where(rest[:, 0, 1] < 0, -along_y, along_y)), -1)
+    candidates = []
+    for sign in (1, -1):
+        first, second = torch.cat((across, sign * along[:, None]), 1).unbind(-1)
+        candidates.append(frame @ torch.stack((first, second, torch.linalg.cross(first, second)), -1))
+    return distances.descended(torch.stack(candidates, 1))
+
+
+def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
+    """(B, 2, 3, 3): of points that are not on a plane, whose main axes are the coordinates'."""
+    sight = normalize((weights[..., None] * rays).sum(-2), dim=-1)
+    frame = _frame(sight)
+    linear = torch.linalg.eigh(distances.form).eigenvectors[..., 0].view(-1, 1, 3, 3)
+    ahead = (distances.translations(linear) * sight[:, None]).sum(-1) >= 0
+    linear = torch.where(ahead[..., None, None], linear, -linear)
+    # from afar, the two rows across the line of sight in units of the distance
+    rows = (weights[..., None] * (rays @ frame[..., :2])).mT @ local
+    rows = normalize(rows / (weights[..., None] * local.square()).sum(-2).clamp(min=_TINY)[:, None], dim=-1)
+    from_afar = frame @ torch.cat((rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])), 1)
+    nearest = _nearest_rotation(torch.cat((linear, from_afar[:, None]), 1))
+    rotations = torch.cat((nearest, frame[:, None] @ _right_turns(frame)), 1)
+    rotations = _taken(rotations, distances.of_rotations(rotations).argsort(-1)[:, :_STARTS])
+    rotations = distances.descended(rotations)
+    costs = distances.of_rotations(rotations)
+    best = _taken(rotations, costs.argmin(-1, keepdim=True))
+    # the trace of the turn between them: within 0.1 radians it is the same minimum
+    same = (rotations * best).sum((-1, -2)) > 1 + 2 * math.cos(0.1)
+    other = torch.where(same, torch.inf, costs).argmin(-1, keepdim=True)
+    return torch.cat((best, _taken(rotations, other)), 1)
+
+
+def _taken(values: Tensor, index: Tensor) -> Tensor:
+    """Of values (B, S, ...) those of an index (B, T)."""
+    return torch.take_along_dim(values, index.view(*index.shape, *[1] * (values.ndim - 2)), 1)
+
+
+def _right_turns(like: Tensor) -> Tensor:
+    """(24, 3, 3): the rotations that take axes to axes."""
+    matrices = torch.eye(3, dtype=like.dtype, device=like.device)[torch.tensor([*permutations(range(3))])]
+    signs = torch.cartesian_prod(*[like.new_tensor([1.0, -1.0])] * 3)
+    matrices = (matrices[:, None] * signs[:, None]).flatten(0, 1)
+    return matrices[torch.linalg.det(matrices) > 0]
+
+
+def _nearest_rotation(matrices: Tensor) -> Tensor:
+    """(..., 3, 3) rotations."""
+    u, _, v = torch.linalg.svd(matrices)
+    last = u[..., 2:] * torch.linalg.det(u @ v)[..., None, None]
+    return torch.cat((u[..., :2], last), -1) @ v
