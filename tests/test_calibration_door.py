@@ -1,0 +1,363 @@
+"""What users pass to calibration: every form that corners come in, and errors that say what to do."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from camtorch.calibration.observations import as_observations, as_rig_observations
+
+SIZE = (480, 640)
+OWNER = "calibrate"
+
+
+def board(columns=9, rows=6, square=0.025):
+    """(N, 3): the inner corners of a chessboard."""
+    y, x = np.mgrid[:rows, :columns]
+    return np.stack((x, y, 0 * x), -1).reshape(-1, 3).astype(np.float32) * square
+
+
+def views(count=5, columns=9, rows=6):
+    """(V, N, 2) float32: the board here and there in the image, to its rim."""
+    flat = board(columns, rows, 1.0)[:, :2]
+    places = np.linspace(0, 1, count)
+    return np.stack([flat * (30 + 5 * s) + [340 * s + 20, 200 * s + 10] for s in places]).astype(np.float32)
+
+
+def refuses(*words, error=ValueError):
+    """The error, and a message in which all the words appear in this order."""
+    return pytest.raises(error, match=re.compile(".*".join(map(re.escape, (OWNER, *words))), re.DOTALL))
+
+
+def same(found, expected_points, expected_pixels):
+    observations, _ = found
+    assert all(t.dtype == torch.float64 for t in observations[:2])
+    torch.testing.assert_close(observations.points, torch.as_tensor(expected_points).double(), rtol=0, atol=0)
+    torch.testing.assert_close(observations.pixels, torch.as_tensor(expected_pixels).double(), rtol=0, atol=0)
+
+
+BOARD, VIEWS = board(), views()
+REPEATED = np.repeat(BOARD[None], len(VIEWS), 0)
+
+
+@pytest.mark.parametrize(
+    "object_points",
+    [
+        BOARD,
+        torch.from_numpy(BOARD),
+        BOARD.tolist(),
+        BOARD[:, None],
+        BOARD[None],
+        REPEATED,
+        REPEATED[:, None],
+        REPEATED[:, :, None],
+        [BOARD] * 5,
+        tuple(torch.from_numpy(BOARD) for _ in range(5)),
+        [BOARD[:, None]] * 5,
+        [BOARD[None]] * 5,
+        [BOARD],
+        REPEATED.tolist(),
+        np.asfortranarray(BOARD),
+        torch.from_numpy(BOARD).requires_grad_(),
+        BOARD.astype(">f4"),
+    ],
+)
+def test_forms_of_object_points(object_points):
+    same(as_observations(object_points, VIEWS, SIZE, OWNER), REPEATED, VIEWS)
+
+
+FORMS = [
+    VIEWS,
+    VIEWS[:, :, None],
+    VIEWS[:, None],
+    torch.from_numpy(VIEWS),
+    torch.from_numpy(VIEWS).double(),
+    torch.from_numpy(VIEWS).requires_grad_(),
+    list(VIEWS),
+    tuple(torch.from_numpy(VIEWS)),
+    [v[:, None] for v in VIEWS],
+    [v[None] for v in VIEWS],
+    VIEWS.tolist(),
+    [list(map(torch.from_numpy, v)) for v in VIEWS],
+]
+
+
+@pytest.mark.parametrize("image_points", FORMS)
+def test_forms_of_image_points_and_back(image_points):
+    found = as_observations(BOARD, image_points, SIZE, OWNER)
+    same(found, REPEATED, VIEWS)
+    (observations, layout) = found
+    assert not observations.pixels.requires_grad
+    assert observations.seen.all()
+    assert layout.image_size == SIZE
+    for values, size in ((observations.pixels, (2,)), (observations.seen, ()), (observations.pixels[..., 0], ())):
+        back = layout.restore(values)
+        stacked = isinstance(image_points, (torch.Tensor, np.ndarray))
+        assert isinstance(back, torch.Tensor if stacked else list)
+        for one, view, value in zip(back, image_points, values, strict=True):
+            assert tuple(one.shape) == (*np.shape(np.asarray(view) if isinstance(view, list) else view)[:-1], *size)
+            assert one.dtype == values.dtype
+            torch.testing.assert_close(one.reshape(value.shape), value, rtol=0, atol=0)
+
+
+def test_integers_and_half_precision_are_numbers():
+    same(as_observations(BOARD, VIEWS.astype(np.int32), SIZE, OWNER), REPEATED, VIEWS.astype(np.int32))
+    half = torch.from_numpy(VIEWS).half()
+    same(as_observations(BOARD, half, SIZE, OWNER), REPEATED, half)
+
+
+def test_what_is_given_is_not_changed():
+    image_points, points = torch.from_numpy(VIEWS).double(), torch.from_numpy(BOARD).double()
+    image_points[0, 3] = torch.nan
+    before = image_points.clone(), points.clone()
+    observations, _ = as_observations(points, image_points, SIZE, OWNER)
+    observations.pixels.zero_()
+    observations.points.zero_()
+    torch.testing.assert_close((image_points, points), before, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("half_seen", [False, True])
+def test_rows_of_nan_are_unseen(half_seen):
+    image_points = VIEWS.copy()
+    image_points[1, 5:9, : 1 if half_seen else 2] = np.nan
+    observations, layout = as_observations(BOARD, image_points, SIZE, OWNER)
+    assert (~observations.seen).nonzero().tolist() == [[1, n] for n in range(5, 9)]
+    assert (observations.pixels[1, 5:9] == 0).all()
+    assert layout.restore(observations.pixels)[1, 5:9].isnan().all()
+    assert not layout.restore(torch.ones_like(observations.seen))[1, 5:9].any()
+
+
+def test_null_is_unseen_in_lists():
+    image_points = VIEWS.tolist()
+    image_points[0][2] = [None, None]
+    image_points[0][4] = None
+    observations, _ = as_observations(BOARD, image_points, SIZE, OWNER)
+    assert (~observations.seen).nonzero().tolist() == [[0, 2], [0, 4]]
+
+
+def test_object_points_may_be_nan_where_nothing_is_seen():
+    points, image_points = REPEATED.copy(), VIEWS.copy()
+    points[2, 7], image_points[2, 7] = np.nan, np.nan
+    observations, _ = as_observations(points, image_points, SIZE, OWNER)
+    assert (observations.points[2, 7] == 0).all()
+
+
+@pytest.mark.parametrize("empty", [None, np.empty((0, 2), np.float32), [], np.full((54, 2), np.nan)])
+def test_views_without_corners_are_left_out(empty):
+    image_points = [VIEWS[0], empty, VIEWS[2], VIEWS[3], empty]
+    with pytest.warns(UserWarning, match=r"left out.* views 1, 4") as caught:
+        observations, layout = as_observations([BOARD] * 5, image_points, SIZE, OWNER)
+    assert len(caught) == 1
+    assert layout.views.tolist() == [0, 2, 3]
+    same((observations, layout), REPEATED[:3], VIEWS[[0, 2, 3]])
+    back = layout.restore(observations.pixels)
+    assert len(back) == 5
+    assert back[1].isnan().all()
+    assert tuple(back[1].shape) == (np.shape(empty)[0] if empty is not None else 54, 2)
+
+
+def test_a_view_left_out_of_a_tensor_comes_back_as_nan():
+    image_points = torch.from_numpy(VIEWS.copy())
+    image_points[3] = torch.nan
+    with pytest.warns(UserWarning, match="left out.* view 3$"):
+        observations, layout = as_observations(BOARD, image_points, SIZE, OWNER)
+    back = layout.restore(observations.pixels)
+    torch.testing.assert_close(back, image_points.double(), rtol=0, atol=0, equal_nan=True)
+
+
+def test_views_of_different_corners():
+    """As ChArUco boards are found."""
+    which = [np.arange(54), np.arange(10, 40), np.arange(0, 54, 3)]
+    points, image_points = [BOARD[w] for w in which], [VIEWS[i][w][:, None] for i, w in enumerate(which)]
+    observations, layout = as_observations(points, image_points, SIZE, OWNER)
+    assert observations.seen.sum(-1).tolist() == [54, 30, 18]
+    assert observations.seen.shape == (3, 54)
+    for back, given in zip(layout.restore(observations.pixels), image_points, strict=True):
+        torch.testing.assert_close(back, torch.from_numpy(given).double(), rtol=0, atol=0)
+    inliers = layout.restore(observations.seen)
+    assert [tuple(t.shape) for t in inliers] == [(54, 1), (30, 1), (18, 1)]
+    points[1] = None
+    image_points[1] = None
+    with pytest.warns(UserWarning, match="view 1"):
+        assert len(as_observations(points, image_points, SIZE, OWNER)[0].seen) == 2
+
+
+def test_some_views():
+    observations, _ = as_observations(BOARD, VIEWS, SIZE, OWNER)
+    assert observations.of(torch.tensor([3, 1])).pixels.tolist() == observations.pixels[[3, 1]].tolist()
+
+
+def changed(index, value):
+    image_points = VIEWS.copy()
+    image_points[index] = value
+    return image_points
+
+
+BAD = {
+    "one view": (BOARD, VIEWS[0], ["image_points", "(54, 2)", "[image_points]"]),
+    "one view of OpenCV's": (BOARD, VIEWS[0][:, None], ["image_points", "(54, 1, 2)", "[image_points]"]),
+    "no view": (BOARD, [], ["image_points", "no view"]),
+    "nothing found": (BOARD, [None, None], ["image_points", "no view"]),
+    "no view in a tensor": (BOARD, VIEWS[:0], ["image_points"]),
+    "nan": (BOARD, np.full_like(VIEWS, np.nan), ["NaN everywhere"]),
+    "empty": (BOARD, [np.empty((0, 2))] * 3, ["no view has a corner"]),
+    "few corners": (BOARD, changed((2, slice(3, None)), np.nan), ["view 2", "3 seen corners", "4"]),
+    "few corners in two": (BOARD, changed((slice(2, 4), slice(3, None)), np.nan), ["view 2", "Likewise view 3"]),
+    "swapped axes": (BOARD, VIEWS.swapaxes(1, 2), ["image_points", "(5, 2, 54)", "swapped", "transpose"]),
+    "swapped axes in a list": (BOARD, [v.T for v in VIEWS], ["image_points[0]", "(2, 54)", "swapped"]),
+    "swapped axes of the board": (BOARD.T, VIEWS, ["object_points", "(3, 54)", "swapped", "transpose"]),
+    "views for corners": (BOARD, VIEWS.swapaxes(0, 1), ["54", "5", "swapped", "transpose the first two"]),
+    "rows and columns": (BOARD, VIEWS[..., ::-1], ["outside", "(480, 640)", "(row, column)"]),
+    "board size": (board(8, 6), VIEWS, ["view 0", "48 corners", "54", "board's size", "inner corners"]),
+    "board size in a list": ([BOARD] * 4 + [board(8, 6)], VIEWS, ["view 4", "48", "54"]),
+    "number of views": ([BOARD] * 4, VIEWS, ["4 views", "image_points", "5"]),
+    "number of views in tensors": (REPEATED[:4], VIEWS, ["4 views", "image_points", "5"]),
+    "exchanged": (VIEWS, REPEATED, ["object_points", "exchanged"]),
+    "exchanged in lists": (list(VIEWS), list(REPEATED), ["exchanged"]),
+    "no z": (BOARD[:, :2], VIEWS, ["object_points", "(54, 2)", "column of zeros"]),
+    "one point": (0 * BOARD, VIEWS, ["object_points", "same point"]),
+    "a point far away": (0 * BOARD + 7, VIEWS, ["object_points", "same point"]),
+    "a line": (BOARD * np.float32([1, 0, 0]), VIEWS, ["object_points", "one line"]),
+    "a line in one view": (BOARD, changed((3, slice(9, None)), np.nan), ["view 3", "one line"]),
+    "a slanted line": ((BOARD[:, :1] + BOARD[:, 1:2]) * np.float32([0.3, 0.7, 0.1]) + 5, VIEWS, ["one line"]),
+    "a corner twice": (np.concatenate((BOARD[:53], BOARD[:1])), VIEWS, ["object_points", "twice"]),
+    "pixels at zero": (BOARD, changed((1, slice(0, 3)), 0.0), ["view 1", "one pixel", "NaN"]),
+    "infinite": (BOARD, changed((2, 7), np.inf), ["image_points", "infinite", "view 2", "NaN"]),
+    "an infinite corner of the board": (
+        np.where(BOARD[-1] == BOARD, np.inf, BOARD),
+        VIEWS,
+        ["object_points", "finite"],
+    ),
+    "a board without a corner": (np.where(BOARD[-1] == BOARD, np.nan, BOARD), VIEWS, ["object_points", "finite"]),
+    "normalised": (BOARD, VIEWS / 640, ["normalised"]),
+    "normalised about the middle": (BOARD, VIEWS / 320 - 1, ["normalised"]),
+    "outside": (BOARD, VIEWS * 3, ["corners of image_points lie outside", "(480, 640)", "reach"]),
+    "another size in one view": (BOARD, changed(4, VIEWS[4] * 2), ["outside", "view 4", "same for all"]),
+    "nowhere": (BOARD, changed((2, 7), 99999.0), ["1 of 270", "far outside", "view 2", "(99999, 99999)"]),
+    "ragged": (BOARD, [[[1.0, 2.0], [3.0]]] * 5, ["image_points[0]"]),
+    "ragged rows": (BOARD, [[1.0, 2.0], [3.0]], ["image_points"]),
+    "too many dims": (BOARD, VIEWS[None, None], ["image_points", "(1, 1, 5, 54, 2)"]),
+}
+
+
+@pytest.mark.parametrize(("object_points", "image_points", "words"), [*BAD.values()], ids=[*BAD])
+def test_bad_points(object_points, image_points, words):
+    with refuses(*words):
+        as_observations(object_points, image_points, SIZE, OWNER)
+
+
+@pytest.mark.parametrize(
+    ("object_points", "image_points", "words"),
+    [
+        (BOARD, None, ["image_points", "NoneType"]),
+        (None, VIEWS, ["object_points", "NoneType"]),
+        (BOARD, "corners.json", ["image_points", "str"]),
+        (BOARD, ["a.jpg", "b.jpg"], ["image_points[0]", "numbers"]),
+        (BOARD, {"left": VIEWS}, ["image_points", "rig"]),
+        ({"left": BOARD}, VIEWS, ["object_points", "dict"]),
+        (BOARD, VIEWS > 0, ["image_points", "bool"]),
+        (BOARD, torch.from_numpy(VIEWS) + 0j, ["image_points", "complex"]),
+        (BOARD, 5 + 0j, ["image_points", "complex"]),
+    ],
+)
+def test_what_is_no_points(object_points, image_points, words):
+    with refuses(*words, error=TypeError):
+        as_observations(object_points, image_points, SIZE, OWNER)
+
+
+def test_sizes_of_images():
+    for size in ((480, 640), [480, 640], np.array([480, 640]), torch.Size(SIZE), [SIZE] * 5):
+        assert as_observations(BOARD, VIEWS, size, OWNER)[1].image_size == SIZE
+    with refuses("image_size", "(640, 480)", "not OpenCV's (width, height)"):
+        as_observations(BOARD, VIEWS, (640, 480), OWNER)
+    with refuses("image_size", "missing", "(height, width)"):
+        as_observations(BOARD, VIEWS, None, OWNER)
+    with refuses("image_size", "(480, 640), (720, 1280)", "apart"):
+        as_observations(BOARD, VIEWS, [SIZE, SIZE, (720, 1280), SIZE, SIZE], OWNER)
+    with refuses("image_size", "positive", "(480, 0)"):
+        as_observations(BOARD, VIEWS, (480, 0), OWNER)
+    with refuses("image_size", "(480.5, 640)", error=TypeError):
+        as_observations(BOARD, VIEWS, (480.5, 640), OWNER)
+
+
+def test_corners_at_the_rim_and_a_few_outliers_are_taken():
+    image_points = VIEWS.copy()
+    image_points[0, 0] = -3.0  # just outside
+    image_points[:, :3] += 300.0  # gross outliers, some of them outside
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        observations, _ = as_observations(BOARD, image_points, SIZE, OWNER)
+    assert observations.seen.all()
+
+
+# -- rigs
+
+MODELS = {"left": "kannala_brandt", "right": "kannala_brandt"}
+SIZES = {"left": SIZE, "right": (600, 800)}
+
+
+def test_cameras_of_a_rig_see_the_same_boards():
+    right = [None, *VIEWS[1:4], np.full((54, 2), np.nan)]
+    left = VIEWS.copy()
+    left[4] = np.nan
+    left[2, 5] = np.nan
+    points = {"right": right, "left": left}  # in another order than the models
+    with pytest.warns(UserWarning, match="left out.* view 4$"):
+        observations, layouts = as_rig_observations(BOARD, points, SIZES, MODELS, OWNER)
+    assert list(observations) == list(layouts) == ["left", "right"]
+    for of in observations.values():
+        assert of.points.tolist() == REPEATED[:4].tolist()
+    assert observations["left"].seen.sum(-1).tolist() == [54, 54, 53, 54]
+    assert observations["right"].seen.sum(-1).tolist() == [0, 54, 54, 54]
+    assert layouts["right"].image_size == (600, 800)
+    back = layouts["left"].restore(observations["left"].pixels)
+    torch.testing.assert_close(back, torch.from_numpy(left).double(), rtol=0, atol=0, equal_nan=True)
+    back = layouts["right"].restore(observations["right"].pixels)
+    assert [tuple(t.shape) for t in back] == [(54, 2)] * 5
+    assert [bool(t.isnan().any()) for t in back] == [True, False, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"image_points": {"left": VIEWS}}, ["'right' of models is missing in image_points", "'left'"]),
+        ({"image_sizes": {"left": SIZE, "rihgt": SIZE}}, ["'right' of models is missing in image_sizes", "'rihgt'"]),
+        ({"models": {"left": "mei"}}, ["'right' of image_points is missing in models", "'left'"]),
+        ({"models": {}}, ["models", "no camera"]),
+        ({"image_points": {"left": VIEWS, "right": VIEWS[:4]}}, ["same views", "5 in image_points['left']", "4 in"]),
+        ({"image_points": {"left": VIEWS, "right": [None] * 5}}, ["image_points['right']", "no view"]),
+        ({"image_points": {"left": VIEWS, "right": VIEWS * np.nan}}, ["image_points['right']", "NaN everywhere"]),
+        (
+            {"image_sizes": {"left": SIZE, "right": (640, 480)}},
+            ["image_points['right']", "image_sizes['right']", "Open"],
+        ),
+        ({"image_sizes": {"left": SIZE, "right": None}}, ["image_sizes['right']", "missing"]),
+        ({"image_points": {"left": VIEWS, "right": VIEWS[:, :48]}}, ["view 0", "54", "image_points['right'][0]", "48"]),
+        ({"image_points": {"left": VIEWS, "right": changed((1, slice(2, None)), np.nan)}}, ["view 1", "['right'][1]"]),
+        (
+            {"image_points": {"left": [*VIEWS[:3], None, None], "right": [None, None, None, *VIEWS[3:]]}},
+            ["'right' never sees", "'left'"],
+        ),
+    ],
+)
+def test_bad_rigs(changes, words):
+    given = {"image_points": {"left": VIEWS, "right": VIEWS}, "image_sizes": SIZES, "models": MODELS, **changes}
+    with refuses(*words):
+        as_rig_observations(BOARD, owner=OWNER, **given)
+
+
+def test_a_rig_is_made_of_mappings():
+    with refuses("image_points", "names of cameras", "list", error=TypeError):
+        as_rig_observations(BOARD, [VIEWS, VIEWS], SIZES, MODELS, OWNER)
+
+
+def test_cameras_linked_by_another():
+    points = {
+        "a": [*VIEWS[:2], None, None],
+        "b": [None, None, *VIEWS[2:4]],
+        "c": [None, VIEWS[1], VIEWS[2], None],
+    }
+    observations, _ = as_rig_observations(BOARD, points, dict.fromkeys("abc", SIZE), dict.fromkeys("abc"), OWNER)
+    assert [of.seen.any(-1).sum().item() for of in observations.values()] == [2, 2, 2]
