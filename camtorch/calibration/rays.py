@@ -12,8 +12,9 @@ from torch.nn.functional import normalize
 
 from camtorch.rotations import rotation_matrix
 
+_PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of symmetric matrices, the place among six entries
 _FLAT = 1e-6  # of the points' extent: less counts as none
-_STARTS, _STEPS = 6, 8  # of the search for rotations
+_STARTS, _FEW, _STEPS = 12, 4, 8  # of the search for rotations: those that are begun, and that are gone on with
 _LEAST, _TINY = 1e-15, 1e-300  # added to what is divided by
 
 
@@ -52,7 +53,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     weights = weights / total[:, None]
     centre = (weights[..., None] * points).sum(-2)
     centred = torch.where(weights[..., None] > 0, points - centre[:, None], 0.0)
-    variances, axes = torch.linalg.eigh(torch.einsum("bn,bni,bnj->bij", weights, centred, centred))
+    variances, axes = torch.linalg.eigh((weights[..., None] * centred).mT @ centred)
     extent = variances.clamp(min=0.0).sqrt()
     size = extent[:, 2].clamp(min=_TINY)
     # from the plane's frame, or that of the points' main axes, in units of their extent
@@ -92,8 +93,8 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
 
 def _cleaned(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """With weight 0 and zeros for what is not finite, and zeros for what has no weight."""
-    finite = torch.isfinite(points).all(-1) & torch.isfinite(rays).all(-1) & torch.isfinite(weights)
-    seen = finite & (weights > 0)
+    # a sum shows what is not finite
+    seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)
     return (
         torch.where(seen[..., None], points, 0.0),
         torch.where(seen[..., None], rays, 0.0),
@@ -111,24 +112,31 @@ def _frame(direction: Tensor) -> Tensor:
     return torch.stack((first, torch.linalg.cross(direction, first), direction), -1)
 
 
-def _off_rays(rays: Tensor) -> Tensor:
-    """(B, N, 3, 3): to the part of a vector that is across the ray."""
-    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
-    return eye - rays[..., :, None] * rays[..., None, :]
+def _products(vectors: Tensor) -> Tensor:
+    """(B, N, 6): the products of two components of (B, N, 3), in the order of `_PAIRS`."""
+    x, y, z = vectors.unbind(-1)
+    return torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
+
+
+def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
+    """(B, 3, 3, 3, 3): the sum of (I - r r^T) x p p^T over points p, which is what is across their unit rays r."""
+    pairs = _products(points) * weights[..., None]
+    along = _products(rays).mT @ pairs
+    across = pairs.sum(-2)[:, None] * pairs.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None] - along
+    index = torch.tensor(_PAIRS, device=rays.device)
+    return across[:, index[:, :, None, None], index]
 
 
 def _homography(local: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
     """(B, 3, 3): of the plane's points (x, y, 1) to their rays, by the least algebraic error."""
     # as pixels are, by R. Hartley, rays are brought apart: those of a narrow view are nearly the same
-    moment = torch.einsum("bn,bni,bnj->bij", weights, rays, rays)
+    moment = (weights[..., None] * rays).mT @ rays
     trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1)
     eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
     spread, _ = torch.linalg.cholesky_ex(moment + _LEAST * trace.clamp(min=_TINY)[:, None, None] * eye)
-    apart = torch.linalg.solve_triangular(spread, rays.mT, upper=False).mT
-    apart = normalize(apart, dim=-1)
+    apart = normalize(rays @ torch.linalg.solve_triangular(spread, eye.expand_as(spread), upper=False).mT, dim=-1)
     plane = torch.cat((local[..., :2], torch.ones_like(local[..., :1])), -1)
-    pairs = (plane[..., :, None] * plane[..., None, :]).flatten(2) * weights[..., None]
-    normal = (pairs.mT @ _off_rays(apart).flatten(2)).view(-1, 3, 3, 3, 3).permute(0, 3, 1, 4, 2).reshape(-1, 9, 9)
+    normal = _moments(apart, plane, weights).transpose(2, 3).reshape(-1, 9, 9)
     _, vectors = torch.linalg.eigh(normal)
     homography = spread @ vectors[..., 0].view(-1, 3, 3)
     ahead = (weights * (rays * (plane @ homography.mT)).sum(-1).sign()).sum(-1)
@@ -140,19 +148,22 @@ class _Distances(NamedTuple):
 
     form: Tensor  # (B, 9, 9)
     to_translation: Tensor  # (B, 3, 9)
+    to_depth: Tensor  # (B, 9): the points' mean distance along their rays
 
     @classmethod
     def between(cls, local: Tensor, rays: Tensor, weights: Tensor) -> _Distances:
         """Of points and rays (B, N, 3)."""
-        off = (_off_rays(rays) * weights[..., None, None]).flatten(2)
-        pairs = (local[..., :, None] * local[..., None, :]).flatten(2)
-        form = (off.mT @ pairs).view(-1, 3, 3, 3, 3).transpose(2, 3).reshape(-1, 9, 9)
-        moved = (off.mT @ local).view(-1, 3, 9)
-        total = off.sum(1).view(-1, 3, 3)
+        form = _moments(rays, local, weights).transpose(2, 3).reshape(-1, 9, 9)
+        eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
+        weighted = weights[..., None] * rays
         # rays that are all the same do not tell the distance
-        total = total + _LEAST * torch.eye(3, dtype=rays.dtype, device=rays.device)
+        total = (weights.sum(-1)[:, None, None] + _LEAST) * eye - weighted.mT @ rays
+        along = weighted.mT @ (rays[..., :, None] * local[..., None, :]).flatten(2)
+        centre = (weights[..., None] * local).sum(-2)
+        moved = (eye[..., None] * centre[:, None, None]).flatten(2) - along
         solution = torch.linalg.solve_ex(total, moved)[0]
-        return cls(form - moved.mT @ solution, -solution)
+        to_depth = (weighted.mT @ local).flatten(1) - (weighted.sum(1)[:, None] @ solution)[:, 0]
+        return cls(form - moved.mT @ solution, -solution, to_depth)
 
     def of(self, rows: Tensor) -> _Distances:
         """Those of some rows."""
@@ -167,13 +178,17 @@ class _Distances(NamedTuple):
         entries = rotations.flatten(2)
         return ((entries @ self.form) * entries).sum(-1)
 
-    def descended(self, rotations: Tensor) -> Tensor:
+    def depths(self, rotations: Tensor) -> Tensor:
+        """(B, S)."""
+        return (rotations.flatten(2) @ self.to_depth[..., None])[..., 0]
+
+    def descended(self, rotations: Tensor, steps: int) -> Tensor:
         """Rotations (B, S, 3, 3) after some steps of Levenberg and Marquardt: three unknowns each, and no points."""
         costs = self.of_rotations(rotations)
         damping = torch.full_like(costs, 1e-2)
         eye = torch.eye(3, dtype=costs.dtype, device=costs.device)
         turns = torch.linalg.cross(eye[:, None], eye[None]).mT
-        for _ in range(_STEPS):
+        for _ in range(steps):
             slopes = (turns @ rotations[:, :, None]).flatten(3)
             mapped = (slopes.flatten(1, 2) @ self.form).view_as(slopes)
             gradient = mapped @ rotations.flatten(2)[..., None]
@@ -191,6 +206,11 @@ class _Distances(NamedTuple):
 
 def _planar_rotations(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
     """(B, 2, 3, 3): of points in the plane z = 0 around its origin."""
+    return distances.descended(_planar_starts(local, rays, weights), _STEPS)
+
+
+def _planar_starts(local: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
+    """(B, 2, 3, 3): the rotations that the homography leaves."""
     homography = _homography(local, rays, weights)
     frame = _frame(normalize(homography[..., 2], dim=-1))
     # across the line of sight the columns of the rotation are known up to the distance, and the larger singular value
@@ -206,29 +226,32 @@ def _planar_rotations(local: Tensor, rays: Tensor, weights: Tensor, distances: _
     for sign in (1, -1):
         first, second = torch.cat((across, sign * along[:, None]), 1).unbind(-1)
         candidates.append(frame @ torch.stack((first, second, torch.linalg.cross(first, second)), -1))
-    return distances.descended(torch.stack(candidates, 1))
+    return torch.stack(candidates, 1)
 
 
 def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
     """(B, 2, 3, 3): of points that are not on a plane, whose main axes are the coordinates'."""
-    sight = normalize((weights[..., None] * rays).sum(-2), dim=-1)
-    frame = _frame(sight)
+    frame = _frame(normalize((weights[..., None] * rays).sum(-2), dim=-1))
     linear = torch.linalg.eigh(distances.form).eigenvectors[..., 0].view(-1, 1, 3, 3)
-    ahead = (distances.translations(linear) * sight[:, None]).sum(-1) >= 0
-    linear = torch.where(ahead[..., None, None], linear, -linear)
+    linear = torch.where(distances.depths(linear)[..., None, None] < 0, -linear, linear)
     # from afar, the two rows across the line of sight in units of the distance
     rows = (weights[..., None] * (rays @ frame[..., :2])).mT @ local
     rows = normalize(rows / (weights[..., None] * local.square()).sum(-2).clamp(min=_TINY)[:, None], dim=-1)
     from_afar = frame @ torch.cat((rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])), 1)
     nearest = _nearest_rotation(torch.cat((linear, from_afar[:, None]), 1))
-    rotations = torch.cat((nearest, frame[:, None] @ _right_turns(frame)), 1)
-    rotations = _taken(rotations, distances.of_rotations(rotations).argsort(-1)[:, :_STARTS])
-    rotations = distances.descended(rotations)
-    costs = distances.of_rotations(rotations)
-    best = _taken(rotations, costs.argmin(-1, keepdim=True))
+    planar = _planar_starts(local, rays, weights)
+    rotations = torch.cat((nearest, planar, frame[:, None] @ _right_turns(frame)), 1)
+
+    def costs(rotations: Tensor) -> Tensor:
+        return torch.where(distances.depths(rotations) > 0, distances.of_rotations(rotations), torch.inf)
+
+    for count, steps in ((_STARTS, 2), (_FEW, _STEPS)):
+        rotations = distances.descended(_taken(rotations, costs(rotations).argsort(-1)[:, :count]), steps)
+    cost = costs(rotations)
+    best = _taken(rotations, cost.argmin(-1, keepdim=True))
     # the trace of the turn between them: within 0.1 radians it is the same minimum
     same = (rotations * best).sum((-1, -2)) > 1 + 2 * math.cos(0.1)
-    other = torch.where(same, torch.inf, costs).argmin(-1, keepdim=True)
+    other = torch.where(same, torch.inf, cost).argmin(-1, keepdim=True)
     return torch.cat((best, _taken(rotations, other)), 1)
 
 
