@@ -1,27 +1,25 @@
-"""Cameras fitted to pixels of rays, by the Levenberg-Marquardt method, each row of a batch for itself."""
+"""Cameras fitted to pixels of rays, each row of a batch for itself."""
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from camtorch._arguments import columns
+from camtorch.least_squares.equations import Equations, System, padded
+from camtorch.least_squares.jacobians import SensorPoints, sensor_jacobians, to_sensor
+from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, minimise
 from camtorch.projection.rays import slopes_at_axis
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
-FURTHEST = 20.0
-"""The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
 _MOST_STEPS = 60
 _ROUNDS = 3
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e8
 _LAWSON_ROUNDS, _LAWSON_STEPS, _PATIENCE = 40, 2, 6
-_SETTLED = 1e-8  # the relative decrease of the cost that ends the search
+_SETTLED = 1e-8  # the part of the cost that is left to gain when the search ends
 _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
 _LEAST_SLOPE = 1e-3  # of a lens at the axis, that a fit starts from
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
@@ -37,28 +35,6 @@ class Observations(NamedTuple):
     def of(self, rows: Tensor) -> Observations:
         """Those of some rows."""
         return Observations(*(t[rows] for t in self))
-
-
-class SensorPoints(NamedTuple):
-    """Planes (C, N): points on the plane of the sensor, the centre where there is none, and whether there is one."""
-
-    a: Tensor
-    b: Tensor
-    covered: Tensor
-
-
-def to_sensor(camera: Camera, k: Tensor, rays: Tensor) -> SensorPoints:
-    """Rays through the chart and the lens of coefficients (C, n), whether or not they lie before a fold."""
-    chart, lens = camera.optics(columns(k))
-    x, y, z = rays.unbind(-1)
-    covered = (chart.margin(x, y, z) > 0).expand_as(x)
-    x, y, z = torch.where(covered, x, 0.0), torch.where(covered, y, 0.0), torch.where(covered, z, 1.0)
-    a, b = chart.to_plane(x, y, z, order=1)
-    covered = covered & (torch.maximum(a.abs(), b.abs()) <= FURTHEST)
-    if lens.stages:
-        a, b = lens(a, b)
-    covered = covered & torch.isfinite(a) & torch.isfinite(b)
-    return SensorPoints(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
 
 
 def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tensor) -> Tensor:
@@ -116,7 +92,7 @@ def refine_minimax(camera: Camera, observations: Observations, parameters: Tenso
         weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
         weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
         weighted = observations._replace(weights=weights)
-        parameters = _refine(camera, weighted, parameters, low, high, going, _LAWSON_STEPS, _LEAST_DAMPING)
+        parameters = _refine(camera, weighted, parameters, low, high, going, _LAWSON_STEPS, LEAST_DAMPING)
         error = _distances(observations, camera, parameters)
         better = going & (error.amax(-1) < least)
         best = torch.where(better[:, None], parameters, best)
@@ -160,37 +136,46 @@ def _cost(camera: Camera, observations: Observations, parameters: Tensor) -> Ten
     return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
 
 
-def _linearised(camera: Camera, observations: Observations, parameters: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
-    """The residuals (C, 2 N), and their derivatives (C, F, 2 N) by the parameters of indices (F,), 0 to 3 first."""
-    k = parameters[:, 4:]
-    seen = to_sensor(camera, k, observations.rays)
+class _Fit:
+    """The problem, for `levenberg_marquardt.minimise`: the state is the parameters (C, P)."""
+
+    def __init__(self, camera: Camera, observations: Observations, low: Tensor, high: Tensor):
+        self.camera, self.observations, self.low, self.high = camera, observations, low, high
+        (self.free,) = (low < high).any(0).nonzero(as_tuple=True)
+
+    def cost(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:
+        """(R,)."""
+        return _cost(self.camera, self.observations.of(rows), state[0])
+
+    def linearised(self, state: tuple[Tensor, ...], rows: Tensor) -> System:
+        """At parameters."""
+        (parameters,), free = state, self.free
+        residuals, slopes = _linearised(self.camera, self.observations.of(rows), parameters)
+        slope, values = (slopes @ residuals[..., None])[:, free, 0], parameters[:, free]
+        # what would leave its bounds stays there, so that the others can move on
+        held = (values <= self.low[rows][:, free]) & (slope > 0) | (values >= self.high[rows][:, free]) & (slope < 0)
+        columns = torch.cat((slopes[:, free], residuals[:, None]), 1).mT
+        triangle = torch.linalg.qr(padded(columns), mode="r").R
+        none = triangle.new_zeros(len(rows), 0, 0, triangle.shape[-1])
+        return System(Equations(none, triangle), 0, held)
+
+    def moved(self, state: tuple[Tensor, ...], step: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
+        """Within the bounds."""
+        new = state[0].clone()
+        new[:, self.free] += step[1]
+        return (new.clamp(self.low[rows], self.high[rows]),)
+
+
+def _linearised(camera: Camera, observations: Observations, parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """The residuals (C, 2 N), and their derivatives (C, P, 2 N) by the parameters."""
+    seen, _, by_k = sensor_jacobians(camera, parameters[:, 4:], observations.rays)
     fx, fy, _, _ = columns(parameters[:, :4])
     zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
     derivatives = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
     slopes = torch.stack([torch.stack(pair, 1) for pair in derivatives], 1)
-    if len(free) > 4:
-        along = torch.eye(k.shape[-1], dtype=k.dtype, device=k.device)[free[4:] - 4]
-        by_k = _derivatives(camera, k, observations.rays, along)
-        slopes = torch.cat((slopes, by_k * torch.stack((fx, fy), 1)[:, None]), 1)
-    # where a derivative is no number, as at the end of a chart, a step goes without it
-    slopes = slopes.nan_to_num(0.0, 0.0, 0.0) * observations.weights[:, None, None]
+    slopes = torch.cat((slopes, by_k.transpose(1, 2) * torch.stack((fx, fy), 1)[:, None]), 1)
+    slopes = slopes * observations.weights[:, None, None]
     return _residuals(observations, parameters, seen).flatten(1), slopes.flatten(2)
-
-
-def _derivatives(camera: Camera, k: Tensor, rays: Tensor, directions: Tensor) -> Tensor:
-    """(C, D, 2, N): of `to_sensor` by the coefficients (C, n), along directions (D, n).
-
-    The directions are rows more: vmap over the derivatives of one would take Python's word for many operations.
-    """
-    count = len(directions)
-    with warnings.catch_warnings(), forward_ad.dual_level():
-        # on its first use forward mode loads what calls the deprecated torch.jit.script
-        warnings.simplefilter("ignore", DeprecationWarning)
-        dual = forward_ad.make_dual(k.repeat_interleave(count, 0), directions.repeat(len(k), 1))
-        seen = to_sensor(camera, dual, rays.repeat_interleave(count, 0))
-        tangents = [forward_ad.unpack_dual(plane).tangent for plane in seen[:2]]
-    planes = [torch.zeros_like(seen.a) if t is None else t for t in tangents]
-    return torch.stack(planes, 1).unflatten(0, (len(k), count))
 
 
 def _refine(
@@ -201,49 +186,12 @@ def _refine(
     high: Tensor,
     going: Tensor,
     steps: int = _MOST_STEPS,
-    first_damping: float = _FIRST_DAMPING,
+    first_damping: float = FIRST_DAMPING,
 ) -> Tensor:
     """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
-    parameters = parameters.clone()
-    cost = _cost(camera, observations, parameters)
-    damping = torch.full_like(cost, first_damping)
     tiny = _NOTHING**2 * observations.weights.sum(-1)
-    going = going & torch.isfinite(cost) & (cost > tiny)
-    (free,) = (low < high).any(0).nonzero(as_tuple=True)
-    for _ in range(steps):
-        rows = going.nonzero()[:, 0]
-        if len(rows) == 0:
-            break
-        # rows that have settled are left alone, so that each goes the way that it would go alone
-        these, old, weight = observations.of(rows), parameters[rows], damping[rows]
-        residuals, slopes = _linearised(camera, these, old, free)
-        # what would leave its bounds stays there, so that the others can move on
-        slope = (slopes @ residuals[..., None])[..., 0]
-        at_low, at_high = ((old <= low[rows])[:, free], (old >= high[rows])[:, free])
-        held = at_low & (slope > 0) | at_high & (slope < 0)
-        step = torch.zeros_like(old)
-        step[:, free] = _step(residuals, torch.where(held[..., None], 0.0, slopes), weight)
-        new = (old + step).clamp(low[rows], high[rows])
-        new_cost = _cost(camera, these, new)
-        better = new_cost < cost[rows]
-        settled = better & (cost[rows] - new_cost <= _SETTLED * cost[rows]) & (weight <= 1e-6)
-        stuck = ~better & (weight >= _MOST_DAMPING)
-        parameters[rows] = torch.where(better[:, None], new, old)
-        cost[rows] = torch.where(better, new_cost, cost[rows])
-        damping[rows] = torch.where(better, weight / 10, weight * 10).clamp(_LEAST_DAMPING, _MOST_DAMPING)
-        going[rows] = ~(settled | stuck | (cost[rows] <= tiny[rows]))
-    return parameters
-
-
-def _step(residuals: Tensor, slopes: Tensor, damping: Tensor) -> Tensor:
-    """(C, P): the damped step of Gauss and Newton; none where its equations have no solution."""
-    # the columns differ by many orders of magnitude
-    scale = slopes.square().sum(-1).sqrt()
-    scale = torch.where(scale > 0, scale, 1.0)
-    # the columns of high powers are nearly the same: normal equations would square that
-    damped = torch.diag_embed(damping.sqrt()[:, None].expand(scale.shape))
-    q, r = torch.linalg.qr(torch.cat((slopes / scale[..., None], damped), -1).mT)
-    count = residuals.shape[-1]
-    right = q[:, :count].mT @ -residuals[..., None]
-    step = torch.linalg.solve_triangular(r, right, upper=True)[..., 0] / scale
-    return torch.where(torch.isfinite(step).all(-1, keepdim=True), step, 0.0)
+    problem = _Fit(camera, observations, low, high)
+    found = minimise(
+        problem, (parameters,), tolerance=_SETTLED, tiny=tiny, going=going, steps=steps, damping=first_damping
+    )
+    return found.state[0]

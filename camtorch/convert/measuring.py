@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from camtorch.convert import views
-from camtorch.convert.least_squares import to_sensor
+from camtorch.least_squares.jacobians import to_sensor
 from camtorch.projection.rays import image_edges, ray_fan
 
 if TYPE_CHECKING:

@@ -1,0 +1,118 @@
+"""Linearised least squares as triangles of a QR: of what each view has for itself, and of what all of them share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Equations(NamedTuple):
+    """Triangles of the linearised problem; the unknowns are six numbers a view, and G that all views share.
+
+    A row of `view`, (B, V, L, L + G + 1), says: view[:L] * step of the view + view[L:-1] * shared step = -view[-1], and
+    one of `shared`, (B, G + 1, G + 1), what is left of all views. `columns`: (G,) names of the shared unknowns, pairs
+    of the camera (-1 for the board's bend) and the index of a parameter, 4 + n and on for its mount.
+    """
+
+    view: Tensor
+    shared: Tensor
+    columns: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def decrement(self) -> Tensor:
+        """(B,) by how much the cost would fall if the problem were linear."""
+        return self.view[..., -1].square().sum((-1, -2)) + self.shared[:, :-1, -1].square().sum(-1)
+
+
+class System:
+    """Linear problems with their damped steps: what `levenberg_marquardt.minimise` asks for."""
+
+    def __init__(self, equations: Equations, width: int, held: Tensor):
+        self.width = width
+        if bool(held.any()):
+            keep = torch.nn.functional.pad(~held, (width, 1), value=True)
+            equations = Equations(
+                torch.where(keep[:, None, None], equations.view, 0.0),
+                torch.where(keep[:, None, width:], equations.shared, 0.0),
+                equations.columns,
+            )
+            # without a column the rest is no triangle any more
+            equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
+        self.equations, self.decrement = equations, equations.decrement
+
+    def step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Of the views (R, V, L), and of what they share (R, G); and by how much the linear problem's cost falls."""
+        view, shared, width = self.equations.view, self.equations.shared, self.width
+        squares = view[..., :-1].square().sum(-2)
+        root = damping.sqrt()
+        rest = shared.shape[-1] - 1
+        if width:
+            scale = squares[..., :width].sqrt()
+            scale = torch.where(scale > 0, scale, 1.0) * root[:, None, None]
+            damped = torch.cat((torch.diag_embed(scale), view.new_zeros(*scale.shape, rest + 1)), -1)
+            if rest:
+                view = torch.linalg.qr(torch.cat((view, damped), -2), mode="r").R
+                left = view[..., width:, width:].flatten(1, 2)
+                view = view[..., :width, :]
+            else:
+                view = triangle_of_few(torch.cat((view, damped), -2))
+                left = view.new_zeros(len(view), 0, 1)
+        else:
+            left = view.new_zeros(len(view), 0, rest + 1)
+        if rest:
+            scale = (squares[..., width:].sum(1) + shared[:, :-1, :-1].square().sum(-2)).sqrt()
+            scale = torch.where(scale > 0, scale, 1.0)
+            damped = torch.nn.functional.pad(torch.diag_embed(root[:, None].expand_as(scale)), (0, 1))
+            # columns differ by many orders of magnitude
+            by = torch.nn.functional.pad(scale, (0, 1), value=1.0)[:, None]
+            triangle = torch.linalg.qr(torch.cat((shared / by, left / by, damped), 1), mode="r").R
+            whole = -_solved(triangle[:, :rest, :rest], triangle[:, :rest, -1:])[..., 0] / scale
+        else:
+            whole = shared.new_zeros(len(shared), 0)
+        if width:
+            right = view[..., -1:] + view[..., width:-1] @ whole[:, None, :, None]
+            of_views = -_solved(view[..., :width], right)[..., 0]
+        else:
+            of_views = view.new_zeros(*view.shape[:2], 0)
+        fine = torch.isfinite(whole).all(-1) & torch.isfinite(of_views).all(-1).all(-1)
+        of_views, whole = torch.where(fine[:, None, None], of_views, 0.0), torch.where(fine[:, None], whole, 0.0)
+        return (of_views, whole), self.decrement - self._left(of_views, whole)
+
+    def _left(self, of_views: Tensor, whole: Tensor) -> Tensor:
+        """(R,) what of the decrement a step leaves."""
+        view, shared = self.equations.view, self.equations.shared[:, :-1]
+        mine = (view[..., :-1] @ torch.cat((of_views, whole[:, None].expand(-1, view.shape[1], -1)), -1)[..., None])[
+            ..., 0
+        ]
+        ours = (shared[..., :-1] @ whole[..., None])[..., 0]
+        return (mine + view[..., -1]).square().sum((-1, -2)) + (ours + shared[..., -1]).square().sum(-1)
+
+
+def triangle_of_few(rows: Tensor) -> Tensor:
+    """(..., L, L + 1): a triangle of rows (..., M, L + 1), of few columns that are well apart."""
+    matrix, right = rows[..., :-1], rows[..., -1:]
+    squares = matrix.mT @ matrix
+    scale = squares.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where(scale > 0, scale, 1.0).rsqrt()
+    scaled = squares * scale[..., None] * scale[..., None, :]
+    # a view in which nothing is seen, or too little, stays where it is
+    scaled = scaled + torch.diag_embed(torch.full_like(scale, 1e-14))
+    lower, _ = torch.linalg.cholesky_ex(scaled)
+    turned = torch.linalg.solve_triangular(lower, scale[..., None] * (matrix.mT @ right), upper=False)
+    return torch.cat((lower.mT / scale[..., None, :], turned), -1)
+
+
+def _solved(triangle: Tensor, right: Tensor) -> Tensor:
+    """Where the triangle is zero, nothing."""
+    diagonal = triangle.diagonal(dim1=-2, dim2=-1)
+    empty = diagonal == 0
+    triangle = triangle + torch.diag_embed(empty.to(triangle.dtype))
+    return torch.linalg.solve_triangular(triangle, torch.where(empty[..., None], 0.0, right), upper=True)
+
+
+def padded(rows: Tensor) -> Tensor:
+    """Rows (..., M, K), at least K of them."""
+    missing = rows.shape[-1] - rows.shape[-2]
+    return torch.nn.functional.pad(rows, (0, 0, 0, missing)) if missing > 0 else rows
