@@ -1,0 +1,233 @@
+"""How far a calibration can be trusted: what the noise of the corners does to parameters and to projections."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, as_values
+from camtorch.calibration.bundle import Adjusted, Equations, robust
+from camtorch.camera import Camera, from_values
+from camtorch.least_squares.jacobians import sensor_jacobians
+
+_PIXELS = 1 << 15  # that are looked at together
+
+
+class Spread(NamedTuple):
+    """How the noise of the corners moves a camera and its frame, of B problems.
+
+    Independent numbers of variance 1 move the P = 4 + n parameters, the frame's turn (a rotation vector, radians) and
+    its shift by the rows of `factor` (B, P + 6, K). The turn and the shift are those of the mean over the boards, each
+    carried along by its own pose: a calibration finds the lens and the poses together, and where it gets one wrong it
+    makes up for it by the other. model: the class. parameters: (B, P).
+    """
+
+    model: type[Camera]
+    parameters: Tensor
+    factor: Tensor
+
+    @property
+    def covariance(self) -> Tensor:
+        """(B, P, P) of the parameters; zeros for those that were fixed."""
+        own = self.factor[:, : self.parameters.shape[-1]]
+        return own @ own.mT
+
+    @property
+    def std(self) -> Tensor:
+        """(B, P)."""
+        return torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
+
+    def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
+        """(B, M, 2, 2) covariances, in px^2, of where points are seen that lie at pixels; NaN where one has no ray.
+
+        What is seen is taken into the frame of every board by its pose, and back by the pose that the noise made of it;
+        the mean of all these is projected by the camera that the noise made: mrcal's mean-pcam.
+
+        Args:
+            pixels: (B, M, 2).
+            distance: (B, M) from the camera; infinite for directions.
+        """
+        parts = zip(pixels.split(_PIXELS, 1), distance.split(_PIXELS, 1), strict=True)
+        return torch.cat([self._of_pixels(*part) for part in parts], 1)
+
+    def _of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
+        intrinsics, k = self.parameters[:, :4], self.parameters[:, 4:]
+        rays, valid = from_values(self.model._model, intrinsics, k, (1, 1)).unproject(pixels)
+        found = sensor_jacobians(self.model, k, rays)
+        points, zero, one = found.points, torch.zeros_like(rays[..., 0]), torch.ones_like(rays[..., 0])
+        focal = intrinsics[:, None, :2, None]
+        by_intrinsics = torch.stack(
+            [torch.stack(pair, -1) for pair in ((points.a, zero), (zero, points.b), (one, zero), (zero, one))], -1
+        )
+        by_k, by_ray = found.by_k.permute(0, 3, 1, 2) * focal, found.by_ray.permute(0, 3, 1, 2) * focal
+        by_turn = torch.linalg.cross(rays[:, :, None].expand_as(by_ray), by_ray, dim=-1)
+        slopes = torch.cat((by_intrinsics, by_k, by_turn, by_ray / distance[..., None, None]), -1)
+        moved = slopes @ self.factor[:, None]
+        known = valid & points.covered
+        return torch.where(known[..., None, None], moved @ moved.mT, torch.nan)
+
+
+def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) -> Spread:
+    """That of one camera at an optimum.
+
+    Args:
+        adjusted: the optimum.
+        model: the camera's class.
+        camera: which of the cameras it is.
+        noise: (B,) of the corners, px per coordinate.
+    """
+    equations, state = adjusted.equations, adjusted.state
+    parameters, mounts = state.parameters[camera], state.mounts
+    shared = shared_factor(equations)
+    frame = _frame_factor(equations, state.boards.translations, shared)
+    count = parameters.shape[-1]
+    own = shared.new_zeros(len(shared), count + 6, shared.shape[-1])
+    for g, (c, i) in enumerate(equations.columns):
+        if c == camera:
+            own[:, i] = shared[:, g]
+    turn, shift = own[:, count : count + 3], own[:, count + 3 :]
+    # of the frame of the first camera, in that of this one
+    rotation = mounts.rotations[:, camera]
+    none = frame.new_zeros(len(frame), 3, frame.shape[-1] - shared.shape[-1])
+    turn = torch.cat((turn, none), -1) + rotation @ frame[:, :3]
+    shift = torch.cat((shift, none), -1) + rotation @ frame[:, 3:]
+    shift = shift + _cross_matrix(mounts.translations[:, camera]) @ turn
+    own = torch.cat((own[:, :count], none[:, :1].expand(-1, count, -1)), -1)
+    factor = torch.cat((own, turn, shift), 1) * noise[:, None, None]
+    return Spread(model, parameters.expand(len(factor), -1), factor)
+
+
+def noise_under(
+    loss: str | None, loss_scale: float, residuals: Sequence[Tensor], seen: Sequence[Tensor], free: int
+) -> Tensor:
+    """(B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
+
+    Without a loss it is sqrt(sum of squares / (2 N - free)). A robust loss with weights w of squares pulls with the
+    force w r, which gives way by the mean of w + s dw/ds where residuals of squared length s move, and by the mean of w
+    in the weighted problem: this is sqrt(mean(w^2 r^2) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator. It
+    holds where outliers fall on all corners alike, and they widen the intervals of a Huber loss as they widen its
+    estimates; of a view that is nothing but outliers it knows nothing.
+
+    Args:
+        loss: as `adjust` takes it.
+        loss_scale: likewise.
+        residuals: of each camera (B, V, N, 2).
+        seen: of each camera (B or 1, V, N) bool.
+        free: how many parameters were free, poses included.
+    """
+    force = weight = slope = count = residuals[0].new_zeros(())
+    for moved, here in zip(residuals, seen, strict=True):
+        squares = moved.square().sum(-1)
+        _, weights = robust(loss, loss_scale, squares)
+        change = torch.zeros_like(weights)
+        if loss == "huber":
+            change = torch.where(weights < 1, -weights / 2, 0.0)
+        elif loss == "cauchy":
+            change = weights * (weights - 1)
+        terms = weights.square() * squares, weights, weights + change, torch.ones_like(weights)
+        sums = [(term * here).sum((-1, -2)) for term in terms]
+        force, weight, slope, count = (t + new for t, new in zip((force, weight, slope, count), sums, strict=True))
+    return (force / (2 * count - free).clamp(min=1) * weight * count).sqrt() / slope.clamp(min=1)
+
+
+def shared_factor(equations: Equations) -> Tensor:
+    """(B, G, G) F, of which F F^T times the variance of the noise is the covariance of what all views share.
+
+    A combination of the unknowns that the data leave open has a variance that is huge, but no infinity.
+    """
+    triangle = equations.shared[:, :-1, :-1]
+    if not triangle.shape[-1]:
+        return triangle
+    # the columns differ by many orders of magnitude
+    scale = torch.linalg.vector_norm(triangle, dim=-2)
+    scale = torch.where(scale > 0, scale, 1.0)
+    _, sizes, axes = torch.linalg.svd(triangle / scale[:, None])
+    least = torch.finfo(sizes.dtype).eps * sizes[:, :1].clamp(min=torch.finfo(sizes.dtype).tiny)
+    return axes.mT / torch.maximum(sizes, least)[:, None] / scale[..., None]
+
+
+def _frame_factor(equations: Equations, translations: Tensor, shared: Tensor) -> Tensor:
+    """(B, 6, G + 6): the turn and the shift, the mean of all boards, that stem from `shared`, and from their own noise.
+
+    A view's own step is -R11^-1 (R12 s + e), where s are the shared unknowns and e noise that is independent of them.
+    """
+    view, batch, count = equations.view, len(shared), shared.shape[-1]
+    width = view.shape[-2]
+    if not width:
+        return shared.new_zeros(batch, 6, count + 6)
+    corner, right = view[..., :width], view[..., width:-1]
+    diagonal = corner.diagonal(dim1=-2, dim2=-1).abs()
+    # a view in which too little is seen has no pose to go by
+    seen = (diagonal > torch.finfo(view.dtype).eps * diagonal.amax(-1, keepdim=True)).all(-1)
+    eye = torch.eye(width, dtype=view.dtype, device=view.device)
+    corner = torch.where(seen[..., None, None], corner, eye)
+    inverse = torch.linalg.solve_triangular(corner, eye.expand_as(corner), upper=True)
+    share = seen.to(view.dtype) / seen.sum(-1, keepdim=True).clamp(min=1)
+    inverse = inverse * share[..., None, None]
+    if width == 6:
+        turn = inverse[..., :3, :]
+        # about the origin, not the board
+        shift = inverse[..., 3:, :] + _cross_matrix(translations) @ turn
+    else:
+        turn, shift = torch.zeros_like(inverse), inverse
+    carried = torch.cat((turn, shift), -2)
+    by_shared = -(carried @ right).sum(1)
+    by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, V L)
+    missing = max(0, 6 - by_noise.shape[-1])
+    rows = torch.nn.functional.pad(by_noise.mT, (0, 0, 0, missing))
+    return torch.cat((by_shared @ shared, torch.linalg.qr(rows, mode="r").R.mT), -1)
+
+
+def _cross_matrix(vectors: Tensor) -> Tensor:
+    """(..., 3, 3): that of the product v x."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+
+
+def worst(covariances: Tensor) -> Tensor:
+    """(..., 2, 2) -> (...): the standard deviation in the direction in which it is largest."""
+    a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    return ((a + c) / 2 + torch.hypot((a - c) / 2, b)).clamp(min=0).sqrt()
+
+
+@torch.no_grad()
+def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -> Tensor:
+    """The standard deviation in px, in its worst direction, of where a calibrated camera sees what is at a pixel.
+
+    Args:
+        spread: of a single problem.
+        pixels: (..., 2).
+        distance: of what is seen, from the camera in units of the board: one, or for each pixel (...).
+
+    Returns:
+        (...) float64; NaN where a pixel has no ray.
+
+    Raises:
+        ValueError: pixels of another shape, distances that are not positive or do not fit the pixels.
+        TypeError: not numbers.
+    """
+    owner, like = "uncertainty", spread.parameters
+    pixels, distance = (
+        as_values(value, name, owner, like.device).detach().to(like)
+        for value, name in ((pixels, "pixels"), (distance, "distance"))
+    )
+    if pixels.ndim == 0 or pixels.shape[-1] != 2:
+        raise ValueError(f"{owner}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
+    if not bool((distance > 0).all()):
+        raise ValueError(
+            f"{owner}: distance must be positive, in the unit of the board, or math.inf; got {distance.tolist()}"
+        )
+    shape = pixels.shape[:-1]
+    try:
+        distance = distance.expand(shape)
+    except RuntimeError:
+        raise ValueError(
+            f"{owner}: distance must be one number, or one for each pixel {tuple(shape)}; got shape "
+            f"{tuple(distance.shape)}"
+        ) from None
+    return worst(spread.of_pixels(pixels.reshape(1, -1, 2), distance.reshape(1, -1)))[0].view(shape)
