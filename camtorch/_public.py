@@ -1,6 +1,9 @@
 """The names that `camtorch` shows: this file imports what `camtorch/__init__.py` hands out at first use."""
 
 from camtorch import augment, io
+from camtorch.calibration.calibrate import Calibration, calibrate
+from camtorch.calibration.from_rays import fit
+from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.camera import MODELS, Camera
 from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
@@ -42,6 +45,7 @@ __all__ = [
     "MODELS",
     "UCM",
     "BrownConrady",
+    "Calibration",
     "Camera",
     "CameraFileError",
     "Conversion",
@@ -64,6 +68,7 @@ __all__ = [
     "Pinhole",
     "PositiveFocal",
     "Rig",
+    "RigCalibration",
     "Stereographic",
     "Tabulated",
     "ThinPrismFisheye",
@@ -71,6 +76,9 @@ __all__ = [
     "Warp",
     "WoodScape",
     "augment",
+    "calibrate",
+    "calibrate_rig",
+    "fit",
     "io",
     "load",
     "native_available",

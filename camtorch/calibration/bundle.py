@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.camera import Camera, from_values
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise
@@ -410,12 +410,9 @@ class Bundle:
 
 def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     """A frozen camera of the model, for others that have its number of coefficients."""
-    if isinstance(model, Camera):
-        return model
-    count = parameters.shape[-1] - 4
-    usual = parameters.new_tensor([1.0, 1.0, 0.0, 0.0])
-    arguments = (usual, parameters.new_tensor(model.ideal(count))) if count else (usual,)
-    return model(*arguments).requires_grad_(False)
+    made = from_values(model._model, parameters[0, :4], parameters[0, 4:], (1, 1))
+    made._warned = True  # a step that is refused may have gone anywhere
+    return made
 
 
 def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:

@@ -42,6 +42,10 @@ class Observations(NamedTuple):
         """Those of some views, given by numbers or by a mask."""
         return Observations(*(t[views] for t in self))
 
+    def about(self, middle: Tensor) -> Observations:
+        """With the points about another origin (3,)."""
+        return self._replace(points=torch.where(self.seen[..., None], self.points - middle, 0.0))
+
 
 class Layout(NamedTuple):
     """The form in which the image points of one camera came."""

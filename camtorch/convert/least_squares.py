@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -37,7 +38,9 @@ class Observations(NamedTuple):
         return Observations(*(t[rows] for t in self))
 
 
-def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tensor) -> Tensor:
+def fit(
+    camera: Camera, observations: Observations, starts: Tensor, slopes: Tensor, held: Collection[str] = ()
+) -> Tensor:
     """The parameters (C, 4 + n) at which a camera sees the pixels of the rays as nearly as it can.
 
     Rays that the camera's chart never covers do not count. No row depends on another.
@@ -47,6 +50,7 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
         observations: what it shall see.
         starts: (S, C, n) coefficients to start from; of what becomes of them the best is kept.
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
+        held: names of coefficients that stay as they start.
     """
     results, scores = [], []
     tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
@@ -54,7 +58,7 @@ def fit(camera: Camera, observations: Observations, starts: Tensor, slopes: Tens
     for start in starts:
         focal = slopes[:, :2] / slopes_at_axis(camera.optics, start).clamp(min=_LEAST_SLOPE)
         parameters = torch.cat((focal, slopes[:, 2:], start), -1)
-        low, high = _bounds(camera, parameters)
+        low, high = _bounds(camera, parameters, held)
         parameters = parameters.clamp(low, high)
         within = observations._replace(weights=torch.zeros_like(observations.weights))
         for _ in range(_ROUNDS):
@@ -108,13 +112,13 @@ def _distances(observations: Observations, camera: Camera, parameters: Tensor) -
     )
 
 
-def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
+def _bounds(camera: Camera, parameters: Tensor, held: Collection[str] = ()) -> tuple[Tensor, Tensor]:
     """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
     low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
     low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
     for i, name in enumerate(camera.distortion_names, 4):
-        if name in camera.fit_bounds:
-            low[:, i], high[:, i] = camera.fit_bounds[name] or (parameters[:, i], parameters[:, i])
+        ends = None if name in held else camera.fit_bounds.get(name, (-torch.inf, torch.inf))
+        low[:, i], high[:, i] = ends or (parameters[:, i], parameters[:, i])
     return low, high
 
 

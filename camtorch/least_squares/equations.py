@@ -26,6 +26,9 @@ class Equations(NamedTuple):
         return self.view[..., -1].square().sum((-1, -2)) + self.shared[:, :-1, -1].square().sum(-1)
 
 
+_FIRM = 1e-4  # of the largest singular value: what is less belongs to unknowns that the data hardly determine
+
+
 class System:
     """Linear problems with their damped steps: what `levenberg_marquardt.minimise` asks for."""
 
@@ -41,6 +44,19 @@ class System:
             # without a column the rest is no triangle any more
             equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
         self.equations, self.decrement = equations, equations.decrement
+
+    @property
+    def firm_decrement(self) -> Tensor:
+        """(R,) the decrement without combinations of unknowns that the data hardly determine."""
+        view, shared = self.equations.view[..., -1], self.equations.shared
+        if shared.shape[-1] == 1:
+            return self.decrement
+        matrix = shared[:, :-1, :-1]
+        scale = torch.linalg.vector_norm(matrix, dim=-2, keepdim=True)
+        axes, sizes, _ = torch.linalg.svd(matrix / torch.where(scale > 0, scale, 1.0))
+        along = (axes.mT @ shared[:, :-1, -1:])[..., 0]
+        firm = sizes > _FIRM * sizes[:, :1]
+        return view.square().sum((-1, -2)) + torch.where(firm, along, 0.0).square().sum(-1)
 
     def step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """Of the views (R, V, L), and of what they share (R, G); and by how much the linear problem's cost falls."""

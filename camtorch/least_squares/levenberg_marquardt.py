@@ -21,6 +21,11 @@ class System(Protocol):
     decrement: Tensor
     """(R,) by how much their costs would fall, were they linear."""
 
+    @property
+    def firm_decrement(self) -> Tensor:
+        """(R,) likewise, but for combinations of unknowns that hardly matter, along which no problem is linear."""
+        ...
+
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
         """The damped step of Gauss and Newton, zero where there is none, and (R,) by how much the linear costs fall.
 
@@ -111,6 +116,8 @@ def minimise(
         weights[rows] = (weight * torch.where(better, factor, growth[rows])).clamp(LEAST_DAMPING, MOST_DAMPING)
         growth[rows] = torch.where(better, 4.0, growth[rows] * 2).clamp(max=64.0)
         settled = last | (cost[rows] <= tiny[rows])
+        if bool(stuck.any()):
+            settled = settled | stuck & (system.firm_decrement <= tolerance[rows] * before)
         converged[rows] = settled
         going[rows] = ~(settled | stuck)
         if progress is not None:

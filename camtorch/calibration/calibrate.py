@@ -1,0 +1,366 @@
+"""One camera from what it saw of known boards: `calibrate` and its result."""
+
+from __future__ import annotations
+
+import math
+import warnings as python_warnings
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.utils.parametrize import type_before_parametrizations
+
+from camtorch._arguments import as_whole
+from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Sight, State, adjust
+from camtorch.calibration.observations import Layout, Observations, Points, as_observations
+from camtorch.calibration.start import poses_for, start_from_nothing
+from camtorch.calibration.uncertainty import Spread, spread, uncertainty
+from camtorch.camera import MODELS, Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.rotations import rotation_vector
+
+INTRINSICS = ("fx", "fy", "cx", "cy")
+STEPS = 300
+_OUTLIER = 3.0  # standard deviations
+_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class Model:
+    """Which camera is asked for: a class, its number of coefficients, a camera to start from or None, what is held."""
+
+    kind: type[Camera]
+    count: int
+    start: Camera | None
+    free: Tensor
+    """(4 + n,) bool, on the CPU."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters."""
+        return (*INTRINSICS, *(self.kind.names_of(self.count) or ()))
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether nothing of it learns."""
+        return not bool(self.free.any())
+
+
+def as_model(
+    model: type[Camera] | str | Camera,
+    count: int | None,
+    start: Camera | None,
+    fixed: Collection[str] | str,
+    owner: str,
+) -> Model:
+    """What the arguments of `calibrate` say about the camera.
+
+    Raises:
+        ValueError: no such model, a number of coefficients that it does not take, unknown names in `fixed`, a start
+            that is another model, that has a batch, or that is missing where a focal length is fixed. TypeError: no
+            model.
+    """
+    if isinstance(model, Camera):
+        if start is not None:
+            raise ValueError(f"{owner}: model is a camera to start from already; got start={start!r} as well")
+        start, model = model, type_before_parametrizations(model)
+    if isinstance(model, str):
+        if model not in MODELS:
+            raise ValueError(f"{owner}: no model has the key {model!r}; there are {', '.join(sorted(MODELS))}")
+        model = MODELS[model]
+    if not (isinstance(model, type) and issubclass(model, Camera)):
+        raise TypeError(f"{owner}: model must be a class of cameras, its key, or a camera; got {model!r}")
+    if start is not None:
+        start = _as_start(start, model, owner)
+        if count is not None and count != start.distortion.shape[-1]:
+            raise ValueError(f"{owner}: count={count}, and the start has {start.distortion.shape[-1]} coefficients")
+        count = start.distortion.shape[-1]
+    count = model.default_count if count is None else as_whole(count, "count", owner)
+    names = model.names_of(count) if count >= 0 else None
+    if names is None:
+        raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}; got count={count}")
+    names = (*INTRINSICS, *names)
+    fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
+    unknown = [name for name in fixed if name not in names]
+    if unknown:
+        raise ValueError(
+            f"{owner}: fixed names {', '.join(map(repr, unknown))}; {model.__name__} has {', '.join(names)}"
+        )
+    if start is None and {"fx", "fy"} & set(fixed):
+        raise ValueError(f"{owner}: a focal length is held at its value of the start; give start=a camera")
+    return Model(model, count, start, torch.tensor([name not in fixed for name in names]))
+
+
+def _as_start(start: Camera, model: type[Camera], owner: str) -> Camera:
+    if not isinstance(start, Camera):
+        raise TypeError(f"{owner}: start must be a camera; got {type(start).__name__}")
+    if type_before_parametrizations(start) is not model:
+        raise ValueError(
+            f"{owner}: start is {type(start).__name__}, and the model {model.__name__}; "
+            f"start.convert({model.__name__}).camera is one"
+        )
+    if start.batch_shape.numel() != 1:
+        raise ValueError(f"{owner}: start must be one camera; got batch_shape={tuple(start.batch_shape)}")
+    return start
+
+
+def as_loss(loss: str | None, loss_scale: float, owner: str) -> None:
+    """Refuse what is no loss."""
+    if loss is not None and loss not in LOSSES:
+        raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {loss!r}")
+    if not (math.isfinite(loss_scale) and loss_scale > 0):
+        raise ValueError(f"{owner}: loss_scale must be positive pixels; got {loss_scale}")
+
+
+@dataclass(repr=False)
+class Calibration:
+    """What `calibrate` found, and how far it can be trusted.
+
+    Units are pixels, and for poses those of the object points. The pose of a view is `extrinsics[i]`; views without a
+    corner have none, see `views`.
+    """
+
+    camera: Camera
+    """The camera: float64, an ordinary module that goes on learning."""
+    extrinsics: Extrinsics
+    """Camera from board, of batch dims (V,)."""
+    rms: float
+    """The root of the mean squared length of the residuals, per point, as OpenCV's."""
+    sigma: float
+    """The standard deviation of a coordinate of a pixel: sqrt(sum of squares / (2 N - parameters)). With a robust loss
+    that of the inliers."""
+    residuals: Any
+    """Projected minus observed, in the shape or the list form of the image points, NaN where unseen."""
+    inliers: Any
+    """Bool, in the same form: the residual is shorter than max(3 loss_scale, 3 sigma of the inliers)."""
+    parameter_names: tuple[str, ...]
+    """fx, fy, cx, cy and the names of the coefficients."""
+    spread: Spread = field(repr=False)
+    """What the noise of the corners does to the parameters and the poses."""
+    converged: bool
+    """Whether nothing was left to gain when the search ended."""
+    bend: tuple[float, float]
+    """How far the middle of the board lies off the plane of its edges, along x and y; zeros unless it was asked for."""
+    image_size: tuple[int, int]
+    views: tuple[int, ...]
+    """The numbers of the views that have poses, of those that were passed."""
+    object_points: Any = field(repr=False)
+    image_points: Any = field(repr=False)
+    observations: Observations = field(repr=False)
+    adjusted: Adjusted = field(repr=False)
+    index: int = field(default=0, repr=False)
+    """Which of the cameras that were adjusted together it is."""
+
+    @property
+    def covariance(self) -> Tensor:
+        """(P, P) of the parameters, in their order; 0 for those that were fixed."""
+        return self.spread.covariance[0]
+
+    @property
+    def std(self) -> Tensor:
+        """(P,) the standard deviations of the parameters; 0 for those that were fixed."""
+        return self.spread.std[0]
+
+    @property
+    def point_residuals(self) -> Tensor:
+        """(V, N, 2) the residuals of `observations`."""
+        return self.adjusted.residuals[self.index][0]
+
+    def uncertainty(self, pixels: Any, distance: float = math.inf) -> Tensor:
+        """How far the camera may be wrong about pixels, were it calibrated again from other pictures of such quality.
+
+        The standard deviation in the worst direction of where a point is seen, with the poses of the boards in their
+        own uncertainty: mrcal's mean-pcam.
+
+        Args:
+            pixels: (..., 2).
+            distance: from the camera, in units of the object points.
+
+        Returns:
+            (...,) px; NaN where a pixel has no ray.
+        """
+        return uncertainty(self.spread, pixels, distance)
+
+    def __repr__(self) -> str:
+        values = [*self.camera.intrinsics.tolist(), *self.camera.distortion.tolist()]
+        pairs = zip(self.parameter_names, values, self.std.tolist(), strict=True)
+        numbers = [f"  {name} = {value:.7g}" + (f" +- {std:.2g}" if std else "") for name, value, std in pairs]
+        count, seen = len(self.views), int(self.observations.seen.sum())
+        head = (
+            f"Calibration({type(self.camera).__name__}: rms {self.rms:.4g} px, sigma {self.sigma:.4g} px, "
+            f"{count} view{'s' * (count != 1)}, {seen} corners{'' if self.converged else ', NOT CONVERGED'})"
+        )
+        return "\n".join((head, *numbers))
+
+
+def calibrate(
+    model: type[Camera] | str | Camera,
+    object_points: Points,
+    image_points: Points,
+    *,
+    image_size: Sequence[int],
+    count: int | None = None,
+    start: Camera | None = None,
+    fixed: Collection[str] | str = (),
+    loss: str | None = None,
+    loss_scale: float = 1.0,
+    bend: bool = False,
+    progress: Callable[[int, float], None] | None = None,
+) -> Calibration:
+    """The camera of a model under which known points are seen where they were seen, from nothing.
+
+    No focal length has to be given, and angles may go beyond 90 degrees. Least squares of the distances in pixels, over
+    the parameters of the camera and the poses of all views.
+
+    Args:
+        model: a class of cameras, its key, or a camera to start from.
+        object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3), in the board's frame and any unit.
+        image_points: (V, N, 2) or a list of (N_i, 2), in pixels, (0, 0) the centre of the top-left one. Rows with NaN
+            are unseen.
+        image_size: (height, width), as `image.shape`.
+        count: of the coefficients; the model's default if left out.
+        start: a camera to start from, of the model.
+        fixed: names of parameters that are held ("cx", "k3", ...) where the start has them; without a start distortion
+            at zero and the principal point in the middle of the image. "all" leaves the poses alone to be found.
+        loss: None for least squares, "huber" or "cauchy" where some corners may be wrong; of a residual's length.
+        loss_scale: px, from where a robust loss grows slower.
+        bend: whether the board may be bent: two numbers more, see `Calibration.bend`.
+        progress: called after each step of the final search with its number and the cost.
+
+    Raises:
+        ValueError: bad arguments, each with what to do; a problem that has no one solution, as a single view of a plane
+            may be.
+    """
+    owner = "calibrate"
+    seen, layout = as_observations(object_points, image_points, image_size, owner)
+    asked = as_model(model, count, start, fixed, owner)
+    as_loss(loss, loss_scale, owner)
+    # about its middle a pose's turn and its shift keep apart
+    middle = middle_of([seen])
+    centred = seen.about(middle)
+    first = first_state(centred, asked, layout.image_size, loss, loss_scale)
+    sight = Sight(asked.kind, centred.points[None], centred.pixels[None], centred.seen[None].double())
+    free = Free((asked.free.to(seen.pixels.device),), (False,), bend=bend)
+    told = None if progress is None else lambda number, cost: progress(number, float(cost))
+    adjusted = adjust([sight], first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
+    free_parameters = free_count(adjusted, [seen.seen])
+    noise = noise_of(adjusted.residuals[0][0], seen.seen, adjusted.valid[0][0], loss, loss_scale, free_parameters)
+    result = result_of(adjusted, 0, asked, seen, middle, layout, noise, (object_points, image_points))
+    if not result.converged:
+        python_warnings.warn(
+            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its warnings",
+            stacklevel=2,
+        )
+    return result
+
+
+def middle_of(seen: Iterable[Observations]) -> Tensor:
+    """(3,) of all points of boards that were seen."""
+    points = torch.cat([s.points[s.seen] for s in seen])
+    return (points.amin(0) + points.amax(0)) / 2
+
+
+def first_state(
+    seen: Observations, asked: Model, image_size: tuple[int, int], loss: str | None, loss_scale: float
+) -> State:
+    """Where to start from: nothing, or a camera that was given."""
+    if asked.start is None:
+        fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
+        return start_from_nothing(
+            seen, asked.kind, asked.count, image_size, fixed=fixed, loss=loss, loss_scale=loss_scale
+        )
+    given = (t.detach().to(seen.pixels).reshape(1, -1) for t in (asked.start.intrinsics, asked.start.distortion))
+    return poses_for(torch.cat(tuple(given), -1), seen, asked.kind, image_size)
+
+
+def noise_of(
+    residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: int
+) -> tuple[Tensor, Tensor]:
+    """The inliers, bool (V, N), and sigma: that of all residuals, with a robust loss that of the inliers.
+
+    A residual of an inlier is shorter than max(3 loss_scale, 3 sigma of the inliers).
+
+    Args:
+        residuals: (V, N, 2).
+        seen: (V, N) bool.
+        valid: (V, N) bool; where it is not, nothing fits.
+        loss: as `calibrate` takes it.
+        loss_scale: px.
+        free: the number of parameters that were free.
+    """
+    lengths = torch.linalg.vector_norm(residuals, dim=-1)
+    inliers = seen & valid
+    whole = sigma = _sigma_of(lengths[inliers], free)
+    for _ in range(_ROUNDS):
+        found = seen & valid & (lengths < _OUTLIER * max(loss_scale, float(sigma)))
+        if torch.equal(found, inliers):
+            break
+        inliers, sigma = found, _sigma_of(lengths[found], free)
+    return inliers, whole if loss is None else sigma
+
+
+def _sigma_of(lengths: Tensor, free: int) -> Tensor:
+    """The standard deviation of a coordinate from the lengths of residuals, (N,)."""
+    return (lengths.square().sum() / max(2 * len(lengths) - free, 1)).sqrt()
+
+
+def free_count(adjusted: Adjusted, seen: Sequence[Tensor]) -> int:
+    """How many parameters were free, poses of boards that were seen included. seen: (V, N) of each camera."""
+    views = torch.stack([s.any(-1) for s in seen]).any(0)
+    return len(adjusted.equations.columns) + 6 * int(views.sum())
+
+
+def result_of(
+    adjusted: Adjusted,
+    camera: int,
+    asked: Model,
+    seen: Observations,
+    middle: Tensor,
+    layout: Layout,
+    noise: tuple[Tensor, Tensor],
+    passed: tuple[Any, Any],
+) -> Calibration:
+    """The result for one of the cameras.
+
+    Args:
+        adjusted: the optimum, with the boards about their middle.
+        camera: which one.
+        asked: its model.
+        seen: what it saw, in the frame of the boards as they were passed.
+        middle: (3,) of the boards.
+        layout: of its image points.
+        noise: inliers (V, N) bool, and sigma.
+        passed: the object points and image points as they came.
+    """
+    inliers, sigma = noise
+    state, residuals = adjusted.state, adjusted.residuals[camera][0]
+    parameters = state.parameters[camera][0]
+    arguments = (parameters[:4], parameters[4:]) if asked.count else (parameters[:4],)
+    made = asked.kind(*arguments, image_size=layout.image_size)
+    rotations, translations = (t[0] for t in state.boards)
+    mount = tuple(t[0, camera] for t in state.mounts)
+    rotations, translations = mount[0] @ rotations, translations @ mount[0].mT + mount[1]
+    translations = translations - rotations @ middle
+    found = spread(adjusted, asked.kind, camera, sigma.reshape(1))
+    whole = torch.where(seen.seen, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
+    return Calibration(
+        camera=made,
+        extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations),
+        rms=float((whole.square().sum() / seen.seen.sum().clamp(min=1)).sqrt()),
+        sigma=float(sigma),
+        residuals=layout.restore(residuals),
+        inliers=layout.restore(inliers),
+        parameter_names=asked.names,
+        spread=found,
+        converged=bool(adjusted.converged[0]) and bool((adjusted.valid[camera][0] | ~seen.seen).all()),
+        bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
+        image_size=layout.image_size,
+        views=tuple(layout.views.tolist()),
+        object_points=passed[0],
+        image_points=passed[1],
+        observations=seen,
+        adjusted=adjusted,
+        index=camera,
+    )

@@ -1,0 +1,160 @@
+"""A camera from pixels and their rays, whatever predicted them: `fit`."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, as_image_size, as_values
+from camtorch.calibration.calibrate import as_model
+from camtorch.camera import Camera, from_values
+from camtorch.convert import least_squares, views
+from camtorch.convert.conversion import Conversion
+from camtorch.models import UCM
+from camtorch.projection.rays import angles_from_axis
+
+_ALPHAS = (0.0, 0.35, 0.5, 0.6, 0.65, 0.75)
+"""Of the unified lenses that are tried first: perspective for 0, stereographic for 1/2, nearly equidistant for 0.65."""
+_NEAREST = 0.05  # to the plane through a unified lens' centre, in units of a ray, that a point of the first fit may be
+_LEAST = 4  # rays
+
+
+@torch.no_grad()
+def fit(
+    model: type[Camera] | str,
+    pixels: Numbers,
+    rays: Numbers,
+    *,
+    weights: Numbers | None = None,
+    image_size: tuple[int, int] | None = None,
+    count: int | None = None,
+) -> Conversion[Camera]:
+    """The camera of a model that sees rays at pixels, as nearly as it can: by least squares of the distances in px.
+
+    The rays may come from a network, from a table, from a lens designer's program; where they are not known, the weight
+    is 0, or they are NaN. How far the result is from them is said in `Conversion.rms` and `max_error`, in px.
+
+    Args:
+        model: a class of cameras, or its key.
+        pixels: (*N, 2).
+        rays: (*N, 3) for one camera, or (*B, *N, 3) for a batch of them, of any length, in the camera's frame.
+        weights: of the squared errors, broadcast against the rays' (*B, *N); 1 if left out.
+        image_size: (height, width) of the camera that is made.
+        count: of the coefficients; the model's default if left out.
+
+    Returns:
+        The camera, float64, and how far it is from the rays: compared are the pixels of those that count.
+
+    Raises:
+        ValueError: shapes that do not fit, fewer than four rays, rays and pixels that no lens looking along z makes.
+        TypeError: no model, no numbers.
+    """
+    owner = "fit"
+    asked = as_model(model, count, None, (), owner)
+    size = as_image_size(image_size, owner)
+    given_pixels = as_values(pixels, "pixels", owner).detach().double()
+    given_rays = as_values(rays, "rays", owner).detach().double()
+    dims = given_pixels.ndim - 1
+    is_pixels = dims > 0 and given_pixels.shape[-1] == 2
+    if not is_pixels or given_rays.shape[-1:] != (3,) or given_rays.shape[-1 - dims : -1] != given_pixels.shape[:-1]:
+        raise ValueError(
+            f"{owner}: pixels must be (*N, 2) and rays (*N, 3), or (*B, *N, 3); got pixels "
+            f"{tuple(given_pixels.shape)} and rays {tuple(given_rays.shape)}"
+        )
+    batch = given_rays.shape[: given_rays.ndim - 1 - dims]
+    seen = _observations(given_pixels, given_rays, weights, dims, owner)
+    counted = (seen.weights > 0).sum(-1)
+    if not bool((counted >= _LEAST).all()):
+        raise ValueError(f"{owner}: a camera takes {_LEAST} rays at least that are finite; got {counted.tolist()}")
+    lens = _unified(seen, owner)
+    slopes = views.focal_at_axis(lens)
+    reach = torch.where(seen.weights > 0, angles_from_axis(seen.rays), 0.0).amax(-1)
+    names = asked.kind.names_of(asked.count) or ()
+    starts = asked.kind.fit_start(names, *views.radii(lens, slopes, reach.clamp(max=math.pi)))
+    ideal = slopes.new_tensor(asked.kind.ideal(asked.count)).expand(len(slopes), -1)
+    template = from_values(asked.kind._model, slopes, ideal, size or (1, 1))
+    parameters = least_squares.fit(template, seen, starts, slopes)
+    parts = parameters[:, :4].reshape(*batch, 4), parameters[:, 4:].reshape(*batch, asked.count)
+    camera = asked.kind(*parts[: 1 + (asked.count > 0)], image_size=size)
+    found, valid = from_values(asked.kind._model, parameters[:, :4], parameters[:, 4:], (1, 1)).project(seen.rays)
+    counts = seen.weights > 0
+    shown = valid & counts
+    errors = torch.where(shown, torch.linalg.vector_norm(found - seen.pixels, dim=-1), 0.0)
+    numbers = {
+        "rms": (errors.square().sum(-1) / shown.sum(-1).clamp(min=1)).sqrt(),
+        "max_error": errors.amax(-1),
+        "max_angle": torch.where(shown, angles_from_axis(seen.rays), 0.0).amax(-1),
+        "valid_fraction": shown.sum(-1) / counts.sum(-1),
+        "exact": torch.zeros_like(counts[:, 0]),
+    }
+    return Conversion(camera, **{name: t.reshape(batch) for name, t in numbers.items()}, source_name="rays")
+
+
+def _observations(
+    pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: int, owner: str
+) -> least_squares.Observations:
+    """Rows of unit rays; what is not finite, or of no length, has no weight."""
+    shape = rays.shape[:-1]
+    flat_rays = rays.reshape(-1, math.prod(shape[-dims:]), 3)
+    flat_pixels = pixels.to(rays.device).expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
+    lengths = torch.linalg.vector_norm(flat_rays, dim=-1, keepdim=True)
+    good = torch.isfinite(flat_rays).all(-1) & torch.isfinite(flat_pixels).all(-1) & (lengths[..., 0] > 0)
+    flat_weights = good.double()
+    if weights is not None:
+        given = as_values(weights, "weights", owner).detach().to(rays)
+        try:
+            given = given.expand(shape).reshape(good.shape)
+        except RuntimeError:
+            raise ValueError(
+                f"{owner}: weights must broadcast against the rays {tuple(shape)}; got {tuple(given.shape)}"
+            ) from None
+        if bool((given < 0).any()) or not bool(torch.isfinite(given).all()):
+            raise ValueError(f"{owner}: weights must be finite, and not negative")
+        # of squares: the fit weighs errors
+        flat_weights = flat_weights * given.sqrt()
+    axis = flat_rays.new_tensor([0.0, 0.0, 1.0])
+    unit = torch.where(good[..., None], flat_rays / torch.where(good[..., None], lengths, 1.0), axis)
+    return least_squares.Observations(unit, torch.where(good[..., None], flat_pixels, 0.0), flat_weights)
+
+
+def _unified(seen: least_squares.Observations, owner: str) -> Camera:
+    """The unified lenses (C,) that see the rays best, of a few: focal lengths and axis are linear in the pixels.
+
+    Raises:
+        ValueError: none has a positive focal length.
+    """
+    lenses, costs = [], []
+    x, y, z = seen.rays.unbind(-1)
+    for alpha in _ALPHAS:
+        depth = alpha + (1 - alpha) * z
+        inside = depth > _NEAREST
+        weights, depth = torch.where(inside, seen.weights, 0.0), torch.where(inside, depth, 1.0)
+        across, down = (_line(w / depth, p, weights) for w, p in zip((x, y), seen.pixels.unbind(-1), strict=True))
+        focal, centre = (torch.stack(pair, -1) for pair in zip(across[:2], down[:2], strict=True))
+        # what it does not see shall not make it better
+        share = weights.square().sum(-1) / seen.weights.square().sum(-1)
+        costs.append(torch.where((focal > 0).all(-1), across[2] + down[2], torch.inf) / share.square())
+        lenses.append(torch.cat((focal, centre, torch.full_like(focal[:, :1], alpha)), -1))
+    every = torch.stack(costs)
+    least, best = torch.where(torch.isnan(every), torch.inf, every).min(0)
+    if not bool(torch.isfinite(least).all()):
+        raise ValueError(
+            f"{owner}: no camera that looks along z, with x to the right and y down, sees these rays at these pixels. "
+            "Is their frame another one (OpenGL's looks along -z, y up), or are the pixels (row, column)?"
+        )
+    lens = torch.stack(lenses)[best, torch.arange(len(best), device=best.device)]
+    return from_values(UCM._model, lens[:, :4], lens[:, 4:], (1, 1))
+
+
+def _line(m: Tensor, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Slope, offset and mean square (C,) of the line p = slope m + offset."""
+    w = weights.square()
+    total = w.sum(-1, keepdim=True).clamp(min=torch.finfo(w.dtype).tiny)
+    middle, at = (w * m).sum(-1, keepdim=True) / total, (w * p).sum(-1, keepdim=True) / total
+    spread = (w * (m - middle).square()).sum(-1, keepdim=True)
+    slope = (w * (m - middle) * (p - at)).sum(-1, keepdim=True) / spread.clamp(min=torch.finfo(w.dtype).tiny)
+    offset = at - slope * middle
+    square = (w * (p - slope * m - offset).square()).sum(-1, keepdim=True) / total
+    return slope[:, 0], offset[:, 0], square[:, 0]

@@ -1,0 +1,315 @@
+"""Several cameras from what they saw of the same boards: `calibrate_rig` and its result."""
+
+from __future__ import annotations
+
+import math
+import warnings as python_warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State, adjust
+from camtorch.calibration.calibrate import (
+    STEPS,
+    Calibration,
+    Model,
+    as_loss,
+    as_model,
+    first_state,
+    free_count,
+    middle_of,
+    noise_of,
+    result_of,
+)
+from camtorch.calibration.observations import Observations, Points, as_rig_observations
+from camtorch.calibration.uncertainty import shared_factor
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.rig import Rig
+from camtorch.rotations import rotation_vector
+
+_LEAST = 4  # corners of a view that give a pose
+
+
+@dataclass(repr=False)
+class RigCalibration:
+    """What `calibrate_rig` found. Units are pixels, and for poses those of the object points."""
+
+    rig: Rig
+    """The cameras, float64, and for each the extrinsics: camera from the first camera."""
+    boards: Extrinsics
+    """First camera from board, of batch dims (V,)."""
+    rms: float
+    """The root of the mean squared length of the residuals of all cameras, per point."""
+    sigma: float
+    """The standard deviation of a coordinate of a pixel, in all cameras; see `Calibration.sigma`."""
+    cameras: dict[str, Calibration]
+    """What belongs to one camera, by its name: as if it had been calibrated alone, but by what all have seen."""
+    mount_std: dict[str, Tensor]
+    """(6,) the standard deviations of each camera's pose: of its turn in radians, about its own axes, and its shift."""
+    converged: bool
+    """Whether nothing was left to gain when the search ended."""
+    bend: tuple[float, float]
+    """As in `Calibration`."""
+    views: tuple[int, ...]
+    """The numbers of the views that some camera saw, of those that were passed."""
+    adjusted: Adjusted = field(repr=False)
+
+    @property
+    def residuals(self) -> dict[str, Any]:
+        """By the name of a camera: projected minus observed, in the form of its image points, NaN where unseen."""
+        return {name: camera.residuals for name, camera in self.cameras.items()}
+
+    @property
+    def inliers(self) -> dict[str, Any]:
+        """By the name of a camera, as in `Calibration`."""
+        return {name: camera.inliers for name, camera in self.cameras.items()}
+
+    @property
+    def parameter_names(self) -> dict[str, tuple[str, ...]]:
+        """By the name of a camera."""
+        return {name: camera.parameter_names for name, camera in self.cameras.items()}
+
+    @property
+    def covariance(self) -> dict[str, Tensor]:
+        """By the name of a camera, (P, P) of its parameters."""
+        return {name: camera.covariance for name, camera in self.cameras.items()}
+
+    @property
+    def std(self) -> dict[str, Tensor]:
+        """By the name of a camera, (P,) of its parameters."""
+        return {name: camera.std for name, camera in self.cameras.items()}
+
+    def __repr__(self) -> str:
+        count, boards = len(self.cameras), len(self.views)
+        state = "" if self.converged else ", NOT CONVERGED"
+        head = f"{count} cameras, {boards} views: rms {self.rms:.4g} px, sigma {self.sigma:.4g} px{state}"
+        lines = [f"RigCalibration({head})"]
+        first = next(iter(self.cameras))
+        for name, camera in self.cameras.items():
+            pose = self.rig.extrinsics[name]
+            turn, shift = pose.rotation.detach(), pose.translation.detach()
+            if name != first:
+                angle = math.degrees(float(torch.linalg.vector_norm(turn)))
+                distance = float(torch.linalg.vector_norm(shift))
+                spread = float(torch.linalg.vector_norm(self.mount_std[name][3:]))
+                lines.append(f"{name}: {distance:.6g} +- {spread:.2g} from {first}, turned by {angle:.4g} degrees")
+            lines.append(f"{name}: {camera!r}")
+        return "\n".join(lines)
+
+
+def calibrate_rig(
+    models: Mapping[str, type[Camera] | str | Camera],
+    object_points: Points,
+    image_points: Mapping[str, Points],
+    *,
+    image_sizes: Mapping[str, Sequence[int]],
+    count: int | Mapping[str, int | None] | None = None,
+    start: Mapping[str, Camera] | None = None,
+    fixed: Collection[str] | str | Mapping[str, Collection[str] | str] = (),
+    loss: str | None = None,
+    loss_scale: float = 1.0,
+    bend: bool = False,
+    progress: Callable[[int, float], None] | None = None,
+) -> RigCalibration:
+    """Cameras that see the same boards, and where they are.
+
+    Not every camera has to see every board; but each has to see some together with others, so that all are linked.
+
+    Args:
+        models: by the name of a camera: a class, its key, or a camera to start from. The first camera's frame is that
+            of the rig.
+        object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3): of the boards, the same for all cameras.
+        image_points: by the name of a camera, as `calibrate` takes them, of V views at the same times: None or NaN
+            where it did not see the board.
+        image_sizes: by the name of a camera, (height, width).
+        count: as in `calibrate`, one for all or by the name of a camera; likewise `fixed`.
+        start: by the name of a camera: cameras to start from.
+        fixed: names of parameters that are held; "all" holds a camera's intrinsics and distortion.
+        loss: as in `calibrate`; likewise the others.
+        loss_scale: px.
+        bend: whether the board may be bent.
+        progress: called after each step of the last search with its number and the cost.
+
+    Raises:
+        ValueError: what `calibrate` refuses; names that differ; cameras that no board links.
+    """
+    owner = "calibrate_rig"
+    seen, layouts = as_rig_observations(object_points, image_points, image_sizes, models, owner)
+    as_loss(loss, loss_scale, owner)
+    names = list(seen)
+    for given in (count, start, fixed):
+        stray = [name for name in given if name not in seen] if isinstance(given, Mapping) else []
+        if stray:
+            raise ValueError(
+                f"{owner}: no camera is called {', '.join(map(repr, stray))}; there are {', '.join(names)}"
+            )
+    asked = [
+        as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), f"{owner}: {name}")
+        for name in names
+    ]
+    middle = middle_of(seen.values())
+    centred = [s.about(middle) for s in seen.values()]
+    sights = [
+        Sight(m.kind, s.points[None], s.pixels[None], s.seen[None].to(s.pixels))
+        for m, s in zip(asked, centred, strict=True)
+    ]
+    alone = [
+        _alone(m, s, loss, loss_scale, layout.image_size)
+        for m, s, layout in zip(asked, centred, layouts.values(), strict=True)
+    ]
+    device = sights[0].pixels.device
+    free = Free(tuple(a.free.to(device) for a in asked), tuple(c > 0 for c in range(len(asked))), bend=bend)
+    first = _joined(names, sights, alone, free, owner)
+    told = None if progress is None else lambda number, cost: progress(number, float(cost))
+    adjusted = adjust(sights, first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
+    parameters = free_count(adjusted, [s.seen for s in seen.values()])
+    residuals, valid, used = (
+        torch.cat(parts)
+        for parts in zip(
+            *((r[0], v[0], s.seen) for r, v, s in zip(adjusted.residuals, adjusted.valid, seen.values(), strict=True)),
+            strict=True,
+        )
+    )
+    inliers, sigma = noise_of(residuals, used, valid, loss, loss_scale, parameters)
+    each = inliers.split([len(s.seen) for s in seen.values()])
+    cameras = {
+        name: result_of(
+            adjusted,
+            c,
+            asked[c],
+            seen[name],
+            middle,
+            layouts[name],
+            (each[c], sigma),
+            (object_points, image_points[name]),
+        )
+        for c, name in enumerate(names)
+    }
+    lengths = torch.where(used, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
+    rotations, translations = (t[0] for t in adjusted.state.boards)
+    mounts = {
+        name: Extrinsics(rotation_vector(r).unsqueeze(-1), t)
+        for name, r, t in zip(names, *(t[0] for t in adjusted.state.mounts), strict=True)
+    }
+    result = RigCalibration(
+        rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
+        boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
+        rms=float((lengths.square().sum() / used.sum()).sqrt()),
+        sigma=float(sigma),
+        cameras=cameras,
+        mount_std=_mount_std(adjusted, asked, names, sigma),
+        converged=all(c.converged for c in cameras.values()),
+        bend=next(iter(cameras.values())).bend,
+        views=next(iter(cameras.values())).views,
+        adjusted=adjusted,
+    )
+    if not result.converged:
+        python_warnings.warn(
+            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its warnings",
+            stacklevel=2,
+        )
+    return result
+
+
+def _of(given: Any, name: str, otherwise: Any) -> Any:
+    """What is given for one camera, by name or for all."""
+    return given.get(name, otherwise) if isinstance(given, Mapping) else given
+
+
+class _Alone(NamedTuple):
+    """A camera by itself: parameters (4 + n,), and the poses of boards (V,), where it has them, bool (V,)."""
+
+    parameters: Tensor
+    boards: Poses
+    has_pose: Tensor
+
+
+def _alone(
+    asked: Model, seen: Observations, loss: str | None, loss_scale: float, image_size: tuple[int, int]
+) -> _Alone:
+    """What one camera says."""
+    has_pose = seen.seen.sum(-1) >= _LEAST
+    some = seen.of(has_pose)
+    first = first_state(some, asked, image_size, loss, loss_scale)
+    sight = Sight(asked.kind, some.points[None], some.pixels[None], some.seen[None].to(some.pixels))
+    free = Free((asked.free.to(some.pixels.device),), (False,))
+    state = adjust([sight], first, free, loss=loss, loss_scale=loss_scale, steps=STEPS).state
+    boards = Poses(*(t[0] for t in Poses.none(1, len(has_pose), some.pixels)))
+    for whole, part in zip(boards, state.boards, strict=True):
+        whole[has_pose] = part[0]
+    return _Alone(state.parameters[0][0], boards, has_pose)
+
+
+def _joined(names: list[str], sights: list[Sight], alone: list[_Alone], free: Free, owner: str) -> State:
+    """Where to start from: mounts by what two cameras say of the same boards, boards by the camera that says it best.
+
+    Raises:
+        ValueError: cameras that no board links.
+    """
+    mounts = Poses(*(t[0] for t in Poses.none(1, len(names), alone[0].parameters)))
+    together = torch.stack([one.has_pose for one in alone]).double()
+    together = together @ together.mT
+    known = [0]
+    while len(known) < len(names):
+        rest = [c for c in range(len(names)) if c not in known]
+        links = together[known][:, rest]
+        if not bool((links > 0).any()):
+            raise ValueError(
+                f"{owner}: no board is seen both by {', '.join(names[c] for c in known)} and by "
+                f"{', '.join(names[c] for c in rest)}; take pictures at the same time in which both see one"
+            )
+        i, j = divmod(int(links.argmax()), len(rest))
+        a, b = known[i], rest[j]
+        rotation, translation = _between(alone[a], alone[b])
+        mounts.rotations[b] = rotation @ mounts.rotations[a]
+        mounts.translations[b] = rotation @ mounts.translations[a] + translation
+        known.append(b)
+    parameters = tuple(one.parameters[None] for one in alone)
+    boards, least = alone[0].boards, torch.full_like(alone[0].boards.translations[:, 0], torch.inf)
+    for c, one in enumerate(alone):
+        back = mounts.rotations[c].mT
+        own = Poses(back @ one.boards.rotations, (one.boards.translations - mounts.translations[c]) @ back.mT)
+        state = State(parameters, _batched(mounts), _batched(own), own.translations.new_zeros(1, 2))
+        bundle = Bundle(sights, state, free, "cauchy", 1.0)
+        flat = bundle.flat(state)
+        cost = torch.stack([bundle.look(k, flat).cost[0].sum(-1) for k in range(len(sights))]).sum(0)
+        better = one.has_pose & (cost < least)
+        least = torch.where(better, cost, least)
+        boards = Poses(
+            *(torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(own, boards, strict=True))
+        )
+    return State(parameters, _batched(mounts), _batched(boards), least.new_zeros(1, 2))
+
+
+def _batched(poses: Poses) -> Poses:
+    return Poses(*(t[None] for t in poses))
+
+
+def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
+    """The pose from camera a to b that lies in the middle of those that each of the boards gives."""
+    both = a.has_pose & b.has_pose
+    (from_a, at_a), (from_b, at_b) = ((t[both] for t in one.boards) for one in (a, b))
+    rotations = from_b @ from_a.mT
+    translations = at_b - (rotations @ at_a[..., None])[..., 0]
+    turned = (rotations[:, None] - rotations).flatten(2).norm(dim=-1)
+    length = translations.norm(dim=-1).median().clamp(min=torch.finfo(translations.dtype).tiny)
+    shifted = (translations[:, None] - translations).norm(dim=-1) / length
+    middle = (turned + shifted).median(-1).values.argmin()
+    return rotations[middle], translations[middle]
+
+
+def _mount_std(adjusted: Adjusted, asked: list[Model], names: list[str], sigma: Tensor) -> dict[str, Tensor]:
+    """(6,) by the name of a camera; zeros for the first one."""
+    std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0], dim=-1) * sigma
+    result = {}
+    for c, (name, model) in enumerate(zip(names, asked, strict=True)):
+        own = std.new_zeros(6)
+        for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
+            if camera == c and i >= 4 + model.count:
+                own[i - 4 - model.count] = value
+        result[name] = own
+    return result

@@ -1,0 +1,336 @@
+"""A calibration from nothing: about which lens took pictures of known boards, and from where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
+from camtorch.calibration.rays import poses_from_rays
+from camtorch.camera import Camera, from_values
+from camtorch.convert import least_squares, views
+from camtorch.models import UCM, KannalaBrandt
+from camtorch.projection.rays import angles_from_axis
+
+if TYPE_CHECKING:
+    from camtorch.calibration.observations import Observations
+
+# Lenses that are tried. The unified camera is a perspective one for 0, a stereographic one for 1/2, and nearly an
+# equidistant or equisolid one for 0.65; degrees from the axis, at the seen pixel that is furthest from the middle
+_TRIED = {
+    0.0: (3.0, 5.0, 8.0, 12.0, 18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 72.0),
+    0.5: (8.0, 14.0, 22.0, 32.0, 44.0, 56.0, 68.0, 80.0, 92.0, 104.0, 116.0),
+    0.65: (8.0, 14.0, 22.0, 32.0, 44.0, 56.0, 68.0, 80.0, 92.0, 104.0),
+}
+_VIEWS, _POINTS = 24, 64  # that the search looks at
+_KEPT = 5  # of the lenses tried
+_ROUNDS, _MANY_ROUNDS = 3, 12  # of poses
+_BAD = 2.0  # times the error that is usual: a view whose pose may be spoilt by outliers
+_TRIMMED = 0.8  # of the views decide: others may be spoilt
+_LEAST_SCALE = 0.5  # px, of robust weights
+_NO_PIXEL = 1e3  # px, the error of a corner without a pixel
+_OUTLIER = 3.0  # times the scale
+_WORSE, _LITTLE_WORSE = 2.0, 1.01  # than the best: costs of what is kept
+_SAME = 1e-7  # the difference of two costs, of one optimum
+_FEW_STEPS, _STEPS, _MANY_STEPS = 6, 12, 40
+# Coefficients with which the others make a valley that has several deepest places, and where along it to start
+_ALONG = {
+    "double_sphere": ("xi", (-0.3, 0.0, 0.3, 0.7)),
+    "eucm": ("beta", (0.5, 1.0, 2.0)),
+    "mei": ("xi", (0.0, 1.0, 2.0, 4.0)),
+}
+_REACH = 1.1  # how much further than the data a start shall reach
+_LOST = 0.01  # the part of the corners without a pixel, with which a model is the wrong one
+
+
+def start_from_nothing(
+    observations: Observations,
+    model: type[Camera],
+    count: int,
+    image_size: tuple[int, int],
+    *,
+    fixed: Collection[str] = (),
+    loss: str | None = None,
+    loss_scale: float = 1.0,
+) -> State:
+    """A camera of the model, B = 1, and the poses of all views, from which an adjustment reaches the optimum.
+
+    Unified cameras of all widths are tried, their axis in the middle of the image: the rays of the pixels give poses in
+    closed form, and those a score. The best few are refined together, and the model is fitted to what is best then,
+    from several starts. Errors count by the loss of Cauchy, in units of those that most corners have, so that gross
+    ones do not matter.
+
+    Args:
+        observations: what was seen.
+        model: of the camera.
+        count: of its coefficients.
+        image_size: (height, width).
+        fixed: names of parameters that are held: coefficients as in `Camera.ideal`, the principal point in the middle
+            of the image.
+        loss: that of the adjustment, which decides where several cameras are nearly as good.
+        loss_scale: px, of the loss.
+
+    Raises:
+        ValueError: corners lie further from the axis than the model reaches.
+    """
+    few = _few(observations)
+    lens = _unified(few, image_size, fixed)
+    bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
+    if bounds and all(ends is None for ends in bounds):
+        # what keeps the shape that it starts with takes that of a good lens
+        lens = _refined(lens, few, KannalaBrandt, KannalaBrandt.default_count, image_size, fixed).row(0)
+    lens = _refined(lens, few, model, count, image_size, fixed)
+    _check_reach(lens.row(0), few, image_size)
+    states = [poses_for(row[None], observations, model, image_size, lens.scale) for row in lens.parameters]
+    if len(states) == 1:
+        return states[0]
+    boards = Poses(*(torch.cat(t) for t in zip(*(state.boards for state in states), strict=True)))
+    sight, free = _sight(model, observations), _free(model, count, fixed)
+    state = _state(lens.parameters, boards)
+    found = adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
+    row = found.cost.argmin()[None]
+    return _state(found.state.parameters[0][row], Poses(*(t[row] for t in found.state.boards)))
+
+
+def poses_for(
+    parameters: Tensor,
+    observations: Observations,
+    model: type[Camera],
+    image_size: tuple[int, int],
+    scale: float = _LEAST_SCALE,
+) -> State:
+    """A known camera, B = 1, and the poses of all views.
+
+    Args:
+        parameters: (1, 4 + n) of the camera.
+        observations: what it saw.
+        model: of the camera.
+        image_size: (height, width).
+        scale: px, the error from which corners count less.
+    """
+    boards, _ = _posed(_camera(model, parameters, image_size), observations, _MANY_ROUNDS)
+    return _turned(_Lens(model, parameters, boards, scale), observations, image_size).state
+
+
+class _Lens(NamedTuple):
+    """Cameras of a model, parameters (B, 4 + n), with poses (B, V) of the boards."""
+
+    model: type[Camera]
+    parameters: Tensor
+    boards: Poses
+    scale: float
+    """px: twice the error that most corners have."""
+
+    @property
+    def state(self) -> State:
+        """Where an adjustment starts."""
+        return _state(self.parameters, self.boards)
+
+    def row(self, index: int) -> _Lens:
+        """One of them."""
+        return self.of(slice(index, index + 1))
+
+    def of(self, rows: Tensor | slice) -> _Lens:
+        """Some of them."""
+        return self._replace(parameters=self.parameters[rows], boards=Poses(*(t[rows] for t in self.boards)))
+
+    def adjusted(self, few: Observations, free: Free, steps: int, worst: float) -> _Lens:
+        """Nearer to what they saw, the best first, without those whose cost is above the least by that factor."""
+        sights = [_sight(self.model, few)]
+        found = adjust(sights, self.state, free, loss="cauchy", loss_scale=self.scale, steps=steps)
+        cost, rows = found.cost.sort()
+        near = cost <= worst * cost[0]
+        near[1:] &= cost.diff() > _SAME * cost[:-1]
+        rows = rows[near]
+        errors = torch.linalg.vector_norm(found.residuals[0][rows[0]], dim=-1)
+        errors = torch.where(found.valid[0][rows[0]], errors, _NO_PIXEL)[few.seen]
+        scale = max(_LEAST_SCALE, 2 * float(errors.median()))
+        return _Lens(self.model, found.state.parameters[0], found.state.boards, scale).of(rows)
+
+
+def _state(parameters: Tensor, boards: Poses) -> State:
+    batch = len(boards.translations)
+    return State((parameters,), Poses.none(batch, 1, parameters), boards, parameters.new_zeros(batch, 2))
+
+
+def _sight(model: type[Camera], observations: Observations) -> Sight:
+    points, pixels, seen = observations
+    return Sight(model, points[None], pixels[None], seen[None].to(pixels.dtype))
+
+
+def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
+    """All parameters but those that are held, or that never learn."""
+    names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
+    learns = [name not in fixed and model.fit_bounds.get(name, ()) is not None for name in names]
+    return Free((torch.tensor(learns),), (False,))
+
+
+def _camera(model: type[Camera], parameters: Tensor, image_size: tuple[int, int]) -> Camera:
+    return from_values(model._model, parameters[:, :4], parameters[:, 4:], image_size)
+
+
+def _few(observations: Observations) -> Observations:
+    """Of many views those with the most corners, of many points as many as are enough."""
+    views_, number = observations.seen.shape
+    if views_ > _VIEWS:
+        observations = observations.of(observations.seen.sum(-1).argsort(descending=True)[:_VIEWS].sort().values)
+    if number > _POINTS:
+        index = torch.linspace(0, number - 1, _POINTS, device=observations.seen.device).round().long()
+        observations = observations._replace(
+            points=observations.points[:, index],
+            pixels=observations.pixels[:, index],
+            seen=observations.seen[:, index],
+        )
+    return observations
+
+
+def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> _Lens:
+    """The unified camera that explains best what was seen."""
+    centre = few.pixels.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
+    reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
+    tried = [(alpha, math.radians(degrees)) for alpha, angles in _TRIED.items() for degrees in angles]
+    radii = [math.sin(theta) / (alpha + (1 - alpha) * math.cos(theta)) for alpha, theta in tried]
+    focal = reach / centre.new_tensor(radii)[:, None]
+    alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
+    parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
+    boards, errors = _posed(_camera(UCM, parameters, image_size), few, _ROUNDS)
+    by_view = errors.nanmedian(-1).values.sort(-1).values
+    score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
+    score, rows = score.topk(_KEPT, largest=False)
+    lens = _Lens(UCM, parameters[rows], Poses(*(t[rows] for t in boards)), max(_LEAST_SCALE, 2 * float(score[0])))
+    lens = lens.adjusted(few, _free(UCM, 1, ("cx", "cy")), _FEW_STEPS, _WORSE).row(0)
+    free = _free(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
+    return _turned(lens.adjusted(few, free, _FEW_STEPS, _WORSE), few, image_size)
+
+
+def _posed(camera: Camera, some: Observations, rounds: int) -> tuple[Poses, Tensor]:
+    """Poses (B, V) in closed form for cameras (B,), and the errors in px, (B, V, N); NaN for what is not seen.
+
+    Each round goes without the outliers of the one before; those after the second are for views that still fit worse
+    than others.
+    """
+    shape = len(camera.intrinsics), *some.seen.shape
+    rays, has_ray = camera.unproject(some.pixels.flatten(0, 1).expand(shape[0], -1, -1))
+    rays, has_ray = rays.view(-1, shape[2], 3), (has_ray.view(shape) & some.seen).flatten(0, 1)
+    points = some.points.expand(*shape, 3).flatten(0, 1)
+    weights, rows = has_ray.to(rays.dtype), torch.arange(len(rays), device=rays.device)
+    boards = Poses.none(shape[0], shape[1], rays)
+    for i in range(rounds):
+        found = poses_from_rays(points[rows], rays[rows], weights[rows])
+        for poses, new in zip(boards, found[:2], strict=True):
+            poses.flatten(0, 1)[rows] = new[:, 0]
+        errors = _errors(camera, boards, some)
+        typical = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
+        weights = 1 / (1 + (errors / (2 * typical[..., None])).square())
+        weights = torch.where(has_ray, weights.flatten(0, 1), 0.0)
+        if i > 0:
+            (rows,) = (typical > _BAD * typical.median(-1, keepdim=True).values).flatten().nonzero(as_tuple=True)
+            if len(rows) == 0:
+                break
+    return boards, errors
+
+
+def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
+    """(B, V, N) px, NaN for what is not seen."""
+    pixels, valid = camera.project(boards.moved(some.points).flatten(1, 2))
+    shape = len(pixels), *some.seen.shape
+    errors = torch.linalg.vector_norm(pixels.view(*shape, 2) - some.pixels, dim=-1)
+    return torch.where(some.seen, torch.where(valid.view(shape), errors, _NO_PIXEL), torch.nan)
+
+
+def _turned(lens: _Lens, some: Observations, image_size: tuple[int, int]) -> _Lens:
+    """With the best of the poses that each view may have under a single camera: a plane has two that look alike."""
+    camera = _camera(lens.model, lens.parameters, image_size)
+    rays, has_ray = camera.unproject(some.pixels.flatten(0, 1)[None])
+    errors = _errors(camera, lens.boards, some)[0]
+    near = 1 / (1 + (errors / lens.scale).square())
+    weights = torch.where(has_ray.view(some.seen.shape) & some.seen, near, 0.0)
+    found = poses_from_rays(some.points, rays.view(*some.seen.shape, 3), weights)
+    # each pose of each view is a problem of its own
+    pairs = zip(lens.boards, found[:2], strict=True)
+    boards = Poses(*(torch.cat((old[0, :, None], new), 1).flatten(0, 1)[:, None] for old, new in pairs))
+    many = 1 + found.rotations.shape[1]
+    sight = Sight(lens.model, *(t[0].repeat_interleave(many, 0)[:, None] for t in _sight(lens.model, some)[1:]))
+    free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool),), (False,))
+    ended = adjust(
+        [sight],
+        _state(lens.parameters, boards),
+        free,
+        loss="cauchy",
+        loss_scale=lens.scale,
+        steps=_STEPS,
+    )
+    best = ended.cost.view(-1, many).argmin(-1)
+    best = best + many * torch.arange(len(best), device=best.device)
+    return lens._replace(boards=Poses(*(t[best].transpose(0, 1) for t in ended.state.boards)))
+
+
+def _refined(
+    lens: _Lens,
+    few: Observations,
+    model: type[Camera],
+    count: int,
+    image_size: tuple[int, int],
+    fixed: Collection[str],
+) -> _Lens:
+    """Cameras of another model that explain best what was seen, the best first; those that are nearly as good."""
+    free = _free(model, count, fixed)
+    lens = _fitted(lens, few, model, count, image_size, fixed).adjusted(few, free, _STEPS, _WORSE)
+    return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE)
+
+
+def _fitted(
+    lens: _Lens,
+    few: Observations,
+    model: type[Camera],
+    count: int,
+    image_size: tuple[int, int],
+    fixed: Collection[str],
+) -> _Lens:
+    """Cameras (S,) of another model that see the corners, as the boards lie, where they were seen."""
+    camera = _camera(lens.model, lens.parameters, image_size)
+    slopes = views.focal_at_axis(camera)
+    rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)
+    inliers = few.seen & (_errors(camera, lens.boards, few) < _OUTLIER * lens.scale)
+    reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
+    names = model.names_of(count) or ()
+    ideal = slopes.new_tensor(model.ideal(count))
+    held = [name for name in names if name in fixed]
+    starts = model.fit_start(names, *views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi)))[:, 0]
+    sets = [(starts, held)]
+    along, values = _ALONG.get(model.key, ("", ()))
+    if values and along not in fixed:
+        more = starts[:1].repeat(len(values), 1)
+        more[:, names.index(along)] = more.new_tensor(values)
+        sets.append((more, [*held, along]))
+    seen = least_squares.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
+    template = _camera(model, torch.cat((slopes[0], ideal))[None], image_size)
+    is_held = torch.tensor([name in held for name in names], dtype=torch.bool, device=slopes.device)
+    fitted = []
+    for some, stay in sets:
+        some = torch.where(is_held, ideal, some)
+        rows = least_squares.Observations(*(t.expand(len(some), *t.shape[1:]) for t in seen))
+        fitted.append(least_squares.fit(template, rows, some[None], slopes.expand(len(some), -1), stay))
+    parameters = torch.cat(fitted)
+    for i, name in enumerate(("cx", "cy"), 2):
+        if name in fixed:
+            parameters[:, i] = (image_size[3 - i] - 1) / 2
+    boards = Poses(*(t.expand(len(parameters), *t.shape[1:]) for t in lens.boards))
+    return _Lens(model, parameters, boards, lens.scale)
+
+
+def _check_reach(lens: _Lens, few: Observations, image_size: tuple[int, int]) -> None:
+    """Raise a ValueError where the model has no pixel for many of the corners."""
+    points = lens.boards.moved(few.points)
+    _, valid = _camera(lens.model, lens.parameters, image_size).project(points.flatten(1, 2))
+    lost = few.seen & ~valid.view(few.seen.shape)
+    if int(lost.sum()) > _LOST * int(few.seen.sum()):
+        furthest = math.degrees(float(angles_from_axis(points)[0][few.seen].amax()))
+        raise ValueError(
+            f"calibrate: {lens.model.__name__} has no pixels for {int(lost.sum())} of {int(few.seen.sum())} corners, "
+            f"seen up to about {furthest:.0f} degrees from the axis; kannala_brandt and other fisheye models do"
+        )

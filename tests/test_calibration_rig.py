@@ -1,0 +1,160 @@
+"""Rigs: cameras that see the same boards, some of them, are found with where they are and how sure that is."""
+
+import math
+
+import pytest
+import torch
+from boards import chessboard
+
+import camtorch as ct
+from camtorch.rotations import rotation_matrix, rotation_vector
+
+NOISE = 0.2
+BOARD = chessboard(9, 6, 0.05)
+MODELS = {"left": "kannala_brandt", "right": "brown_conrady", "side": "double_sphere"}
+
+
+def the_rig():
+    """Three cameras of three models and sizes, and their poses, camera from left."""
+    cameras = {
+        "left": ct.KannalaBrandt([300.0, 301, 320, 240], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)),
+        "right": ct.BrownConrady([500.0, 500, 400, 300], [-0.2, 0.05, 0.001, -0.0005, 0.0], image_size=(600, 800)),
+        "side": ct.DoubleSphere([280.0, 280, 320, 250], [-0.2, 0.6], image_size=(500, 640)),
+    }
+    turns = torch.tensor([[0, 0, 0], [0, 0.1, 0.02], [0.02, -0.9, 0]], dtype=torch.float64)
+    shifts = torch.tensor([[0, 0, 0], [-0.2, 0, 0.01], [0.3, 0.02, 0.2]], dtype=torch.float64)
+    return {name: camera.double().requires_grad_(False) for name, camera in cameras.items()}, turns, shifts
+
+
+def seen(views=24, seed=0, noise=NOISE, board=BOARD):
+    """Corners by the name of a camera, NaN where one does not see the board, and the poses of the boards."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64) - 0.5
+
+    cameras, turns, shifts = the_rig()
+    rotations = rotation_matrix(1.2 * draw(views, 3))
+    away = torch.cat((1.6 * draw(views, 1) + 0.1, 0.5 * draw(views, 1), torch.ones(views, 1)), -1) * (
+        1 + draw(views, 1)
+    )
+    translations = away - rotations @ board.mean(0)
+    pixels = {}
+    for i, (name, camera) in enumerate(cameras.items()):
+        points = (board @ rotations.mT + translations[:, None]) @ rotation_matrix(turns[i]).mT + shifts[i]
+        found, valid = camera.project(points)
+        valid = valid & camera.contains(found)
+        valid = valid & (valid.sum(-1, keepdim=True) >= 12)
+        found = found + noise * torch.randn(found.shape, generator=generator, dtype=torch.float64)
+        pixels[name] = torch.where(valid[..., None], found, torch.nan)
+    return pixels, rotations, translations
+
+
+def calibrated(pixels, models=MODELS, **options):
+    sizes = {name: camera.image_size for name, camera in the_rig()[0].items() if name in models}
+    return ct.calibrate_rig(models, BOARD, {name: pixels[name] for name in models}, image_sizes=sizes, **options)
+
+
+def test_cameras_and_poses_are_found_within_their_sigma():
+    pixels, rotations, translations = seen()
+    found = calibrated(pixels)
+    cameras, turns, shifts = the_rig()
+    assert found.converged
+    assert found.sigma == pytest.approx(NOISE, rel=0.05)
+    assert list(found.rig) == list(cameras)
+    off = []
+    for i, (name, camera) in enumerate(cameras.items()):
+        near = torch.cat((found.rig[name].intrinsics, found.rig[name].distortion)).detach()
+        off.append((near - torch.cat((camera.intrinsics, camera.distortion))) / found.std[name])
+        if i:
+            pose = found.rig.extrinsics[name]
+            turn = rotation_vector(rotation_matrix(pose.rotation.detach()) @ rotation_matrix(turns[i]).mT)
+            off.append(torch.cat((turn, pose.translation.detach() - shifts[i])) / found.mount_std[name])
+    off = torch.cat(off)
+    assert float(off.abs().max()) < 4
+    assert 0.5 < float(off.square().mean().sqrt()) < 1.5
+    # a board far away is tilted by a fifth of a pixel more or less
+    torch.testing.assert_close(rotation_matrix(found.boards.rotation.detach()), rotations, atol=0.02, rtol=0)
+    torch.testing.assert_close(found.boards.translation.detach(), translations, atol=0.01, rtol=0)
+
+
+def test_exact_corners_give_the_exact_rig():
+    pixels, rotations, _ = seen(noise=0.0)
+    found = calibrated(pixels)
+    assert found.rms < 1e-8
+    for name, camera in the_rig()[0].items():
+        torch.testing.assert_close(found.rig[name].intrinsics.detach(), camera.intrinsics, rtol=1e-8, atol=1e-6)
+    torch.testing.assert_close(rotation_matrix(found.boards.rotation.detach()), rotations, atol=1e-9, rtol=0)
+
+
+def test_a_camera_of_a_result_sees_its_corners_through_its_own_poses():
+    pixels, _, _ = seen(views=12)
+    found = calibrated(pixels)
+    for name, camera in found.cameras.items():
+        projected, valid = camera.camera.project(camera.extrinsics(BOARD.expand(12, -1, -1)))
+        assert valid[~torch.isnan(pixels[name][..., 0])].all()
+        torch.testing.assert_close(
+            torch.where(torch.isnan(pixels[name]), torch.nan, projected - pixels[name]).detach(),
+            found.residuals[name],
+            equal_nan=True,
+            atol=1e-8,
+            rtol=0,
+        )
+
+
+def test_cameras_that_are_linked_by_a_third_one():
+    pixels, _, _ = seen(views=30)
+    pixels["right"][:15] = math.nan
+    pixels["side"][15:] = math.nan
+    found = calibrated(pixels)
+    assert found.converged
+    _, _, shifts = the_rig()
+    torch.testing.assert_close(found.rig.extrinsics["side"].translation.detach(), shifts[2], atol=3e-3, rtol=0)
+
+
+def test_a_camera_that_is_held_stays_as_it_is():
+    pixels, _, _ = seen(views=12)
+    known = the_rig()[0]["left"]
+    found = calibrated(pixels, {**MODELS, "left": known}, fixed={"left": "all", "right": ("cx",)})
+    torch.testing.assert_close(found.rig["left"].intrinsics.detach(), known.intrinsics, rtol=0, atol=0)
+    assert float(found.std["left"].abs().max()) == 0
+    assert found.rig["right"].cx.item() == 399.5  # the middle
+    assert float(found.std["right"][2]) == 0 < float(found.std["right"][3])
+
+
+def test_one_camera_is_a_rig_as_well():
+    pixels, _, _ = seen(views=12)
+    alone = ct.calibrate("kannala_brandt", BOARD, pixels["left"], image_size=(480, 640))
+    found = calibrated(pixels, {"left": "kannala_brandt"})
+    torch.testing.assert_close(
+        found.rig["left"].intrinsics.detach(), alone.camera.intrinsics.detach(), rtol=1e-9, atol=0
+    )
+    torch.testing.assert_close(found.std["left"], alone.std, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: {**p, "right": p["right"][:5]}, "same views"),
+        (lambda p: {k: v for k, v in p.items() if k != "right"}, "right"),
+        (lambda p: {**p, "right": torch.full_like(p["right"], math.nan)}, "right"),
+    ],
+)
+def test_what_makes_no_rig_is_said(change, words):
+    pixels, _, _ = seen(views=10)
+    sizes = {name: camera.image_size for name, camera in the_rig()[0].items()}
+    with pytest.raises(ValueError, match=words):
+        ct.calibrate_rig(MODELS, BOARD, change(pixels), image_sizes=sizes)
+
+
+def test_cameras_that_no_board_links_are_named():
+    pixels, _, _ = seen(views=20)
+    pixels["left"][10:], pixels["right"][:10], pixels["side"][:10] = math.nan, math.nan, math.nan
+    with pytest.raises(ValueError, match=r"right.*side|no board"):
+        calibrated(pixels)
+
+
+def test_names_that_no_camera_has_are_refused():
+    pixels, _, _ = seen(views=10)
+    with pytest.raises(ValueError, match="middle"):
+        calibrated(pixels, fixed={"middle": "all"})
