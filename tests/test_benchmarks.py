@@ -35,7 +35,10 @@ linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks a
 
 @pytest.mark.parametrize(
     "subject",
-    [pytest.param(subject, marks=pytest.mark.slow) for subject in ("images", "augment", "points", "load", "scaling")],
+    [
+        pytest.param(subject, marks=pytest.mark.slow)
+        for subject in ("images", "augment", "calibration", "points", "load", "scaling")
+    ],
 )
 def test_a_quick_run_measures_everyone_and_writes_every_figure(subject, tmp_path):
     path = tmp_path / "figures.json"

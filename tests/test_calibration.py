@@ -1,0 +1,309 @@
+"""What must hold of calibrations: the optimum from nothing, the same for all forms and orders, outliers named."""
+
+import copy
+import math
+
+import pytest
+import torch
+from boards import chessboard, opencv_left, ov_plane, seen_by
+from torch.testing import assert_close
+
+import camtorch as ct
+from camtorch.rotations import rotation_matrix
+
+LEFT, OPTIMA = opencv_left()
+slow = pytest.mark.slow
+exactly = {"rtol": 0.0, "atol": 0.0, "equal_nan": True}
+
+
+def values(calibration):
+    camera = calibration.camera
+    return torch.cat((camera.intrinsics, camera.distortion), -1).detach()
+
+
+def calibrate(corners, model="brown_conrady", **options):
+    return ct.calibrate(model, corners.object_points, corners.image_points, image_size=corners.image_size, **options)
+
+
+@pytest.fixture(scope="module")
+def left():
+    return calibrate(LEFT)
+
+
+@pytest.mark.parametrize(("count", "part"), [(5, 1e-3), pytest.param(8, 1e-2, marks=slow)])
+def test_opencvs_optimum_from_nothing(count, part, left):
+    """OpenCV stops a little earlier: eight coefficients have a condition of 1e10."""
+    optimum = OPTIMA[count]
+    found = left if count == 5 else calibrate(LEFT, count=count)
+    assert found.converged
+    assert found.rms == pytest.approx(float(optimum["rms"]), abs=1e-6)
+    truth = torch.cat((optimum["intrinsics"], optimum["distortion"]))
+    assert bool(((values(found) - truth).abs() < part * optimum["std"]).all())
+    assert_close(found.std, optimum["std"], rtol=1e-2 * 10 ** (count > 5), atol=0)
+    assert found.parameter_names[:4] == ("fx", "fy", "cx", "cy")
+    assert len(found.parameter_names) == 4 + count
+    assert_close(
+        rotation_matrix(found.extrinsics.rotation).detach(),
+        rotation_matrix(optimum["rotations"].unflatten(0, (13, 3))),
+        rtol=0,
+        atol=1e-4 if count > 5 else 1e-6,
+    )
+    assert_close(
+        found.extrinsics.translation.detach(), optimum["translations"].unflatten(0, (13, 3)), rtol=0, atol=1e-5
+    )
+
+
+def test_numbers_agree_with_the_residuals(left):
+    squares = left.residuals.square().sum()
+    count = 13 * 54
+    assert left.rms == pytest.approx(float((squares / count).sqrt()), rel=1e-12)
+    assert left.sigma == pytest.approx(float((squares / (2 * count - 9 - 6 * 13)).sqrt()), rel=1e-12)
+    assert_close(left.std, left.covariance.diagonal().sqrt(), rtol=1e-9, atol=0)
+    board = LEFT.object_points.expand(13, -1, -1)
+    pixels, valid = left.camera.project(left.extrinsics(board))
+    assert valid.all()
+    assert_close(left.residuals, (pixels - LEFT.image_points).detach(), rtol=0, atol=1e-9)
+    assert left.inliers.all()
+
+
+def test_results_are_without_a_graph_but_go_on_learning(left):
+    for value in (left.residuals, left.inliers, left.covariance, left.std, left.uncertainty([[320.0, 240.0]])):
+        assert not value.requires_grad
+    camera, extrinsics = copy.deepcopy((left.camera, left.extrinsics))
+    points = extrinsics(LEFT.object_points.expand(13, -1, -1))
+    (camera.project(points)[0] - LEFT.image_points).square().mean().backward()
+    parameters = [*camera.parameters(), *extrinsics.parameters()]
+    assert len(parameters) == 4
+    assert all(p.grad.isfinite().all() for p in parameters)
+    # at the optimum the gradient vanishes
+    assert bool((camera.intrinsics.grad.abs() * left.std[:4] < 1e-6).all())
+    assert bool((camera.distortion.grad.abs() * left.std[4:] < 1e-6).all())
+
+
+@torch.no_grad()
+def test_the_same_bit_for_bit_and_without_autograd(left):
+    again = calibrate(LEFT)
+    assert_close(values(again), values(left), **exactly)
+    assert_close(again.residuals, left.residuals, **exactly)
+    assert_close(again.covariance, left.covariance, **exactly)
+
+
+@pytest.mark.parametrize("form", [pytest.param("list", marks=slow), "OpenCV", pytest.param("float32", marks=slow)])
+def test_every_form_gives_the_same(form, left):
+    points, pixels = LEFT.object_points, LEFT.image_points
+    if form == "list":
+        found = ct.calibrate("brown_conrady", [points] * 13, list(pixels), image_size=LEFT.image_size)
+        assert [tuple(t.shape) for t in found.residuals] == [(54, 2)] * 13
+        assert [tuple(t.shape) for t in found.inliers] == [(54,)] * 13
+    elif form == "OpenCV":
+        boards = [points.float().numpy()[:, None]] * 13
+        corners = [view.float().numpy()[:, None] for view in pixels]
+        found = ct.calibrate("brown_conrady", boards, corners, image_size=LEFT.image_size)
+        assert [tuple(t.shape) for t in found.residuals] == [(54, 1, 2)] * 13
+    else:
+        found = ct.calibrate("brown_conrady", points.float(), pixels.float(), image_size=LEFT.image_size)
+        assert tuple(found.residuals.shape) == (13, 54, 2)
+    # the corners of the file are rounded to float32's nine digits
+    assert bool(((values(found) - values(left)).abs() < 1e-4 * left.std).all())
+    assert found.camera.intrinsics.dtype == torch.float64
+    assert not isinstance(found.rms, torch.Tensor) or found.rms.ndim == 0
+
+
+@slow
+def test_the_order_of_views_does_not_matter(left):
+    order = torch.randperm(13, generator=torch.Generator().manual_seed(1))
+    found = ct.calibrate("brown_conrady", LEFT.object_points, LEFT.image_points[order], image_size=LEFT.image_size)
+    assert bool(((values(found) - values(left)).abs() < 1e-6 * left.std).all())
+    assert_close(found.residuals, left.residuals[order], rtol=0, atol=1e-6)
+
+
+@slow
+def test_the_order_of_corners_and_the_frame_of_the_board_do_not_matter(left):
+    order = torch.randperm(54, generator=torch.Generator().manual_seed(2))
+    turn = rotation_matrix(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
+    # in millimetres, and far from the origin
+    points = (1000 * LEFT.object_points @ turn.mT + torch.tensor([2000.0, -500.0, 900.0]))[order]
+    found = ct.calibrate("brown_conrady", points, LEFT.image_points[:, order], image_size=LEFT.image_size)
+    assert bool(((values(found) - values(left)).abs() < 1e-5 * left.std).all())
+    assert_close(found.residuals, left.residuals[:, order], rtol=0, atol=1e-5)
+    assert found.rms == pytest.approx(left.rms, abs=1e-9)
+
+
+@slow
+def test_corners_may_be_missing(left):
+    pixels = LEFT.image_points.clone()
+    hidden = torch.rand(13, 54, generator=torch.Generator().manual_seed(3)) < 0.3
+    pixels[hidden] = torch.nan
+    found = ct.calibrate("brown_conrady", LEFT.object_points, pixels, image_size=LEFT.image_size)
+    assert_close(found.residuals.isnan().any(-1), hidden)
+    assert not found.inliers[hidden].any()
+    assert found.inliers[~hidden].all()
+    # what is hidden carries no information, so that the other corners' optimum lies within the noise
+    assert bool(((values(found) - values(left)).abs() < 3 * found.std).all())
+    ragged = [points[~missing] for points, missing in zip(LEFT.object_points.expand(13, -1, -1), hidden, strict=True)]
+    seen = [view[~missing] for view, missing in zip(LEFT.image_points, hidden, strict=True)]
+    listed = ct.calibrate("brown_conrady", ragged, seen, image_size=LEFT.image_size)
+    assert bool(((values(listed) - values(found)).abs() < 1e-6 * found.std).all())
+    assert [tuple(t.shape) for t in listed.residuals] == [tuple(t.shape) for t in seen]
+
+
+@slow
+def test_a_view_without_corners_is_left_out(left):
+    pixels = [*LEFT.image_points[:5], None, *LEFT.image_points[5:]]
+    with pytest.warns(UserWarning, match="view 5"):
+        found = ct.calibrate("brown_conrady", LEFT.object_points, pixels, image_size=LEFT.image_size)
+    assert_close(values(found), values(left), **exactly)
+    assert len(found.residuals) == 14
+    assert found.residuals[5].isnan().all()
+    assert found.extrinsics.batch_shape == (13,)
+
+
+def test_fixed_coefficients(left):
+    found = calibrate(LEFT, fixed=("cx", "k3", "p1"))
+    named = dict(zip(found.parameter_names, zip(values(found).tolist(), found.std.tolist(), strict=True), strict=True))
+    assert named["k3"] == (0.0, 0.0)
+    assert named["p1"] == (0.0, 0.0)
+    assert named["cx"] == (319.5, 0.0)  # the middle of the image, whose first pixel is at 0
+    assert all(std > 0 for name, (_, std) in named.items() if name not in ("cx", "k3", "p1"))
+    assert found.rms > left.rms
+
+
+@slow
+def test_a_coefficient_held_at_its_best_value_changes_no_other(left):
+    held = calibrate(LEFT, start=left.camera, fixed=("k1",))
+    assert bool(((values(held) - values(left)).abs() < 1e-4 * left.std).all())
+    assert float(held.std[4]) == 0.0
+    assert bool((held.std <= left.std * (1 + 1e-6)).all())
+
+
+def test_a_camera_that_is_held_leaves_the_poses_to_be_found(left):
+    poses = calibrate(LEFT, model=left.camera, fixed="all")
+    assert_close(values(poses), values(left), **exactly)
+    assert poses.rms == pytest.approx(left.rms, abs=1e-9)
+    assert_close(poses.extrinsics.translation, left.extrinsics.translation, rtol=0, atol=1e-6)
+    assert not poses.std.any()
+
+
+@pytest.mark.parametrize("loss", [pytest.param("huber", marks=slow), "cauchy"])
+def test_gross_outliers(loss, left):
+    """One corner in ten is 5 to 60 px off."""
+    generator = torch.Generator().manual_seed(4)
+    wrong = torch.zeros(13 * 54, dtype=torch.bool)
+    wrong[torch.randperm(13 * 54, generator=generator)[:70]] = True
+    wrong = wrong.view(13, 54)
+    angle = 2 * math.pi * torch.rand(13, 54, generator=generator)
+    length = 5 + 55 * torch.rand(13, 54, generator=generator)
+    pixels = LEFT.image_points + (wrong * length)[..., None] * torch.stack((angle.cos(), angle.sin()), -1)
+    found = ct.calibrate(
+        "brown_conrady", LEFT.object_points, pixels, image_size=LEFT.image_size, loss=loss, loss_scale=0.3
+    )
+    assert bool(((values(found) - values(left)).abs() < 3 * left.std).all())
+    assert float((~found.inliers[wrong]).double().mean()) >= 0.99
+    assert float(found.inliers[~wrong].double().mean()) >= 0.98
+    # their noise is no part of sigma
+    assert found.sigma < 1.3 * left.sigma
+
+
+@slow
+def test_a_fisheye_past_its_plane():
+    """OV-plane, rays to 93 degrees: as good as the least squares that are known, and on images that it never saw."""
+    train, test = ov_plane("train"), ov_plane("test")
+    found = calibrate(train, model=ct.KannalaBrandt)
+    assert found.rms <= 0.4816
+    poses = calibrate(test, model=found.camera, fixed="all")
+    assert poses.rms <= 0.4747
+    _, rms, valid = ct.solve_pnp(found.camera, test.object_points.expand(7, -1, -1), test.image_points)
+    assert valid.all()
+    seen = (~test.image_points.isnan().any(-1)).sum(-1)
+    assert float(((rms.detach().square() * seen).sum() / seen.sum()).sqrt()) == pytest.approx(poses.rms, rel=1e-6)
+
+
+@slow
+@pytest.mark.parametrize(
+    ("model", "best"),
+    # double sphere and EUCM have two coefficients, and their optimum is 2 % above
+    [("fisheye624", 0.4816), ("fisheye62", 0.4816), ("mei", 0.4816), ("double_sphere", 0.49138), ("eucm", 0.49141)],
+)
+def test_every_fisheye_model_starts_from_nothing(model, best):
+    train, test = ov_plane("train"), ov_plane("test")
+    found = calibrate(train, model=model)
+    assert found.converged
+    assert found.rms <= best
+    assert calibrate(test, model=found.camera, fixed="all").rms <= 1.01 * best
+
+
+STEREO = {
+    "left": ct.KannalaBrandt([300.0, 301.0, 321.0, 238.0], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)),
+    "right": ct.BrownConrady([420.0, 421.0, 402.0, 295.0], [-0.2, 0.05, 1e-3, -5e-4, 0.0], image_size=(600, 800)),
+}
+
+
+def stereo(noise=0.1):
+    """What a fisheye camera and a webcam beside it see of the same boards."""
+    corners, rotations, translations = seen_by(STEREO["left"], 25, noise=noise)
+    rotation = rotation_matrix(torch.tensor([0.05, -0.9, 0.02], dtype=torch.float64))
+    translation = torch.tensor([-0.12, 0.003, 0.01], dtype=torch.float64)
+    points = corners.object_points @ rotations.mT + translations[:, None]
+    with torch.no_grad():
+        pixels, valid = STEREO["right"].double().project(points @ rotation.mT + translation)
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    inside = ((pixels >= 0) & (pixels <= pixels.new_tensor([799.0, 599.0]))).all(-1) & valid
+    inside &= inside.sum(-1, keepdim=True) > 11
+    return corners, torch.where(inside[..., None], pixels, torch.nan), rotation, translation
+
+
+def test_a_rig_of_two_cameras():
+    corners, right, rotation, translation = stereo()
+    unseen = right.isnan().all(-1).all(-1)
+    assert 0 < int(unseen.sum()) < 20
+    models = {name: type(camera) for name, camera in STEREO.items()}
+    sizes = {name: camera.image_size for name, camera in STEREO.items()}
+    points = {"right": [None if none else view for none, view in zip(unseen, right, strict=True)]}
+    points["left"] = corners.image_points
+    found = ct.calibrate_rig(models, corners.object_points, points, image_sizes=sizes)
+    assert list(found.rig) == ["left", "right"]
+    assert found.rms == pytest.approx(0.1 * math.sqrt(2), rel=0.05)
+    assert found.boards.batch_shape == (25,)
+    for name, truth in STEREO.items():
+        expected = torch.cat((truth.intrinsics, truth.distortion)).detach()
+        got = torch.cat((found.rig[name].intrinsics, found.rig[name].distortion)).detach()
+        assert bool(((got - expected).abs() < 4 * found.std[name]).all())
+    pose = found.rig.extrinsics["right"]
+    turn = rotation_matrix(pose.rotation).detach() @ rotation.mT
+    assert float((turn - torch.eye(3)).abs().max()) < 1e-3
+    assert_close(pose.translation.detach(), translation, rtol=0, atol=2e-4)
+    identity = found.rig.extrinsics["left"]
+    assert not identity.rotation.any()
+    assert not identity.translation.any()
+    assert isinstance(found.residuals["left"], torch.Tensor)
+    assert [bool(view.isnan().all()) for view in found.residuals["right"]] == unseen.tolist()
+    # every corner of both cameras, from one set of boards
+    held = found.boards(corners.object_points.expand(25, -1, -1))
+    pixels, _ = found.rig["right"].project(pose(held))
+    assert_close(torch.stack(found.residuals["right"]), (pixels - right).detach(), rtol=0, atol=1e-9, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"model": "brown"}, "brown_conrady"),
+        ({"count": 3}, "count=3"),
+        ({"fixed": ("k9",)}, "k9"),
+        ({"fixed": ("fx",)}, "start"),
+        ({"loss": "tukey"}, "tukey"),
+        ({"loss": "huber", "loss_scale": 0.0}, "loss_scale"),
+        ({"start": ct.KannalaBrandt([500.0, 500.0, 320.0, 240.0])}, "KannalaBrandt"),
+        ({"image_size": (640, 480)}, "height"),
+        ({"image_size": None}, "image_size"),
+        ({"image_points": LEFT.image_points.mT}, "swapped"),
+        ({"object_points": chessboard(8, 6, 0.025)}, "48"),
+        ({"image_points": LEFT.image_points * math.nan}, "NaN"),
+        ({"image_points": LEFT.image_points[:, :3], "object_points": LEFT.object_points[:3]}, "3"),
+    ],
+)
+def test_bad_arguments(changes, words):
+    given = {"model": "brown_conrady", "object_points": LEFT.object_points, "image_points": LEFT.image_points}
+    given |= {"image_size": LEFT.image_size, **changes}
+    with pytest.raises(ValueError, match=words) as caught:
+        ct.calibrate(given.pop("model"), given.pop("object_points"), given.pop("image_points"), **given)
+    assert "calibrate" in str(caught.value)
