@@ -212,10 +212,6 @@ def test_a_fisheye_past_its_plane():
     assert found.rms <= 0.4816
     poses = calibrate(test, model=found.camera, fixed="all")
     assert poses.rms <= 0.4747
-    _, rms, valid = ct.solve_pnp(found.camera, test.object_points.expand(7, -1, -1), test.image_points)
-    assert valid.all()
-    seen = (~test.image_points.isnan().any(-1)).sum(-1)
-    assert float(((rms.detach().square() * seen).sum() / seen.sum()).sqrt()) == pytest.approx(poses.rms, rel=1e-6)
 
 
 @slow
