@@ -1411,7 +1411,11 @@ static const float OVERSHOOT = 0.5f;    /* of the range of its nodes by which a 
 
 INLINE float greater(float a, float b) { return a > b ? a : b; }
 INLINE float lesser(float a, float b) { return a < b ? a : b; }
-INLINE float fourth(float a, float b, float c, float d, float e) { return fabsf(a - 4 * b + 6 * c - 4 * d + e); }
+/* By differences of differences, which numbers that lie close together have without roundings */
+INLINE float fourth(float a, float b, float c, float d, float e) {
+    const float ab = b - a, bc = c - b, cd = d - c, de = e - d;
+    return fabsf(((de - cd) - (cd - bc)) - ((cd - bc) - (bc - ab)));
+}
 
 /* The largest fourth differences at the corners of a row of cells; nodes: of the first of its six rows */
 static void misses(const float *nodes, int64_t width, int64_t n, float *by_column, float *across, float *down) {
