@@ -1,5 +1,6 @@
 """Laws of the compiled sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
 
+import copy
 import gc
 import math
 import os
@@ -435,6 +436,16 @@ def classified():
         yield counts
 
 
+def lost_in_single(exact, source, target, turned):
+    """By how many pixels positions in float32 differ from those in float64, at most."""
+    double = [copy.deepcopy(camera).double() for camera in (source, target)]
+    truth = ct.Warp(*double, None if turned is None else turned.double())._sampling()
+    both = exact.mapped & truth.mapped & (truth.grid.abs() <= 1).all(-1)
+    height, width = source.image_size
+    off = (exact.grid - truth.grid)[both] * torch.tensor([width / 2, height / 2])
+    return float(off.norm(dim=-1).max())
+
+
 errors: dict[float, list[float]] = {}
 
 
@@ -452,6 +463,8 @@ def check_lattice(source, target, turned):
             continue
         # what single precision leaves of a position, in the grid, in the nodes and in the ramp itself
         rounding = 8 * torch.finfo(torch.float32).eps * max(source.image_size)
+        if error > tolerance + rounding:  # near a fold it leaves less
+            rounding += 2 * lost_in_single(exact, source, target, turned)
         assert error <= tolerance + rounding
         errors.setdefault(tolerance, []).append(error / tolerance)
 
@@ -479,17 +492,30 @@ def pairs(draw):
 MIRRORED = (
     ct.Tabulated(
         [868.73376, 951.8356, 392.1125, 306.13748],
-        [0.67461783, 1.1450148, 1.6574193, 1.8895897, 2.1105397, 2.5912719, 3.1810648]
-        + [0.5185443, 0.5185443, 1.486181, 1.7968031, 2.6724687, 2.6724687, 2.9069364],
+        [
+            *(0.67461783, 1.1450148, 1.6574193, 1.8895897, 2.1105397, 2.5912719, 3.1810648),
+            *(0.5185443, 0.5185443, 1.486181, 1.7968031, 2.6724687, 2.6724687, 2.9069364),
+        ],
         image_size=(612, 784),
     ).requires_grad_(False),
     ct.Pinhole([247.59793, 313.31616, 122.864525, 121.24709], image_size=(243, 246)).requires_grad_(False),
     torch.tensor([[0.84, 0, 0.5426], [0, 1, 0], [-0.5426, 0, 0.84]]),
 )
+# the curvature steps at the axis, in the middle of a cell, against that of the lens around it
+STEPPED = (
+    ct.FTheta(
+        [76.575363, 70.01177, 76.61903, 46.695038],
+        [0.060716812, 0.0, 0.0, -0.06474075, 1e-11, 1e-10, -0.0053527234],
+        image_size=(96, 154),
+    ).requires_grad_(False),
+    ct.Pinhole([30.38603, 93.54958, 49.238407, 92.780914], image_size=(190, 99)).requires_grad_(False),
+    None,
+)
 
 
 @given(pairs())
 @example(MIRRORED)
+@example(STEPPED)
 @settings(max_examples=40)
 def test_positions_of_lattices_keep_their_tolerance(pair):
     check_lattice(*pair)

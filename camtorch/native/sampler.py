@@ -237,7 +237,7 @@ def classify(
         return None
     rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(len(nodes), rows, columns, dtype=torch.int32, device="cpu")
-    scratch = torch.empty(10 * (columns + 8), dtype=torch.float32, device="cpu")
+    scratch = torch.empty(20 * (columns + 8), dtype=torch.float32, device="cpu")
     given = _Classification(
         nodes.data_ptr(),
         nodes.stride()[:2],

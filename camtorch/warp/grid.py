@@ -29,7 +29,7 @@ _OVERSHOOT = 0.5  # of the range of its nodes by which a cubic may leave it: 0.2
 _CUBIC = 3 / 128  # a cubic through four even nodes misses its middle by this part of their fourth difference
 _QUINTIC = 5 / 1024  # and a polynomial through six by this part of their sixth one
 _CARE = 12.0  # times what sixth differences say is assumed: towards a fold up to 7.7 of it was measured
-_SAFETY = 3.0  # times that is assumed: at a step of the curvature, fourth differences tell less; 0.6 of it is then used
+_SAFETY = 3.0  # times that is assumed: at steps of the curvature, fourth differences tell less; 0.9 of it is then used
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
@@ -395,10 +395,15 @@ def _classified(
 
 
 def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
-    """(B, 2, n, m): the largest absolute fourth difference along an axis at the corners of each cell."""
+    """(B, 2, n, m): the largest absolute fourth difference along an axis, at each cell's corners and the next ones.
+
+    Where the curvature steps within a cell, those at its corners may be none. At the ends of the lattice, where there
+    are no five nodes, it is that at the corners.
+    """
     other = -3 - dim
     d = nodes.narrow(other, 2, nodes.shape[other] - 4).diff(4, dim=dim).abs()
-    return _over_windows(_over_windows(d, -1, 2, torch.maximum), -2, 2, torch.maximum)
+    d = torch.cat((d.narrow(dim, 0, 1), d, d.narrow(dim, d.shape[dim] - 1, 1)), dim)
+    return _over_windows(_over_windows(d, dim, 4, torch.maximum), other, 2, torch.maximum)
 
 
 def _over_windows(values: Tensor, dim: int, width: int, pick: Callable) -> Tensor:
