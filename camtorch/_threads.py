@@ -176,9 +176,28 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
+def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Leave the operations of a function undivided on the CPU: many small ones, whose results are always the same."""
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling() or torch.jit.is_tracing() or _limits is None or _mine.stays_alone:
+            return function(*args, **kwargs)
+        threads, was_alone = _mine.threads, _mine.is_alone
+        _mine.threads, _mine.stays_alone = threads or torch.get_num_threads(), True
+        try:
+            _mine.set_alone(True)
+            return function(*args, **kwargs)
+        finally:
+            _mine.set_alone(was_alone)
+            _mine.threads, _mine.stays_alone = threads, False
+
+    return call
+
+
 def split(elements: int | None = None) -> None:
     """Whether the next operations are to be split. elements: of each of them, if that is known."""
-    if _mine.threads > 1:
+    if _mine.threads > 1 and not _mine.stays_alone:
         small = elements is not None and elements <= ALONE
         _mine.set_alone(small or _crowd.meets(_mine.threads, _mine.was_split))
         _mine.was_split = elements is not None and not _mine.is_alone
@@ -213,6 +232,8 @@ class _Mine(threading.local):
     is_alone = False
     was_split = False
     """Whether the last operations were."""
+    stays_alone = False
+    """Whether that is so to the end of a function."""
     _of_mkl = 0
 
     def set_alone(self, alone: bool) -> None:

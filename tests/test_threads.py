@@ -448,3 +448,26 @@ def test_workers_of_a_loader():
     for index, (pixels, threads) in enumerate(torch.utils.data.DataLoader(dataset, None, num_workers=2)):
         assert threads == 1
         assert torch.equal(pixels, dataset[index][0])
+
+
+def test_a_function_on_one_thread_gives_the_threads_back():
+    @_threads.on_one_thread
+    def look(nested):
+        seen.append((torch.get_num_threads(), _threads.is_split()))
+        _threads.split(1 << 20)
+        seen.append((torch.get_num_threads(), _threads.is_split()))
+        if nested:
+            look(False)
+            seen.append((torch.get_num_threads(), _threads.is_split()))
+
+    seen, before = [], torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        look(True)
+        assert torch.get_num_threads() == 2
+        with pytest.raises(ZeroDivisionError):
+            _threads.on_one_thread(lambda: 1 / 0)()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert seen == 5 * [(1, False)]

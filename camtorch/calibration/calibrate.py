@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_whole
+from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations
 from camtorch.calibration.start import poses_for, start_from_nothing
@@ -195,6 +196,7 @@ class Calibration:
         return "\n".join((head, *numbers))
 
 
+@on_one_thread
 def calibrate(
     model: type[Camera] | str | Camera,
     object_points: Points,

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_image_size, as_values
+from camtorch._threads import on_one_thread
 from camtorch.calibration.calibrate import as_model
 from camtorch.camera import Camera, from_values
 from camtorch.convert import least_squares, views
@@ -21,6 +22,7 @@ _NEAREST = 0.05  # to the plane through a unified lens' centre, in units of a ra
 _LEAST = 4  # rays
 
 
+@on_one_thread
 @torch.no_grad()
 def fit(
     model: type[Camera] | str,

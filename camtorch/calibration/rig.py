@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State, adjust
 from camtorch.calibration.calibrate import (
     STEPS,
@@ -101,6 +102,7 @@ class RigCalibration:
         return "\n".join(lines)
 
 
+@on_one_thread
 def calibrate_rig(
     models: Mapping[str, type[Camera] | str | Camera],
     object_points: Points,
