@@ -29,12 +29,13 @@ _TRIED = {
 _VIEWS, _POINTS = 24, 64  # that the search looks at
 _KEPT = 5  # of the lenses tried
 _ROUNDS, _MANY_ROUNDS = 3, 12  # of poses
-_BAD = 2.0  # times the error that is usual: a view whose pose may be spoilt by outliers
+_CHANGED = 0.9  # of the usual error of a view before: then another round is worth it
 _TRIMMED = 0.8  # of the views decide: others may be spoilt
 _LEAST_SCALE = 0.5  # px, of robust weights
 _NO_PIXEL = 1e3  # px, the error of a corner without a pixel
 _OUTLIER = 3.0  # times the scale
 _WORSE, _LITTLE_WORSE = 2.0, 1.01  # than the best: costs of what is kept
+_ALIKE = 1e-3  # the relative difference of two starts, of one
 _SAME = 1e-7  # the difference of two costs, of one optimum
 _FEW_STEPS, _STEPS, _MANY_STEPS = 6, 12, 40
 # Coefficients with which the others make a valley that has several deepest places, and where along it to start
@@ -85,10 +86,10 @@ def start_from_nothing(
         lens = _refined(lens, few, KannalaBrandt, KannalaBrandt.default_count, image_size, fixed).row(0)
     lens = _refined(lens, few, model, count, image_size, fixed)
     _check_reach(lens.row(0), few, image_size)
-    states = [poses_for(row[None], observations, model, image_size, lens.scale) for row in lens.parameters]
-    if len(states) == 1:
-        return states[0]
-    boards = Poses(*(torch.cat(t) for t in zip(*(state.boards for state in states), strict=True)))
+    state = poses_for(lens.parameters[:1], observations, model, image_size, lens.scale)
+    if len(lens.parameters) == 1:
+        return state
+    boards = Poses(*(t.expand(len(lens.parameters), *t.shape[1:]) for t in state.boards))
     sight, free = _sight(model, observations), _free(model, count, fixed)
     state = _state(lens.parameters, boards)
     found = adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
@@ -210,8 +211,7 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
 def _posed(camera: Camera, some: Observations, rounds: int) -> tuple[Poses, Tensor]:
     """Poses (B, V) in closed form for cameras (B,), and the errors in px, (B, V, N); NaN for what is not seen.
 
-    Each round goes without the outliers of the one before; those after the second are for views that still fit worse
-    than others.
+    Each round goes without the outliers of the one before, for views to which that made a difference.
     """
     shape = len(camera.intrinsics), *some.seen.shape
     rays, has_ray = camera.unproject(some.pixels.flatten(0, 1).expand(shape[0], -1, -1))
@@ -219,18 +219,20 @@ def _posed(camera: Camera, some: Observations, rounds: int) -> tuple[Poses, Tens
     points = some.points.expand(*shape, 3).flatten(0, 1)
     weights, rows = has_ray.to(rays.dtype), torch.arange(len(rays), device=rays.device)
     boards = Poses.none(shape[0], shape[1], rays)
+    before = rays.new_full(shape[:2], torch.inf)
     for i in range(rounds):
         found = poses_from_rays(points[rows], rays[rows], weights[rows])
         for poses, new in zip(boards, found[:2], strict=True):
             poses.flatten(0, 1)[rows] = new[:, 0]
         errors = _errors(camera, boards, some)
-        typical = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
-        weights = 1 / (1 + (errors / (2 * typical[..., None])).square())
+        usual = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
+        weights = 1 / (1 + (errors / (2 * usual[..., None])).square())
         weights = torch.where(has_ray, weights.flatten(0, 1), 0.0)
         if i > 0:
-            (rows,) = (typical > _BAD * typical.median(-1, keepdim=True).values).flatten().nonzero(as_tuple=True)
-            if len(rows) == 0:
-                break
+            (rows,) = (usual < _CHANGED * before).flatten().nonzero(as_tuple=True)
+        if len(rows) == 0:
+            break
+        before = usual
     return boards, errors
 
 
@@ -315,12 +317,18 @@ def _fitted(
         some = torch.where(is_held, ideal, some)
         rows = least_squares.Observations(*(t.expand(len(some), *t.shape[1:]) for t in seen))
         fitted.append(least_squares.fit(template, rows, some[None], slopes.expand(len(some), -1), stay))
-    parameters = torch.cat(fitted)
+    parameters = _distinct(torch.cat(fitted))
     for i, name in enumerate(("cx", "cy"), 2):
         if name in fixed:
             parameters[:, i] = (image_size[3 - i] - 1) / 2
     boards = Poses(*(t.expand(len(parameters), *t.shape[1:]) for t in lens.boards))
     return _Lens(model, parameters, boards, lens.scale)
+
+
+def _distinct(parameters: Tensor) -> Tensor:
+    """Those of parameters (S, 4 + n) that are not as good as the same as an earlier one."""
+    apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
+    return parameters[~(~apart.any(-1)).tril(-1).any(-1)]
 
 
 def _check_reach(lens: _Lens, few: Observations, image_size: tuple[int, int]) -> None:
