@@ -24,6 +24,7 @@ from camtorch.models import (
     FTheta,
     FThetaBackward,
     KannalaBrandt,
+    LatLon,
     Mei,
     OCamCalib,
     OrthographicFisheye,
@@ -31,6 +32,7 @@ from camtorch.models import (
     Stereographic,
     Tabulated,
     ThinPrismFisheye,
+    TransverseCylindrical,
     WoodScape,
 )
 from camtorch.native.library import native_available
@@ -62,6 +64,7 @@ __all__ = [
     "Fisheye624",
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
+    "LatLon",
     "Mei",
     "OCamCalib",
     "OrthographicFisheye",
@@ -73,6 +76,7 @@ __all__ = [
     "Tabulated",
     "ThinPrismFisheye",
     "TiedFocal",
+    "TransverseCylindrical",
     "Warp",
     "WoodScape",
     "augment",

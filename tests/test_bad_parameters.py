@@ -33,7 +33,8 @@ def test_bad_rows_of_a_predicted_batch_are_invalid_and_the_others_live(key, grap
         rays, has_ray = camera.unproject(torch.full((5, 3, 2), 250.0, dtype=torch.float64))
     reference = make(key, intrinsics.detach()[0], distortion)
     assert torch.equal(valid, reference.project(POINTS)[1] & good[:, None])
-    assert torch.equal(pixels[2], reference.project(POINTS)[0])
+    # torch.atan2 rounds the last elements of a tensor otherwise than the others
+    torch.testing.assert_close(pixels[2], reference.project(POINTS)[0], rtol=1e-15, atol=0)
     assert torch.equal(has_ray[:, 0], good)
     assert [c.project(POINTS)[1].any().item() for c in camera] == good.tolist()
     if graph:

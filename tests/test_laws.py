@@ -26,7 +26,7 @@ from torch.func import jacfwd, jacrev, jvp, vmap
 
 import camtorch as ct
 from camtorch.optics.backprojection import Inverted
-from camtorch.optics.charts import CylinderChart, Perspective, SphereChart
+from camtorch.optics.charts import CylinderChart, Perspective, SphereChart, Transverse
 from camtorch.optics.lens import Lens
 
 EPS = torch.finfo(torch.float64).eps
@@ -269,7 +269,7 @@ def bad_points(camera):
     chart = optics(camera)[0]
     if isinstance(chart, Perspective):
         never += [[0, 0, -1], [0.1, 0.2, -1], [1, 0, 0], [1, 1, -1e-12]]
-    elif not isinstance(chart, (CylinderChart, SphereChart)):
+    elif not isinstance(chart, (CylinderChart, SphereChart, Transverse)):
         never += [[0, 0, -1], [0, 0, -1e-9]]
     return never
 

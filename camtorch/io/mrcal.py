@@ -15,6 +15,7 @@ NAMES = Names("mrcal", "mrcal", (".cameramodel",), ("*.cameramodel",))
 _MODELS = {
     "LENSMODEL_PINHOLE": ("pinhole", 0),
     "LENSMODEL_LONLAT": ("equirectangular", 0),
+    "LENSMODEL_LATLON": ("latlon", 0),
     "LENSMODEL_STEREOGRAPHIC": ("stereographic", 0),
     **{f"LENSMODEL_OPENCV{count}": ("brown_conrady", count) for count in (4, 5, 8, 12, 14)},
 }

@@ -19,6 +19,7 @@ from camtorch.models.fisheye62 import Fisheye62
 from camtorch.models.fisheye624 import Fisheye624, FisheyeRadTanThinPrism
 from camtorch.models.fov import FOV
 from camtorch.models.kannala_brandt import KannalaBrandt
+from camtorch.models.lat_lon import LatLon
 from camtorch.models.mei import Mei
 from camtorch.models.ocamcalib import OCamCalib
 from camtorch.models.orthographic_fisheye import OrthographicFisheye
@@ -26,6 +27,7 @@ from camtorch.models.pinhole import Pinhole
 from camtorch.models.stereographic import Stereographic
 from camtorch.models.tabulated import Tabulated
 from camtorch.models.thin_prism_fisheye import ThinPrismFisheye
+from camtorch.models.transverse_cylindrical import TransverseCylindrical
 from camtorch.models.ucm import UCM
 from camtorch.models.woodscape import WoodScape
 
@@ -46,6 +48,7 @@ __all__ = [
     "Fisheye624",
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
+    "LatLon",
     "Mei",
     "OCamCalib",
     "OrthographicFisheye",
@@ -53,5 +56,6 @@ __all__ = [
     "Stereographic",
     "Tabulated",
     "ThinPrismFisheye",
+    "TransverseCylindrical",
     "WoodScape",
 ]

@@ -11,6 +11,7 @@ from camtorch.optics.charts import (
     OneDivision,
     Perspective,
     SphereChart,
+    Transverse,
 )
 from camtorch.optics.lens import Lens, Planar, Stage, Tilt
 from camtorch.optics.radial import AnglePerRadius, Polynomial, RadialFactor, RadiusPolynomial, RadiusTable, Rational
@@ -37,5 +38,6 @@ __all__ = [
     "SphereChart",
     "Stage",
     "Tilt",
+    "Transverse",
     "Unified",
 ]

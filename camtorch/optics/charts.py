@@ -282,6 +282,32 @@ class SphereChart(Chart):
         return torch.sin(a) * across, torch.sin(b), torch.cos(a) * across
 
 
+class Transverse(Chart):
+    """Another chart about the x axis instead of the y axis: x and y change places, as do a and b."""
+
+    has_scale = False
+
+    def __init__(self, chart: Chart):
+        self.chart = chart
+
+    def margin(self, x, y, z):
+        return self.chart.margin(y, x, z)
+
+    def covers_all(self, nearest, extent, dtype):
+        return self.chart.covers_all(nearest, extent, dtype)
+
+    def to_plane(self, x, y, z, order=2, scale=None):
+        b, a = self.chart.to_plane(y, x, z, order)
+        return a, b
+
+    def on_plane(self, a, b):
+        return self.chart.on_plane(b, a)
+
+    def to_ray(self, a, b, order=2):
+        y, x, z = self.chart.to_ray(b, a, order)
+        return x, y, z
+
+
 def _length(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
     rho2 = torch.addcmul(x * x, y, y)
     return rho2, torch.addcmul(rho2, z, z).sqrt()
