@@ -1,5 +1,31 @@
-"""Plots of cameras, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and returns them."""
+"""Plots of cameras and calibrations, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and
+returns them.
+"""
 
-from camtorch.plot.cameras import difference, distortion_field, portrait, radius_curve
+from camtorch.plot.calibrations import (
+    boards,
+    calibrated_radius,
+    coverage,
+    residual_histogram,
+    residuals,
+    uncertainty,
+    view,
+    views,
+)
+from camtorch.plot.cameras import difference, distortion_field, portrait, radius_curve, rig
 
-__all__ = ["difference", "distortion_field", "portrait", "radius_curve"]
+__all__ = [
+    "boards",
+    "calibrated_radius",
+    "coverage",
+    "difference",
+    "distortion_field",
+    "portrait",
+    "radius_curve",
+    "residual_histogram",
+    "residuals",
+    "rig",
+    "uncertainty",
+    "view",
+    "views",
+]

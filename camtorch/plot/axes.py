@@ -19,6 +19,12 @@ COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
 """Of what is told apart by its name, as cameras are; the second one is also that of marks."""
 NO_RAYS = "#d9d4ca"
 """Of pixels without a value."""
+LEVELS = {
+    "counts": ("Blues", 0.2, 0.75, 5),
+    "residuals": ("viridis", 0.85, 0.05, 5),
+    "uncertainty": ("magma", 0.95, 0.2, 8),
+}
+"""Scales of few colours: matplotlib's map, the part of it from the palest colour to the darkest, how many."""
 
 
 def require_pyplot() -> ModuleType:
@@ -56,6 +62,7 @@ def draw_frame(ax: Axes, height: int, width: int) -> None:
     ax.set_xlim(-0.5 - margin, width - 0.5 + margin)
     ax.set_ylim(height - 0.5 + margin, -0.5 - margin)
     ax.set_aspect("equal")
+    ax.spines[:].set_visible(False)
     ax.plot([-0.5, width - 0.5, width - 0.5, -0.5, -0.5], [-0.5, -0.5, height - 0.5, height - 0.5, -0.5], color=INK)
 
 
@@ -73,6 +80,28 @@ def without_palest(name: str) -> Colormap:
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(colormaps[name](np.linspace(0.15, 1, 256)))
+
+
+def printable(name: str) -> str:
+    """A name without what fonts cannot draw: control characters, halves of characters in names of files."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
+
+
+def level_colours(name: str, count: int | None = None) -> list[str]:
+    """A few colours in order, from what is little to what is much, of "counts", "residuals" or "uncertainty".
+
+    Args:
+        name: of the scale.
+        count: as many, evenly chosen; by default, and at most, all of them.
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    source, start, end, most = LEVELS[name]
+    colours = [to_hex(colour) for colour in colormaps[source](np.linspace(start, end, most))]
+    if count is None:
+        return colours
+    return [colours[i] for i in np.linspace(0, most - 1, min(count, most)).round().astype(int)]
 
 
 def cycle(count: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""Plots of cameras: distortion, radius over angle, the difference of two."""
+"""Plots of cameras: distortion, radius over angle, the difference of two, where those of a rig are."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ from camtorch.plot.axes import (
     cycle,
     draw_frame,
     magnification,
+    printable,
     require_pyplot,
     size_of,
     without_palest,
 )
 from camtorch.projection.rays import angles_from_axis, followed, ideal, image_lattice
+from camtorch.rotations import rotation_matrix
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from camtorch.camera import Camera
+    from camtorch.rig import Rig
 
 _AZIMUTHS, _ANGLES = 32, 721
 _NOTHING = 1e-6  # px: what is less is rounding, and shown as none
@@ -182,6 +185,61 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     if remove_rotation:
         turned = f", turned by {math.degrees(differences.angle(compared.rotation)):.3g} degrees"
     ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
+    return ax
+
+
+@torch.no_grad()
+def rig(rig: Rig, ax: Axes | None = None) -> Axes:
+    """Where the cameras of a rig are, from above, with wedges for the horizontal fields of view.
+
+    In the frame of the rig, z to the top. Cameras that are above each other are seen from the right instead, with
+    vertical fields of view, z to the right.
+
+    Args:
+        rig: single cameras, of which those with a pose are shown.
+        ax: by default new ones.
+
+    Raises:
+        ValueError: no camera has a pose. ImportError: no matplotlib.
+    """
+    ax = axes_or_new(ax)
+    names = [name for name in rig.cameras if name in rig.extrinsics]
+    if not names:
+        raise ValueError("a plot of a rig shows cameras with extrinsics; got none")
+    places = torch.stack([rig.extrinsics[name].position for name in names]).double().numpy(force=True)
+    spread = np.ptp(places, axis=0)
+    above = spread[1] <= max(spread[0], spread[2])
+    across, up = (0, 2) if above else (2, 1)
+    size = float(spread.max()) or 1.0
+    for name, place, colour in zip(names, places, cycle(len(names)), strict=True):
+        camera = rig.cameras[name]
+        wide, tall = (1.0, 1.0) if camera.image_size is None else camera.field_of_view[:2].tolist()
+        half = min(math.pi, (wide if above else tall) / 2)
+        turns = np.linspace(-half, half, 49)
+        around, ahead = np.sin(turns), np.cos(turns)
+        arc = np.stack((around, 0 * turns, ahead) if above else (0 * turns, around, ahead), -1)
+        turned = arc @ rotation_matrix(rig.extrinsics[name].rotation).double().numpy(force=True)
+        wedge = place + 0.45 * size * np.concatenate((0 * arc[:1], turned, 0 * arc[:1]))
+        ax.fill(wedge[:, across], wedge[:, up], color=colour, alpha=0.16, linewidth=0, zorder=1)
+        ax.plot(wedge[:, across], wedge[:, up], color=colour, linewidth=0.9, zorder=2)
+        ax.plot(place[across], place[up], "o", color=colour, markersize=6, zorder=3)
+        label = ax.annotate(
+            printable(name),
+            place[[across, up]],
+            xytext=(0, -7),
+            textcoords="offset points",
+            color=INK,
+            ha="center",
+            va="top",
+        )
+        label.set_parse_math(False)
+    ax.set_aspect("equal")
+    ax.margins(0.15)
+    if not above:
+        ax.invert_yaxis()
+    ax.set_xlabel("xyz"[across])
+    ax.set_ylabel("xyz"[up])
+    ax.set_title(f"{len(names)} cameras from {'above' if above else 'the right'}")
     return ax
 
 

@@ -1,0 +1,590 @@
+"""Plots of calibrations: what the camera saw, how well it was explained, and how far the result can be trusted."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from camtorch.plot.axes import (
+    COLOURS,
+    GREY,
+    INK,
+    NO_RAYS,
+    PALE,
+    axes_or_new,
+    draw_frame,
+    level_colours,
+    magnification,
+    printable,
+    size_of,
+)
+from camtorch.projection.rays import followed, image_lattice
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from numpy.typing import ArrayLike
+    from torch import Tensor
+
+    from camtorch.calibration.calibrate import Calibration
+
+_CELLS = 14  # of the coverage, along the longer side
+_ARROWS = 15_000  # which is as many as an image has room for
+_LATTICE = 96  # of the map of uncertainty, along the longer side
+_AZIMUTHS = 16
+_BANDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # px
+_MOST_BANDS = 8
+
+
+class Sightings(NamedTuple):
+    """What a camera saw of V views of up to N corners each: NaN and False where there is nothing.
+
+    numbers: (V,) of the views, among those that were passed. pixels: (V, N, 2) observed. errors: (V, N, 2) projected
+    minus observed. inliers: (V, N). points: (V, N, 3) in the camera's frame.
+    """
+
+    numbers: tuple[int, ...]
+    pixels: np.ndarray
+    errors: np.ndarray
+    inliers: np.ndarray
+    points: np.ndarray
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(V, N) corners that have a residual."""
+        found: np.ndarray = np.isfinite(self.errors).all(-1)
+        return found
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """(V, N) px, of the residuals."""
+        found: np.ndarray = np.hypot(self.errors[..., 0], self.errors[..., 1])
+        return found
+
+    @property
+    def angles(self) -> np.ndarray:
+        """(V, N) radians from the optical axis."""
+        x, y, z = np.moveaxis(self.points, -1, 0)
+        found: np.ndarray = np.where(self.seen, np.arctan2(np.hypot(x, y), z), np.nan)
+        return found
+
+    @property
+    def rms(self) -> np.ndarray:
+        """(V,) px per point of the inliers of each view, NaN for a view without any."""
+        squares = np.where(self.inliers & self.seen, self.lengths**2, 0).sum(-1)
+        counts = (self.inliers & self.seen).sum(-1)
+        found: np.ndarray = np.sqrt(np.where(counts > 0, squares, np.nan) / np.maximum(counts, 1))
+        return found
+
+
+@torch.no_grad()
+def sightings(calibration: Calibration) -> Sightings:
+    """Of the views that have corners."""
+    found = calibration.observations
+    inliers = torch.zeros_like(found.seen)
+    for row, number in zip(inliers, calibration.views, strict=True):
+        flags = calibration.inliers[number].flatten()
+        row[: len(flags)] = flags
+    placed = (found.pixels, calibration.point_residuals, calibration.extrinsics(found.points))
+    known = [torch.where(found.seen[..., None], t, torch.nan) for t in placed]
+    some = found.seen.any(-1)
+    numbers = tuple(number for number, has in zip(calibration.views, some.tolist(), strict=True) if has)
+    pixels, errors, points = (t[some].double().numpy(force=True) for t in known)
+    return Sightings(numbers, pixels, errors, inliers[some].numpy(force=True), points)
+
+
+def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
+    """Where the image has corners: dots, on cells that are the darker the more corners they have; crosses are outliers.
+
+    The title says in how many of the cells that have rays a corner was seen.
+
+    Args:
+        calibration: of a camera.
+        ax: by default new ones.
+
+    Raises:
+        ImportError: no matplotlib.
+    """
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    ax, shots = axes_or_new(ax), sightings(calibration)
+    height, width = size_of(calibration.camera)
+    draw_frame(ax, height, width)
+    rows, columns = _cells(height, width)
+    pixels = shots.pixels[shots.seen & shots.inliers]
+    edges = [np.linspace(-0.5, length - 0.5, count + 1) for length, count in ((height, rows), (width, columns))]
+    counts = np.histogram2d(pixels[:, 1], pixels[:, 0], edges)[0]
+    colours = level_colours("counts")
+    steps = np.ceil(len(colours) * np.sqrt(counts / max(counts.max(), 1)))
+    cmap, norm = ListedColormap([PALE, *colours]), BoundaryNorm(np.arange(len(colours) + 2) - 0.5, len(colours) + 1)
+    ax.pcolormesh(edges[1], edges[0], steps, cmap=cmap, norm=norm, zorder=0.5, edgecolors="#ffffff", linewidth=0.6)
+    _dots(ax, pixels[_thinned(len(pixels))], INK, 1.6 if len(pixels) < 3000 else 0.9)
+    _crosses(ax, shots)
+    share = _covered(calibration, counts)
+    ax.set_title(f"{len(pixels):,} corners in {100 * share:.0f} % of the image")
+    return ax
+
+
+def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
+    """The residuals of all corners over the image, from where a corner was seen to where the model shows it.
+
+    They are drawn longer, by a factor that the title says. Crosses are outliers. Of more than 15,000 the longest and
+    an even choice of the others are drawn.
+
+    Args:
+        calibration: of a camera.
+        ax: by default new ones.
+
+    Raises:
+        ImportError: no matplotlib.
+    """
+    ax, shots = axes_or_new(ax), sightings(calibration)
+    height, width = size_of(calibration.camera)
+    draw_frame(ax, height, width)
+    use = shots.seen & shots.inliers
+    pixels, errors, lengths = shots.pixels[use], shots.errors[use], shots.lengths[use]
+    few = _thinned(len(lengths), lengths)
+    pixels, errors, lengths = pixels[few], errors[few], lengths[few]
+    most = _round_up(float(np.quantile(lengths, 0.98))) if len(lengths) else 1.0
+    longer = magnification(0.045 * max(height, width) / most)
+    scale = _scale("residuals", np.linspace(0, most, len(level_colours("residuals")) + 1))
+    place = np.minimum(len(scale.colours) - 1, (lengths / most * len(scale.colours)).astype(int))
+    for i, colour in enumerate(scale.colours):
+        here = place == i
+        _segments(ax, pixels[here], pixels[here] + longer * errors[here], colour, zorder=2 + i / 10)
+    _crosses(ax, shots)
+    _bar(ax, scale, "px", open_end=bool((lengths > most).any()))
+    times = f", {longer:,} times as long" if longer > 1 else ""
+    less = "" if len(few) == use.sum() else f", {len(few):,} of {use.sum():,}"
+    ax.set_title(f"residuals, from the seen corner to the projected one{times}{less}")
+    return ax
+
+
+def residual_histogram(calibration: Calibration, ax: Axes | None = None) -> Axes:
+    """How often residuals have a size, across (u) and down (v), beside the normal distribution of sigma.
+
+    Args:
+        calibration: of a camera.
+        ax: by default new ones.
+
+    Raises:
+        ImportError: no matplotlib.
+    """
+    ax, shots = axes_or_new(ax), sightings(calibration)
+    errors = shots.errors[shots.seen & shots.inliers]
+    sigma = float(calibration.sigma)
+    reach = 4.5 * sigma if sigma > 0 else 1.0
+    bins = np.linspace(-reach, reach, 46).tolist()
+    inside = errors.clip(-reach, reach)
+    ax.hist(inside[:, 0], bins, color=COLOURS[0], alpha=0.35, label="u", linewidth=0)
+    ax.hist(inside[:, 1], bins, color=COLOURS[3], histtype="step", linewidth=1.4, label="v")
+    if sigma > 0:
+        x = np.linspace(-reach, reach, 181)
+        normal = np.exp(-((x / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
+        label = f"normal, {sigma:.3g} px"
+        ax.plot(x, normal * len(errors) * (bins[1] - bins[0]), color=INK, linestyle="--", linewidth=1, label=label)
+    ax.set_xlim(-reach, reach)
+    ax.set_xlabel("residual, px")
+    ax.set_ylabel("corners")
+    ax.set_title("residuals across (u) and down (v)")
+    ax.legend(frameon=False, loc="upper right", handlelength=1.4)
+    return ax
+
+
+def views(calibration: Calibration, ax: Axes | None = None, *, names: Sequence[str] | None = None) -> Axes:
+    """The rms of the residuals of each view, as bars, and that of all as a line.
+
+    Args:
+        calibration: of a camera.
+        ax: by default new ones.
+        names: of all views that were passed; by default their numbers from 0.
+
+    Raises:
+        ValueError: not as many names as views. ImportError: no matplotlib.
+    """
+    ax, shots = axes_or_new(ax), sightings(calibration)
+    rms = shots.rms
+    count = len(calibration.image_points)
+    if names is not None and len(names) != count:
+        raise ValueError(f"{count} views, and names for {len(names)}")
+    labels = [str(number) if names is None else printable(names[number]) for number in shots.numbers]
+    ax.bar(np.arange(len(rms)), np.nan_to_num(rms), color=COLOURS[0], width=0.8)
+    ax.axhline(float(calibration.rms), color=INK, linestyle="--", linewidth=1)
+    step = max(1, math.ceil(len(rms) / (40 if names is None else 25)))
+    shown = np.arange(0, len(rms), step)
+    turned = 0 if names is None else 90
+    ax.set_xticks(shown, [labels[i] for i in shown], parse_math=False, rotation=turned)
+    ax.set_xlim(-0.6, len(rms) - 0.4)
+    ax.set_xlabel("view")
+    ax.set_ylabel("rms, px")
+    ax.set_title("rms of each view; dashed: of all")
+    return ax
+
+
+def view(calibration: Calibration, number: int, ax: Axes | None = None, *, image: ArrayLike | None = None) -> Axes:
+    """The corners of one view as rings, on its photograph; lines to where the model shows them, longer than they are.
+
+    Args:
+        calibration: of a camera.
+        number: of the view, from 0, among those that were passed.
+        ax: by default new ones.
+        image: (H, W) or (H, W, C), of the size of the camera's image.
+
+    Raises:
+        ValueError: no such view, or one without corners; an image of another size. ImportError: no matplotlib.
+    """
+    ax, shots = axes_or_new(ax), sightings(calibration)
+    height, width = size_of(calibration.camera)
+    if number not in shots.numbers:
+        raise ValueError(f"no view {number} with corners; of {len(calibration.image_points)} {len(shots.numbers)} have")
+    index = shots.numbers.index(number)
+    draw_frame(ax, height, width)
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    if image is not None:
+        image = np.asarray(image)
+        if image.shape[:2] != (height, width):
+            raise ValueError(f"an image of {image.shape[:2]} for a camera of image_size {(height, width)}")
+        ax.imshow(image, extent=edges, cmap="gray", zorder=0)
+    use = shots.seen[index] & shots.inliers[index]
+    pixels, errors = shots.pixels[index][use], shots.errors[index][use]
+    usual = float(np.quantile(shots.lengths[index][use], 0.9)) if use.any() else 1.0
+    longer = magnification(0.03 * max(height, width) / max(usual, 1e-9))
+    size = 4.5 if use.sum() < 150 else 2.5
+    u, v = pixels.T
+    ax.plot(u, v, "o", markersize=size, markerfacecolor="none", markeredgecolor=COLOURS[0], markeredgewidth=0.9)
+    _segments(ax, pixels, pixels + longer * errors, COLOURS[3], zorder=4, dots=False)
+    _crosses(ax, shots, index)
+    times = f", residuals {longer:,} times as long" if longer > 1 else ""
+    ax.set_title(f"view {number}, rms {shots.rms[index]:.3g} px{times}")
+    return ax
+
+
+def uncertainty(calibration: Calibration, ax: Axes | None = None, *, distance: float = math.inf) -> Axes:
+    """How far a pixel can be trusted: `calibration.uncertainty` over the image, with the outline of what has corners.
+
+    Args:
+        calibration: of a camera.
+        ax: by default new ones.
+        distance: of what is seen, in the unit of the boards.
+
+    Raises:
+        ImportError: no matplotlib.
+    """
+    ax, shots = axes_or_new(ax), sightings(calibration)
+    height, width = size_of(calibration.camera)
+    draw_frame(ax, height, width)
+    rows, columns = (max(2, round(_LATTICE * side / max(height, width))) + 1 for side in (height, width))
+    pixels = image_lattice(calibration.camera, rows, columns).double()
+    values = np.ma.masked_invalid(calibration.uncertainty(pixels, distance).double().numpy(force=True))
+    ax.fill_between([-0.5, width - 0.5], -0.5, height - 0.5, color=NO_RAYS, linewidth=0, zorder=0.5)
+    at = "at infinity" if math.isinf(distance) else f"at a distance of {distance:.3g}"
+    ax.set_title(f"sigma of a projection {at}")
+    if values.count():
+        scale = _scale("uncertainty", _bands(values.compressed()))
+        u, v = pixels[0, :, 0].numpy(force=True), pixels[:, 0, 1].numpy(force=True)
+        most = max(float(values.max()), scale.bounds[-1]) * 2
+        filled = np.ma.maximum(values, scale.bounds[0])
+        for low, colour in zip(scale.bounds, scale.colours, strict=False):
+            # from this band on: the next ones come on top, so that no seam is left between two
+            ax.contourf(u, v, filled, [low, most], colors=[colour], zorder=1)
+        _bar(ax, scale, "px", open_end=float(values.max()) > scale.bounds[-1])
+        ax.set_title(f"sigma of a projection {at}: median {np.median(values.compressed()):.2g} px")
+    outline = _hull(shots.pixels[shots.seen & shots.inliers])
+    ax.plot(*outline.T, color=INK, linestyle=(0, (4, 3)), linewidth=1.1, zorder=4)
+    return ax
+
+
+@torch.no_grad()
+def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
+    """The distance from the principal point over the angle from the axis, and what is known of it.
+
+    Shaded are the angles that the corners have, with their histogram at the bottom. The band is the uncertainty of a
+    projection at infinity, drawn wider by the factor that the legend says; dots end the curve where its rays do.
+
+    Args:
+        calibration: of a camera.
+        ax: by default new ones.
+
+    Raises:
+        ImportError: no matplotlib.
+    """
+    ax, shots, camera = axes_or_new(ax), sightings(calibration), calibration.camera
+    size_of(camera)
+    angles = torch.linspace(0, math.pi, 181).to(camera.intrinsics)
+    pixels, valid = followed(camera, angles, _AZIMUTHS)
+    inside = valid & camera.contains(pixels)
+    radius = torch.linalg.vector_norm(pixels - camera.intrinsics[2:], dim=-1)
+    seen = np.degrees(shots.angles[shots.seen & shots.inliers])
+    known = float(seen.max()) if len(seen) else 0.0
+    ax.axvspan(0, known, color=PALE, zorder=0)
+    some = inside.any(-1)
+    middle = torch.where(inside, radius, torch.nan).nanmean(-1)[some].double()
+    sigma = _worst(calibration, pixels, inside)[some.numpy(force=True)]
+    x, y = np.degrees(angles[some].double().numpy(force=True)), middle.numpy(force=True)
+    top = 1.08 * float(np.nanmax(y)) if len(y) else 1.0
+    within = sigma[x <= known]
+    usual = float(np.nanmax(within)) if np.isfinite(within).any() else math.nan
+    if usual > 0:
+        wider = magnification(0.06 * top / usual)
+        label = f"± sigma at infinity, {wider:,} times" if wider > 1 else "± sigma at infinity"
+        low, high = (np.clip(y + sign * wider * sigma, 0, top) for sign in (-1, 1))
+        ax.fill_between(x, low, high, color=COLOURS[0], alpha=0.22, linewidth=0, zorder=2, label=label)
+    ax.plot(x, y, color=COLOURS[0], linewidth=1.8, zorder=3, label=camera.key)
+    if len(x):
+        ax.plot(x[-1:], y[-1:], "o", color=COLOURS[0], markersize=4.5, zorder=3)
+    if len(seen):
+        edges = np.arange(0, known + 2.5, 2.5)
+        counts = np.histogram(seen, edges)[0]
+        ax.bar(
+            edges[:-1],
+            counts * (0.16 * top / counts.max()),
+            2.3,
+            align="edge",
+            color=GREY,
+            alpha=0.55,
+            zorder=1,
+            label="corners",
+        )
+    ax.set_xlim(0, 1.06 * max(float(x[-1]) if len(x) else 1.0, known, 1e-3))
+    ax.set_ylim(0, top)
+    ax.set_xlabel("angle from the axis, degrees")
+    ax.set_ylabel("distance from the principal point, px")
+    ax.set_title("radius over angle, within the image")
+    ax.legend(frameon=False, loc="upper left", handlelength=1.4)
+    return ax
+
+
+def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
+    """The boards as they stood before the camera, seen from its upper right, each in the colour of its rms.
+
+    Args:
+        calibration: of a camera.
+        ax: by default new ones.
+
+    Raises:
+        ImportError: no matplotlib.
+    """
+    from matplotlib.collections import PolyCollection
+
+    ax, shots = axes_or_new(ax), sightings(calibration)
+    rms = shots.rms
+    outlines = [_hull(_oblique(points[np.isfinite(points).all(-1)])) for points in shots.points]
+    some = [i for i, outline in enumerate(outlines) if len(outline) > 2 and math.isfinite(rms[i])]
+    extent = np.concatenate([outlines[i] for i in some]) if some else np.ones((1, 2))
+    size = float(np.abs(extent).max())
+    if some:
+        ends = float(rms[some].min()), float(rms[some].max())
+        step = max(_round_up(max(ends[1] - ends[0], 1e-9) / len(level_colours("residuals"))), 1e-9)
+        bounds = math.floor(ends[0] / step) * step + step * np.arange(len(level_colours("residuals")) + 1)
+        scale = _scale("residuals", bounds)
+        place = [max(0, min(len(scale.colours) - 1, int((rms[i] - bounds[0]) / step))) for i in some]
+        faces = PolyCollection(
+            [outlines[i] for i in some],
+            facecolors=[scale.colours[k] for k in place],
+            edgecolors=[scale.colours[k] for k in place],
+            alpha=0.35 if len(some) < 60 else 0.15,
+            zorder=2,
+        )
+        rims = PolyCollection(
+            [outlines[i] for i in some],
+            facecolors="none",
+            edgecolors=[scale.colours[k] for k in place],
+            linewidths=1.0 if len(some) < 60 else 0.5,
+            zorder=3,
+        )
+        ax.add_collection(faces)
+        ax.add_collection(rims)
+        _bar(ax, scale, "rms, px")
+    _draw_camera(ax, 0.12 * size)
+    _ruler(ax, size)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.margins(0.06)
+    ax.set_axis_off()
+    ax.set_title(f"{len(some)} boards before the camera")
+    return ax
+
+
+# -- parts of plots
+
+
+class _Scale(NamedTuple):
+    """A few colours and their bounds, one more."""
+
+    colours: list[str]
+    bounds: list[float]
+    mappable: ScalarMappable
+
+
+def _scale(name: str, bounds: np.ndarray) -> _Scale:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    colours = level_colours(name, len(bounds) - 1)
+    norm = BoundaryNorm(bounds.tolist(), len(colours))
+    return _Scale(colours, bounds.tolist(), ScalarMappable(norm, ListedColormap(colours)))
+
+
+def _bar(ax: Axes, scale: _Scale, label: str, *, open_end: bool = False) -> None:
+    bar = ax.figure.colorbar(scale.mappable, ax=ax, shrink=0.8, pad=0.02, aspect=28, spacing="uniform", drawedges=False)
+    ticks = scale.bounds if len(scale.bounds) < 10 else scale.bounds[::2]
+    texts = [f"{value:.3g}" for value in ticks]
+    if open_end:
+        texts[-1] = f"> {texts[-1]}"
+    bar.set_ticks(ticks, labels=texts)
+    bar.ax.minorticks_off()
+    bar.ax.tick_params(length=0)
+    bar.outline.set_visible(False)
+    bar.set_label(label)
+
+
+def _cells(height: int, width: int) -> tuple[int, int]:
+    rows, columns = (max(3, round(_CELLS * side / max(height, width))) for side in (height, width))
+    return rows, columns
+
+
+@torch.no_grad()
+def _covered(calibration: Calibration, counts: np.ndarray) -> float:
+    """The part of the cells with rays that have a corner."""
+    rows, columns = counts.shape
+    lattice = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
+    rays = calibration.camera.unproject(lattice)[1].numpy(force=True) | (counts > 0)
+    return float((counts > 0).sum() / rays.sum()) if rays.any() else 0.0
+
+
+def _thinned(count: int, lengths: np.ndarray | None = None) -> np.ndarray:
+    """Indices of at most _ARROWS: the longest tenth of them, if there are lengths, and the others evenly."""
+    if count <= _ARROWS:
+        return np.arange(count)
+    order = np.arange(count) if lengths is None else np.argsort(-lengths)
+    longest, others = np.split(order, [0 if lengths is None else _ARROWS // 10])
+    evenly = np.linspace(0, len(others) - 1, _ARROWS - len(longest)).astype(int)
+    return np.concatenate((longest, np.sort(others)[evenly]))
+
+
+def _segments(ax: Axes, start: np.ndarray, end: np.ndarray, colour: str, *, zorder: float, dots: bool = True) -> None:
+    """Lines, and dots where they start, each as one path: thousands of them make a small file."""
+    if not len(start):
+        return
+    width = 0.9 if len(start) < 3000 else 0.6
+    _strokes(ax, np.stack((start, end), 1), colour, width, zorder)
+    if dots:
+        _dots(ax, start, colour, 2.0 if len(start) < 3000 else 1.2, zorder)
+
+
+def _dots(ax: Axes, places: np.ndarray, colour: str, size: float, zorder: float = 2.0) -> None:
+    if len(places):
+        _strokes(ax, np.stack((places, places), 1), colour, size, zorder)
+
+
+def _strokes(ax: Axes, ends: np.ndarray, colour: str, width: float, zorder: float) -> None:
+    """(K, 2, 2) lines with round ends."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    codes = np.tile([Path.MOVETO, Path.LINETO], len(ends)).astype(np.uint8)
+    path = Path(ends.reshape(-1, 2), codes)
+    path.should_simplify = False  # which would drop the dots
+    stroke = PathPatch(path, facecolor="none", edgecolor=colour, linewidth=width, capstyle="round", zorder=zorder)
+    ax.add_patch(stroke)
+
+
+def _crosses(ax: Axes, shots: Sightings, index: int | None = None) -> None:
+    """Outliers."""
+    out = shots.seen & ~shots.inliers
+    if index is not None:
+        out = out & (np.arange(len(out)) == index)[:, None]
+    if out.any():
+        u, v = shots.pixels[out].T
+        label = f"{len(u):,} outlier{'s' * (len(u) > 1)}"
+        ax.plot(u, v, "x", color=COLOURS[1], markersize=4, markeredgewidth=1, label=label, zorder=5, linestyle="none")
+        ax.legend(loc="lower right", framealpha=0.8, handletextpad=0.2)
+
+
+def _bands(values: np.ndarray) -> np.ndarray:
+    """Bounds from 1, 2, 5, 10, ... around what most values are."""
+    low, high = np.quantile(values, (0.01, 0.97))
+    power = 10.0 ** math.floor(math.log10(max(low, 1e-6)))
+    low = max(n * power for n in (1, 2, 5) if n * power <= max(low, 1e-6) * 1.0001)
+    bounds = [low]
+    while bounds[-1] < high and len(bounds) <= _MOST_BANDS:
+        power = 10.0 ** math.floor(math.log10(bounds[-1] * 1.001))
+        bounds.append(min(n * power for n in (2, 5, 10) if n * power > bounds[-1] * 1.001))
+    if len(bounds) == 1:
+        bounds.append(2 * low)
+    return np.array(bounds)
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 2, 3, 5, 10, ..."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
+    return min((n * power for n in (1, 2, 3, 5, 10) if n * power >= value * (1 - 1e-9)), default=10 * power)
+
+
+def _worst(calibration: Calibration, pixels: Tensor, inside: Tensor) -> np.ndarray:
+    """(K,) the greatest uncertainty at infinity among the azimuths (K, A) that are inside; NaN without any."""
+    values = torch.full(inside.shape, -math.inf, dtype=torch.float64)
+    if bool(inside.any()):
+        values[inside.cpu()] = calibration.uncertainty(pixels[inside].double(), math.inf).double().cpu().nan_to_num(-1)
+    most = values.amax(-1)
+    found: np.ndarray = torch.where(most >= 0, most, torch.nan).numpy()
+    return found
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    """(M, 2), closed: the convex hull of (N, 2), by Andrew's monotone chain."""
+    ordered = sorted(set(map(tuple, points.tolist())))
+    if len(ordered) < 3:
+        return np.array(ordered).reshape(-1, 2)
+
+    def half(along: Sequence[tuple[float, ...]]) -> list[tuple[float, ...]]:
+        kept: list[tuple[float, ...]] = []
+        for p in along:
+            while len(kept) > 1:
+                (ax, ay), (bx, by) = kept[-2], kept[-1]
+                if (bx - ax) * (p[1] - ay) - (by - ay) * (p[0] - ax) > 0:
+                    break
+                kept.pop()
+            kept.append(p)
+        return kept[:-1]
+
+    around = half(ordered) + half(ordered[::-1])
+    return np.array([*around, around[0]])
+
+
+_TURN, _TILT = math.radians(58), math.radians(24)
+
+
+def _oblique(points: np.ndarray) -> np.ndarray:
+    """(..., 3) of the camera's frame to (..., 2), right and up, as seen from its right, behind and above."""
+    x, y, z = np.moveaxis(np.asarray(points, float), -1, 0)
+    across = z * math.sin(_TURN) + x * math.cos(_TURN)
+    away = z * math.cos(_TURN) - x * math.sin(_TURN)
+    return np.stack((across, -y * math.cos(_TILT) + away * math.sin(_TILT)), -1)
+
+
+def _draw_camera(ax: Axes, size: float) -> None:
+    """A frustum at the origin, and its axis."""
+    rim = size * np.array(
+        [(-0.6, -0.45, 1.0), (0.6, -0.45, 1.0), (0.6, 0.45, 1.0), (-0.6, 0.45, 1.0), (-0.6, -0.45, 1)]
+    )
+    around = _oblique(rim)
+    centre = _oblique(np.zeros(3))
+    ax.plot(*around.T, color=INK, linewidth=1.2, zorder=5)
+    for corner in around[:4]:
+        ax.plot(*np.stack((centre, corner)).T, color=INK, linewidth=1.2, zorder=5)
+    ax.plot(*_oblique(np.array([(0, 0, 0), (0, 0, 2.2 * size)])).T, color=GREY, linewidth=0.9, linestyle="--", zorder=4)
+
+
+def _ruler(ax: Axes, size: float) -> None:
+    """A length, for the boards' unit is the user's."""
+    length = _round_up(0.15 * size)
+    (left, low), (_, high) = ax.dataLim.min, ax.dataLim.max
+    low -= 0.06 * (high - low)
+    ax.plot([left, left + length], [low, low], color=GREY, linewidth=1.6, solid_capstyle="butt")
+    middle = left + length / 2, low
+    ax.annotate(f"{length:.3g}", middle, (0, -3), textcoords="offset points", color=GREY, ha="center", va="top")
