@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from photographs import fisheye, photograph
 
+from camtorch.calibration import detection
 from camtorch.calibration.boards import AprilGrid, Charuco, Chessboard, board_of
 from camtorch.calibration.detection import detect
 
@@ -95,6 +96,28 @@ def test_noisy_and_blurred_chessboards_are_found_no_worse_than_by_their_sectors(
     noisy = np.clip(cv2.GaussianBlur(image, (0, 0), 2.0) + noise, 0, 255).astype(np.uint8)
     # gradients alone: 0.6
     assert np.sqrt(((detect(board, noisy).pixels - truth) ** 2).sum(-1).mean()) < 0.35
+
+
+def test_corners_that_opencv_puts_beside_their_rows_are_mended():
+    board, rng = BOARDS[0], np.random.default_rng(0)
+    image, truth = photograph(board, fisheye(), (0.1, -0.3, 0.1), (-0.12, -0.1, 0.25))
+
+    class OffBoard:
+        """OpenCV, three of whose corners are off."""
+
+        def __getattr__(self, name):
+            return getattr(cv2, name)
+
+        def findChessboardCornersSB(self, *arguments, **options):  # noqa: N802
+            found, corners = cv2.findChessboardCornersSB(*arguments, **options)
+            for index in (0, 30, 53):
+                corners[index] += 9 * rng.choice((-1, 1), 2)
+            return found, corners
+
+    pixels = detection._chessboard(OffBoard(), board, image)
+    seen = np.isfinite(pixels[:, 0])
+    assert seen.sum() >= 53
+    assert np.abs(pixels - truth)[seen].max() < 0.2
 
 
 def test_too_little_of_a_board_has_a_reason():

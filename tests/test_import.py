@@ -21,7 +21,18 @@ def python(code, *words, expect=0):
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["--version"], ["--help"], ["dewarp", "--help"], ["show", "--help"], ["dewarp", "--fov", "x"], ["x"]]
+    "words",
+    [
+        [],
+        ["--version"],
+        ["--help"],
+        ["dewarp", "--help"],
+        ["show", "--help"],
+        ["calibrate", "--help"],
+        ["board", "--help"],
+        ["dewarp", "--fov", "x"],
+        ["x"],
+    ],
 )
 def test_the_command_answers_without_torch(words):
     code = """

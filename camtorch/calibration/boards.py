@@ -60,6 +60,8 @@ class Board:
     counted: ClassVar[str]
     """What `columns` and `rows` count."""
     least: ClassVar[int]
+    sides: ClassVar[tuple[str, ...]] = ("square",)
+    """Which of its numbers are lengths."""
 
     def __post_init__(self) -> None:
         owner = type(self).__name__
@@ -88,9 +90,18 @@ class Board:
         """What is black."""
         raise NotImplementedError
 
-    def options(self) -> dict[str, str | int | float | bool]:
+    def options(self) -> dict[str, str | int | float]:
         """What makes this board, in plain values; `board_of` reads it."""
         return {"type": self.kind, **asdict(self)}
+
+    def looks_like(self, other: Board) -> bool:
+        """Whether it is the same but for its size: its points are found at the same pixels."""
+
+        def shape(board: Board) -> dict[str, object]:
+            sides = {side: round(float(getattr(board, side)) / board.square, 6) for side in board.sides}
+            return {**board.options(), **sides}
+
+        return shape(self) == shape(other)
 
     def words(self, unit: str = "") -> str:
         """What it is, in a few words."""
@@ -158,6 +169,7 @@ class Charuco(Board):
     kind = "charuco"
     counted = "squares"
     least = 3
+    sides = ("square", "marker")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -5,6 +5,7 @@ An integer coordinate is a pixel's centre.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from typing import Any, NamedTuple
@@ -20,11 +21,13 @@ _PIXELS = 3e6
 """Chessboards are searched for in images of at most so many pixels, and refined in the whole one."""
 _WINDOWS = (0.2, 0.3, 0.4)
 """Half the sides of windows around corners, in distances to the nearest other one."""
+_STRAY = 0.15
+"""How far a corner may be from where its rows have it, in distances to the nearest other one."""
 _SMALL = 1.5e6
 """Markers in images of fewer pixels are also searched for in one of twice the size."""
 _FEWEST = 6
 """Points of a board, below which what is seen does not tell its pose well."""
-_NOT_FOUND = "no board found"
+NOT_FOUND = "no board found"
 
 
 class Detection(NamedTuple):
@@ -63,7 +66,7 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
         pixels = _aprilgrid(cv2, board, grey)
     nothing = np.full((len(board.points()), 2), np.nan)
     if pixels is None or np.isnan(pixels).all():
-        return Detection(nothing, _NOT_FOUND)
+        return Detection(nothing, NOT_FOUND)
     seen = np.isfinite(pixels[:, 0])
     if seen.sum() < _FEWEST:
         return Detection(nothing, f"only {seen.sum()} points of the board found, of which {_FEWEST} are needed")
@@ -99,26 +102,54 @@ def _chessboard(cv2: Any, board: Chessboard, grey: NDArray[np.uint8]) -> Pixels 
         return None
     scale = np.array([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
     pixels = (corners.reshape(-1, 2).astype(np.float64) + 0.5) * scale - 0.5
-    return _ordered(board, grey, _smoothest(cv2, board, grey, pixels))
+    return _moved_by_gradients(cv2, board, grey, _ordered(board, grey, pixels))
 
 
-def _smoothest(cv2: Any, board: Chessboard, grey: NDArray[np.uint8], pixels: Pixels) -> Pixels:
+def _moved_by_gradients(cv2: Any, board: Chessboard, grey: NDArray[np.uint8], pixels: Pixels) -> Pixels:
     """The corners as found, or moved to where the gradients around them say, in a smaller or larger window.
 
     Gradients are three times as exact in sharp images, and worse than nothing in noisy ones. A lens bends rows of
-    corners smoothly, so what the third differences along them have is noise: the least of it is taken.
+    corners smoothly, so what the third differences along them have is noise: the least of it is taken. A corner that
+    is no part of its rows, as OpenCV has some at the ends of steep ones, is looked for where they say, or unseen.
     """
-
-    def roughness(corners: Pixels) -> float:
-        grid = corners.reshape(board.rows, board.columns, 2)
-        return sum(float((np.diff(grid, 3, axis=axis) ** 2).sum()) for axis in (0, 1))
-
-    nearest = [np.partition(np.linalg.norm(pixels - corner, axis=1), 1)[1] for corner in pixels]
-    tried = [pixels]
+    differences = _third_differences(board.rows, board.columns)
+    expected, strays = _mended(differences, pixels)
+    nearest = np.array([np.partition(np.linalg.norm(expected - corner, axis=1), 1)[1] for corner in expected])
+    tried = [np.where(strays[:, None], np.nan, expected)]
     for part in _WINDOWS:
-        moved = [_refined(cv2, grey, one[None], part * side) for one, side in zip(pixels, nearest, strict=True)]
-        tried.append(np.concatenate(moved))
-    return min(tried, key=roughness)
+        moved = [_refined(cv2, grey, one[None], part * side) for one, side in zip(expected, nearest, strict=True)]
+        corners = np.concatenate(moved)
+        far = np.linalg.norm(corners - expected, axis=1) > _STRAY * nearest
+        tried.append(np.where((strays & far)[:, None], np.nan, corners))
+    return min(tried, key=lambda c: float(np.square(differences @ np.where(np.isnan(c), expected, c)).sum()))
+
+
+@functools.cache
+def _third_differences(rows: int, columns: int) -> Pixels:
+    """(D, N) that makes third differences, along rows and columns, of the N points of a grid."""
+    numbers = np.arange(rows * columns).reshape(rows, columns)
+    runs = [line[i : i + 4] for line in (*numbers, *numbers.T) for i in range(len(line) - 3)]
+    matrix = np.zeros((len(runs), rows * columns))
+    for row, run in zip(matrix, runs, strict=True):
+        row[run] = 1, -3, 3, -1
+    return matrix
+
+
+def _mended(differences: Pixels, pixels: Pixels) -> tuple[Pixels, NDArray[np.bool_]]:
+    """The corners with those that are far from where their rows have them put there; and which those are."""
+    mended, strays = pixels.copy(), np.zeros(len(pixels), bool)
+    weights = np.square(differences).sum(0)
+    for _ in range(len(pixels) // 10):
+        # what moving one corner does best for all differences that it is in
+        off = differences.T @ (differences @ mended) / np.maximum(weights, 1)[:, None]
+        nearest = np.array([np.partition(np.linalg.norm(mended - corner, axis=1), 1)[1] for corner in mended])
+        far = np.linalg.norm(off, axis=1) / np.maximum(nearest, 1e-9)
+        worst = int(far.argmax())
+        if far[worst] < _STRAY:
+            break
+        mended[worst] -= off[worst]
+        strays[worst] = True
+    return mended, strays
 
 
 def _refined(cv2: Any, grey: NDArray[np.uint8], pixels: Pixels, radius: float) -> Pixels:

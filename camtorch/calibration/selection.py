@@ -1,0 +1,190 @@
+"""Which model fits a lens: cross-validation over views."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camtorch.calibration.calibrate import INTRINSICS, Calibration, calibrate
+from camtorch.calibration.observations import Points, as_observations
+from camtorch.camera import MODELS, Camera
+
+Array = NDArray[Any]
+
+CANDIDATES: tuple[tuple[str, int], ...] = (
+    ("pinhole", 0),
+    ("brown_conrady", 5),
+    ("brown_conrady", 8),
+    ("kannala_brandt", 4),
+    ("eucm", 2),
+    ("double_sphere", 2),
+    ("mei", 5),
+    ("fisheye62", 8),
+    ("fisheye624", 12),
+)
+"""Models that are tried, with their numbers of coefficients."""
+_FOLDS = 5
+_WORSE = 0.01
+"""The part by which an error may be larger without a reason to take more coefficients."""
+_MUCH_WORSE = 0.05
+"""The part that is a reason, however much views differ."""
+
+
+@dataclass
+class Trial:
+    """How a model fares.
+
+    Args:
+        model: its key.
+        count: of its coefficients.
+        calibration: by all views, or None where that failed.
+        rms: px per point of all views together, NaN where it failed.
+        held_out: px per point of views that the camera was not fitted to, only their poses; NaN where it failed.
+        errors: (V,) mean squared of each view, held out.
+        reason: why it failed, or empty.
+    """
+
+    model: str
+    count: int
+    calibration: Calibration | None
+    rms: float
+    held_out: float
+    errors: Array
+    reason: str = ""
+
+
+@dataclass
+class Selection:
+    """Which model was taken.
+
+    Args:
+        trials: of all models, in the order in which they were tried.
+        best: the one that was taken.
+        why: in words.
+    """
+
+    trials: list[Trial]
+    best: Trial
+    why: str
+
+    def lines(self) -> list[str]:
+        """A table, and the reason below it."""
+        rows = [("model", "coefficients", "rms fitted", "rms held out")]
+        for trial in self.trials:
+            values = (f"{trial.rms:.4f}", f"{trial.held_out:.4f}") if not trial.reason else ("failed", "")
+            rows.append((trial.model, str(trial.count), *values))
+        widths = [max(len(row[column]) for row in rows) for column in range(4)]
+        lines = [f"  {row[0]:<{widths[0]}}  " + "  ".join(f"{row[i]:>{widths[i]}}" for i in (1, 2, 3)) for row in rows]
+        lines[1 + self.trials.index(self.best)] += "  taken"
+        return [line.rstrip() for line in lines] + [self.why]
+
+
+def select(
+    object_points: Points,
+    image_points: Points,
+    *,
+    image_size: Sequence[int],
+    candidates: Iterable[tuple[str, int]] = CANDIDATES,
+    loss: str | None = None,
+    loss_scale: float = 1.0,
+    fixed: Sequence[str] = (),
+    progress: Callable[[float], None] | None = None,
+) -> Selection:
+    """Find the model that predicts views best that it was not fitted to, and of about equals the simplest.
+
+    The views are dealt into five parts, or as many as there are. A camera is fitted to all parts but one, and on that
+    one only the poses are; so each view is held out once. The model with the smallest error is taken, or one with fewer
+    coefficients if it is worse by no more than 1 %, or by no more than 5 % and the standard error of
+    the difference by views.
+
+    Args:
+        object_points: as `calibrate` takes them.
+        image_points: likewise.
+        image_size: (height, width).
+        candidates: models and their numbers of coefficients.
+        loss: as `calibrate` takes it.
+        loss_scale: px.
+        fixed: as `calibrate` takes it; names that a model does not have are left out.
+        progress: called with the part that is done.
+
+    Raises:
+        ValueError: bad points; no model can be fitted.
+    """
+    tried = list(candidates)
+    seen, layout = as_observations(object_points, image_points, image_size, "select")
+    views = _Views(
+        seen.points.cpu().numpy(), np.where(seen.seen[..., None].cpu(), seen.pixels.cpu(), np.nan), layout.image_size
+    )
+    trials: list[Trial] = []
+    for model, count in tried:
+        names = [name for name in fixed if name in (*INTRINSICS, *(MODELS[model].names_of(count) or ()))]
+        trials.append(_tried(model, count, views, {"fixed": names, "loss": loss, "loss_scale": loss_scale}))
+        if progress is not None:
+            progress(len(trials) / len(tried))
+    fitted = [trial for trial in trials if not trial.reason]
+    if not fitted:
+        raise ValueError(f"select: no model can be fitted; {trials[0].model}: {trials[0].reason}")
+    return _chosen(trials, fitted)
+
+
+class _Views(NamedTuple):
+    """Points (V, N, 3) and where they are seen, (V, N, 2), NaN where not."""
+
+    points: Array
+    pixels: Array
+    image_size: tuple[int, int]
+
+    def calibrated(self, rows: Array, model: str | Camera, **options: Any) -> Calibration:
+        """By some of the views."""
+        return calibrate(model, self.points[rows], self.pixels[rows], image_size=self.image_size, **options)
+
+
+def _tried(model: str, count: int, views: _Views, options: dict[str, Any]) -> Trial:
+    total = len(views.points)
+    errors, all_views = np.full(total, np.nan), np.arange(total)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
+            whole = views.calibrated(all_views, model, count=count, **options)
+            if not whole.converged:
+                raise ValueError("no optimum was found")
+            folds = min(_FOLDS, total)
+            for fold in range(folds):
+                out = all_views % folds == fold
+                part = views.calibrated(np.flatnonzero(~out), whole.camera, **options)
+                posed = views.calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
+                squares = np.square(np.asarray(posed.residuals)).sum(-1)
+                errors[out] = np.nanmean(squares, axis=1)
+    except ValueError as error:
+        return Trial(model, count, None, math.nan, math.nan, errors, str(error))
+    weights = np.isfinite(views.pixels[..., 0]).sum(1)
+    held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
+    if not math.isfinite(held_out):
+        return Trial(model, count, None, math.nan, math.nan, errors, "views that it was not fitted to are lost")
+    return Trial(model, count, whole, whole.rms, held_out, errors)
+
+
+def _chosen(trials: list[Trial], fitted: list[Trial]) -> Selection:
+    least = min(fitted, key=lambda trial: trial.held_out)
+
+    def as_good(trial: Trial) -> bool:
+        more = trial.errors - least.errors
+        noise = float(more.std()) / math.sqrt(len(more))
+        worse = trial.held_out / max(least.held_out, 1e-300) - 1
+        return worse <= _WORSE or (worse <= _MUCH_WORSE and float(more.mean()) <= noise)
+
+    best = min(filter(as_good, fitted), key=lambda trial: trial.count)  # of as many the first, which is better known
+    named = f"{best.model} with {best.count} coefficients" if best.count else best.model
+    error = f"{best.held_out:.4g} px on views that it was not fitted to"
+    if best is least:
+        why = f"{named}: {error}, the smallest error"
+    else:
+        part = 100 * (1 - least.held_out / best.held_out)
+        why = f"{named}: {error}; {least.model} with {least.count} has {part:.1f} % less, which is no more than chance"
+    return Selection(trials, best, why)

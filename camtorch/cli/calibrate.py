@@ -1,0 +1,368 @@
+"""The command `camtorch calibrate`: from photographs of a board to the file of a camera, or of a rig."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from camtorch.cli.boards import add_board, read_board
+from camtorch.cli.options import add_output, parse_path
+from camtorch.cli.terminal import note, progress
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from camtorch.calibration.boards import Board
+    from camtorch.calibration.calibrate import Calibration
+    from camtorch.calibration.corners import ImageCorners
+    from camtorch.calibration.rig import RigCalibration
+    from camtorch.cli.options import Commands
+
+_LEAST_VIEWS = 3
+_WORST = 3
+"""Views that are named."""
+_OUTLYING = 2.0
+"""Times the rms of all views, from where a view is named as bad."""
+
+Views = dict[str, dict[str, "ImageCorners"]]
+"""View -> camera -> what its image shows."""
+
+
+def add(commands: Commands) -> None:
+    """Add the command to a command line."""
+    command = commands.add_parser(
+        "calibrate",
+        help="calibrate a camera or a rig from photographs of a board",
+        description="Calibrate a camera from photographs of a board: camtorch calibrate images/*.jpg --board 9x6 "
+        "--square 25mm -o camera.yml",
+        allow_abbrev=False,
+    )
+    command.set_defaults(run=run)
+    command.add_argument("images", nargs="*", metavar="IMAGE", help="files, quoted patterns, or folders")
+    rigs = command.add_argument_group("several cameras, instead of IMAGE")
+    rigs.add_argument("--left", nargs="+", metavar="IMAGE", help="of the left camera of a pair")
+    rigs.add_argument("--right", nargs="+", metavar="IMAGE", help="of the right one")
+    rigs.add_argument("--rig", nargs="+", metavar="NAME=IMAGE", help="of any number of cameras: a folder or a pattern")
+    rigs.add_argument(
+        "--match",
+        choices=("name", "order"),
+        help="what says which images were taken together; by default names where they agree, else the order",
+    )
+    add_board(command, "if left out, distances are in squares")
+    lens = command.add_argument_group("camera")
+    lens.add_argument("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
+    lens.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
+    lens.add_argument("--fixed", metavar="NAMES", help="held parameters, as cx,cy (in the middle) or k3 (at 0)")
+    lens.add_argument("--loss", choices=("huber", "cauchy"), help="for corners of which some are wrong")
+    lens.add_argument("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
+    lens.add_argument("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
+    command.add_argument(
+        "--corners", type=parse_path, metavar="FILE", help="a .json to keep corners in, and to take them from"
+    )
+    command.add_argument("--format", help="of OUT; by default what its name says, OpenCV's for .yml")
+    add_output(command, "camera.json", "the calibration")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carry it out."""
+    from camtorch.cli import targets
+    from camtorch.cli.searching import found_corners, usable_views
+
+    cameras = _cameras(arguments)
+    given = tuple(path for paths in cameras.values() for path in paths)
+    path = arguments.output
+    targets.check(path, force=arguments.force, inputs=given if path.exists() else ())
+    if arguments.corners is not None and arguments.corners.absolute() == path.absolute():
+        raise ValueError("-o and --corners must be different files")
+    if arguments.corners is not None and not arguments.corners.exists():
+        targets.check(arguments.corners, force=False)
+    format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
+    board = read_board(arguments, 1.0) if arguments.board is not None else None
+    corners = found_corners(cameras, board, arguments.corners, arguments.match, force=arguments.force)
+    if arguments.square is None and arguments.board is not None:
+        note("no --square is given: distances are in sides of a square")
+    views, size_of = usable_views(corners)
+    words = "its points" if corners.board is None else corners.board.words("m" if arguments.square else "")
+    _tell_found(words, views, corners.images, size_of)
+    found: Calibration | RigCalibration
+    if list(size_of) == [""]:
+        found = _calibrated(arguments, corners.points, views, size_of[""], candidates)
+    else:
+        found = _calibrated_rig(arguments, corners.board, corners.points, views, size_of, candidates)
+    _write(arguments, found, views, format)
+
+
+def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
+    """The images by the names of cameras, "" for a single one; nothing where a file of corners shall say."""
+    from camtorch.cli.gathering import gather
+
+    pair = {name: words for name in ("left", "right") if (words := getattr(arguments, name))}
+    ways = [bool(arguments.images), bool(pair), bool(arguments.rig)]
+    if sum(ways) > 1:
+        raise ValueError("images of one camera, --left and --right, or --rig: one of these says what to calibrate")
+    if len(pair) == 1:
+        raise ValueError(f"--{next(iter(pair))} is one of a pair: --left and --right are both needed")
+    if arguments.match and not (pair or arguments.rig):
+        raise ValueError("--match is for --left and --right, or --rig")
+    if arguments.rig:
+        named: dict[str, list[str]] = {}
+        for word in arguments.rig:
+            name, equals, images = word.partition("=")
+            if not (name and equals and images):
+                raise ValueError(f"--rig takes NAME=IMAGE, as in cam0=folder or cam1='right*.png'; got {word!r}")
+            named.setdefault(name, []).append(images)
+        if len(named) < 2:
+            raise ValueError("--rig takes several cameras; one is calibrated without it")
+        return {name: gather(words) for name, words in named.items()}
+    if pair:
+        return {name: gather(words) for name, words in pair.items()}
+    if arguments.images:
+        return {"": gather(arguments.images)}
+    if arguments.corners is None or not arguments.corners.exists():
+        raise ValueError("which images? Files, quoted patterns or folders; or --corners, a file that holds corners")
+    return {}
+
+
+def _writable(
+    path: Path, format: str | None, model: str | None, count: int | None
+) -> tuple[str | None, list[tuple[str, int]]]:
+    """The format of a file to be written, and the models to try that it can hold, before the work.
+
+    Raises:
+        ValueError: the name does not say the format; it holds no camera of the model.
+    """
+    from camtorch.calibration.selection import CANDIDATES
+    from camtorch.camera import MODELS
+    from camtorch.io import CameraFileError, formats
+
+    def failure(key: str, count: int) -> CameraFileError | None:
+        kind = MODELS[key]
+        camera = kind([500.0, 500.0, 320.0, 240.0], *([kind.ideal(count)] if count else []), image_size=(480, 640))
+        try:
+            formats.rendered(camera, path, format)
+        except CameraFileError as error:
+            return error
+        return None
+
+    if format is None:
+        try:
+            failure("pinhole", 0)
+        except ValueError:  # as YAML is written by several
+            if path.suffix.lower() not in (".yml", ".yaml"):
+                raise
+            format = "opencv"
+    if model is None:
+        if count is not None:
+            raise ValueError("--count is for a --model")
+        held = [(key, count) for key, count in CANDIDATES if failure(key, count) is None]
+        if not held:
+            raise ValueError(
+                f"{path}: {format or path.suffix} holds none of the models that are tried; --model says one"
+            )
+        return format, held
+    if model not in MODELS:
+        raise ValueError(f"--model: {model!r} is none; there are {', '.join(sorted(MODELS))}")
+    kind = MODELS[model]
+    count = kind.default_count if count is None else count
+    if kind.names_of(count) is None:
+        raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")
+    error = failure(model, count)
+    if error is not None:
+        raise ValueError(f"{error}; -o camera.json holds every model")
+    return format, [(model, count)]
+
+
+def _tell_found(
+    words: str, views: Views, images: Sequence[ImageCorners], size_of: Mapping[str, tuple[int, int]]
+) -> None:
+    for name, (height, width) in size_of.items():
+        seen = [of_view[name] for of_view in views.values() if name in of_view]
+        total, points = sum(image.camera == name for image in images), sum(image.seen for image in seen)
+        head = f"{name}: " if name else ""
+        print(f"{head}{words}: in {len(seen)} of {total} images of {width}x{height}, {points} corners")
+
+
+def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+    fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
+    return {"fixed": fixed, "loss": arguments.loss, "loss_scale": arguments.loss_scale}
+
+
+def _model_for(
+    arguments: argparse.Namespace,
+    points: NDArray[Any],
+    pixels: NDArray[Any],
+    size: tuple[int, int],
+    candidates: list[tuple[str, int]],
+    head: str,
+) -> tuple[str, int]:
+    """The one asked for, or the one that fits; that is said."""
+    from camtorch.calibration.selection import CANDIDATES, select
+
+    if len(candidates) == 1:
+        return candidates[0]
+    show = progress("trying models")
+    chosen = select(points, pixels, image_size=size, candidates=candidates, progress=show, **_options(arguments))
+    left_out = [f"{key} with {count}" if count else key for key, count in CANDIDATES if (key, count) not in candidates]
+    print(f"{head}models by cross-validation, px per point:")
+    print("\n".join(chosen.lines()))
+    if left_out:
+        note(f"{arguments.output.name} cannot hold {', '.join(left_out)}, which were not tried; a .json can")
+    return chosen.best.model, chosen.best.count
+
+
+def _calibrated(
+    arguments: argparse.Namespace,
+    points: NDArray[Any],
+    views: Views,
+    size: tuple[int, int],
+    candidates: list[tuple[str, int]],
+) -> Calibration:
+    from camtorch.calibration.calibrate import calibrate
+    from camtorch.calibration.corners import image_points
+
+    pixels = image_points([of_view[""] for of_view in views.values()], len(points))
+    model, count = _model_for(arguments, points, pixels, size, candidates, "")
+    found = calibrate(model, points, pixels, image_size=size, count=count, bend=arguments.bend, **_options(arguments))
+    _check_converged(found)
+    _tell(found, [str(of_view[""].path) for of_view in views.values()], "")
+    _tell_bend(arguments, found)
+    return found
+
+
+def _calibrated_rig(
+    arguments: argparse.Namespace,
+    board: Board | None,
+    points: NDArray[Any],
+    views: Views,
+    size_of: Mapping[str, tuple[int, int]],
+    candidates: list[tuple[str, int]],
+) -> RigCalibration:
+    from camtorch.calibration.corners import image_points
+    from camtorch.calibration.rig import calibrate_rig
+
+    pixels = {name: image_points([of_view.get(name) for of_view in views.values()], len(points)) for name in size_of}
+    models, counts = {}, {}
+    for name, size in size_of.items():
+        seen = pixels[name][[name in of_view for of_view in views.values()]]
+        models[name], counts[name] = _model_for(arguments, points, seen, size, candidates, f"{name}: ")
+    if board is not None and board.symmetries > 1:
+        pixels = _agreeing(arguments, board, points, pixels, size_of, models, counts)
+    found = calibrate_rig(
+        models, points, pixels, image_sizes=size_of, count=counts, bend=arguments.bend, **_options(arguments)
+    )
+    _check_converged(found)
+    for name, camera in found.cameras.items():
+        names = [str(of_view[name].path) if name in of_view else "" for of_view in views.values()]
+        _tell(camera, names, f"{name}: ")
+    _tell_mounts(found, "m" if arguments.square else "")
+    _tell_bend(arguments, found)
+    return found
+
+
+def _agreeing(
+    arguments: argparse.Namespace,
+    board: Board,
+    points: NDArray[Any],
+    pixels: dict[str, NDArray[Any]],
+    size_of: Mapping[str, tuple[int, int]],
+    models: Mapping[str, str],
+    counts: Mapping[str, int],
+) -> dict[str, NDArray[Any]]:
+    """The points of a board that looks the same after a turn, numbered alike in all cameras."""
+    import numpy as np
+
+    from camtorch.calibration.calibrate import calibrate
+    from camtorch.calibration.orders import agreeing, reordered
+
+    poses = {}
+    for name, seen in pixels.items():
+        rows = np.flatnonzero(np.isfinite(seen[..., 0]).any(1))
+        alone = calibrate(
+            models[name], points, seen[rows], image_size=size_of[name], count=counts[name], **_options(arguments)
+        )
+        poses[name] = dict(zip(rows.tolist(), alone.extrinsics.matrix().detach().cpu().numpy(), strict=True))
+    turned, changed = agreeing(board, poses), 0
+    for name, turns in turned.items():
+        pixels[name] = reordered(board, pixels[name], [turns.get(view, 0) for view in range(len(pixels[name]))])
+        changed += sum(turn > 0 for turn in turns.values())
+    note(
+        f"this board looks the same after a turn; {changed} views were turned for the cameras to agree. A board with "
+        "an even and an odd number of corners, as 9x6, leaves no doubt"
+    )
+    return pixels
+
+
+def _check_converged(found: Calibration | RigCalibration) -> None:
+    if not found.converged:
+        raise ValueError(
+            f"no optimum was found (rms {found.rms:.4g} px), so nothing is written: are --board and the images right? "
+            "Another --model, or --loss huber where some corners are wrong, may help"
+        )
+
+
+def _tell(found: Calibration, names: Sequence[str], head: str) -> None:
+    """The numbers of a camera, the views that fit badly, and what is to be said of it."""
+    import numpy as np
+
+    corners = int(found.observations.seen.sum())
+    print(
+        f"{head}{found.camera.key}: rms {found.rms:.4g} px per point, sigma {found.sigma:.4g} px per coordinate, "
+        f"{len(found.views)} views, {corners} corners"
+    )
+    values = [*found.camera.intrinsics.tolist(), *found.camera.distortion.tolist()]
+    for name, value, std in zip(found.parameter_names, values, found.std.tolist(), strict=True):
+        spread = f" +- {std:.2g}" if std else "  held"
+        print(f"  {name:<6} {value: .7g}{spread}")
+    squares = np.square(np.stack([np.asarray(one) for one in found.residuals])).sum(-1)
+    shown = np.isfinite(squares).any(1)
+    errors = {
+        name: float(np.sqrt(np.nanmean(row))) for name, row, one in zip(names, squares, shown, strict=True) if one
+    }
+    worst = sorted(errors, key=lambda name: -errors[name])[:_WORST]
+    bad = [f"{name} {errors[name]:.3g} px" for name in worst if errors[name] > _OUTLYING * found.rms]
+    if bad:
+        print(f"{head}views that fit badly: {', '.join(bad)}")
+    for warning in getattr(found, "warnings", ()):
+        note(f"{head}{warning}")
+
+
+def _tell_mounts(found: RigCalibration, unit: str) -> None:
+    import math
+
+    from camtorch.calibration.boards import shown_length
+
+    first, *others = found.cameras
+    for name in others:
+        turn, shift = (
+            t.detach() for t in (found.rig.extrinsics[name].rotation, found.rig.extrinsics[name].translation)
+        )
+        spread = found.mount_std[name].tolist()
+        print(
+            f"{name}: {shown_length(float(shift.norm()), unit)} +- {shown_length(math.hypot(*spread[3:]), unit)} from "
+            f"{first}, turned by {math.degrees(float(turn.norm())):.4g} +- {math.degrees(math.hypot(*spread[:3])):.2g} "
+            "degrees"
+        )
+    print(f"rig: rms {found.rms:.4g} px per point, sigma {found.sigma:.4g} px per coordinate, {len(found.views)} views")
+
+
+def _tell_bend(arguments: argparse.Namespace, found: Calibration | RigCalibration) -> None:
+    from camtorch.calibration.boards import shown_length
+
+    if arguments.bend:
+        lengths = [shown_length(bend, "m" if arguments.square else "") for bend in found.bend]
+        print(f"board: its middle lies {lengths[0]} off its sides, {lengths[1]} off its top and bottom")
+
+
+def _write(
+    arguments: argparse.Namespace, found: Calibration | RigCalibration, views: Views, format: str | None
+) -> None:
+    from camtorch.calibration.rig import RigCalibration
+    from camtorch.io import formats
+
+    path: Path = arguments.output
+    path.parent.mkdir(parents=True, exist_ok=True)
+    formats.save(found.rig if isinstance(found, RigCalibration) else found.camera, path, format)
+    print(f"{path}: {f'{len(found.rig)} cameras' if isinstance(found, RigCalibration) else found.camera.key}")

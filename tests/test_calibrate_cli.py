@@ -1,0 +1,364 @@
+"""From photographs on the command line to a camera's file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from photographs import fisheye, photograph
+from PIL import Image
+
+import camtorch as ct
+from camtorch.calibration.boards import AprilGrid, Chessboard
+from camtorch.calibration.corners import Corners, ImageCorners, read_corners, write_corners
+from camtorch.calibration.orders import agreeing, reordered, turns_of
+from camtorch.calibration.selection import select
+from camtorch.cli import gathering, searching
+from camtorch.cli.main import main
+from camtorch.rotations import rotation_matrix
+
+BOARD = Chessboard(9, 6, 0.03)
+TILTS = [(0.1, -0.3, 0.1), (-0.5, 0.2, 0.3), (0.4, 0.5, -0.2), (0.3, -0.5, 1.2), (-0.3, -0.4, 0.0), (0.5, 0.1, -0.6)]
+TILTS += [(-0.45, 0.45, 0.5), (0.05, 0.55, 0.1)]
+
+
+def poses(board, count=8, seed=0):
+    """Rotations and translations that put the board's middle here and there in front of a camera."""
+    rng, points = np.random.default_rng(seed), board.points()
+    middle = (points.min(0) + points.max(0)) / 2
+    for index in range(count):
+        turn = torch.tensor(TILTS[index % len(TILTS)], dtype=torch.float64) + 0.1 * torch.as_tensor(rng.normal(size=3))
+        at = np.array([0.1, 0.07, 0.03]) * rng.uniform(-1, 1, 3) + (0, 0, 0.22)
+        yield turn, torch.as_tensor(at - rotation_matrix(turn).numpy() @ middle)
+
+
+def seen_by(camera, board, turn, shift, noise, rng):
+    pixels, valid = camera.project(torch.as_tensor(board.points()) @ rotation_matrix(turn).T + shift)
+    inside = (valid & camera.contains(pixels))[..., None]
+    return np.where(inside, pixels.detach().numpy() + noise * rng.normal(size=pixels.shape), np.nan)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """A folder of photographs of a chessboard."""
+    folder = tmp_path_factory.mktemp("photographs")
+    for index, (turn, shift) in enumerate(poses(BOARD), 1):
+        image, _ = photograph(BOARD, fisheye(), turn.tolist(), shift.tolist(), seed=index)
+        Image.fromarray(image).save(folder / f"view{index}.png")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def calibrate(*words, expect=0):
+    assert main(["calibrate", *map(str, words)]) == expect
+
+
+def found_camera(path="camera.yml"):
+    return ct.load(path).camera
+
+
+def assert_near(camera, true, pixels):
+    """Where the two see rays up to 55 degrees from the axis, as far as boards reach."""
+    rays, _ = true.resize(24, 32).rays()
+    rays = rays[rays[..., 2] > np.cos(np.radians(55))]
+    assert (camera.project(rays)[0] - true.project(rays)[0]).norm(dim=-1).max() < pixels
+
+
+def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypatch):
+    words = "--board", "9x6", "--square", "30mm", "--model", "kannala_brandt", "--corners", "corners.json"
+    calibrate(photographs, *words, "-o", "camera.yml")
+    captured = capsys.readouterr()
+    out = captured.out.splitlines()
+    assert out[0] == "chessboard, 9x6 inner corners, squares of 30 mm: in 8 of 8 images of 640x480, 431 corners"
+    assert out[1].startswith("kannala_brandt: rms 0.0")
+    assert out[1].endswith(" px per coordinate, 8 views, 431 corners")
+    assert [line.split()[0] for line in out[2:10]] == ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]
+    assert out[-1] == "camera.yml: kannala_brandt"
+    assert_near(found_camera(), fisheye(), 0.3)
+    assert found_camera().image_size == (480, 640)
+    assert "fisheye_model: 1" in Path("camera.yml").read_text()
+    # what was found is not searched for again, also where it is called and lies otherwise, in any order
+    monkeypatch.setattr(searching, "detect", None)
+    before = Path("corners.json").read_bytes()
+    for index in range(1, 9):
+        Path(f"{9 - index}.png").write_bytes((photographs / f"view{index}.png").read_bytes())
+    calibrate("[0-9].png", *words, "-o", "again.yml")
+    assert torch.allclose(found_camera("again.yml").intrinsics, found_camera().intrinsics, rtol=1e-6)
+    # its folder may be moved as well; a square of another size changes nothing in images
+    Path("corners.json").write_bytes(before)
+    calibrate(photographs, *words[:-4], "--square", 0.06, *words[-4:], "-o", "large.json")
+    assert Path("corners.json").read_bytes() != before  # of another board, though seen at the same places
+    assert torch.allclose(found_camera("large.json").intrinsics, found_camera().intrinsics, rtol=1e-6)
+
+
+def corners_of(board=BOARD, count=8, **more):
+    """A file's worth of corners that no image was searched for."""
+    camera, rng = fisheye(), np.random.default_rng(0)
+    found = [seen_by(camera, board, turn, shift, 0.1, rng) for turn, shift in poses(board, count)]
+    images = [ImageCorners(Path(f"{i}.png"), camera.image_size, p, view=str(i), **more) for i, p in enumerate(found)]
+    return Corners(board, board.points(), images)
+
+
+def test_corners_of_another_tool_need_no_image(capsys):
+    corners = corners_of()
+    corners.board = None
+    write_corners(corners, "corners.json")
+    content = json.loads(Path("corners.json").read_text())
+    assert content["board"] is None
+    assert len(content["points"]) == 54
+    assert set(content["images"][0]) == {"path", "view", "width", "height", "corners"}
+    calibrate("--corners", "corners.json", "--model", "kannala_brandt", "-o", "camera.yml")
+    assert "in 8 of 8 images of 640x480" in capsys.readouterr().out
+    assert_near(found_camera(), fisheye(), 0.5)
+
+
+def test_corners_are_read_as_they_were_written():
+    corners = corners_of(board=AprilGrid(4, 3, 0.05), hash="abc")
+    corners.images[2].pixels[:] = np.nan
+    corners.images[2].reason = "no board found"
+    write_corners(corners, "corners.json")
+    again = read_corners("corners.json")
+    assert again.board == corners.board
+    for one, other in zip(again.images, corners.images, strict=True):
+        assert np.array_equal(one.pixels, other.pixels, equal_nan=True)
+        assert (one.reason, one.hash, one.view, one.image_size) == (other.reason, other.hash, other.view, (480, 640))
+        assert one.path.resolve() == other.path.resolve()
+
+
+def test_what_is_left_out_has_a_reason(photographs, capsys):
+    for index in range(1, 5):
+        Path(f"{index}.png").write_bytes((photographs / f"view{index}.png").read_bytes())
+    Image.new("L", (640, 480)).save("5.png")
+    Path("6.png").write_text("no image")
+    Path("7.png").write_bytes((photographs / "view7.png").read_bytes()[:2000])
+    with Image.open("1.png") as image:
+        image.resize((960, 720)).save("8.png")
+    words = ".", "none.png", "--board", "9x6", "--model", "kannala_brandt", "--fixed", "k3,k4", "-o", "camera.json"
+    calibrate(*words)
+    captured = capsys.readouterr()
+    notes = captured.err.splitlines()
+    for text in (
+        "5.png is left out: no board found",
+        "6.png is left out: not an image that Pillow can read",
+        "7.png is left out: ",
+        "8.png is left out: 960x720, but most images are 640x480",
+        "none.png is left out: No such file or directory",
+        "no --square is given: distances are in sides of a square",
+    ):
+        assert sum(text in line for line in notes) == 1, text
+    assert "squares of 1: in 4 of 9 images of 640x480" in captured.out
+    assert captured.out.count("held") == 2
+
+
+def test_a_wrong_size_of_the_board_is_named(photographs, capsys):
+    words = [photographs / f"view{index}.png" for index in (1, 2, 3)]
+    calibrate(*words, "--board", "10x7", "-o", "camera.yml", expect=2)
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "a board was found in 0 of 3 images, and 3 are needed" in error
+    assert "shows one of 9x6 inner corners: --board 9x6" in error
+
+
+def two_cameras(board):
+    """Corners of a pair, some views by one camera only; and right from left."""
+    rng = np.random.default_rng(1)
+    turn, shift = torch.tensor([0.02, -0.3, 0.05], dtype=torch.float64), torch.tensor([-0.12, 0.01, 0.02]).double()
+    right = ct.KannalaBrandt([255.0, 254, 318, 242], [0.01, -0.004, 0.0, 0.0], image_size=(480, 640)).double()
+    images = []
+    for index, (tilt, move) in enumerate(poses(board, 10, seed=3)):
+        first = rotation_matrix(tilt), move
+        second = rotation_matrix(turn) @ first[0], rotation_matrix(turn) @ first[1] + shift
+        for name, camera, (rotation, translation) in (("left", fisheye(), first), ("right", right, second)):
+            pixels, valid = camera.project(torch.as_tensor(board.points()) @ rotation.T + translation)
+            pixels = pixels.detach().numpy() + 0.1 * rng.normal(size=pixels.shape)
+            pixels[~(valid & camera.contains(torch.as_tensor(pixels))).numpy()] = np.nan
+            if not (name == "left" and index == 4):
+                image = ImageCorners(Path(f"{name}{index}.png"), (480, 640), pixels, camera=name, view=str(index))
+                images.append(image)
+    return Corners(board, board.points(), images), turn, shift
+
+
+@pytest.mark.parametrize("board", [BOARD, Chessboard(7, 7, 0.03)], ids=["clear", "ambiguous"])
+def test_a_pair_becomes_a_rig(capsys, board):
+    corners, turn, shift = two_cameras(board)
+    rng = np.random.default_rng(5)
+    if board.symmetries > 1:
+        for image in corners.images:  # as a detector may begin anywhere
+            image.pixels = reordered(board, image.pixels[None], [int(rng.integers(board.symmetries))])[0]
+    write_corners(corners, "corners.json")
+    calibrate("--corners", "corners.json", "--square", "30mm", "--model", "kannala_brandt", "-o", "rig.yml")
+    captured = capsys.readouterr()
+    assert "left: chessboard" in captured.out
+    assert "in 9 of 9 images of 640x480" in captured.out
+    assert ("this board looks the same after a turn" in captured.err) == (board.symmetries > 1)
+    rig = ct.load("rig.yml")
+    assert list(rig.cameras) == ["left", "right"]
+    mount = rig.extrinsics["right"].compose(rig.extrinsics["left"].inverse())
+    assert (mount.rotation - turn).abs().max() < 2e-3
+    assert (mount.translation - shift).abs().max() < 1e-3
+
+
+def test_turns_of_boards():
+    for board in (Chessboard(9, 6), Chessboard(7, 5), Chessboard(6, 6), Chessboard(5, 5)):
+        turns = turns_of(board)
+        assert len(turns) == board.symmetries
+        for order, matrix in turns:
+            moved = board.points() @ matrix[:3, :3].T + matrix[:3, 3]
+            assert np.allclose(moved, board.points()[order])
+
+
+def test_cameras_agree_on_the_turns_of_a_board():
+    board, rng = Chessboard(6, 6, 0.03), np.random.default_rng(0)
+
+    def random_pose(reach):
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_matrix(torch.as_tensor(reach * rng.normal(size=3))).numpy()
+        pose[:3, 3] = 0.3 * rng.normal(size=3)
+        return pose
+
+    mounts = {"a": np.eye(4), "b": random_pose(0.3), "c": random_pose(1.0)}
+    matrices = [matrix for _, matrix in turns_of(board)]
+    poses, truth = {}, {}
+    for name, views in (("a", range(6)), ("b", range(3, 12)), ("c", range(8, 14))):
+        truth[name] = {view: int(rng.integers(4)) for view in views}
+    boards = {view: random_pose(0.5) for view in range(14)}
+    for name, turns in truth.items():
+        poses[name] = {view: mounts[name] @ boards[view] @ np.linalg.inv(matrices[t]) for view, t in turns.items()}
+    found = agreeing(board, poses)
+    for view in range(14):
+        seen = [name for name in poses if view in poses[name]]
+        # each by the turn that makes its board the true one, or all by one turn more
+        assert len({(found[name][view] - truth[name][view]) % 4 for name in seen}) == 1
+
+
+def test_images_come_in_natural_order():
+    for name in ("a10.png", "a9.jpg", "a1.PNG", "notes.txt"):
+        Path(name).touch()
+    Path("folder").mkdir()
+    assert [str(path) for path in gathering.gather(["."])] == ["a1.PNG", "a9.jpg", "a10.png"]
+    assert [str(path) for path in gathering.gather(["a?.*", "a10.png", "a9.jpg"])] == ["a1.PNG", "a9.jpg", "a10.png"]
+    Path("[1].png").touch()
+    assert gathering.gather(["[1].png"]) == [Path("[1].png")]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "how", "views"),
+    [
+        (["l/1.png", "l/2.png"], ["r/2.png", "r/3.png", "r/1.png"], "by the file name", ["1", "2", "3"]),
+        (["left01.png", "left02.png"], ["right2.png"], "by the number in the file name", ["1", "2"]),
+        (["left7.png", "left9.png"], ["right1.png", "right2.png"], "by their order", ["0", "1"]),
+    ],
+)
+def test_images_taken_together(left, right, how, views):
+    cameras = {"left": list(map(Path, left)), "right": list(map(Path, right))}
+    found, words = gathering.together(cameras, None)
+    assert words == how
+    assert list(found) == views
+    assert sum(map(len, found.values())) == len(left) + len(right)
+
+
+def test_images_that_cannot_be_matched():
+    cameras = {"left": [Path("left7.png")], "right": [Path("right1.png"), Path("right2.png")]}
+    with pytest.raises(ValueError, match="1 of left, 2 of right: images are matched by their order, so as"):
+        gathering.together(cameras, None)
+    with pytest.raises(ValueError, match="have no names in common; --match order"):
+        gathering.together(cameras, "name")
+    cameras = {"left": [Path("l/1.png"), Path("l/2.png")], "right": [Path("r/2.png"), Path("r/3.png")]}
+    assert gathering.together(cameras, "order")[0]["0"] == {"left": Path("l/1.png"), "right": Path("r/2.png")}
+
+
+@pytest.mark.slow
+def test_the_model_is_taken_that_predicts_best():
+    corners = corners_of()
+    pixels = np.stack([image.pixels for image in corners.images])
+    candidates = [("pinhole", 0), ("brown_conrady", 5), ("kannala_brandt", 4), ("fisheye624", 12)]
+    chosen = select(corners.points, pixels, image_size=(480, 640), candidates=candidates)
+    assert chosen.best.model == "kannala_brandt"
+    assert chosen.best.calibration.rms < 0.15
+    lines = chosen.lines()
+    assert [line.split()[0] for line in lines[1:5]] == [key for key, _ in candidates]
+    assert [line.endswith("taken") for line in lines[1:5]] == [False, False, True, False]
+    errors = {trial.model: trial.held_out for trial in chosen.trials}
+    assert errors["pinhole"] > 3 * errors["kannala_brandt"]
+    assert errors["fisheye624"] >= 0.99 * errors["kannala_brandt"]
+
+
+def test_models_that_the_file_cannot_hold_are_not_tried(capsys, monkeypatch):
+    from camtorch.calibration import selection
+
+    monkeypatch.setattr(selection, "CANDIDATES", (("brown_conrady", 5), ("kannala_brandt", 4), ("double_sphere", 2)))
+    write_corners(corners_of(count=5), "corners.json")
+    calibrate("--corners", "corners.json", "-o", "camera.yml")
+    captured = capsys.readouterr()
+    assert "double_sphere" not in captured.out
+    assert "camera.yml cannot hold double_sphere with 2, which were not tried; a .json can" in captured.err
+    assert "  taken" in captured.out
+    assert found_camera().key == "kannala_brandt"
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ("", "which images? Files, quoted patterns or folders"),
+        ("a.png", "which board? --board COLUMNSxROWS"),
+        ("none*.png --board 9x6", "none*.png: no file has such a name"),
+        ("empty --board 9x6", "empty: a folder without images"),
+        ("a.png --board 9", "'9' is not COLUMNSxROWS"),
+        ("a.png --board 9x6 --left b.png", "one of these says what to calibrate"),
+        ("--left b.png --board 9x6", "--left is one of a pair: --left and --right are both needed"),
+        ("--rig a.png --board 9x6", "--rig takes NAME=IMAGE, as in cam0=folder"),
+        ("--rig cam0=a.png --board 9x6", "--rig takes several cameras"),
+        ("--left a.png --right a.png --board 9x6", "a.png: is given as an image of two cameras"),
+        ("a.png --board 9x6 --match name", "--match is for --left and --right, or --rig"),
+        ("a.png --board 9x6 --model lens", "--model: 'lens' is none; there are brown_conrady"),
+        ("a.png --board 9x6 --model fisheye62 -o camera.yml", "-o camera.json holds every model"),
+        ("a.png --board 9x6 --model fisheye62 --count 3", "--count: fisheye62 takes n = 8"),
+        ("a.png --board 9x6 --count 3", "--count is for a --model"),
+        ("a.png --board 9x6 -o camera.foo", "camera.foo: the name does not say the format"),
+        ("a.png --board 9x6 -o a.png --force", "would overwrite a.png, which is read"),
+        ("a.png --board 9x6 -o exists.json", "exists.json: exists already; --force"),
+        ("a.png --board 9x6 -o new.json --corners new.json", "must be different files"),
+        ("a.png --board 9x6 --corners exists.json", "exists.json: no file of corners"),
+        ("a.png --board 8x6 --corners corners.json", "holds corners of chessboard, 9x6 inner corners"),
+        ("--board 8x6 --corners corners.json --force", "no images are given to find this one in"),
+        ("a.png --board 9x6", "a board was found in 0 of 1 images, and 3 are needed"),
+        ("--corners corners.json --model kannala_brandt --fixed q", "fixed names 'q'; KannalaBrandt has fx, fy"),
+    ],
+)
+def test_what_cannot_be_calibrated(capsys, words, text):
+    Image.new("L", (64, 48)).save("a.png")
+    Path("exists.json").write_text("{}")
+    Path("empty").mkdir()
+    write_corners(corners_of(count=3), "corners.json")
+    calibrate(*words.split(), expect=2)
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert text in error
+    assert not Path("camera.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda c: c.pop("camtorch_corners"), "no file of corners, which begin with"),
+        (lambda c: c.pop("images"), "images: 'images' is missing"),
+        (lambda c: c.update(board={"type": "moon"}), "board: a board's type must be one of"),
+        (lambda c: c.update(board=None, points=[[1, 2]]), "points: must be rows of 3 finite numbers"),
+        (lambda c: c["images"][1].update(corners=[[54, 1, 2]]), "images[1]: corners must begin with the number of a"),
+        (lambda c: c["images"][1].update(corners=[[1, 1, 2]] * 2), "images[1]: a point appears twice"),
+        (lambda c: c["images"][0].pop("width"), "images[0]: width and height of the image are missing"),
+        (lambda c: c["images"][0].pop("path"), "images[0]: 'path' is missing"),
+        (lambda c: c["images"][0].update(corners=3), "images[0]: "),
+        (lambda c: c.update(images=[3]), "images[0]: "),
+    ],
+)
+def test_damaged_files_of_corners(capsys, change, text):
+    write_corners(corners_of(count=3), "corners.json")
+    content = json.loads(Path("corners.json").read_text())
+    change(content)
+    Path("corners.json").write_text(json.dumps(content))
+    calibrate("--corners", "corners.json", expect=2)
+    assert f"corners.json: {text}" in capsys.readouterr().err
