@@ -28,7 +28,9 @@ _TRIED = {
 }
 _VIEWS, _POINTS = 24, 64  # that the search looks at
 _KEPT = 5  # of the lenses tried
-_ROUNDS, _MANY_ROUNDS = 3, 12  # of poses
+_ROUNDS = 4  # of poses
+_BAD = 2.0  # times the usual error: a view whose pose may be spoilt
+_HANDFULS, _HANDFUL = 48, 6  # of corners, of which a pose is made where outliers spoil that of all
 _CHANGED = 0.9  # of the usual error of a view before: then another round is worth it
 _TRIMMED = 0.8  # of the views decide: others may be spoilt
 _LEAST_SCALE = 0.5  # px, of robust weights
@@ -44,6 +46,7 @@ _ALONG = {
     "eucm": ("beta", (0.5, 1.0, 2.0)),
     "mei": ("xi", (0.0, 1.0, 2.0, 4.0)),
 }
+_LOW_ORDER = 4  # coefficients that a start of many has: with all of them it may fold just beyond the corners
 _REACH = 1.1  # how much further than the data a start shall reach
 _LOST = 0.01  # the part of the corners without a pixel, with which a model is the wrong one
 
@@ -83,8 +86,8 @@ def start_from_nothing(
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # what keeps the shape that it starts with takes that of a good lens
-        lens = _refined(lens, few, KannalaBrandt, KannalaBrandt.default_count, image_size, fixed).row(0)
-    lens = _refined(lens, few, model, count, image_size, fixed)
+        lens = _refined(lens, few, KannalaBrandt, 4, image_size, fixed, ("cauchy", lens.scale)).row(0)
+    lens = _refined(lens, few, model, count, image_size, fixed, (loss, loss_scale))
     _check_reach(lens.row(0), few, image_size)
     state = poses_for(lens.parameters[:1], observations, model, image_size, lens.scale)
     if len(lens.parameters) == 1:
@@ -113,7 +116,7 @@ def poses_for(
         image_size: (height, width).
         scale: px, the error from which corners count less.
     """
-    boards, _ = _posed(_camera(model, parameters, image_size), observations, _MANY_ROUNDS)
+    boards, _ = _posed(_camera(model, parameters, image_size), observations)
     return _turned(_Lens(model, parameters, boards, scale), observations, image_size).state
 
 
@@ -139,10 +142,20 @@ class _Lens(NamedTuple):
         """Some of them."""
         return self._replace(parameters=self.parameters[rows], boards=Poses(*(t[rows] for t in self.boards)))
 
-    def adjusted(self, few: Observations, free: Free, steps: int, worst: float) -> _Lens:
-        """Nearer to what they saw, the best first, without those whose cost is above the least by that factor."""
-        sights = [_sight(self.model, few)]
-        found = adjust(sights, self.state, free, loss="cauchy", loss_scale=self.scale, steps=steps)
+    def adjusted(
+        self,
+        few: Observations,
+        free: Free,
+        steps: int,
+        worst: float,
+        loss: tuple[str | None, float] | None = None,
+    ) -> _Lens:
+        """Nearer to what they saw, the best first, without those whose cost is above the least by the factor `worst`.
+
+        loss: name and scale; Cauchy's of the scale here if left out.
+        """
+        name, scale = loss or ("cauchy", self.scale)
+        found = adjust([_sight(self.model, few)], self.state, free, loss=name, loss_scale=scale, steps=steps)
         cost, rows = found.cost.sort()
         near = cost <= worst * cost[0]
         near[1:] &= cost.diff() > _SAME * cost[:-1]
@@ -198,7 +211,7 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     focal = reach / centre.new_tensor(radii)[:, None]
     alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
-    boards, errors = _posed(_camera(UCM, parameters, image_size), few, _ROUNDS)
+    boards, errors = _posed(_camera(UCM, parameters, image_size), few)
     by_view = errors.nanmedian(-1).values.sort(-1).values
     score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
     score, rows = score.topk(_KEPT, largest=False)
@@ -208,19 +221,19 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     return _turned(lens.adjusted(few, free, _FEW_STEPS, _WORSE), few, image_size)
 
 
-def _posed(camera: Camera, some: Observations, rounds: int) -> tuple[Poses, Tensor]:
+def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
     """Poses (B, V) in closed form for cameras (B,), and the errors in px, (B, V, N); NaN for what is not seen.
 
     Each round goes without the outliers of the one before, for views to which that made a difference.
     """
-    shape = len(camera.intrinsics), *some.seen.shape
-    rays, has_ray = camera.unproject(some.pixels.flatten(0, 1).expand(shape[0], -1, -1))
-    rays, has_ray = rays.view(-1, shape[2], 3), (has_ray.view(shape) & some.seen).flatten(0, 1)
+    rays, has_ray = _rays(camera, some)
+    shape = has_ray.shape
     points = some.points.expand(*shape, 3).flatten(0, 1)
+    rays, has_ray = rays.flatten(0, 1), has_ray.flatten(0, 1)
     weights, rows = has_ray.to(rays.dtype), torch.arange(len(rays), device=rays.device)
     boards = Poses.none(shape[0], shape[1], rays)
     before = rays.new_full(shape[:2], torch.inf)
-    for i in range(rounds):
+    for i in range(_ROUNDS):
         found = poses_from_rays(points[rows], rays[rows], weights[rows])
         for poses, new in zip(boards, found[:2], strict=True):
             poses.flatten(0, 1)[rows] = new[:, 0]
@@ -236,6 +249,36 @@ def _posed(camera: Camera, some: Observations, rounds: int) -> tuple[Poses, Tens
     return boards, errors
 
 
+def _resampled(camera: Camera, boards: Poses, some: Observations) -> Poses:
+    """Poses (1, V) of which those that outliers spoilt are the best by handfuls of corners."""
+    usual = _errors(camera, boards, some)[0].nanmedian(-1).values
+    (bad,) = (usual > _BAD * usual.median().clamp(min=_LEAST_SCALE)).nonzero(as_tuple=True)
+    if len(bad) == 0:
+        return boards
+    generator = torch.Generator().manual_seed(0)
+    many = some.of(bad.repeat_interleave(_HANDFULS))
+    rays, has_ray = (t[0] for t in _rays(camera, many))
+    chances = torch.rand(has_ray.shape, generator=generator).to(rays.device).masked_fill(~has_ray, -1.0)
+    least = chances.topk(min(_HANDFUL, has_ray.shape[1])).values[:, -1:]
+    found = poses_from_rays(many.points, rays, (has_ray & (chances >= least)).to(rays.dtype))
+    tried = Poses(found.rotations[None, :, 0], found.translations[None, :, 0])
+    usual = torch.cat((_errors(camera, tried, many)[0].nanmedian(-1).values.view(-1, _HANDFULS), usual[bad, None]), 1)
+    best = usual.argmin(-1)
+    changed = best < _HANDFULS
+    rows = (torch.arange(len(bad), device=bad.device) * _HANDFULS + best)[changed]
+    boards = Poses(*(t.clone() for t in boards))
+    for poses, new in zip(boards, tried, strict=True):
+        poses[0, bad[changed]] = new[0, rows]
+    return boards
+
+
+def _rays(camera: Camera, some: Observations) -> tuple[Tensor, Tensor]:
+    """(B, V, N, 3) of the pixels for cameras (B,), and which there are of corners that were seen, bool (B, V, N)."""
+    rays, has_ray = camera.unproject(some.pixels.flatten(0, 1).expand(len(camera.intrinsics), -1, -1))
+    shape = len(rays), *some.seen.shape
+    return rays.view(*shape, 3), has_ray.view(shape) & some.seen
+
+
 def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
     """(B, V, N) px, NaN for what is not seen."""
     pixels, valid = camera.project(boards.moved(some.points).flatten(1, 2))
@@ -247,11 +290,11 @@ def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
 def _turned(lens: _Lens, some: Observations, image_size: tuple[int, int]) -> _Lens:
     """With the best of the poses that each view may have under a single camera: a plane has two that look alike."""
     camera = _camera(lens.model, lens.parameters, image_size)
-    rays, has_ray = camera.unproject(some.pixels.flatten(0, 1)[None])
+    lens = lens._replace(boards=_resampled(camera, lens.boards, some))
+    rays, has_ray = (t[0] for t in _rays(camera, some))
     errors = _errors(camera, lens.boards, some)[0]
-    near = 1 / (1 + (errors / lens.scale).square())
-    weights = torch.where(has_ray.view(some.seen.shape) & some.seen, near, 0.0)
-    found = poses_from_rays(some.points, rays.view(*some.seen.shape, 3), weights)
+    weights = torch.where(has_ray, 1 / (1 + (errors / lens.scale).square()), 0.0)
+    found = poses_from_rays(some.points, rays, weights)
     # each pose of each view is a problem of its own
     pairs = zip(lens.boards, found[:2], strict=True)
     boards = Poses(*(torch.cat((old[0, :, None], new), 1).flatten(0, 1)[:, None] for old, new in pairs))
@@ -278,11 +321,12 @@ def _refined(
     count: int,
     image_size: tuple[int, int],
     fixed: Collection[str],
+    loss: tuple[str | None, float],
 ) -> _Lens:
     """Cameras of another model that explain best what was seen, the best first; those that are nearly as good."""
     free = _free(model, count, fixed)
-    lens = _fitted(lens, few, model, count, image_size, fixed).adjusted(few, free, _STEPS, _WORSE)
-    return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE)
+    lens = _fitted(lens, few, model, count, image_size, fixed).adjusted(few, free, _STEPS, _WORSE, loss)
+    return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
 
 
 def _fitted(
@@ -309,6 +353,8 @@ def _fitted(
         more = starts[:1].repeat(len(values), 1)
         more[:, names.index(along)] = more.new_tensor(values)
         sets.append((more, [*held, along]))
+    if len(names) > _LOW_ORDER + 1:
+        sets.append((starts[:1], [*held, *names[_LOW_ORDER:]]))
     seen = least_squares.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
     template = _camera(model, torch.cat((slopes[0], ideal))[None], image_size)
     is_held = torch.tensor([name in held for name in names], dtype=torch.bool, device=slopes.device)
