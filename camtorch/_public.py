@@ -3,6 +3,7 @@
 from camtorch import augment, io
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
+from camtorch.calibration.pnp import solve_pnp
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.camera import MODELS, Camera
 from camtorch.convert.conversion import Conversion
@@ -87,4 +88,5 @@ __all__ = [
     "load",
     "native_available",
     "save",
+    "solve_pnp",
 ]

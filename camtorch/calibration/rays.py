@@ -14,6 +14,7 @@ from camtorch.rotations import rotation_matrix
 
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of symmetric matrices, the place among six entries
 _FLAT = 1e-6  # of the points' extent: less counts as none
+_SAME = 0.02  # radians between two rotations that are one minimum
 _STARTS, _FEW, _STEPS = 12, 4, 8  # of the search for rotations: those that are begun, and that are gone on with
 _LEAST, _TINY = 1e-15, 1e-300  # added to what is divided by
 
@@ -24,6 +25,10 @@ class RayPoses(NamedTuple):
     rotations: Tensor
     translations: Tensor
     valid: Tensor
+
+    def moved(self, points: Tensor) -> Tensor:
+        """(B, S, N, 3): points (B, N, 3) of the object in the camera's frame."""
+        return points[:, None] @ self.rotations.mT + self.translations[:, :, None]
 
 
 def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
@@ -44,9 +49,9 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
         weights: (B, N), not negative; 0 for what is not seen, whose points and rays do not matter.
 
     Returns:
-        Two poses a row, S = 2; of points in space the second is the first again where no other was met. A pose is valid
-        if four points or more are seen that are not on a line, everything is finite, and most of what is seen lies
-        ahead on its rays. Others are finite and mean nothing.
+        Two poses a row, S = 2. A pose is valid if four points or more are seen that are not on a line, everything is
+        finite, and most of what is seen lies ahead on its rays; the second one if it is another minimum. Others are
+        finite and mean nothing.
     """
     points, rays, weights = _cleaned(points, rays, weights)
     total = weights.sum(-1).clamp(min=_TINY)
@@ -85,6 +90,9 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     translations = translations * size[:, None, None] - (rotations @ centre[:, None, :, None])[..., 0]
     finite = torch.isfinite(rotations).all(-1).all(-1) & torch.isfinite(translations).all(-1)
     valid = finite & ahead & enough[:, None]
+    # the trace of the turn between them
+    same = (rotations[:, 0] * rotations[:, 1]).sum((-1, -2)) > 1 + 2 * math.cos(_SAME)
+    valid = torch.stack((valid[:, 0], valid[:, 1] & ~same), -1)
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     return RayPoses(
         torch.where(finite[..., None, None], rotations, eye), torch.where(finite[..., None], translations, 0.0), valid
@@ -249,8 +257,7 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
         rotations = distances.descended(_taken(rotations, costs(rotations).argsort(-1)[:, :count]), steps)
     cost = costs(rotations)
     best = _taken(rotations, cost.argmin(-1, keepdim=True))
-    # the trace of the turn between them: within 0.1 radians it is the same minimum
-    same = (rotations * best).sum((-1, -2)) > 1 + 2 * math.cos(0.1)
+    same = (rotations * best).sum((-1, -2)) > 1 + 2 * math.cos(_SAME)
     other = torch.where(same, torch.inf, cost).argmin(-1, keepdim=True)
     return torch.cat((best, _taken(rotations, other)), 1)
 

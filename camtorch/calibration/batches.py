@@ -1,0 +1,59 @@
+"""What users pass to functions of many independent rows: tensors that keep their graphs, cameras of as many rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, _as_plain, as_values
+from camtorch._module import BatchedModule
+from camtorch.camera import Camera
+
+
+def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> Tensor:
+    """A tensor of real numbers, NaN among them: of a tensor, an array, lists, or a list of such of one shape.
+
+    Raises:
+        TypeError: no real numbers. ValueError: parts of different shapes.
+    """
+    if isinstance(values, (list, tuple)) and values and all(getattr(v, "ndim", 0) for v in values):
+        parts = [as_tensor(v, f"{name}[{i}]", owner, device) for i, v in enumerate(values)]
+        if len({part.shape for part in parts}) > 1:
+            shapes = ", ".join(str(tuple(part.shape)) for part in parts[:8])
+            raise ValueError(f"{owner}: the parts of {name} must have one shape; got {shapes}. Pad pixels with NaN")
+        return torch.stack(parts)
+    return as_values(_as_plain(values), name, owner, device).to(device)
+
+
+def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:
+    """(*B, N, size) of that, or of OpenCV's (*B, N, 1, size).
+
+    Raises:
+        TypeError: no real numbers. ValueError: another shape.
+    """
+    vectors = as_tensor(values, name, owner, device)
+    if vectors.ndim > 2 and vectors.shape[-2] == 1 and vectors.shape[-3] > 1:
+        vectors = vectors.squeeze(-2)
+    if vectors.ndim < 2 or vectors.shape[-1] != size:
+        raise ValueError(f"{owner}: {name} must be (*B, N, {size}); got shape {tuple(vectors.shape)}")
+    return vectors
+
+
+def rows_of(camera: Camera, batch: torch.Size) -> Camera:
+    """The camera in float64, with its graph: of `math.prod(batch)` rows, or of none if it is one for all of them."""
+    tensors = {}
+    shared = math.prod(camera.batch_shape) == 1
+    for name in camera.tensor_names:
+        tensor = getattr(camera, name).double()
+        count = tensor.shape[-1]
+        tensors[name] = tensor.reshape(count) if shared else tensor.expand(*batch, count).reshape(-1, count)
+    return camera.with_tensors(**tensors)
+
+
+def learns(modules: Sequence[BatchedModule], *tensors: Tensor) -> bool:
+    """Whether a graph shall lead to any of them."""
+    held = [getattr(module, name) for module in modules for name in module.tensor_names]
+    return torch.is_grad_enabled() and any(t.requires_grad for t in (*held, *tensors))

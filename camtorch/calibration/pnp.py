@@ -1,0 +1,231 @@
+"""The pose of an object whose points are known, from the pixels at which a camera sees them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from camtorch._arguments import Numbers, broadcast_shapes, working_dtype
+from camtorch._threads import on_one_thread
+from camtorch.calibration.batches import as_tensor, as_vectors, learns, rows_of
+from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
+from camtorch.calibration.rays import poses_from_rays
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.least_squares.implicit import attached
+from camtorch.least_squares.levenberg_marquardt import minimise
+from camtorch.rotations import rotation_matrix, rotation_vector
+
+_LEAST = 4  # points
+_FEW = 5  # points, that may have minima far from where they start
+_WORSE, _MUCH_WORSE = 4.0, 100.0  # times the cost of the best start, beyond which none became the best; of few points
+_THIN = 0.1  # of the extent of points: what is thinner may have the minima of a plane
+_STEPS, _DAMPING = 60, 1e-8  # the first damping: a start is nearly the optimum
+_SETTLED = 1e-8  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
+_NOTHING = 1e-9  # px, that rounding may leave
+_LOST = 1e3  # px, that a point without a pixel counts as where starts are compared
+
+
+class Pose(NamedTuple):
+    """What `solve_pnp` returns."""
+
+    extrinsics: Extrinsics
+    """Camera from object, batch *B."""
+    rms: Tensor
+    """(*B,) px: the root of the weighted mean over the seen points of the squared distance; infinite where invalid."""
+    valid: Tensor
+    """(*B,) bool."""
+
+
+@on_one_thread
+def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weights: Numbers | None = None) -> Pose:
+    """The pose, camera from object, under which known points are seen nearest to pixels: least squares in px.
+
+    Any camera model, rays of any angle, four points or more, on a plane or not, and no start: closed forms on rays give
+    it (`camtorch.calibration.rays`), the Levenberg-Marquardt method the optimum. Points on a plane may have two
+    minima: both are refined, and the better one is returned.
+
+    Pose and rms have first derivatives by pixels, points, weights and the camera's parameters, by the implicit function
+    theorem at the optimum, whatever led there. All is computed in float64 and returned in the widest dtype that came
+    in. It looks at values: not for torch.compile and vmap, whose batch goes in as one.
+
+    Args:
+        camera: with batch dims or without; all broadcast.
+        object_points: (*B, N, 3) in the object's frame, in any unit; (N, 3) for one object in all rows.
+        pixels: (*B, N, 2). NaN is unseen, as is a pixel that the camera has no ray for. OpenCV's points (N, 1, 2), and
+            (N, 1, 3), are N points.
+        weights: (*B, N) of the squared residuals, not negative, 0 for unseen; all 1 if left out.
+
+    Returns:
+        A `Pose`: extrinsics (camera from object, batch *B), rms (*B,) in px and valid (*B,) bool. A row is invalid, its
+        pose finite and without a meaning, if less than four points are seen or all of them on one line, if a point or
+        a parameter is not finite, or if no minimum was found that has all seen points in the camera's view.
+
+    Raises:
+        TypeError: no camera, or no numbers. ValueError: shapes that do not fit, less than four points, negative
+            weights.
+    """
+    task = _Task.of(camera, object_points, pixels, weights)
+    with torch.no_grad():
+        unknowns, valid = _solved(task)
+    if learns([camera], task.points, task.pixels, task.weights):
+        unknowns = attached(task.cost, unknowns, valid)
+    mean = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
+    # of a perfect fit the root has no derivative
+    rms = torch.where(valid & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), torch.where(valid, 0.0, torch.inf))
+    rotation, translation = unknowns.to(task.dtype).view(*task.batch, 6).split(3, -1)
+    return Pose(
+        Extrinsics(rotation[..., None], translation), rms.to(task.dtype).view(task.batch), valid.view(task.batch)
+    )
+
+
+class _Task(NamedTuple):
+    """B rows, float64, with graphs where there are: what is unseen has weight 0 and is finite."""
+
+    camera: Camera  # of B rows, or of none for all
+    points: Tensor  # (B, N, 3)
+    pixels: Tensor  # (B, N, 2)
+    weights: Tensor  # (B, N)
+    rays: Tensor  # (B, N, 3)
+    batch: torch.Size
+    dtype: torch.dtype
+
+    @classmethod
+    def of(cls, camera: Camera, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> _Task:
+        """What users pass, checked."""
+        owner = "solve_pnp"
+        if not isinstance(camera, Camera):
+            raise TypeError(f"{owner}: camera must be a camera, as ct.KannalaBrandt(...); got {type(camera).__name__}")
+        device = camera.intrinsics.device
+        points = as_vectors(object_points, "object_points", 3, owner, device)
+        seen_at = as_vectors(pixels, "pixels", 2, owner, device)
+        count = seen_at.shape[-2]
+        given = None if weights is None else as_tensor(weights, "weights", owner, device)
+        shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
+        if points.shape[-2] != count:
+            hint = ". Rows of fewer points are padded with NaN pixels"
+            raise ValueError(f"{owner}: {shapes} are not the same number of points{hint}")
+        if count < _LEAST:
+            raise ValueError(f"{owner}: it takes {_LEAST} points at least; got {shapes}")
+        if given is not None and given.shape[-1:] != (count,):
+            raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}; got shape {tuple(given.shape)}")
+        if given is not None and not bool((given >= 0).all()):
+            raise ValueError(f"{owner}: weights must not be negative; got {given.detach().min().item():.4g}")
+        lead = () if given is None else given.shape[:-1]
+        try:
+            batch = broadcast_shapes(camera.batch_shape, points.shape[:-2], seen_at.shape[:-2], lead)
+        except ValueError:
+            also = "" if given is None else f", weights {tuple(given.shape)}"
+            raise ValueError(
+                f"{owner}: the batch dims of {shapes}{also} and the camera's {tuple(camera.batch_shape)} do not fit"
+            ) from None
+        dtype = working_dtype(points, seen_at, *camera._tensors)
+        points = points.double().expand(*batch, count, 3).reshape(-1, count, 3)
+        seen_at = seen_at.double().expand(*batch, count, 2).reshape(-1, count, 2)
+        given = seen_at.new_ones(count) if given is None else given.double()
+        given = given.expand(*batch, count).reshape(-1, count)
+        rows = rows_of(camera, batch)
+        with torch.no_grad():
+            rays, seen = rows.unproject(seen_at)
+            # a sum shows what is not finite
+            seen = seen & torch.isfinite(points.sum(-1) + given)
+        return cls(
+            rows,
+            torch.where(seen[..., None], points, 0.0),
+            torch.where(seen[..., None], seen_at, 0.0),
+            torch.where(seen, given, 0.0),
+            rays,
+            batch,
+            dtype,
+        )
+
+    def cost(self, unknowns: Tensor) -> Tensor:
+        """(B,) half the sum of squares at rotation vectors and translations (B, 6)."""
+        seen = self.points @ rotation_matrix(unknowns[:, :3]).mT + unknowns[:, None, 3:]
+        pixels, valid = self.camera.project(seen)
+        squares = (pixels - self.pixels).square().sum(-1)
+        return 0.5 * (torch.where(valid, squares, 0.0) * self.weights).sum(-1)
+
+
+def _solved(task: _Task) -> tuple[Tensor, Tensor]:
+    """(B, 6): the rotation vectors and translations of least cost, and whether they are."""
+    points, pixels, weights = (t.detach() for t in task[1:4])
+    starts = poses_from_rays(points, task.rays, weights)
+    seen_at, mapped = task.camera.project(starts.moved(points).flatten(1, 2))
+    shape = *starts.valid.shape, points.shape[1]
+    squares = (seen_at.view(*shape, 2) - pixels[:, None]).square().sum(-1)
+    costs = (torch.where(mapped.view(shape), squares, _LOST**2) * weights[:, None]).sum(-1)
+    costs = torch.where(starts.valid, costs, torch.inf)
+    few = (weights > 0).sum(-1) <= _FEW
+    most = torch.where(few, _MUCH_WORSE, _WORSE) * costs.amin(-1)
+    rows, which = ((costs <= most[:, None]) & (costs < torch.inf)).nonzero(as_tuple=True)
+    found = _refined(task, rows, starts.rotations[rows, which], starts.translations[rows, which])
+    costs = torch.full_like(costs, torch.inf)
+    rotations, translations = starts.rotations.clone(), starts.translations.clone()
+    costs[rows, which], rotations[rows, which], translations[rows, which] = found
+    best, every = costs.argmin(-1), torch.arange(len(costs), device=costs.device)
+    cost, rotations, translations = costs[every, best], rotations[every, best], translations[every, best]
+    # of so few points on a plane the other minimum may be one of pixels, and none of rays
+    (rows,) = (few & starts.valid[:, 0] & ~starts.valid[:, 1]).nonzero(as_tuple=True)
+    if len(rows):
+        flat, *mirrored = _mirrored(points[rows], weights[rows], rotations[rows], translations[rows])
+        rows = rows[flat]
+        found = _refined(task, rows, *(t[flat] for t in mirrored))
+        better = found.costs < cost[rows]
+        rows = rows[better]
+        cost[rows], rotations[rows], translations[rows] = (t[better] for t in found)
+    return torch.cat((rotation_vector(rotations), translations), -1), torch.isfinite(cost)
+
+
+class _Refined(NamedTuple):
+    """Costs (R,), infinite where no minimum was found, rotations (R, 3, 3) and translations (R, 3)."""
+
+    costs: Tensor
+    rotations: Tensor
+    translations: Tensor
+
+
+def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor) -> _Refined:
+    """The minima that starts (R, ...) for some rows of the task lead to."""
+    points, pixels, weights = (t.detach()[rows, None] for t in task[1:4])
+    parameters = torch.cat(task.camera._tensors, -1).detach()
+    parameters = parameters[None] if parameters.ndim == 1 else parameters[rows]
+    start = State(
+        (parameters,),
+        Poses.none(len(rows), 1, points),
+        Poses(rotations[:, None], translations[:, None]),
+        points.new_zeros(len(rows), 2),
+    )
+    nothing = torch.zeros(parameters.shape[-1], dtype=torch.bool, device=points.device)
+    problem = Bundle([Sight(task.camera, points, pixels, weights)], start, Free((nothing,), (False,)), None, 1.0)
+    counts = (weights > 0).sum((-1, -2))
+    found = minimise(
+        problem,
+        problem.flat(start),
+        tolerance=_SETTLED / (2 * counts - 6).clamp(min=1),
+        tiny=_NOTHING**2 * counts,
+        steps=_STEPS,
+        damping=_DAMPING,
+    )
+    complete = (problem.look(0, found.state).valid | (weights == 0)).all(-1)[:, 0]
+    rotations, translations = found.state[:2]
+    return _Refined(torch.where(found.converged & complete, found.cost, torch.inf), rotations[:, 0], translations[:, 0])
+
+
+def _mirrored(points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor) -> tuple[Tensor, ...]:
+    """Whether points are nearly on a plane, and poses whose normals of it mirror those given at the line of sight."""
+    share = weights / weights.sum(-1, keepdim=True)
+    centre = (share[..., None] * points).sum(-2)
+    centred = points - centre[:, None]
+    variances, axes = torch.linalg.eigh((share[..., None] * centred).mT @ centred)
+    flat, normal = variances[:, 0] <= _THIN**2 * variances[:, 2], axes[..., 0]
+    middle = (rotations @ centre[..., None])[..., 0] + translations
+    across_sight, in_plane = (
+        torch.eye(3, dtype=v.dtype, device=v.device) - 2 * v[..., :, None] * v[..., None, :]
+        for v in (normalize(middle, dim=-1), normal)
+    )
+    mirrored = across_sight @ rotations @ in_plane
+    return flat, mirrored, middle - (mirrored @ centre[..., None])[..., 0]

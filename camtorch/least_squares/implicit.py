@@ -1,0 +1,35 @@
+"""What an optimum owes to the numbers that it was found from: its derivatives by the implicit function theorem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def attached(objective: Callable[[Tensor], Tensor], optimum: Tensor, valid: Tensor) -> Tensor:
+    """The optimum with a graph, of the same value, for first derivatives by whatever the objective depends on.
+
+    The gradient of the objective is zero at an optimum and stays zero when it moves: one step by Newton's method, with
+    the exact Hessian, has the derivatives of the optimum however that was found.
+
+    Args:
+        objective: of unknowns (B, K) the costs (B,), each of its own row, differentiable twice.
+        optimum: (B, K), where it is least.
+        valid: (B,) bool; other rows get no gradient.
+    """
+    with torch.enable_grad():
+        unknowns = optimum.detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(objective(unknowns).sum(), unknowns, create_graph=True)
+        rows = [
+            torch.autograd.grad(column.sum(), unknowns, retain_graph=True)[0].detach() for column in gradient.unbind(-1)
+        ]
+        hessian = torch.stack(rows, -2)
+        eye = torch.eye(optimum.shape[-1], dtype=optimum.dtype, device=optimum.device)
+        hessian = torch.where(valid[:, None, None], hessian, eye)
+        inverse, failed = torch.linalg.inv_ex(hessian)
+        fine = valid & (failed == 0) & torch.isfinite(inverse).all(-1).all(-1)
+        inverse = torch.where(fine[:, None, None], inverse, 0.0)
+        step = (inverse @ gradient[..., None])[..., 0]
+        return optimum.detach() - (step - step.detach())

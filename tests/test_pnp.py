@@ -1,0 +1,269 @@
+"""solve_pnp: poses of objects by any lens, at any angle, from no start; the optimum, and its derivatives."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.rotations import rotation_matrix
+
+SIZE = (960, 1280)
+
+
+def lens(fov):
+    """A camera of that field of view in degrees; beyond 100 a fisheye."""
+    model, k = (
+        (ct.BrownConrady, [-0.1, 0.02, 1e-3, -5e-4]) if fov <= 100 else (ct.KannalaBrandt, [0.01, -0.004, 1e-3, 0])
+    )
+    return model.from_fov(fov, image_size=SIZE, distortion=torch.tensor(k).double()).double().requires_grad_(False)
+
+
+def scenes(camera, fov, count, points, kind, seed=0):
+    """Objects anywhere in the image: points (B, N, 3), poses (rotation, t) and the pixels they have."""
+    g = torch.Generator().manual_seed(seed)
+    parts = []
+    while sum(len(part[0]) for part in parts) < count:
+        many = 4 * count
+        target = torch.rand(many, points, 3, generator=g).double() * 2 - 1
+        target = target * torch.tensor([1.0, 1.0, 0.0 if kind == "planar" else 1.0])
+        at = torch.rand(many, 2, generator=g).double() * torch.tensor([SIZE[1], SIZE[0]])
+        sight, valid = camera.unproject(at)
+        half = math.radians(fov) / 2 * 10 ** (-torch.rand(many, 1, generator=g).double())
+        t = sight * 1.5 / torch.tan(half.clamp(max=1.2))
+        axis = torch.nn.functional.normalize(torch.randn(many, 3, generator=g).double(), dim=-1)
+        rotation = rotation_matrix(axis * math.pi * torch.rand(many, 1, generator=g).double())
+        pixels, seen = camera.project(target @ rotation.mT + t[:, None])
+        ok = valid & (seen & camera.contains(pixels)).all(-1)
+        if kind == "planar":
+            ok &= (rotation[..., 2] * sight).sum(-1).abs() > math.cos(math.radians(75))
+        parts.append([w[ok] for w in (target, rotation, t, pixels)])
+    return [torch.cat(w)[:count] for w in zip(*parts, strict=True)]
+
+
+def rms_of(camera, extrinsics, target, pixels):
+    found, valid = camera.project(extrinsics(target))
+    assert valid.all()
+    return (found - pixels).square().sum(-1).mean(-1).sqrt()
+
+
+@pytest.mark.parametrize("kind", ["planar", "space"])
+@pytest.mark.parametrize("fov", [10, 60, 130, 190])
+def test_exact_pixels_give_the_pose(fov, kind):
+    camera = lens(fov)
+    for points in (4, 5, 6, 20):
+        target, rotation, t, pixels = scenes(camera, fov, 20, points, kind)
+        extrinsics, rms, valid = ct.solve_pnp(camera, target, pixels)
+        assert valid.all()
+        assert rms.max() < 1e-8
+        # of four points another pose may explain the pixels as well
+        found = extrinsics.matrix()
+        right = (found[:, :3, :3] - rotation).abs().amax((-1, -2)) < 1e-6
+        assert right.double().mean() > (0.9 if points < 6 else 0.99)
+        torch.testing.assert_close(found[right, :3, 3], t[right], rtol=1e-6, atol=1e-6)
+
+
+def attempts(camera, fov, count, points, kind, noise, seed):
+    """Whether noisy pixels are explained at least as well as by the true pose."""
+    target, rotation, t, pixels = scenes(camera, fov, count, points, kind, seed)
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(seed)).double()
+    with torch.no_grad():
+        found, rms, valid = ct.solve_pnp(camera, target, pixels)
+        torch.testing.assert_close(rms_of(camera, found, target, pixels)[valid], rms[valid])
+        near_truth = rms_of(camera, ct.Extrinsics.from_matrix(rotation, t), target, pixels)
+    return valid & (rms <= near_truth)
+
+
+@pytest.mark.parametrize("kind", ["planar", "space"])
+def test_noisy_pixels_are_explained_better_than_by_the_truth(kind):
+    good = [
+        attempts(lens(fov), fov, 60, points, kind, noise, points)
+        for fov in (10, 60, 190)
+        for points in (4, 12)
+        for noise in (0.1, 1.0)
+    ]
+    assert torch.cat(good).double().mean() > 0.99
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["planar", "space"])
+@pytest.mark.parametrize("fov", [10, 30, 60, 90, 130, 170, 190])
+def test_thousands_of_poses_end_in_the_optimum(fov, kind):
+    good = [
+        attempts(lens(fov), fov, 100, points, kind, noise, points)
+        for points in (4, 5, 6, 8, 12, 20, 50)
+        for noise in (0.0, 0.1, 0.5, 1.0)
+    ]
+    assert torch.cat(good).double().mean() > 0.998
+
+
+@pytest.mark.parametrize("kind", ["planar", "space"])
+def test_the_cost_is_opencvs_or_less(kind):
+    camera = lens(60)
+    target, _, _, pixels = scenes(camera, 60, 30, 8, kind)
+    pixels = pixels + 0.5 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
+    _, rms, valid = ct.solve_pnp(camera, target, pixels)
+    assert valid.all()
+    matrix, k = camera.K.numpy(), camera.distortion.numpy()
+    for row in range(len(target)):
+        points, seen = target[row].numpy(), pixels[row].numpy()
+        _, r, t = cv2.solvePnP(points, seen, matrix, k, flags=cv2.SOLVEPNP_SQPNP)
+        r, t = cv2.solvePnPRefineLM(points, seen, matrix, k, r, t)
+        theirs = np.sqrt(np.mean(np.sum((cv2.projectPoints(points, r, t, matrix, k)[0][:, 0] - seen) ** 2, -1)))
+        assert rms[row] <= theirs * (1 + 1e-6)
+
+
+def test_both_minima_of_a_plane_are_compared():
+    """A small square far away, whose two poses explain it nearly as well: the better one is returned."""
+    camera = lens(10)
+    target = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double()
+    g = torch.Generator().manual_seed(0)
+    better = 0
+    for tilt in (0.3, 0.5, 0.7):
+        rotation = rotation_matrix(torch.tensor([tilt, 0.2, 0.0]).double())
+        t = torch.tensor([0.3, 0.1, 60.0]).double()
+        pixels = camera.project(target @ rotation.mT + t)[0] + 0.3 * torch.randn(40, 4, 2, generator=g).double()
+        found, rms, valid = ct.solve_pnp(camera, target, pixels)
+        assert valid.all()
+        # the mirror image of what was found, and what a local search makes of it
+        sight = torch.nn.functional.normalize(found.translation.detach(), dim=-1)
+        flip = torch.eye(3) - 2 * sight[:, :, None] * sight[:, None]
+        other = flip @ found.matrix()[:, :3, :3].detach() @ torch.diag(torch.tensor([1.0, 1, -1])).double()
+        for row in range(len(pixels)):
+            r, _ = cv2.Rodrigues(other[row].numpy())
+            matrix, k = camera.K.numpy(), camera.distortion.numpy()
+            start = r, found.translation[row].detach().numpy()[:, None].copy()
+            r, t_ = cv2.solvePnPRefineLM(target.numpy(), pixels[row].numpy(), matrix, k, *start)
+            error = cv2.projectPoints(target.numpy(), r, t_, matrix, k)[0][:, 0] - pixels[row].numpy()
+            theirs = np.sqrt(np.mean(np.sum(error**2, -1)))
+            assert rms[row] <= theirs * (1 + 1e-6)
+            better += bool(rms[row] < theirs * 0.999)
+    assert better > 60
+
+
+def test_gradients_are_those_of_the_optimum():
+    camera = lens(130)
+    target, _, _, pixels = scenes(camera, 130, 2, 7, "planar")
+    pixels = pixels + 2 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
+    weights = torch.rand(2, 7, generator=torch.Generator().manual_seed(2)).double() + 0.5
+    inputs = [w.clone().requires_grad_() for w in (target, pixels, weights, camera.intrinsics, camera.distortion)]
+
+    def pose(target, pixels, weights, intrinsics, distortion):
+        camera = ct.KannalaBrandt(intrinsics, distortion, image_size=SIZE)
+        found, rms, valid = ct.solve_pnp(camera, target, pixels, weights=weights)
+        assert valid.all()
+        return found.rotation, found.translation, rms
+
+    assert torch.autograd.gradcheck(pose, inputs, eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
+
+
+def test_what_is_unseen_does_not_matter():
+    camera = lens(60)
+    target, _, _, pixels = scenes(camera, 60, 5, 9, "space")
+    pixels = pixels + 0.5 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
+    expected = ct.solve_pnp(camera, target[:, :6], pixels[:, :6])
+    hidden = pixels.clone()
+    hidden[:, 6:] = torch.nan
+    weights = torch.ones(5, 9)
+    weights[:, 6:] = 0
+    hidden_points = target.clone()
+    hidden_points[:, 6:] = torch.inf
+    for found in (
+        ct.solve_pnp(camera, target, hidden),
+        ct.solve_pnp(camera, target, pixels, weights=weights),
+        ct.solve_pnp(camera, hidden_points, pixels),
+    ):
+        torch.testing.assert_close(found.extrinsics.matrix(), expected.extrinsics.matrix())
+        torch.testing.assert_close(found.rms, expected.rms)
+
+
+def test_pixels_without_a_ray_are_unseen():
+    camera = lens(190)
+    target, _, _, pixels = scenes(camera, 190, 4, 8, "space")
+    blind = torch.tensor([1e5, 1e5]).double()
+    assert not camera.unproject(blind)[1]
+    changed = torch.cat((pixels[:, :7], blind.expand(4, 1, 2)), 1)
+    expected = ct.solve_pnp(camera, target[:, :7], pixels[:, :7])
+    torch.testing.assert_close(ct.solve_pnp(camera, target, changed).extrinsics.matrix(), expected.extrinsics.matrix())
+
+
+def test_bad_rows_are_invalid_and_leave_the_others_alone():
+    camera = lens(60)
+    target, _, _, pixels = scenes(camera, 60, 6, 6, "planar")
+    expected = ct.solve_pnp(camera, target, pixels)
+    target, pixels = target.clone(), pixels.clone()
+    pixels[0, 3:] = torch.nan  # three points
+    target[1] = target[1, :, :1]  # a line
+    target[2] = torch.inf
+    pixels[3] = pixels[3, :1]  # one pixel
+    target[4] = 0
+    target.requires_grad_(), pixels.requires_grad_()
+    extrinsics, rms, valid = ct.solve_pnp(camera, target, pixels)
+    assert not valid[[0, 1, 2, 4]].any()
+    assert valid[5]
+    assert torch.isinf(rms[[0, 1, 2, 4]]).all()
+    torch.testing.assert_close(extrinsics.matrix()[5], expected.extrinsics.matrix()[5])
+    assert torch.isfinite(extrinsics.matrix()).all()
+    (extrinsics.matrix().sum() + rms[valid].sum()).backward()
+    for given in (target, pixels):
+        assert torch.isfinite(given.grad).all()
+        assert not given.grad[[0, 1, 2, 4]].any()
+        assert given.grad[5].any()
+
+
+def test_shapes():
+    camera = lens(60)
+    target, _, _, pixels = scenes(camera, 60, 3, 6, "space")
+    one = ct.solve_pnp(camera, target[0], pixels[0])
+    assert one.extrinsics.batch_shape == ()
+    assert one.rms.shape == ()
+    assert one.valid.shape == ()
+    same = [
+        (target[0].numpy(), pixels[0].numpy()[:, None]),
+        (target[0].numpy()[:, None], pixels[0].numpy()[:, None]),
+        (target[0].numpy()[None], pixels[0].numpy()[:, None]),
+        (target[0].tolist(), pixels[0].tolist()),
+    ]
+    for points, seen in same:
+        found = ct.solve_pnp(camera, points, seen)
+        torch.testing.assert_close(found.extrinsics.matrix().reshape(4, 4), one.extrinsics.matrix(), rtol=0, atol=1e-4)
+    several = ct.solve_pnp(camera, [x.numpy() for x in target], [p.numpy()[:, None] for p in pixels])
+    assert several.extrinsics.batch_shape == (3,)
+    torch.testing.assert_close(several.extrinsics[0].matrix(), one.extrinsics.matrix())
+    shared = ct.solve_pnp(camera, target[0], pixels[:1].expand(2, 5, 6, 2))
+    assert shared.extrinsics.batch_shape == (2, 5)
+    assert shared.valid.all()
+    cameras = ct.BrownConrady(camera.intrinsics.repeat(3, 1), camera.distortion.repeat(3, 1))
+    torch.testing.assert_close(
+        ct.solve_pnp(cameras, target, pixels).extrinsics.matrix(), several.extrinsics.matrix(), rtol=1e-6, atol=1e-6
+    )
+    single = ct.solve_pnp(camera.float(), target.float(), pixels.float())
+    assert single.rms.dtype == single.extrinsics.translation.dtype == torch.float32
+    assert isinstance(one.extrinsics.rotation, torch.nn.Parameter)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "says"),
+    [
+        ((None, torch.rand(6, 3), torch.rand(6, 2)), TypeError, "camera must be a camera"),
+        ((lens(60), torch.rand(6, 3), torch.rand(6, 3)), ValueError, "pixels must be"),
+        ((lens(60), torch.rand(6, 2), torch.rand(6, 2)), ValueError, "object_points must be"),
+        ((lens(60), torch.rand(6, 3), torch.rand(5, 2)), ValueError, "not the same number"),
+        ((lens(60), torch.rand(3, 3), torch.rand(3, 2)), ValueError, "4 points at least"),
+        ((lens(60), torch.rand(2, 6, 3), torch.rand(3, 6, 2)), ValueError, "do not fit"),
+        ((lens(60), [torch.rand(6, 3), torch.rand(5, 3)], torch.rand(2, 6, 2)), ValueError, "one shape"),
+        ((lens(60), "points", torch.rand(2, 6, 2)), TypeError, "object_points must be"),
+    ],
+)
+def test_bad_arguments(arguments, error, says):
+    with pytest.raises(error, match=rf"solve_pnp: .*{says}"):
+        ct.solve_pnp(*arguments)
+
+
+def test_bad_weights():
+    with pytest.raises(ValueError, match="weights must not be negative"):
+        ct.solve_pnp(lens(60), torch.rand(6, 3), torch.rand(6, 2), weights=-torch.ones(6))
+    with pytest.raises(ValueError, match="weights must be"):
+        ct.solve_pnp(lens(60), torch.rand(6, 3), torch.rand(6, 2), weights=torch.ones(5))
