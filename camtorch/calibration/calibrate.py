@@ -6,7 +6,8 @@ import math
 import warnings as python_warnings
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +18,8 @@ from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations
 from camtorch.calibration.start import poses_for, start_from_nothing
-from camtorch.calibration.uncertainty import Spread, spread, uncertainty
+from camtorch.calibration.uncertainty import Spread, noise_under, spread, uncertainty
+from camtorch.calibration.verdict import check_determined, verdict, warnings
 from camtorch.camera import MODELS, Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rotations import rotation_vector
@@ -151,12 +153,20 @@ class Calibration:
     image_points: Any = field(repr=False)
     observations: Observations = field(repr=False)
     adjusted: Adjusted = field(repr=False)
+    point_inliers: Tensor = field(repr=False)
+    """(V, N) bool, the inliers of `observations`."""
+    loss: str | None = None
+    """The robust loss, if there was one."""
     index: int = field(default=0, repr=False)
     """Which of the cameras that were adjusted together it is."""
 
     @property
     def covariance(self) -> Tensor:
-        """(P, P) of the parameters, in their order; 0 for those that were fixed."""
+        """(P, P) of the parameters, in their order; 0 for those that were fixed.
+
+        With a robust loss that of the weighted problem at its optimum, by the noise that the loss leaves: intervals
+        hold where outliers fall on all corners alike, and are somewhat too narrow where they gather in some views.
+        """
         return self.spread.covariance[0]
 
     @property
@@ -184,6 +194,16 @@ class Calibration:
         """
         return uncertainty(self.spread, pixels, distance)
 
+    @cached_property
+    def warnings(self) -> list[str]:
+        """What the data do not carry, and what does not fit, in words: each with what to do."""
+        return warnings(self)
+
+    @property
+    def verdict(self) -> str:
+        """In words: what it is good for, up to which angle, and what to photograph next."""
+        return verdict(self)
+
     def __repr__(self) -> str:
         values = [*self.camera.intrinsics.tolist(), *self.camera.distortion.tolist()]
         pairs = zip(self.parameter_names, values, self.std.tolist(), strict=True)
@@ -193,7 +213,7 @@ class Calibration:
             f"Calibration({type(self.camera).__name__}: rms {self.rms:.4g} px, sigma {self.sigma:.4g} px, "
             f"{count} view{'s' * (count != 1)}, {seen} corners{'' if self.converged else ', NOT CONVERGED'})"
         )
-        return "\n".join((head, *numbers))
+        return "\n".join((head, *numbers, *(f"  ! {text}" for text in self.warnings)))
 
 
 @on_one_thread
@@ -247,6 +267,7 @@ def calibrate(
     free = Free((asked.free.to(seen.pixels.device),), (False,), bend=bend)
     told = None if progress is None else lambda number, cost: progress(number, float(cost))
     adjusted = adjust([sight], first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
+    check_determined(adjusted, [asked.kind], [asked.names], [sight], owner)
     free_parameters = free_count(adjusted, [seen.seen])
     noise = noise_of(adjusted.residuals[0][0], seen.seen, adjusted.valid[0][0], loss, loss_scale, free_parameters)
     result = result_of(adjusted, 0, asked, seen, middle, layout, noise, (object_points, image_points))
@@ -277,9 +298,19 @@ def first_state(
     return poses_for(torch.cat(tuple(given), -1), seen, asked.kind, image_size)
 
 
-def noise_of(
-    residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: int
-) -> tuple[Tensor, Tensor]:
+class Noise(NamedTuple):
+    """Of the corners: the inliers, bool (V, N), sigma, and what makes the covariance; px per coordinate.
+
+    Without a loss both are one number.
+    """
+
+    inliers: Tensor
+    sigma: Tensor
+    spread: Tensor
+    loss: str | None
+
+
+def noise_of(residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: int) -> Noise:
     """The inliers, bool (V, N), and sigma: that of all residuals, with a robust loss that of the inliers.
 
     A residual of an inlier is shorter than max(3 loss_scale, 3 sigma of the inliers).
@@ -300,7 +331,9 @@ def noise_of(
         if torch.equal(found, inliers):
             break
         inliers, sigma = found, _sigma_of(lengths[found], free)
-    return inliers, whole if loss is None else sigma
+    if loss is None:
+        return Noise(inliers, whole, whole, loss)
+    return Noise(inliers, sigma, noise_under(loss, loss_scale, [residuals], [seen & valid], free), loss)
 
 
 def _sigma_of(lengths: Tensor, free: int) -> Tensor:
@@ -321,7 +354,7 @@ def result_of(
     seen: Observations,
     middle: Tensor,
     layout: Layout,
-    noise: tuple[Tensor, Tensor],
+    noise: Noise,
     passed: tuple[Any, Any],
 ) -> Calibration:
     """The result for one of the cameras.
@@ -333,10 +366,9 @@ def result_of(
         seen: what it saw, in the frame of the boards as they were passed.
         middle: (3,) of the boards.
         layout: of its image points.
-        noise: inliers (V, N) bool, and sigma.
+        noise: of its corners.
         passed: the object points and image points as they came.
     """
-    inliers, sigma = noise
     state, residuals = adjusted.state, adjusted.residuals[camera][0]
     parameters = state.parameters[camera][0]
     arguments = (parameters[:4], parameters[4:]) if asked.count else (parameters[:4],)
@@ -345,15 +377,15 @@ def result_of(
     mount = tuple(t[0, camera] for t in state.mounts)
     rotations, translations = mount[0] @ rotations, translations @ mount[0].mT + mount[1]
     translations = translations - rotations @ middle
-    found = spread(adjusted, asked.kind, camera, sigma.reshape(1))
+    found = spread(adjusted, asked.kind, camera, noise.spread.reshape(1))
     whole = torch.where(seen.seen, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
     return Calibration(
         camera=made,
         extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations),
         rms=float((whole.square().sum() / seen.seen.sum().clamp(min=1)).sqrt()),
-        sigma=float(sigma),
+        sigma=float(noise.sigma),
         residuals=layout.restore(residuals),
-        inliers=layout.restore(inliers),
+        inliers=layout.restore(noise.inliers),
         parameter_names=asked.names,
         spread=found,
         converged=bool(adjusted.converged[0]) and bool((adjusted.valid[camera][0] | ~seen.seen).all()),
@@ -364,5 +396,7 @@ def result_of(
         image_points=passed[1],
         observations=seen,
         adjusted=adjusted,
+        point_inliers=noise.inliers,
+        loss=noise.loss,
         index=camera,
     )

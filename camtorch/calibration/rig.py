@@ -27,6 +27,7 @@ from camtorch.calibration.calibrate import (
 )
 from camtorch.calibration.observations import Observations, Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
+from camtorch.calibration.verdict import check_determined
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
@@ -83,6 +84,11 @@ class RigCalibration:
     def std(self) -> dict[str, Tensor]:
         """By the name of a camera, (P,) of its parameters."""
         return {name: camera.std for name, camera in self.cameras.items()}
+
+    @property
+    def warnings(self) -> list[str]:
+        """Those of all cameras, each with the camera's name; see `Calibration.warnings`."""
+        return [f"{name}: {text}" for name, camera in self.cameras.items() for text in camera.warnings]
 
     def __repr__(self) -> str:
         count, boards = len(self.cameras), len(self.views)
@@ -176,8 +182,9 @@ def calibrate_rig(
             strict=True,
         )
     )
-    inliers, sigma = noise_of(residuals, used, valid, loss, loss_scale, parameters)
-    each = inliers.split([len(s.seen) for s in seen.values()])
+    check_determined(adjusted, [a.kind for a in asked], [a.names for a in asked], sights, owner)
+    noise = noise_of(residuals, used, valid, loss, loss_scale, parameters)
+    each = noise.inliers.split([len(s.seen) for s in seen.values()])
     cameras = {
         name: result_of(
             adjusted,
@@ -186,7 +193,7 @@ def calibrate_rig(
             seen[name],
             middle,
             layouts[name],
-            (each[c], sigma),
+            noise._replace(inliers=each[c]),
             (object_points, image_points[name]),
         )
         for c, name in enumerate(names)
@@ -201,9 +208,9 @@ def calibrate_rig(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
         rms=float((lengths.square().sum() / used.sum()).sqrt()),
-        sigma=float(sigma),
+        sigma=float(noise.sigma),
         cameras=cameras,
-        mount_std=_mount_std(adjusted, asked, names, sigma),
+        mount_std=_mount_std(adjusted, asked, names, noise.spread),
         converged=all(c.converged for c in cameras.values()),
         bend=next(iter(cameras.values())).bend,
         views=next(iter(cameras.values())).views,
@@ -304,9 +311,9 @@ def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     return rotations[middle], translations[middle]
 
 
-def _mount_std(adjusted: Adjusted, asked: list[Model], names: list[str], sigma: Tensor) -> dict[str, Tensor]:
+def _mount_std(adjusted: Adjusted, asked: list[Model], names: list[str], noise: Tensor) -> dict[str, Tensor]:
     """(6,) by the name of a camera; zeros for the first one."""
-    std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0], dim=-1) * sigma
+    std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0], dim=-1) * noise
     result = {}
     for c, (name, model) in enumerate(zip(names, asked, strict=True)):
         own = std.new_zeros(6)

@@ -1,0 +1,659 @@
+"""What a calibration is good for, and what its data do not carry: in words, each with what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import columns
+from camtorch.calibration.bundle import Adjusted, Bundle, Free, Sight, State
+from camtorch.calibration.uncertainty import spread, worst
+from camtorch.projection.rays import angles_from_axis, image_edges
+
+if TYPE_CHECKING:
+    from camtorch.calibration.calibrate import Calibration
+    from camtorch.camera import Camera
+
+FINE, ROUGH = 0.5, 3.0
+"""Px, the standard deviations of projections that are good enough to measure by, and to look at pictures."""
+
+_CELLS, _PATTERN = 32, 8  # along the longer side: of the map of uncertainty, and of that of residuals
+_FEW_VIEWS = 6
+_ALIKE = math.radians(30)  # the largest angle between two boards
+_LOOSE_FOCAL, _LOOSE_CENTRE = 0.01, 0.005  # standard deviations: of a focal length, and of the longer side
+_BEYOND = math.radians(3)
+_FISHEYE, _RIM = math.radians(60), math.radians(8)  # beyond the corners of a fisheye its picture ends
+_CORNER_NOISE = 1.0  # px, more than detectors leave
+_WORSE_VIEW = 3.0  # times the median of all views
+_PATTERN_SHARE = 0.3  # of the residuals
+_CERTAIN = 5.0  # standard deviations
+_GAIN = 0.02  # of the sum of squares, for which a model may have more parameters
+_USUAL_NOISE = 0.1  # px
+_OPEN = 0.02  # of the corners' extent: the uncertainty of projections that are not determined
+_OPEN_COEFFICIENT = 0.1  # standard deviation
+_NAMED = 6  # views, in a sentence
+
+_ROWS, _COLUMNS = ("top", "", "bottom"), ("left", "", "right")
+
+
+class Zone(NamedTuple):
+    """A ninth of the image."""
+
+    name: str
+    corners: int
+    """How many were seen there."""
+    share: float
+    """The part of its cells that corners lie in or next to."""
+    rays: float
+    """The part of its cells that have rays."""
+    uncertainty: float
+    """Px, the largest there, of directions; NaN where it has no ray."""
+
+
+class Survey:
+    """Numbers of a calibration that sentences are made of, over a map of the image."""
+
+    def __init__(self, calibration: Calibration):
+        self.calibration = calibration
+        height, width = calibration.image_size
+        cell = max(height, width) / _CELLS
+        self.shape = max(1, round(height / cell)), max(1, round(width / cell))
+        low, high = image_edges(calibration.image_size, self.parameters)
+        steps = [
+            (torch.arange(count).to(low) + 0.5) / count * (high[i] - low[i]) + low[i]
+            for i, count in ((1, self.shape[0]), (0, self.shape[1]))
+        ]
+        self.pixels = torch.stack(torch.meshgrid(*steps, indexing="ij")[::-1], -1)
+        """(rows, columns, 2) the middle of each cell."""
+
+    @property
+    def parameters(self) -> Tensor:
+        """(4 + n,)."""
+        return self.calibration.spread.parameters[0]
+
+    @cached_property
+    def rays(self) -> tuple[Tensor, Tensor]:
+        """Of the cells (rows, columns, 3), and whether there is one."""
+        with torch.no_grad():
+            return self.calibration.camera.unproject(self.pixels)
+
+    @cached_property
+    def angles(self) -> Tensor:
+        """(rows, columns) radians from the axis, NaN where there is no ray."""
+        rays, valid = self.rays
+        return torch.where(valid, angles_from_axis(rays), torch.nan)
+
+    @cached_property
+    def uncertainty(self) -> Tensor:
+        """(rows, columns) px, of directions; NaN where there is no ray."""
+        return self.calibration.uncertainty(self.pixels)
+
+    @cached_property
+    def seen(self) -> Tensor:
+        """(V, N) bool."""
+        return self.calibration.observations.seen
+
+    @cached_property
+    def corners(self) -> Tensor:
+        """(M, 2) all that were seen."""
+        return self.calibration.observations.pixels[self.seen]
+
+    @cached_property
+    def points(self) -> Tensor:
+        """(V, N, 3) those of the boards in the camera's frame."""
+        with torch.no_grad():
+            pose = self.calibration.extrinsics.matrix().to(self.seen.device)
+            return self.calibration.observations.points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+
+    @cached_property
+    def reach(self) -> float:
+        """Radians from the axis, of the corner that is furthest from it but for one in 200, which may be wrong."""
+        angles = angles_from_axis(self.points[self.seen])
+        return float(angles.sort().values[math.ceil(0.995 * len(angles)) - 1])
+
+    @cached_property
+    def image_reach(self) -> float:
+        """Radians from the axis, of the ray of the image that is furthest from it."""
+        return float(self.angles.nan_to_num(0.0).amax())
+
+    @property
+    def ends_in_the_dark(self) -> bool:
+        """Whether the lens ends beyond the circle that a fisheye shows, where corners reach."""
+        return self.reach > _FISHEYE and self.image_reach > self.reach + _RIM
+
+    @cached_property
+    def covered(self) -> Tensor:
+        """(rows, columns) bool: in the cell or in one next to it there is a corner."""
+        low, high = image_edges(self.calibration.image_size, self.corners)
+        count = self.corners.new_tensor(self.shape[::-1])
+        index = ((self.corners - low) / (high - low) * count).long().clamp(min=0)
+        column, row = torch.minimum(index, count.long() - 1).unbind(-1)
+        cells = torch.zeros(self.shape, dtype=self.corners.dtype, device=self.corners.device)
+        cells[row, column] = 1
+        return torch.nn.functional.max_pool2d(cells[None, None], 3, 1, 1)[0, 0] > 0
+
+    @cached_property
+    def loose_focal(self) -> float:
+        """The standard deviation of the focal length at the axis over itself: the worse of both.
+
+        In some models a coefficient does nearly what the parameter called focal length does.
+        """
+        with torch.enable_grad():
+            p = self.parameters.detach().clone().requires_grad_()
+            x, y = (p.new_zeros(1, 1).requires_grad_() for _ in range(2))
+            chart, lens = self.calibration.spread.model.optics(columns(p[None, 4:]))
+            a, b = chart.to_plane(x, y, torch.ones_like(x), order=2)
+            if lens.stages:
+                a, b = lens(a, b)
+            pairs = (p[0] * a, x), (p[1] * b, y)
+            focal = [torch.autograd.grad(to.sum(), of, create_graph=True)[0].sum() for to, of in pairs]
+            slopes = [torch.autograd.grad(f, p, retain_graph=True)[0] for f in focal]
+        factor = self.calibration.spread.factor[0, : len(p)]
+        stds = [float(torch.linalg.vector_norm(slope @ factor)) for slope in slopes]
+        return max(std / abs(float(f.detach())) for std, f in zip(stds, focal, strict=True))
+
+    @cached_property
+    def zones(self) -> list[Zone]:
+        """Nine, by rows."""
+        low, high = image_edges(self.calibration.image_size, self.corners)
+        places = ((self.corners - low) / (high - low) * 3).long().clamp(0, 2)
+        result = []
+        for i, band in enumerate(torch.arange(self.shape[0]).tensor_split(3)):
+            for j, part in enumerate(torch.arange(self.shape[1]).tensor_split(3)):
+                here = self.uncertainty[band][:, part]
+                known = here[~here.isnan()]
+                result.append(
+                    Zone(
+                        " ".join(filter(None, (_ROWS[i], _COLUMNS[j]))) or "middle",
+                        int(((places[:, 0] == j) & (places[:, 1] == i)).sum()),
+                        float(self.covered[band][:, part].double().mean()),
+                        len(known) / here.numel(),
+                        float(known.amax()) if len(known) else math.nan,
+                    )
+                )
+        return result
+
+    @property
+    def missing(self) -> list[Zone]:
+        """Where there are few corners, and the lens is much less certain than in the middle or has no rays at all."""
+        middle = self.zones[4].uncertainty
+        limit = max(FINE, 3 * middle) if math.isfinite(middle) else FINE
+        return [
+            zone
+            for zone in self.zones
+            if zone.share < 0.5
+            and (zone.uncertainty > limit or zone.rays < 0.5)
+            and not (zone.rays < 0.5 and self.ends_in_the_dark)
+        ]
+
+    def good_within(self, limit: float, furthest: float = math.inf) -> tuple[float, float]:
+        """The angle from the axis up to which projections are known that well, and the part of the image within it.
+
+        Args:
+            limit: px.
+            furthest: radians, an angle beyond which they count as unknown.
+        """
+        known, angles = self.uncertainty.nan_to_num(torch.inf), self.angles
+        bad = angles[~((known <= limit) & (angles <= furthest))]
+        angle = float(bad[~bad.isnan()].amin()) if bool((~bad.isnan()).any()) else math.inf
+        within = angles < angle
+        found = float(angles[within].amax()) if bool(within.any()) else 0.0
+        return found, float(within.double().mean())
+
+    @cached_property
+    def normals(self) -> Tensor | None:
+        """(V, 3) of the boards, towards the camera; None if some are no planes."""
+        weights = self.seen.to(self.points)[..., None]
+        middle = (self.points * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp(min=1)
+        _, sizes, axes = torch.linalg.svd((self.points - middle) * weights, full_matrices=False)
+        used = self.seen.any(-1)
+        if not bool(used.any()) or bool((sizes[used, 2] > 1e-3 * sizes[used, 1]).any()):
+            return None
+        normals = axes[used, 2]
+        return torch.where((normals * middle[used, 0]).sum(-1, keepdim=True) > 0, -normals, normals)
+
+    @cached_property
+    def tilt(self) -> float:
+        """Radians, the largest angle between two boards; infinite if some are no planes."""
+        if self.normals is None:
+            return math.inf
+        return float(torch.acos((self.normals @ self.normals.mT).clamp(-1, 1)).amax())
+
+    @cached_property
+    def view_rms(self) -> Tensor:
+        """(V,) px per point; NaN where nothing was seen."""
+        squares = self.calibration.point_residuals.square().sum(-1) * self.seen
+        return (squares.sum(-1) / self.seen.sum(-1)).sqrt()
+
+    @cached_property
+    def gains(self) -> tuple[tuple[float, float, float], tuple[int, float] | None]:
+        """What more parameters would gain, by the linear problem: parts of the sum of squares.
+
+        Of the board's bend: the two numbers, and its gain, 0 where it learned or does not apply. Of more coefficients:
+        how many in all, and their gain; None where the model takes no more.
+        """
+        calibration, adjusted = self.calibration, self.calibration.adjusted
+        none = (0.0, 0.0, 0.0), None
+        state, cost = adjusted.state, float(adjusted.cost[0])
+        if len(state.parameters) > 1 or not cost > 0 or not self.learns.any():
+            return none
+        points, seen = calibration.observations.points, self.seen
+        ends = torch.stack((points[seen].amin(0), points[seen].amax(0)))
+        points = torch.where(seen[..., None], points - ends.mean(0), 0.0)
+        model = calibration.spread.model
+        sight = Sight(model, points[None], calibration.observations.pixels[None], adjusted.weights[0])
+        bend = none[0]
+        if not any(calibration.bend) and self.normals is not None and float(points.abs().amax((0, 1))[2]) == 0:
+            free = Free((self.learns,), (False,), bend=True)
+            step, gain = _more(Bundle([sight], state, free, None, 1.0), state, 2)
+            bend = (*step.tolist(), gain / cost)
+        count = len(self.parameters) - 4
+        counts = [n for n in (*model.fit_counts, count + 1, count + 2, count + 3, count + 4) if n > count]
+        more = next((n for n in counts if _extends(model, count, n)), None)
+        if more is None or not bool(self.learns[4:].all()):
+            return bend, None
+        free = Free((torch.cat((self.learns, self.learns.new_ones(more - count))),), (False,))
+        ideal = self.parameters.new_tensor(model.ideal(more))[count:]
+        wider = state._replace(parameters=(torch.cat((state.parameters[0], ideal[None]), -1),))
+        _, gain = _more(Bundle([sight], wider, free, None, 1.0), wider, more - count)
+        return bend, (more, gain / cost)
+
+    @cached_property
+    def learns(self) -> Tensor:
+        """(4 + n,) bool: which parameters were free."""
+        mine = [i for c, i in self.calibration.adjusted.equations.columns if c == self.calibration.index]
+        learns = torch.zeros(len(self.parameters), dtype=torch.bool, device=self.parameters.device)
+        learns[[i for i in mine if i < len(learns)]] = True
+        return learns
+
+
+def _extends(model: type[Camera], count: int, more: int) -> bool:
+    """Whether with coefficients at zero the model of more is the same camera."""
+    names, others = model.names_of(count), model.names_of(more)
+    if names is None or others is None or others[:count] != names:
+        return False
+    return not any(model.ideal(more)[count:])
+
+
+def _more(bundle: Bundle, state: State, count: int) -> tuple[Tensor, float]:
+    """The step of the last unknowns, and how much the sum of squares would fall by them, were the problem linear."""
+    shared = bundle.equations(bundle.flat(state)).shared[0, :-1]
+    triangle, right = shared[-count:, -count - 1 : -1], shared[-count:, -1]
+    scale = torch.linalg.vector_norm(shared[:, -count - 1 : -1], dim=0).clamp(min=torch.finfo(shared.dtype).tiny)
+    if bool((triangle.diagonal().abs() < 1e-9 * scale).any()):
+        return torch.zeros_like(right), 0.0
+    step = -torch.linalg.solve_triangular(triangle, right[:, None], upper=True)[:, 0]
+    return step, float(right.square().sum())
+
+
+# -- sentences
+
+
+@torch.no_grad()
+def warnings(calibration: Calibration) -> list[str]:
+    """What the data do not carry, and what does not fit: each with what to do. Empty where all is well."""
+    survey = Survey(calibration)
+    return [text for find in _FINDERS for text in find(survey)]
+
+
+def _search(survey: Survey) -> Iterator[str]:
+    if not survey.calibration.converged:
+        yield (
+            "The search did not end at an optimum: do not use this camera. See whether the numbers of corners along "
+            "the board's sides, the image size and the model are right, try another model first, or give start=a camera"
+        )
+
+
+def _noise(survey: Survey) -> Iterator[str]:
+    calibration = survey.calibration
+    limit = _CORNER_NOISE * max(1.0, max(calibration.image_size) / 2000)
+    if calibration.sigma > limit:
+        yield (
+            f"What is left is {_px(calibration.sigma)} per coordinate, far more than corners are wrong by: see whether "
+            "the board is flat and as described, and look at the worst views; images out of focus or smeared by motion "
+            "do it too, and so does a model that is not that of the lens"
+        )
+
+
+def _views(survey: Survey) -> Iterator[str]:
+    count = int(survey.seen.any(-1).sum())
+    if count < _FEW_VIEWS:
+        views = "view" if count == 1 else "views"
+        yield (
+            f"Only {count} {views}: a bad one has nothing to be told by. Take 10 to 20, with the board tilted by 30 to "
+            "45 degrees to all sides"
+        )
+
+
+def _parallel(survey: Survey) -> Iterator[str]:
+    loose = survey.loose_focal
+    known = f"known to {_percent(loose)} only" if loose < 1 else "as good as unknown"
+    if loose > _LOOSE_FOCAL and len(survey.seen) > 1 and survey.tilt < _ALIKE:
+        yield (
+            f"All boards are parallel to within {_degrees(survey.tilt)}, so that a longer focal length looks like a "
+            f"greater distance: it is {known}. Tilt the board by 30 to 45 degrees to all sides"
+        )
+    elif loose > _LOOSE_FOCAL:
+        yield (f"The focal length is {known}. Take views in which the board is near and tilted, and fills the image")
+
+
+def _centre(survey: Survey) -> Iterator[str]:
+    calibration = survey.calibration
+    std = max(calibration.std[2:4].tolist())
+    if std > _LOOSE_CENTRE * max(calibration.image_size):
+        yield (
+            f"The principal point is known to {std:.2g} px only. Tilt the board to all sides, turn it by 90 degrees in "
+            'its plane, or hold it in the middle of the image with fixed=("cx", "cy")'
+        )
+
+
+def _coverage(survey: Survey) -> Iterator[str]:
+    missing = survey.missing
+    if not missing:
+        return
+    known = max((zone.uncertainty for zone in missing if zone.rays >= 0.5), default=math.nan)
+    where = f", where projections are uncertain by up to {_px(known)}" if math.isfinite(known) else ""
+    yield (
+        f"Few corners or none in {_places(missing)} of the image{where}. Hold the board there, so near that its "
+        "corners reach the edges"
+    )
+
+
+def _angles(survey: Survey) -> Iterator[str]:
+    reach, end = survey.reach, survey.image_reach
+    lost = float((~survey.rays[1]).double().mean())
+    if lost > 0.001 and not survey.ends_in_the_dark:
+        yield (
+            f"The fitted lens ends inside the image: {_percent(lost)} of the pixels have no ray, beyond {_degrees(end)}"
+            f" from the axis, where corners reach {_degrees(reach)}. If the picture goes on there, take views with "
+            "corners as far out as it shows anything, or a model with fewer coefficients or of a wider lens"
+        )
+    if end > reach + _BEYOND and survey.good_within(ROUGH)[0] < end:
+        yield (
+            f"Corners reach {_degrees(reach)} from the axis, and the image {_degrees(end)}: beyond what was seen the "
+            "lens is a guess. Hold the board nearer to the corners of the image"
+        )
+
+
+def _needless(survey: Survey) -> Iterator[str]:
+    calibration = survey.calibration
+    names = calibration.parameter_names[4:]
+    ideal = calibration.spread.model.ideal(len(names))
+    values = survey.parameters[4:]
+    std, covariance = calibration.std[4:], calibration.covariance[4:, 4:]
+    series: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        if ideal[i] or not name[-1].isdigit():  # no term of a series
+            continue
+        series.setdefault(name.rstrip("0123456789"), []).append(i)
+    taken: list[int] = []
+    for members in series.values():
+        # the last terms of a series; together coefficients may say what each alone does not
+        for i in reversed(members):
+            some = [*taken, i]
+            scale = std[some]
+            if float(scale[-1]) == 0:
+                continue
+            correlation = covariance[some][:, some] / scale[:, None] / scale
+            scaled = (values[some] / scale)[:, None]
+            square = float((scaled.mT @ torch.linalg.pinv(correlation, hermitian=True) @ scaled)[0, 0])
+            if square > len(some) + 2 * math.sqrt(2 * len(some)):
+                break
+            taken = some
+    if taken:
+        found = [names[i] for i in sorted(taken)]
+        many = len(found) > 1
+        yield (
+            f"{_listed(found)} cannot be told from zero: the data do not need {'them' if many else 'it'}. "
+            f"{_fixed(found)} makes the rest more certain"
+        )
+
+
+def _pattern(survey: Survey) -> Iterator[str]:
+    calibration = survey.calibration
+    bend, more = survey.gains
+    share = pattern_share(survey)
+    least = max(_GAIN, (_CERTAIN * calibration.sigma) ** 2 / max(float(calibration.adjusted.cost[0]), 1e-300))
+    is_bent = bend[2] > least and share < 2 * _PATTERN_SHARE and len(survey.seen) >= _FEW_VIEWS
+    if is_bent:
+        x, y = (f"{abs(value):.2g}" for value in bend[:2])
+        yield (
+            f"The board seems to be bent, by {x} along its x and {y} along its y, in the unit of its points: the "
+            f"squares of the residuals would fall by {_percent(bend[2])}. bend=True finds its shape; a stiff board is "
+            "better"
+        )
+    if more is not None and more[1] > max(least, _PATTERN_SHARE * share):
+        yield (
+            f"The model does not quite fit: with count={more[0]} coefficients the squares of the residuals would fall "
+            f"by {_percent(more[1])}"
+        )
+    elif share > _PATTERN_SHARE:
+        size = share * calibration.rms
+        yield (
+            f"The residuals have a pattern over the image, of {_px(size)}: the model is not that of the lens, or the "
+            f"board is not as described. {_instead(survey, is_bent)}"
+        )
+
+
+def _outliers(survey: Survey) -> Iterator[str]:
+    calibration = survey.calibration
+    seen, inliers = survey.seen, calibration.point_inliers
+    bad = seen & ~inliers
+    count, total = int(bad.sum()), int(seen.sum())
+    lengths = torch.linalg.vector_norm(calibration.point_residuals, dim=-1)
+    usual = math.sqrt(float(lengths[inliers].square().mean()) / 2) if bool(inliers.any()) else 0.0
+    # of the lengths of normal errors so many are beyond three standard deviations, and none beyond six
+    if count > 3 + 2 * math.exp(-4.5) * total or bool((lengths[bad] > 6 * usual).any()):
+        number, views = int(bad.any(-1).sum()), int(seen.any(-1).sum())
+        per_view = bad.sum(-1)
+        most = int(per_view.argmax())
+        concentrated = f", {int(per_view[most])} of them in view {calibration.views[most]}" if number < views else ""
+        robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
+        what = "corners are outliers" if count > 1 else "corners is an outlier"
+        yield f"{count} of {total} {what}{concentrated}{robust}. Look at the views"
+
+
+def _bad_views(survey: Survey) -> Iterator[str]:
+    rms = survey.view_rms
+    usual = float(rms[~rms.isnan()].median())
+    (bad,) = (rms > max(_WORSE_VIEW * usual, 1e-9)).nonzero(as_tuple=True)
+    if len(bad) and len(rms) >= _FEW_VIEWS:
+        numbers = [str(survey.calibration.views[i]) for i in bad[:_NAMED].tolist()]
+        rest = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
+        yield (
+            f"View{'s' * (len(bad) > 1)} {', '.join(numbers)}{rest} fit{'s' * (len(bad) == 1)} worse than the others, "
+            f"up to {float(rms[bad].amax()):.2g} px where {usual:.2g} px is usual: look at the corners there, or leave "
+            f"{'them' if len(bad) > 1 else 'it'} out"
+        )
+
+
+_FINDERS: tuple[Callable[[Survey], Iterator[str]], ...] = (
+    _search,
+    _noise,
+    _outliers,
+    _bad_views,
+    _views,
+    _parallel,
+    _centre,
+    _coverage,
+    _angles,
+    _pattern,
+    _needless,
+)
+
+
+def pattern_share(survey: Survey) -> float:
+    """The part of the residuals' size that is a mean over a part of the image, 0 where chance may have done it."""
+    calibration = survey.calibration
+    use = calibration.point_inliers
+    residuals, pixels = calibration.point_residuals[use], calibration.observations.pixels[use]
+    height, width = calibration.image_size
+    side = max(height, width) / _PATTERN
+    columns, rows = math.ceil(width / side), math.ceil(height / side)
+    place = ((pixels + 0.5) / side).long().clamp(min=0)
+    cell = place[:, 1].clamp(max=rows - 1) * columns + place[:, 0].clamp(max=columns - 1)
+    sums = residuals.new_zeros(rows * columns, 2).index_add_(0, cell, residuals)
+    counts = residuals.new_zeros(rows * columns).index_add_(0, cell, torch.ones_like(residuals[:, 0]))
+    here = counts > 0
+    variance = float(residuals.square().mean()) if len(residuals) else 0.0
+    if variance == 0 or not bool(here.any()):
+        return 0.0
+    squares = (sums[here].square().sum(-1) / counts[here]).sum() / variance
+    free = 2 * int(here.sum())
+    if float(squares) - free < _CERTAIN * math.sqrt(2 * free):
+        return 0.0
+    return math.sqrt((float(squares) - free) / (2 * len(residuals)))
+
+
+def _instead(survey: Survey, is_bent: bool) -> str:
+    """What else to try."""
+    key, calibration = survey.calibration.spread.model.key, survey.calibration
+    wide = survey.reach > math.radians(40)
+    others = {
+        "pinhole": "kannala_brandt" if wide else "brown_conrady",
+        "brown_conrady": "kannala_brandt or fisheye624" if wide else "",
+        "kannala_brandt": "fisheye624",
+        "fisheye62": "fisheye624",
+        "fisheye624": "",
+        "thin_prism_fisheye": "",
+    }
+    other = others.get(key, "kannala_brandt or fisheye624")
+    bend = "" if any(calibration.bend) or is_bent else "bend=True"
+    tries = " or ".join(filter(None, (other, bend)))
+    return f"Try {tries}" if tries else "See whether the board is flat and as described, and the corners sharp"
+
+
+@torch.no_grad()
+def verdict(calibration: Calibration) -> str:
+    """One paragraph: what the camera is good for, up to which angle, and what to photograph next."""
+    survey = Survey(calibration)
+    if not calibration.converged:
+        return next(_search(survey)) + "."
+    middle, rays = survey.zones[4].uncertainty, float(survey.rays[1].double().mean())
+    # what the model makes of rays that no corner was near is not told by the noise
+    fine, fine_share = survey.good_within(FINE, survey.reach + _BEYOND)
+    rough, rough_share = survey.good_within(ROUGH)
+    whole = "the whole image" if rays > 0.99 else f"all of the image that has rays, {_percent(rays)}"
+    usual = "one standard deviation in the worst direction, far away"
+    if fine_share > 0.99 * rays:
+        largest = float(survey.uncertainty.nan_to_num(0.0).amax())
+        good = (
+            f"Good for measuring in {whole}, up to {_degrees(fine)} from the optical axis: projections are "
+            f"known to {_px(middle)} in the middle and to {_px(largest)} at worst ({usual})."
+        )
+    elif fine_share > 0:
+        there = survey.uncertainty[survey.angles <= fine].amax()
+        good = (
+            f"Good for measuring up to {_degrees(fine)} from the optical axis, {_percent(fine_share)} of the image: "
+            f"projections are known to {_px(middle)} in the middle and to {_px(float(there))} at that angle ({usual})."
+        )
+        if rough_share > 0.99 * rays:
+            good += " The rest of its rays is good for looking at."
+        else:
+            good += (
+                f" Up to {_degrees(rough)}, {_percent(rough_share)}, it is good for looking at, and the rest a guess."
+            )
+    elif rough_share > 0:
+        good = (
+            f"Not for measuring: projections are known to {_px(middle)} in the middle ({usual}). Good for looking at "
+            f"up to {_degrees(rough)} from the optical axis, {_percent(rough_share)} of the image."
+        )
+    else:
+        good = f"Of no use yet: projections are uncertain by {_px(middle)} even in the middle ({usual})."
+    reach = f"Corners were seen up to {_degrees(survey.reach)}; the image goes to {_degrees(survey.image_reach)}."
+    return f"{good} {reach} {_next(survey)}"
+
+
+def _next(survey: Survey) -> str:
+    """What to photograph next."""
+    loose = [z for z in survey.zones if z.rays >= 0.5 and z.uncertainty > max(FINE, 2 * survey.zones[4].uncertainty)]
+    wanted = survey.missing or sorted(loose, key=lambda z: -z.uncertainty)[:3]
+    tilt = " Tilt the board by 30 to 45 degrees to all sides." if survey.tilt < _ALIKE else ""
+    if wanted:
+        return (
+            f"Next, hold the board in {_places(wanted)} of the image, so near that its corners reach the edges.{tilt}"
+        )
+    if tilt:
+        return f"Next:{tilt}"
+    if survey.zones[4].uncertainty > FINE:
+        return "Next, take more views, near and tilted: four times as many halve the uncertainty."
+    return "More views would change little: four times as many halve the uncertainty."
+
+
+@torch.no_grad()
+def check_determined(
+    adjusted: Adjusted,
+    models: Sequence[type[Camera]],
+    names: Sequence[Sequence[str]],
+    sights: Sequence[Sight],
+    owner: str,
+) -> None:
+    """Refuse a problem in which the single view of a camera leaves it open.
+
+    It is open where corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
+    fiftieth of the extent of the corners. More views that leave it open are what warnings are for.
+
+    Args:
+        adjusted: one problem, at its optimum.
+        models: of the cameras.
+        names: of their parameters.
+        sights: what they saw.
+        owner: the function that asks, for messages.
+
+    Raises:
+        ValueError: it is open, with what to do.
+    """
+    for c, (model, of, sight) in enumerate(zip(models, names, sights, strict=True)):
+        noise = adjusted.cost.new_full((1,), _USUAL_NOISE)
+        found = spread(adjusted, model, c, noise)
+        seen = sight.weights[0] > 0
+        if int(seen.any(-1).sum()) > 1:
+            continue
+        pixels = sight.pixels[0][seen]
+        pixels = pixels[:: max(1, len(pixels) // 512)][None]
+        sizes = worst(found.of_pixels(pixels, torch.full_like(pixels[..., 0], torch.inf)))[0]
+        sizes = sizes[~sizes.isnan()]
+        extent = float((pixels.amax((0, 1)) - pixels.amin((0, 1))).amax())
+        if not len(sizes) or float(sizes.median()) <= _OPEN * max(extent, 1.0):
+            continue
+        std, values = found.std[0], found.parameters[0]
+        limits = torch.cat((values[:2], values[:2])) * _OPEN
+        limits = torch.cat((limits, torch.full_like(values[4:], _OPEN_COEFFICIENT)))
+        open_ones = [name for name, is_open in zip(of, (std > limits).tolist(), strict=True) if is_open]
+        free = [name for name, size in zip(of, std.tolist(), strict=True) if size > 0]
+        hold = [name for name in free if name not in ("fx", "fy")] or free
+        raise ValueError(
+            f"{owner}: a single view of this board leaves {_listed(open_ones or free)} undetermined. Take 10 to 20 "
+            f"views in which the board is tilted by 30 to 45 degrees to all sides, or hold parameters: {_fixed(hold)}"
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _places(zones: Sequence[Zone]) -> str:
+    return _listed([f"the {zone.name}" for zone in zones])
+
+
+def _fixed(names: Sequence[str]) -> str:
+    """The argument, as one writes it."""
+    quoted = ", ".join(f'"{name}"' for name in names)
+    return f"fixed=({quoted}{',' * (len(names) == 1)})"
+
+
+def _px(value: float) -> str:
+    return f"{value:.2g} px"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share > 0.095 else f"{100 * share:.2g} %"
+
+
+def _degrees(angle: float) -> str:
+    return f"{math.degrees(angle):.0f} degrees"
