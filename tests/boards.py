@@ -7,8 +7,13 @@ from typing import NamedTuple
 
 import torch
 
+import camtorch as ct
 from camtorch.rotations import rotation_matrix
 
+STEREO = {
+    "left": ct.KannalaBrandt([300.0, 301.0, 321.0, 238.0], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)),
+    "right": ct.BrownConrady([420.0, 421.0, 402.0, 295.0], [-0.2, 0.05, 1e-3, -5e-4, 0.0], image_size=(600, 800)),
+}
 FOLDER = Path(__file__).parent / "golden" / "calibration"
 
 
@@ -86,3 +91,21 @@ def seen_by(camera, views, *, noise=0.0, columns=9, rows=6, square=0.025, near=0
     inside = ((seen >= 0) & (seen <= seen.new_tensor([width - 1.0, height - 1.0]))).all(-1)
     seen = torch.where((valid & inside)[..., None], seen, torch.nan)
     return Corners(board, seen, camera.image_size), rotations, translations
+
+
+def stereo(views=25, noise=0.1):
+    """What a fisheye camera and a webcam beside it see of the same boards.
+
+    Returns:
+        the corners of the left one, the image points of the right one, and its pose from the left one.
+    """
+    corners, rotations, translations = seen_by(STEREO["left"], views, noise=noise)
+    rotation = rotation_matrix(torch.tensor([0.05, -0.9, 0.02], dtype=torch.float64))
+    translation = torch.tensor([-0.12, 0.003, 0.01], dtype=torch.float64)
+    points = corners.object_points @ rotations.mT + translations[:, None]
+    with torch.no_grad():
+        pixels, valid = STEREO["right"].double().project(points @ rotation.mT + translation)
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    inside = ((pixels >= 0) & (pixels <= pixels.new_tensor([799.0, 599.0]))).all(-1) & valid
+    inside &= inside.sum(-1, keepdim=True) > 11
+    return corners, torch.where(inside[..., None], pixels, torch.nan), rotation, translation

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from boards import chessboard, opencv_left, ov_plane, seen_by
+from boards import STEREO, chessboard, opencv_left, ov_plane, stereo
 from torch.testing import assert_close
 
 import camtorch as ct
@@ -150,8 +150,9 @@ def test_corners_may_be_missing(left):
 @slow
 def test_a_view_without_corners_is_left_out(left):
     pixels = [*LEFT.image_points[:5], None, *LEFT.image_points[5:]]
-    with pytest.warns(UserWarning, match="view 5"):
+    with pytest.warns(UserWarning, match="view 5") as caught:
         found = ct.calibrate("brown_conrady", LEFT.object_points, pixels, image_size=LEFT.image_size)
+    assert [warning.filename for warning in caught] == [__file__]
     assert_close(values(found), values(left), **exactly)
     assert len(found.residuals) == 14
     assert found.residuals[5].isnan().all()
@@ -228,26 +229,7 @@ def test_every_fisheye_model_starts_from_nothing(model, best):
     assert calibrate(test, model=found.camera, fixed="all").rms <= 1.01 * best
 
 
-STEREO = {
-    "left": ct.KannalaBrandt([300.0, 301.0, 321.0, 238.0], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)),
-    "right": ct.BrownConrady([420.0, 421.0, 402.0, 295.0], [-0.2, 0.05, 1e-3, -5e-4, 0.0], image_size=(600, 800)),
-}
-
-
-def stereo(noise=0.1):
-    """What a fisheye camera and a webcam beside it see of the same boards."""
-    corners, rotations, translations = seen_by(STEREO["left"], 25, noise=noise)
-    rotation = rotation_matrix(torch.tensor([0.05, -0.9, 0.02], dtype=torch.float64))
-    translation = torch.tensor([-0.12, 0.003, 0.01], dtype=torch.float64)
-    points = corners.object_points @ rotations.mT + translations[:, None]
-    with torch.no_grad():
-        pixels, valid = STEREO["right"].double().project(points @ rotation.mT + translation)
-    pixels = pixels + noise * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    inside = ((pixels >= 0) & (pixels <= pixels.new_tensor([799.0, 599.0]))).all(-1) & valid
-    inside &= inside.sum(-1, keepdim=True) > 11
-    return corners, torch.where(inside[..., None], pixels, torch.nan), rotation, translation
-
-
+@slow
 def test_a_rig_of_two_cameras():
     corners, right, rotation, translation = stereo()
     unseen = right.isnan().all(-1).all(-1)

@@ -1,5 +1,6 @@
 """README and documentation: every Python block runs on its own, every command runs, every public name has a page."""
 
+import functools
 import re
 import shlex
 import shutil
@@ -8,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from boards import opencv_left, stereo
+from photographs import fisheye, photograph
 from PIL import Image
 
 import camtorch as ct
+from camtorch.calibration.boards import Chessboard
 from camtorch.cli.main import main
 
 ROOT = Path(__file__).parent.parent
@@ -34,8 +38,30 @@ def commands():
             yield pytest.param(page, line, lines, id=param.id)
 
 
+@functools.cache
+def photographs():
+    """Of a board by a fisheye."""
+    board = Chessboard(9, 6, 0.024)
+    poses = [
+        ((0.5 * np.cos(a), 0.5 * np.sin(a), 0.1), (0.06 * np.sin(a) - 0.1, 0.05 * np.cos(a) - 0.07, 0.2 + 0.01 * a))
+        for a in np.linspace(0, 6, 8)
+    ]
+    return [photograph(board, fisheye(), *pose)[0] for pose in poses]
+
+
+def write_calibration_data():
+    """Corners and photographs, as the pages on calibration speak of them."""
+    left, _ = opencv_left()
+    np.savez("corners.npz", object_points=left.object_points, image_points=left.image_points)
+    pair, right, *_ = stereo(12)
+    np.savez("stereo.npz", object_points=pair.object_points, left=pair.image_points, right=right)
+    Path("images").mkdir()
+    for i, image in enumerate(photographs()):
+        Image.fromarray(image).save(f"images/{i}.jpg", quality=95)
+
+
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, request):
     """The current folder, with the files that the pages speak of."""
     torch.manual_seed(0)
     monkeypatch.chdir(tmp_path)
@@ -45,6 +71,8 @@ def folder(tmp_path, monkeypatch):
     height, width = camera.image_size
     ct.save(camera, "other.yml", format="opencv")
     Image.fromarray(np.full((height, width, 3), 128, np.uint8)).save("photo.jpg")
+    if "images/*.jpg" in request.getfixturevalue("page").read_text():
+        write_calibration_data()
     known = dict(ct.MODELS)
     yield tmp_path
     # the models that pages define are theirs

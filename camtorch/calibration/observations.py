@@ -498,7 +498,7 @@ def _kept(seen: Tensor, owner: str) -> Tensor:
     """The numbers of the views with corners, seen (V, N) of any."""
     has = seen.any(-1)
     if not bool(has.all()):
-        warnings.warn(f"{owner}: left out, as nothing was seen{_in(~has)}", UserWarning, stacklevel=4)
+        warnings.warn(f"{owner}: left out, as nothing was seen{_in(~has)}", UserWarning, stacklevel=5)
     return has.nonzero()[:, 0]
 
 
