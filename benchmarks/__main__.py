@@ -13,12 +13,19 @@ try:
     import cv2
     import torch
 
-    from benchmarks import augment, cameras, images, load, machine, points, scaling
+    from benchmarks import augment, calibration, cameras, images, load, machine, points, scaling
     from benchmarks.options import Options, progress
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
 
-SUBJECTS = {"points": points, "images": images, "augment": augment, "load": load, "scaling": scaling}
+SUBJECTS = {
+    "points": points,
+    "images": images,
+    "augment": augment,
+    "calibration": calibration,
+    "load": load,
+    "scaling": scaling,
+}
 # torch keeps so many compiled versions of one function and then gives up; here every contestant is a version
 _COMPILED_VERSIONS = 64
 
@@ -72,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=tuple(cameras.COEFFICIENTS),
         default=[],
         metavar="KEY",
-        help=f"only these models; of {', '.join(cameras.COEFFICIENTS)}. images and scaling have a few of them",
+        help=f"only these models; of {', '.join(cameras.COEFFICIENTS)}. images, calibration and scaling have a few",
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
     parser.add_argument("--threads", type=_positive, default=2, help="of torch and of OpenCV (default: 2)")

@@ -11,19 +11,21 @@ from benchmarks.tables import Record, markdown, number
 
 @dataclass(frozen=True)
 class Requirement:
-    """A bound on ratios, one for each row that it is asked of.
+    """A bound on ratios, or on seconds, one for each row that it is asked of.
 
     Args:
         text: what is required, with its bound.
         bound: the least that every ratio has to be; or the most.
         ratios: by row.
         at_most: whether the bound is the most.
+        unit: of the numbers.
     """
 
     text: str
     bound: float
     ratios: Mapping[str, float]
     at_most: bool = False
+    unit: str = "x"
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -45,7 +47,7 @@ def verdict(requirements: Iterable[Requirement]) -> str:
         row, ratio = one.worst
         failed = sum(not one.holds(value) for value in one.ratios.values())
         judgement = "ok" if not failed else f"NOT in {failed}"
-        lines.append([one.text, row, f"{number(ratio)}x", str(len(one.ratios)), judgement])
+        lines.append([one.text, row, f"{number(ratio)}{one.unit}", str(len(one.ratios)), judgement])
     return f"\n### What is required\n\n{markdown(lines)}\n" if len(lines) > 1 else ""
 
 
