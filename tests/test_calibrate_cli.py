@@ -93,7 +93,12 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypat
     Path("corners.json").write_bytes(before)
     calibrate(photographs, *words[:-4], "--square", 0.06, *words[-4:], "-o", "large.json")
     assert Path("corners.json").read_bytes() != before  # of another board, though seen at the same places
+    assert read_corners("corners.json").board == Chessboard(9, 6, 0.06)
     assert torch.allclose(found_camera("large.json").intrinsics, found_camera().intrinsics, rtol=1e-6)
+    capsys.readouterr()
+    calibrate(photographs, "--board", "9x6", *words[4:], "-o", "kept.json")  # the size that is known
+    assert "squares of 60 mm" in capsys.readouterr().out
+    assert read_corners("corners.json").board == Chessboard(9, 6, 0.06)
 
 
 def corners_of(board=BOARD, count=8, **more):

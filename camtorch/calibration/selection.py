@@ -77,11 +77,12 @@ class Selection:
         """A table, and the reason below it."""
         rows = [("model", "coefficients", "rms fitted", "rms held out")]
         for trial in self.trials:
-            values = (f"{trial.rms:.4f}", f"{trial.held_out:.4f}") if not trial.reason else ("failed", "")
+            values = (f"{trial.rms:.4f}", f"{trial.held_out:.4f}") if not trial.reason else ("-", "-")
             rows.append((trial.model, str(trial.count), *values))
         widths = [max(len(row[column]) for row in rows) for column in range(4)]
         lines = [f"  {row[0]:<{widths[0]}}  " + "  ".join(f"{row[i]:>{widths[i]}}" for i in (1, 2, 3)) for row in rows]
-        lines[1 + self.trials.index(self.best)] += "  taken"
+        for row, trial in enumerate(self.trials, 1):
+            lines[row] += "  taken" if trial is self.best else f"  failed: {trial.reason:.60}" if trial.reason else ""
         return [line.rstrip() for line in lines] + [self.why]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,17 +82,29 @@ def run(arguments: argparse.Namespace) -> None:
         targets.check(arguments.corners, force=False)
     format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
     board = read_board(arguments, 1.0) if arguments.board is not None else None
-    corners = found_corners(cameras, board, arguments.corners, arguments.match, force=arguments.force)
-    if arguments.square is None and arguments.board is not None:
+    corners = found_corners(
+        cameras,
+        board,
+        arguments.corners,
+        arguments.match,
+        measured=arguments.square is not None,
+        force=arguments.force,
+    )
+    unit = "" if corners.board is None or corners.board.square == 1 else "m"
+    if corners.board is not None and not unit and arguments.square is None:
         note("no --square is given: distances are in sides of a square")
     views, size_of = usable_views(corners)
-    words = "its points" if corners.board is None else corners.board.words("m" if arguments.square else "")
+    words = "its points" if corners.board is None else corners.board.words(unit)
     _tell_found(words, views, corners.images, size_of)
     found: Calibration | RigCalibration
     if list(size_of) == [""]:
         found = _calibrated(arguments, corners.points, views, size_of[""], candidates)
     else:
         found = _calibrated_rig(arguments, corners.board, corners.points, views, size_of, candidates)
+        _tell_mounts(found, unit)
+    if arguments.bend:
+        across, down = (f"{1000 * bend:.3g} mm" if unit == "m" else f"{bend:.3g}" for bend in found.bend)
+        print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
     _write(arguments, found, views, format)
 
 
@@ -228,7 +241,6 @@ def _calibrated(
     found = calibrate(model, points, pixels, image_size=size, count=count, bend=arguments.bend, **_options(arguments))
     _check_converged(found)
     _tell(found, [str(of_view[""].path) for of_view in views.values()], "")
-    _tell_bend(arguments, found)
     return found
 
 
@@ -257,8 +269,6 @@ def _calibrated_rig(
     for name, camera in found.cameras.items():
         names = [str(of_view[name].path) if name in of_view else "" for of_view in views.values()]
         _tell(camera, names, f"{name}: ")
-    _tell_mounts(found, "m" if arguments.square else "")
-    _tell_bend(arguments, found)
     return found
 
 
@@ -288,10 +298,11 @@ def _agreeing(
     for name, turns in turned.items():
         pixels[name] = reordered(board, pixels[name], [turns.get(view, 0) for view in range(len(pixels[name]))])
         changed += sum(turn > 0 for turn in turns.values())
-    note(
-        f"this board looks the same after a turn; {changed} views were turned for the cameras to agree. A board with "
-        "an even and an odd number of corners, as 9x6, leaves no doubt"
-    )
+    if changed:
+        note(
+            f"this board looks the same after a turn: {changed} views were turned for the cameras to agree. A board "
+            "with an even and an odd number of corners, as 9x6, leaves no doubt"
+        )
     return pixels
 
 
@@ -314,8 +325,7 @@ def _tell(found: Calibration, names: Sequence[str], head: str) -> None:
     )
     values = [*found.camera.intrinsics.tolist(), *found.camera.distortion.tolist()]
     for name, value, std in zip(found.parameter_names, values, found.std.tolist(), strict=True):
-        spread = f" +- {std:.2g}" if std else "  held"
-        print(f"  {name:<6} {value: .7g}{spread}")
+        print(f"  {name:<6} {_with_spread(value, std) if std else f'{value:11.6g}  held'}")
     squares = np.square(np.stack([np.asarray(one) for one in found.residuals])).sum(-1)
     shown = np.isfinite(squares).any(1)
     errors = {
@@ -329,31 +339,25 @@ def _tell(found: Calibration, names: Sequence[str], head: str) -> None:
         note(f"{head}{warning}")
 
 
+def _with_spread(value: float, std: float, width: int = 11) -> str:
+    """A number to the second digit of its standard deviation."""
+    if not (math.isfinite(value) and math.isfinite(std)):
+        return f"{value:{width}.6g} +- {std:.2g}"
+    digits = min(max(1 - math.floor(math.log10(std)), 0), 12) if std else 6
+    return f"{value:{width}.{digits}f} +- {std:.{digits}f}"
+
+
 def _tell_mounts(found: RigCalibration, unit: str) -> None:
-    import math
-
-    from camtorch.calibration.boards import shown_length
-
     first, *others = found.cameras
+    scale, words = (1000, " mm") if unit == "m" else (1, "")
     for name in others:
-        turn, shift = (
-            t.detach() for t in (found.rig.extrinsics[name].rotation, found.rig.extrinsics[name].translation)
-        )
-        spread = found.mount_std[name].tolist()
+        pose, spread = found.rig.extrinsics[name], found.mount_std[name].tolist()
+        shift, turn = (float(t.detach().norm()) for t in (pose.translation, pose.rotation))
         print(
-            f"{name}: {shown_length(float(shift.norm()), unit)} +- {shown_length(math.hypot(*spread[3:]), unit)} from "
-            f"{first}, turned by {math.degrees(float(turn.norm())):.4g} +- {math.degrees(math.hypot(*spread[:3])):.2g} "
-            "degrees"
+            f"{name}: {_with_spread(scale * shift, scale * math.hypot(*spread[3:]), 0)}{words} from {first}, turned by "
+            f"{_with_spread(math.degrees(turn), math.degrees(math.hypot(*spread[:3])), 0)} degrees"
         )
     print(f"rig: rms {found.rms:.4g} px per point, sigma {found.sigma:.4g} px per coordinate, {len(found.views)} views")
-
-
-def _tell_bend(arguments: argparse.Namespace, found: Calibration | RigCalibration) -> None:
-    from camtorch.calibration.boards import shown_length
-
-    if arguments.bend:
-        lengths = [shown_length(bend, "m" if arguments.square else "") for bend in found.bend]
-        print(f"board: its middle lies {lengths[0]} off its sides, {lengths[1]} off its top and bottom")
 
 
 def _write(

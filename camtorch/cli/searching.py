@@ -24,7 +24,13 @@ _TRIED_ANEW = 5  # images in which a board of another size is looked for
 
 
 def found_corners(
-    cameras: Mapping[str, Sequence[Path]], board: Board | None, path: Path | None, match: str | None, *, force: bool
+    cameras: Mapping[str, Sequence[Path]],
+    board: Board | None,
+    path: Path | None,
+    match: str | None,
+    *,
+    measured: bool,
+    force: bool,
 ) -> Corners:
     """The corners in images of cameras, or all that a file of corners holds if no images are given.
 
@@ -33,6 +39,7 @@ def found_corners(
         board: what to look for, or None for that of the file.
         path: a file of corners, from which those of known images are taken, and which is written; or None.
         match: how images of several cameras are put together, see `gathering.together`.
+        measured: whether the board's size is known, or that in the file is taken.
         force: whether a file of corners of another board may be overwritten.
 
     Raises:
@@ -44,6 +51,8 @@ def found_corners(
             of = "its own points" if known.board is None else known.board.words()
             raise ValueError(f"{path}: holds corners of {of}, not of {board.words()}; --force overwrites it")
         known = None
+    if known is not None and not measured:
+        board = known.board
     if not cameras:
         if known is None:
             raise ValueError(f"{path}: holds corners of another board, and no images are given to find this one in")
