@@ -39,6 +39,7 @@ from camtorch.models import (
 from camtorch.native.library import native_available
 from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
+from camtorch.stereo.rectification import Rectification, rectify
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
@@ -71,6 +72,7 @@ __all__ = [
     "OrthographicFisheye",
     "Pinhole",
     "PositiveFocal",
+    "Rectification",
     "Rig",
     "RigCalibration",
     "Stereographic",
@@ -87,6 +89,7 @@ __all__ = [
     "io",
     "load",
     "native_available",
+    "rectify",
     "save",
     "solve_pnp",
 ]

@@ -1,0 +1,524 @@
+"""Rectification: two warps after which a point of the scene lies in the same row of both images."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from camtorch._arguments import Numbers, as_batch, as_image_size, as_values
+from camtorch._module import GeometryModule, Memo
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
+from camtorch.projection.rays import image_lattice
+from camtorch.rotations import rotation_matrix
+from camtorch.warp.warp import Warp, as_sized
+
+Projection = Literal["perspective", "latlon", "cylindrical"]
+Align = Literal["mean", "opencv"]
+
+_TURN = math.radians(170)  # up and down, that a panorama shows without being asked for more
+_STEEP = math.tan(math.radians(60))  # beyond it the rim of a perspective image is stretched more than fourfold
+_NEAR_POLE = math.radians(75)  # where a panorama about the baseline hardly resolves distances
+
+
+class _Kind(NamedTuple):
+    """A projection: the models whose rows, or columns, correspond, and how far its plane reaches along and across."""
+
+    rows: type[Camera]
+    columns: type[Camera]
+    along: float
+    across: float
+
+
+_KINDS = {
+    "perspective": _Kind(Pinhole, Pinhole, _STEEP, _STEEP),
+    "latlon": _Kind(LatLon, Equirectangular, _NEAR_POLE, _TURN),
+    "cylindrical": _Kind(TransverseCylindrical, Cylindrical, math.tan(_NEAR_POLE), _TURN),
+}
+_LINE = 129  # points along the middle of an image
+_PARALLEL = 1e-6  # the part of the view direction across the baseline, below which there is none
+_STEP = 1e-4  # on the plane of a projection, over which its scale is measured
+_LARGEST = 1 << 14  # px, a side that nobody asked for
+
+
+class Frame(NamedTuple):
+    """Rotations (*B, 3, 3), `ray_rectified = R ray_camera`, and the right camera's place on the axis, (*B,)."""
+
+    left: Tensor
+    right: Tensor
+    baseline: Tensor
+
+
+class Rectification(GeometryModule):
+    """Two warps into images whose rows correspond, or whose columns do: what `rectify` makes.
+
+    `left` and `right` are `Warp`s; the call makes both images. Disparity is u_left - u_right in pixels, v_left -
+    v_right where columns correspond. Both images have the same camera, turned the same way: its x axis (y axis, where
+    columns correspond) lies along the baseline, and the right one stands at `baseline` on it.
+
+    Where the cameras or the extrinsics learn, the warps are made anew each time, and gradients reach them.
+    """
+
+    def __init__(
+        self,
+        source_left: Camera,
+        source_right: Camera,
+        extrinsics: Extrinsics,
+        camera: Camera,
+        projection: Projection,
+        vertical: bool,
+        align: Align,
+    ):
+        super().__init__()
+        self.source_left, self.source_right, self.extrinsics = source_left, source_right, extrinsics
+        self.camera_left = self.camera_right = camera
+        self.projection, self.vertical, self.align = projection, vertical, align
+        self._memo = Memo()
+
+    @property
+    def frame(self) -> Frame:
+        """How both cameras are turned, and how far they are apart; with a graph where the extrinsics learn."""
+        return frame_of(self.extrinsics, self.vertical, self.align)
+
+    @property
+    def baseline(self) -> Tensor:
+        """(*B,) the right camera's place on the axis of the rectified left one; negative where it stands to the left
+        (above).
+        """
+        return self.frame.baseline
+
+    @property
+    def rotation_left(self) -> Tensor:
+        """(*B, 3, 3), `ray_rectified = R ray_left`: OpenCV's R1."""
+        return self.frame.left
+
+    @property
+    def rotation_right(self) -> Tensor:
+        """(*B, 3, 3), `ray_rectified = R ray_right`: OpenCV's R2."""
+        return self.frame.right
+
+    @property
+    def left(self) -> Warp:
+        """From the left camera's image to its rectified one."""
+        return self._warps()[0]
+
+    @property
+    def right(self) -> Warp:
+        """From the right camera's image to its rectified one."""
+        return self._warps()[1]
+
+    def _warps(self) -> tuple[Warp, Warp]:
+        inputs = self.extrinsics.rotation, self.extrinsics.translation
+        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+            return self._made()
+        warps: tuple[Warp, Warp] = self._memo(inputs, (), self._made)
+        return warps
+
+    def _made(self) -> tuple[Warp, Warp]:
+        frame = self.frame
+        return (
+            Warp(self.source_left, self.camera_left, frame.left.to(self.source_left.intrinsics.dtype)),
+            Warp(self.source_right, self.camera_right, frame.right.to(self.source_right.intrinsics.dtype)),
+        )
+
+    def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+        """Both images, (B, C, H, W) each, rectified."""
+        of_left, of_right = self._warps()
+        return of_left(left), of_right(right)
+
+    if TYPE_CHECKING:
+        __call__ = forward  # whose types nn.Module does not tell
+
+    def valid_masks(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(B or 1, 1, H, W) bool: pixels that the left camera sees, that the right one sees, that both do."""
+        left, right = (warp.valid_mask() for warp in self._warps())
+        return left, right, left & right
+
+    # -- depth
+
+    def disparity_to_points(self, disparity: Numbers, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The points of the scene that have these disparities, in the frame of the rectified left camera.
+
+        Args:
+            disparity: (B, 1, H, W), (1, H, W) or (H, W) pixels, of the rectified left image; OpenCV's matchers give
+                sixteen times as much in integers.
+            valid: bool, in the same shape: the disparities that count.
+
+        Returns:
+            points (..., 3) after the shape of the disparities, in the unit of the extrinsics, and valid in their shape:
+            the disparity is finite and has the sign of the baseline. What is not valid is (0, 0, 0).
+
+        Raises:
+            ValueError: another shape.
+        """
+        owner = "disparity_to_points"
+        camera = self.camera_left
+        size = camera._size(owner)
+        d = as_values(disparity, "disparity", owner, camera.intrinsics.device)
+        shape, count = tuple(d.shape), self.extrinsics.batch_shape.numel()
+        if d.ndim not in (2, 3, 4) or shape[-2:] != size or (d.ndim > 2 and shape[-3] != 1):
+            raise ValueError(f"{owner}: disparity must be (B, 1, H, W), (1, H, W) or (H, W) of {size}; got {shape}")
+        if not d.is_floating_point():
+            raise ValueError(
+                f"{owner}: disparity must be floating point pixels; got {d.dtype}. Of OpenCV's matchers "
+                "disparity.astype(np.float32) / 16 is"
+            )
+        batched = bool(self.extrinsics.batch_shape or camera.batch_shape)
+        if batched and (d.ndim != 4 or len(d) not in (1, count, camera.batch_shape.numel())):
+            raise ValueError(f"{owner}: disparity must be (B, 1, H, W) for {count} pairs; got {shape}")
+        if valid is not None and tuple(valid.shape) != shape:
+            raise ValueError(f"{owner}: valid must have the shape of disparity, {shape}; got {tuple(valid.shape)}")
+        rows = d.reshape(-1, *size)
+        points, good = self._points(self._pixels(), rows)
+        good = good.reshape(*(shape if not batched else (len(good), 1, *size)))
+        points = points.reshape(*good.shape, 3)
+        if valid is not None:
+            good = good & valid.to(torch.bool)
+        return torch.where(good[..., None], points, 0.0), good
+
+    def _pixels(self) -> Tensor:
+        """(*B, H, W, 2)."""
+        camera = self.camera_left
+        return camera.pixel_grid().expand(*camera.batch_shape, -1, -1, -1)
+
+    def _points(self, pixels: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        """Of pixels (*B, H, W, 2) and disparities (B, H, W)."""
+        camera, baseline = self.camera_left, self.baseline.to(d.dtype)[..., None, None]
+        focal = camera.intrinsics.to(d.dtype)[..., 1 if self.vertical else 0, None, None]
+        rays, has_ray = camera.unproject(pixels.to(camera.intrinsics.dtype))
+        x, y, z = rays.to(d.dtype).unbind(-1)
+        along = y if self.vertical else x
+        across = torch.hypot(x if self.vertical else y, z)
+        good = torch.isfinite(d) & has_ray & (d * baseline > 0)
+        d = torch.where(good, d, torch.where(baseline < 0, -1.0, 1.0).to(d.dtype))
+        if self.projection == "perspective":
+            distance, unit = focal * baseline / d, z
+        elif self.projection == "cylindrical":
+            distance, unit = focal * baseline / d, across
+        else:
+            # by the angles from the plane across the baseline: tan a - tan b = sin(a - b) / (cos a cos b)
+            angle, turn = torch.atan2(along, across), d / focal
+            other = angle - turn
+            good = good & (turn.abs() < math.pi) & (other.abs() < math.pi / 2)
+            distance = baseline * torch.cos(angle) * torch.cos(other) / torch.sin(torch.where(good, turn, 1.0))
+            unit = across
+        good = good & (distance > 0) & torch.isfinite(distance) & (unit > 0)
+        scale = torch.where(good, distance, 0.0) / torch.where(unit > 0, unit, 1.0)
+        return torch.stack((x * scale, y * scale, z * scale), -1), good
+
+    def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The disparity of points (*B, *N, 3) of the frame of the rectified left camera, and whether both see them."""
+        baseline = self.baseline.to(points.dtype)
+        axis = 1 if self.vertical else 0
+        shift = torch.nn.functional.one_hot(torch.tensor(axis, device=points.device), 3).to(points.dtype)
+        shift = baseline[..., None] * shift
+        lead = points.ndim - 1 - baseline.ndim
+        moved = points - shift.reshape(*baseline.shape, *[1] * lead, 3)
+        (left, one), (right, other) = self.camera_left.project(points), self.camera_right.project(moved)
+        return (left - right)[..., axis], one & other
+
+    def disparity_range(self, near: float, far: float = math.inf) -> tuple[float, float]:
+        """The least and the greatest disparity that points of a range of depths have, over all pixels and pairs.
+
+        Args:
+            near: the least depth: z in perspective, the distance from the baseline in the panoramas about it.
+            far: the greatest.
+        """
+        if not 0 < near < far:
+            raise ValueError(f"disparity_range: 0 < near < far, got near={near}, far={far}")
+        disparities = torch.cat([self._at(depth).flatten() for depth in (near, far)])
+        return float(disparities.min()), float(disparities.max())
+
+    def depth_range(self, least: float, most: float) -> tuple[float, float]:
+        """The other way: the least and the greatest depth that disparities between two have; infinite for zero."""
+        if not least < most:
+            raise ValueError(f"depth_range: least < most, got least={least}, most={most}")
+        with torch.no_grad():
+            camera = self.camera_left
+            depths = []
+            for d in (least, most):
+                like = camera.intrinsics.new_full((1, *camera._size("depth_range")), float(d))
+                points, good = self._points(self._pixels(), like)
+                depth = points[..., 2] if self.projection == "perspective" else self._across(points)
+                depths.append(depth[good])
+        found = torch.cat(depths)
+        ends = [float(found.min()), float(found.max())] if len(found) else [math.inf, math.inf]
+        crosses = least <= 0 <= most
+        return ends[0], math.inf if crosses else ends[1]
+
+    def _across(self, points: Tensor) -> Tensor:
+        return torch.hypot(points[..., 0 if self.vertical else 1], points[..., 2])
+
+    @torch.no_grad()
+    def _at(self, depth: float) -> Tensor:
+        """The disparities of all pixels at a depth."""
+        camera, baseline = self.camera_left, self.baseline[..., None, None]
+        focal = camera.intrinsics[..., 1 if self.vertical else 0, None, None]
+        if self.projection != "latlon":
+            return focal * baseline / depth
+        rays, has_ray = camera.unproject(self._pixels())
+        along, across = rays[..., 1 if self.vertical else 0], self._across(rays)
+        angle = torch.atan2(along, across)
+        return (focal * (angle - torch.atan(torch.tan(angle) - baseline / depth)))[has_ray.expand(angle.shape)]
+
+    def opencv(self) -> dict[str, Tensor]:
+        """R1, R2, P1, P2 and Q, as `cv2.stereoRectify` returns them, for a perspective pair without batch.
+
+        Raises:
+            ValueError: another projection, or a batch.
+        """
+        if self.projection != "perspective" or self.extrinsics.batch_shape or self.camera_left.batch_shape:
+            raise ValueError(f"Rectification.opencv: of one perspective pair alone; this is {self.projection}")
+        frame, (fx, fy, cx, cy) = self.frame, self.camera_left.intrinsics.unbind(-1)
+        zero = torch.zeros_like(fx)
+        first = torch.stack((fx, zero, cx, zero, zero, fy, cy, zero, zero, zero, zero + 1, zero)).view(3, 4)
+        shift = torch.zeros_like(first)
+        axis = 1 if self.vertical else 0
+        shift[axis, 3] = -(fy if self.vertical else fx) * frame.baseline
+        # d = f b / z, and rows of Q are x, y, f and 1 / b times it
+        q = torch.stack(
+            (
+                *(zero + 1, zero, zero, -cx),
+                *(zero, fx / fy, zero, -cy * fx / fy),
+                *(zero, zero, zero, fx),
+                *(zero, zero, (fx / fy if self.vertical else 1.0) / frame.baseline.to(fx.dtype), zero),
+            )
+        ).view(4, 4)
+        return {"R1": frame.left, "R2": frame.right, "P1": first, "P2": first + shift, "Q": q}
+
+    def extra_repr(self) -> str:
+        """How the images lie."""
+        lines = "columns" if self.vertical else "rows"
+        baseline = self.baseline.detach()
+        far = f"{float(baseline):.6g}" if not baseline.ndim else f"of {baseline.numel()} pairs"
+        return f"{self.projection}, {lines} correspond, baseline {far}"
+
+
+def rectify(
+    left: Camera,
+    right: Camera,
+    extrinsics: Extrinsics,
+    *,
+    projection: Projection = "perspective",
+    fov: float | tuple[float, float] | None = None,
+    image_size: tuple[int, int] | None = None,
+    vertical: bool = False,
+    align: Align = "mean",
+) -> Rectification:
+    """Warps of two cameras' images into images whose rows correspond.
+
+    The x axis of both lies along the baseline, from left to right; both look where the two cameras look on average.
+    Cameras of any models and sizes will do. Without further wishes the images show, up and down, what both see, to
+    the sides what either does, as finely as the sharper camera sees the middle of it.
+
+    Args:
+        left: the first camera, with image_size.
+        right: the second one.
+        extrinsics: right from left, `p_right = R p_left + t`, as OpenCV's stereoCalibrate gives R and T.
+        projection: "perspective" up to 120 degrees; "latlon" and "cylindrical", panoramas about the baseline, for more.
+        fov: radians, horizontal, or (horizontal, vertical), of the rectified images, about their axis.
+        image_size: (height, width) of the rectified images.
+        vertical: for cameras that stand above each other: columns correspond, not rows.
+        align: "mean" for the mean of both optical axes, orthogonal to the baseline; "opencv" halves the rotation
+            between the cameras, as `cv2.stereoRectify` does.
+
+    Raises:
+        ValueError: cameras at one place, or that look along the baseline or away from each other; a projection or
+            alignment that does not exist, a fov out of range, cameras without image_size. TypeError: no cameras.
+    """
+    owner = "rectify"
+    left, right = as_sized(left, "left", owner), as_sized(right, "right", owner)
+    if not isinstance(extrinsics, Extrinsics):
+        raise TypeError(
+            f"{owner}: extrinsics must be Extrinsics, right from left; got {type(extrinsics).__name__}. "
+            "Of OpenCV's R and T ct.Extrinsics.from_matrix(R, T) is one"
+        )
+    for value, name, known in ((projection, "projection", tuple(_KINDS)), (align, "align", ("mean", "opencv"))):
+        if not isinstance(value, str) or value not in known:
+            raise ValueError(f"{owner}: {name} must be one of {known}; got {value!r}")
+    size = as_image_size(image_size, owner)
+    batch = as_batch(
+        owner,
+        left=(*left.batch_shape, 1),
+        right=(*right.batch_shape, 1),
+        extrinsics=(*extrinsics.batch_shape, 1),
+    )
+    if len(batch) > 1:
+        raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
+    with torch.no_grad():
+        frame = frame_of(extrinsics, vertical, align)
+        kind = _KINDS[projection]
+        model = kind.columns if vertical else kind.rows
+        views = [_View(left, frame.left), _View(right, frame.right)]
+        low, high, focal = _extent(views, model, kind, vertical, owner)
+        if fov is not None:
+            half = _half(fov, kind, projection, vertical, (high - low) / 2, owner)
+            low, high = -half, half
+        camera = _target(model, low, high, focal, size, fov)
+    dtype = torch.promote_types(left.intrinsics.dtype, right.intrinsics.dtype)
+    return Rectification(left, right, extrinsics, camera.to(dtype), projection, vertical, align)
+
+
+def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
+    """The common frame of both cameras; in float64, with a graph where the extrinsics learn.
+
+    Raises:
+        ValueError: no baseline, or a view along it.
+    """
+    owner = "rectify"
+    rotation = rotation_matrix(extrinsics.rotation.double())
+    translation = extrinsics.translation.double()
+    length = torch.linalg.vector_norm(translation, dim=-1)
+    if not bool((length > 0).all()):
+        raise ValueError(f"{owner}: the cameras stand at one place; extrinsics.translation is {translation.tolist()}")
+    axis = 1 if vertical else 0
+    if align == "opencv":
+        half = rotation_matrix(-extrinsics.rotation.double() / 2)
+        across = (half @ translation[..., None])[..., 0]
+        # the shortest turn that brings the baseline to its axis
+        sign = torch.where(across[..., axis] > 0, 1.0, -1.0).to(across)
+        aim = sign[..., None] * torch.nn.functional.one_hot(torch.tensor(axis), 3).to(across)
+        normal = torch.linalg.cross(across, aim, dim=-1)
+        sine = torch.linalg.vector_norm(normal, dim=-1)
+        angle = torch.atan2(sine, (across * aim).sum(-1))
+        small = sine <= 1e-12 * length
+        factor = torch.where(small, 0.0, angle / torch.where(small, 1.0, sine))
+        turn = rotation_matrix(normal * factor[..., None])
+        return Frame(turn @ half.mT, turn @ half, -sign * length)
+    toward = -(rotation.mT @ translation[..., None])[..., 0] / length[..., None]  # of the right camera, from the left
+    view = rotation[..., 2, :] + rotation.new_tensor([0.0, 0.0, 1.0])
+    upright = rotation[..., axis, :] + torch.nn.functional.one_hot(torch.tensor(axis), 3).to(rotation)
+    sign = torch.where((toward * upright).sum(-1) < 0, -1.0, 1.0).to(toward)
+    along = toward * sign[..., None]
+    ahead = view - (view * along).sum(-1, keepdim=True) * along
+    size = torch.linalg.vector_norm(ahead, dim=-1)
+    if not bool((size > _PARALLEL).all()):
+        raise ValueError(
+            f"{owner}: the cameras look along their baseline, or away from each other: no direction lies before both"
+        )
+    ahead = ahead / size[..., None]
+    third = torch.linalg.cross(along, ahead, dim=-1) if vertical else torch.linalg.cross(ahead, along, dim=-1)
+    rows = (third, along, ahead) if vertical else (along, third, ahead)
+    turned = torch.stack(rows, -2)
+    return Frame(turned, turned @ rotation.mT, sign * length)
+
+
+class _View(NamedTuple):
+    """A camera and how it is turned."""
+
+    camera: Camera
+    rotation: Tensor
+
+
+def _seen(view: _View, plane: Camera, limit: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and greatest (*B, 2) of what the middle row and column of an image show, on the plane of a projection.
+
+    Its corners would have a wide lens fill a panorama with what hardly any pixel shows.
+    """
+    camera, axes = view.camera, []
+    lines = image_lattice(camera, 3, _LINE)[1], image_lattice(camera, _LINE, 3)[:, 1]
+    for line in lines:
+        rays, has_ray = camera.unproject(line.expand(*camera.batch_shape, -1, -1))
+        points, valid = plane.project(rays.double() @ view.rotation.mT)
+        # what is beyond the limits shows that there is something up to them
+        axes.append((torch.maximum(torch.minimum(points, limit), -limit), valid & has_ray))
+    # the one that lies rather across than down counts across; the other one, past a pole, would come back there
+    (row, of_row), (column, of_column) = axes
+    near = slice(_LINE // 2 - 1, _LINE // 2 + 2)
+    turned = [(p[..., near, :][..., -1, :] - p[..., near, :][..., 0, :]).abs() for p in (row, column)]
+    lies = turned[0][..., :1] * turned[1][..., 1:] >= turned[0][..., 1:] * turned[1][..., :1]
+    swapped = ~lies[..., None]
+    across = torch.where(swapped, column, row)[..., 0], torch.where(swapped[..., 0], of_column, of_row)
+    down = torch.where(swapped, row, column)[..., 1], torch.where(swapped[..., 0], of_row, of_column)
+    low = torch.stack([torch.where(valid, p, torch.inf).amin(-1) for p, valid in (across, down)], -1)
+    high = torch.stack([torch.where(valid, p, -torch.inf).amax(-1) for p, valid in (across, down)], -1)
+    return low, high
+
+
+def _extent(
+    views: list[_View], model: type[Camera], kind: _Kind, vertical: bool, owner: str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Lows and highs (*B, 2) on the plane of a projection, and (*B,) the focal length that loses nothing in the middle.
+
+    Raises:
+        ValueError: nothing that both see.
+    """
+    plane = model(torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64, device=views[0].rotation.device))
+    limit = torch.tensor([kind.across, kind.along] if vertical else [kind.along, kind.across]).to(views[0].rotation)
+    (low_left, high_left), (low_right, high_right) = (_seen(view, plane, limit) for view in views)
+    low, high = torch.minimum(low_left, low_right), torch.maximum(high_left, high_right)
+    across = 0 if vertical else 1
+    low[..., across] = torch.maximum(low_left, low_right)[..., across]
+    high[..., across] = torch.minimum(high_left, high_right)[..., across]
+    if not bool((low < high).all()):
+        lines = "columns" if vertical else "rows"
+        raise ValueError(f"{owner}: no {lines} show what both cameras see; are the extrinsics right from left?")
+    middle = (low + high) / 2
+    focal = torch.stack([_scale(view, plane, middle) for view in views]).amax(0)
+    if not bool((focal > 0).all()):
+        raise ValueError(f"{owner}: neither camera sees the middle of the rectified images; give fov and image_size")
+    return low, high, focal
+
+
+def _scale(view: _View, plane: Camera, middle: Tensor) -> Tensor:
+    """(*B,) pixels of a camera per unit of the plane of a projection, at a point of it; 0 where it does not see it."""
+    offsets = _STEP * middle.new_tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    rays, _ = plane.unproject(middle[..., None, :] + offsets)
+    back = rays @ view.rotation
+    camera = view.camera
+    pixels, valid = camera.project(back.to(camera.intrinsics.dtype))
+    pixels = pixels.double()
+    sides = (pixels[..., 1, :] - pixels[..., 0, :], pixels[..., 3, :] - pixels[..., 2, :])
+    area = (sides[0][..., 0] * sides[1][..., 1] - sides[0][..., 1] * sides[1][..., 0]).abs()
+    return torch.where(valid.all(-1), area.sqrt() / (2 * _STEP), 0.0)
+
+
+def _half(
+    fov: float | tuple[float, float], kind: _Kind, projection: str, vertical: bool, usual: Tensor, owner: str
+) -> Tensor:
+    """(*B, 2): half the width and the height of the plane of a projection.
+
+    Raises:
+        ValueError: angles that it does not reach.
+    """
+    angles = fov if isinstance(fov, (tuple, list)) else (fov,)
+    if len(angles) not in (1, 2):
+        raise ValueError(f"{owner}: fov must be horizontal, or (horizontal, vertical) radians; got {fov!r}")
+    half = usual.clone()
+    for i, angle in enumerate(angles):
+        is_along = (i == 1) == vertical
+        most = 2 * math.pi if not is_along and projection != "perspective" else math.pi
+        if not 0 < float(angle) < most:
+            raise ValueError(f"{owner}: fov must be radians between 0 and {most:.4g} for {projection}; got {fov!r}")
+        straight = projection == "perspective" or (projection == "cylindrical" and is_along)
+        half[..., i] = math.tan(angle / 2) if straight else angle / 2
+    return half
+
+
+def _target(
+    model: type[Camera],
+    low: Tensor,
+    high: Tensor,
+    focal: Tensor,
+    size: tuple[int, int] | None,
+    fov: Any,
+) -> Camera:
+    """The camera of both images: square pixels, unless two angles and a size say otherwise."""
+    extent = high - low
+    if size is None:
+        wanted = (extent * focal[..., None]).reshape(-1, 2).amax(0).round().clamp(2, _LARGEST)
+        width, height = (int(side) for side in wanted)
+    else:
+        height, width = size
+    shape = extent.new_tensor([width, height])
+    both = shape / extent
+    if fov is None:
+        both = both.amin(-1, keepdim=True).expand_as(both)
+    elif not (isinstance(fov, (tuple, list)) and len(fov) == 2):
+        both = both[..., :1].expand_as(both)
+    centre = (shape - 1) / 2 - both * (low + high) / 2
+    return model(nn.Parameter(torch.cat((both, centre), -1), requires_grad=False), image_size=(height, width))

@@ -1,0 +1,255 @@
+"""Rectification of any two cameras: rows correspond, disparities give the points, and it agrees with OpenCV's."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from cameras import KEYS, one
+
+import camtorch as ct
+from camtorch.rotations import rotation_matrix
+
+PROJECTIONS = ("perspective", "latlon", "cylindrical")
+LENSES = {
+    "left": ([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0]),
+    "right": ([520.0, 515, 330, 235], [-0.1, 0.02, -0.001, 0.001, 0.0]),
+}
+TURN, SHIFT = [0.02, -0.05, 0.01], [-0.12, 0.005, 0.004]
+
+
+def sized(key):
+    camera = one(key).double().requires_grad_(False)
+    camera.image_size = camera.image_size or (480, 640)
+    return camera
+
+
+def pair():
+    left, right = (ct.BrownConrady(*LENSES[side], image_size=(480, 640)).double() for side in LENSES)
+    return left, right, ct.Extrinsics(TURN, SHIFT).double()
+
+
+def fisheye():
+    camera = ct.KannalaBrandt([180.0, 180, 319.5, 239.5], [0.02, 0, 0, 0], image_size=(480, 640))
+    return camera.double().requires_grad_(False)
+
+
+def fisheyes(pitch=0.0, **options):
+    extrinsics = ct.Extrinsics([pitch, 0, 0], [-0.1, 0, 0]).double().requires_grad_(False)
+    return ct.rectify(fisheye(), fisheye(), extrinsics, **options)
+
+
+def random_pair(seed, vertical=False):
+    """Two models, where they are, points around them, and these seen by both; the last in rectified frames."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    keys = [KEYS[int(i)] for i in torch.randint(len(KEYS), (2,), generator=generator)]
+    turn, place = 0.3 * normal(3), normal(3) * torch.tensor([1, 0.2, 0.2])
+    place = place[[1, 0, 2]] if vertical else place
+    extrinsics = ct.Extrinsics(turn, -(rotation_matrix(turn) @ place)).double().requires_grad_(False)
+    points = torch.nn.functional.normalize(normal(2000, 3), dim=-1) * place.norm() * (2 + 20 * normal(2000, 1).abs())
+    return *map(sized, keys), extrinsics, points
+
+
+@pytest.mark.parametrize("vertical", [False, True])
+@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("seeds", [range(12), pytest.param(range(12, 300), marks=pytest.mark.slow)])
+def test_rows_correspond_and_disparities_give_the_points(projection, vertical, seeds):
+    axis, across = (1, 0) if vertical else (0, 1)
+    for seed in seeds:
+        left, right, extrinsics, points = random_pair(seed, vertical)
+        found = ct.rectify(left, right, extrinsics, projection=projection, vertical=vertical)
+        camera = found.camera_left
+        assert camera.intrinsics.isfinite().all()
+        assert (camera.intrinsics[:2] > 0).all()
+        of_left = points @ found.rotation_left.mT
+        one, in_left = camera.project(of_left)
+        other, in_right = camera.project(extrinsics(points) @ found.rotation_right.mT)
+        both = in_left & in_right & (one.abs() < 1e4).all(-1) & (other.abs() < 1e4).all(-1)
+        assert both.any()
+        one, other, of_left = one[both], other[both], of_left[both]
+        assert ((one - other)[:, across].abs() < 1e-6).all()
+        disparity = (one - other)[:, axis]
+        told, seen = found.disparity(of_left)
+        torch.testing.assert_close(told, disparity, rtol=1e-9, atol=1e-9)
+        assert seen.all()
+        # points as a map of one row
+        again, good = found._points(one[None], disparity[None])
+        assert good.all()
+        error = (again[0] - of_left).norm(dim=-1) / of_left.norm(dim=-1)
+        # a pixel's rounding counts in the ratio of coordinate and disparity
+        condition = one.abs().amax(-1) / disparity.abs() + camera.intrinsics[:2].max() / disparity.abs()
+        assert (error < 1e-13 * condition.clamp(min=1e3)).all()
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_exchanged_cameras_have_negative_disparities_and_upright_images(projection):
+    left, right, extrinsics = pair()
+    one = ct.rectify(left, right, extrinsics, projection=projection)
+    two = ct.rectify(right, left, extrinsics.inverse(), projection=projection)
+    torch.testing.assert_close(two.baseline, -one.baseline)
+    torch.testing.assert_close(two.rotation_left, one.rotation_right)
+    torch.testing.assert_close(two.rotation_right, one.rotation_left)
+    points = torch.tensor([[0.1, 0.2, 1.0], [-0.3, 0.1, 2.0]]).double()
+    first, _ = one.disparity(points)
+    shifted = points - torch.tensor([1.0, 0, 0]).double() * one.baseline
+    second, _ = two.disparity(shifted)
+    scale = (one.camera_left.intrinsics[0] / two.camera_left.intrinsics[0]).item()
+    torch.testing.assert_close(second * scale, -first)
+    assert two.rotation_left[1, 1].item() > 0.9
+
+
+def test_opencv_has_the_same_matrices():
+    cv2 = pytest.importorskip("cv2")
+    left, right, extrinsics = pair()
+    found = ct.rectify(left, right, extrinsics, align="opencv", image_size=(480, 640))
+    matrices = {name: value.detach().numpy() for name, value in found.opencv().items()}
+    given = (m for camera in (left, right) for m in (camera.K.detach().numpy(), camera.distortion.detach().numpy()))
+    rotation, shift = extrinsics.matrix()[:3, :3].detach().numpy(), np.array(SHIFT)[:, None]
+    theirs = cv2.stereoRectify(*given, (640, 480), rotation, shift, flags=1024, alpha=0)
+    np.testing.assert_allclose(matrices["R1"], theirs[0], atol=1e-12)
+    np.testing.assert_allclose(matrices["R2"], theirs[1], atol=1e-12)
+    # what the focal length does not change
+    np.testing.assert_allclose(matrices["P2"][0, 3] / matrices["P2"][0, 0], theirs[3][0, 3] / theirs[3][0, 0])
+    disparity = torch.rand(480, 640, generator=torch.Generator().manual_seed(0)).double() + 5
+    points, valid = found.disparity_to_points(disparity)
+    assert valid.all()
+    by_q = cv2.reprojectImageTo3D(disparity.numpy().astype(np.float32), matrices["Q"])
+    np.testing.assert_allclose(points.detach().numpy(), by_q, rtol=1e-5, atol=1e-6)
+
+
+def test_the_mean_alignment_looks_where_both_look():
+    found = fisheyes(pitch=0.2)
+    for rotation, sign in ((found.rotation_left, -1), (found.rotation_right, 1)):
+        ahead = rotation[2]
+        assert math.atan2(ahead[1], ahead[2]) == pytest.approx(sign * 0.1, abs=1e-6)
+        assert rotation[0, 0].item() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_images_of_a_far_scene_are_the_same(projection):
+    camera = fisheye()
+    extrinsics = ct.Extrinsics([0.05, 0.1, -0.03], [-0.1, 0.01, 0]).double().requires_grad_(False)
+    found = ct.rectify(camera, camera, extrinsics, projection=projection)
+
+    def scene(turn):
+        rays = camera.unproject(camera.pixel_grid())[0] @ turn  # back to the left camera
+        return (0.5 + 0.5 * torch.sin(9 * rays).prod(-1))[None, None]
+
+    left, right = found(scene(torch.eye(3).double()), scene(extrinsics.matrix()[:3, :3]))
+    one, other, both = found.valid_masks()
+    assert left.shape[-2:] == found.camera_left.image_size
+    assert both.float().mean() > 0.5
+    assert (both == (one & other)).all()
+    inner = torch.nn.functional.avg_pool2d(both.double(), 5, 1, 2) == 1
+    assert (left - right)[inner].abs().max() < 0.02
+
+
+def test_extrinsics_and_lenses_learn_through_both_images():
+    left, right, extrinsics = pair()
+    left.float(), right.float(), extrinsics.float()
+    found = ct.rectify(left, right, extrinsics, image_size=(60, 80))
+    one, other = found(torch.rand(1, 1, 480, 640), torch.rand(1, 1, 480, 640))
+    (one.square().mean() + other.square().mean()).backward()
+    for parameter in (*left.parameters(), *right.parameters(), *extrinsics.parameters()):
+        assert parameter.grad.isfinite().all()
+        assert parameter.grad.abs().max() > 0
+    with torch.no_grad():
+        before = found.baseline
+        extrinsics.translation *= 2
+        torch.testing.assert_close(found.baseline, 2 * before)
+
+
+def test_what_does_not_learn_is_kept():
+    found = fisheyes()
+    assert found.left is found.left
+    with torch.no_grad():
+        found.extrinsics.translation *= 2
+    assert found.left is found.left
+
+
+def test_depth_and_disparity_ranges():
+    for projection in PROJECTIONS:
+        found = fisheyes(projection=projection, image_size=(240, 320))
+        least, most = found.disparity_range(0.5, 10.0)
+        assert 0 <= least < most
+        near, far = found.depth_range(least, most)
+        assert near <= 0.5 + 1e-6
+        assert far >= 10 - 1e-6
+        points, valid = found.disparity_to_points(torch.full((240, 320), (least + most) / 2).double())
+        depth = points[..., 2] if projection == "perspective" else torch.hypot(points[..., 1], points[..., 2])
+        assert near <= float(depth[valid].min()) <= float(depth[valid].max()) <= far
+    found = fisheyes(image_size=(240, 320))
+    focal = found.camera_left.intrinsics[0].item()
+    assert found.disparity_range(0.5) == pytest.approx((0.0, focal * 0.1 / 0.5))
+
+
+def test_disparities_of_no_sense_are_invalid():
+    found = fisheyes(image_size=(4, 5))
+    disparity = torch.tensor([1.0, 0.0, -1.0, math.nan, math.inf]).double().expand(4, 5).contiguous()
+    points, valid = found.disparity_to_points(disparity)
+    assert valid.tolist() == [[True, False, False, False, False]] * 4
+    assert points.isfinite().all()
+    points, valid = found.disparity_to_points(disparity, valid=torch.zeros(4, 5, dtype=torch.bool))
+    assert not valid.any()
+    for shape in ((4, 5), (1, 4, 5), (2, 1, 4, 5)):
+        points, valid = found.disparity_to_points(disparity.expand(shape))
+        assert points.shape == (*shape, 3)
+        assert valid.shape == shape
+
+
+def test_a_batch_of_rigs_goes_pair_by_pair():
+    left, right, _ = pair()
+    left.requires_grad_(False), right.requires_grad_(False)
+    turns, shifts = torch.tensor([[0.0, 0.05, 0], [0.02, 0, 0.01]]), torch.tensor([[-0.1, 0, 0], [-0.2, 0.01, 0]])
+    many = ct.rectify(left, right, ct.Extrinsics(turns, shifts).double().requires_grad_(False))
+    images = torch.rand(2, 3, 480, 640, generator=torch.Generator().manual_seed(0)).double()
+    of_left, of_right = many(images, images)
+    disparity = torch.full((2, 1, *many.camera_left.image_size), 7.0).double()
+    points, valid = many.disparity_to_points(disparity)
+    for i in range(2):
+        alone = ct.Extrinsics(turns[i], shifts[i]).double().requires_grad_(False)
+        one = ct.rectify(left, right, alone)
+        one.camera_left = one.camera_right = many.camera_left[i]
+        for whole, part in zip((of_left, of_right), one(images[i : i + 1], images[i : i + 1]), strict=True):
+            torch.testing.assert_close(whole[i : i + 1], part, rtol=0, atol=1e-9)
+        torch.testing.assert_close(one.disparity_to_points(disparity[i, 0])[0], points[i, 0])
+    assert valid.all()
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_field_of_view_and_size_are_as_asked(projection):
+    found = fisheyes(projection=projection, fov=math.radians(100), image_size=(300, 400))
+    assert found.camera_left.image_size == (300, 400)
+    assert math.degrees(found.camera_left.field_of_view[0]) == pytest.approx(100, rel=1e-6)
+    both = fisheyes(projection=projection, fov=(1.5, 1.0))
+    angles = both.camera_left.field_of_view
+    assert angles[:2].tolist() == pytest.approx([1.5, 1.0], rel=0.01)
+
+
+def test_bad_input_is_refused():
+    left, right, extrinsics = pair()
+    with pytest.raises(ValueError, match="one place"):
+        ct.rectify(left, right, ct.Extrinsics([0, 0.1, 0], [0.0, 0, 0]))
+    with pytest.raises(ValueError, match="along their baseline"):
+        ct.rectify(left, right, ct.Extrinsics([0.0, 0, 0], [0, 0, 1.0]))
+    with pytest.raises(ValueError, match=r"along their baseline|sees nothing|share no"):
+        ct.rectify(left, right, ct.Extrinsics([0.0, math.pi, 0], [-1.0, 0, 0]))
+    with pytest.raises(TypeError, match="from_matrix"):
+        ct.rectify(left, right, (np.eye(3), np.ones(3)))
+    with pytest.raises(ValueError, match="projection"):
+        ct.rectify(left, right, extrinsics, projection="fisheye")
+    with pytest.raises(ValueError, match="image_size"):
+        ct.rectify(ct.Pinhole([500.0, 500, 320, 240]), right, extrinsics)
+    with pytest.raises(ValueError, match="radians"):
+        ct.rectify(left, right, extrinsics, fov=90.0)
+    found = ct.rectify(left, right, extrinsics, image_size=(48, 64))
+    with pytest.raises(ValueError, match="/ 16"):
+        found.disparity_to_points(np.zeros((48, 64), np.int16))
+    with pytest.raises(ValueError, match="disparity must be"):
+        found.disparity_to_points(torch.zeros(64, 48))
+    with pytest.raises(ValueError, match="perspective"):
+        ct.rectify(left, right, extrinsics, projection="latlon").opencv()
