@@ -123,7 +123,7 @@ def test_opencv_has_the_same_matrices():
 
 def test_the_mean_alignment_looks_where_both_look():
     found = fisheyes(pitch=0.2)
-    for rotation, sign in ((found.rotation_left, -1), (found.rotation_right, 1)):
+    for rotation, sign in ((found.rotation_left, 1), (found.rotation_right, -1)):
         ahead = rotation[2]
         assert math.atan2(ahead[1], ahead[2]) == pytest.approx(sign * 0.1, abs=1e-6)
         assert rotation[0, 0].item() == pytest.approx(1)
