@@ -24,6 +24,7 @@ from benchmarks.image_peers import CACHED, CLONE, DELTACAMERA, FRESH, Task, cont
 from benchmarks.options import Options, complain, progress
 from benchmarks.tables import Record
 from benchmarks.timing import Run
+from camtorch.native import memory
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _ROOT = Path(__file__).resolve().parents[1]
@@ -93,7 +94,8 @@ def _status(name: str) -> int:
 
 
 def _trim() -> None:
-    """Have the C library give back what it holds for the next allocations, which would be none of the system's."""
+    """Have camtorch and the C library give back what they hold for the next allocations: those would be no new ones."""
+    memory.release()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)

@@ -426,7 +426,7 @@ static void classify_any(const Variant *all, int n) {
     given.mapped = mapped, given.mapped_stride = area, given.rim = rim, given.rim_stride = rim_size;
     for (k = 0; k < n; k++) {
         given.cells = allocated(given.count * given.rows * given.columns * 4);
-        given.scratch = allocated(20 * (given.columns + 8) * 4);
+        given.scratch = allocated(25 * (given.columns + 8) * 4);
         all[k].classify(&given);
         for (i = 0; i < given.count * given.rows * given.columns; i++)
             if (given.cells[i] != CELL_EMPTY && given.cells[i] != CELL_CUBIC && given.cells[i] != 0) abort();

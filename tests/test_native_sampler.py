@@ -511,9 +511,22 @@ STEPPED = (
     ct.Pinhole([30.38603, 93.54958, 49.238407, 92.780914], image_size=(190, 99)).requires_grad_(False),
     None,
 )
+# and beside the limit of a table
+BENT = (
+    ct.Mei(
+        [451.28162, 582.9246, 111.68861, 110.789246], [3.4664693, -0.4027524, -1e-5, 0.0, 0.0], image_size=(222, 224)
+    ).requires_grad_(False),
+    ct.Tabulated(
+        [546.0527, 982.90094, 95.06072, 115.36195],
+        [0.8, 1.300322, 2.02995, 2.291324, 0.16804501, 0.82956624, 0.8295563, 1.638779],
+        image_size=(246, 196),
+    ).requires_grad_(False),
+    None,
+)
 
 
 @given(pairs())
+@example(BENT)
 @example(MIRRORED)
 @example(STEPPED)
 @settings(max_examples=40)

@@ -1,9 +1,4 @@
 /* The entry points: each is that of the best variant that this CPU can run. */
-#if defined(__linux__)
-#define _DEFAULT_SOURCE
-#include <sys/mman.h>
-#endif
-
 #include "sampler.h"
 
 #define DECLARED(variant)                                                                                              \
@@ -61,15 +56,3 @@ EXPORTED const char *camtorch_variant(void) {
 EXPORTED int32_t camtorch_sample(Job *job) { CALLED(sample, job) }
 
 EXPORTED int32_t camtorch_classify(const Classification *given) { CALLED(classify, given) }
-
-/* Asks for a part of memory that nobody has written to in large pages, if the system has them for those who ask */
-EXPORTED void camtorch_large_pages(void *from, int64_t bytes) {
-#if defined(MADV_HUGEPAGE)
-    const uintptr_t page = 4096, start = ((uintptr_t)from + page - 1) & ~(page - 1);
-    const uintptr_t end = ((uintptr_t)from + (uintptr_t)bytes) & ~(page - 1);
-    if (end > start) madvise((void *)start, end - start, MADV_HUGEPAGE);
-#else
-    (void)from;
-    (void)bytes;
-#endif
-}

@@ -1417,22 +1417,25 @@ INLINE float fourth(float a, float b, float c, float d, float e) {
     return fabsf(((de - cd) - (cd - bc)) - ((cd - bc) - (bc - ab)));
 }
 
-/* The largest fourth differences across along a line of corners, of those of a cell and the next ones on either side;
- * nodes: of the first of the five rows around it */
-static void misses_across(const float *nodes, int64_t width, int64_t n, float *line, float *across) {
-    const float *r = nodes + 2 * width;
+NOT_INLINE void windows(const float *a, const float *b, const float *c, const float *d, int64_t n, float *__restrict most) {
     int64_t j;
-    for (j = 0; j < n + 1; j++) line[j + 1] = fourth(r[j], r[j + 1], r[j + 2], r[j + 3], r[j + 4]);
-    line[0] = line[1], line[n + 2] = line[n + 1];
-    for (j = 0; j < n; j++) across[j] = greater(greater(line[j], line[j + 1]), greater(line[j + 2], line[j + 3]));
+    for (j = 0; j < n; j++) most[j] = greater(greater(a[j], b[j]), greater(c[j], d[j]));
 }
 
-/* And the largest ones down, at the corners of cells */
-static void misses_down(const float *nodes, int64_t width, int64_t n, float *line, float *down) {
-    const float *r0 = nodes + 2, *r1 = r0 + width, *r2 = r1 + width, *r3 = r2 + width, *r4 = r3 + width;
-    int64_t j;
-    for (j = 0; j < n + 1; j++) line[j] = fourth(r0[j], r1[j], r2[j], r3[j], r4[j]);
-    for (j = 0; j < n; j++) down[j] = greater(line[j], line[j + 1]);
+/* The largest fourth differences across and down at a line of corners, of those of a cell and the next ones on either
+ * side; nodes: of the first of the five rows around it */
+NOT_INLINE void misses(const float *nodes, int64_t width, int64_t n, float *line, float *across, float *down) {
+    const float *r0 = nodes, *r1 = r0 + width, *r2 = r1 + width, *r3 = r2 + width, *r4 = r3 + width;
+    int64_t j, k;
+    for (k = 0; k < 2; k++) {
+        float *most = k ? down : across;
+        if (k)
+            for (j = 0; j < n + 1; j++) line[j + 1] = fourth(r0[j + 2], r1[j + 2], r2[j + 2], r3[j + 2], r4[j + 2]);
+        else
+            for (j = 0; j < n + 1; j++) line[j + 1] = fourth(r2[j], r2[j + 1], r2[j + 2], r2[j + 3], r2[j + 4]);
+        line[0] = line[1], line[n + 2] = line[n + 1];
+        windows(line, line + 1, line + 2, line + 3, n, most);
+    }
 }
 
 /* The range of a cell's sixteen nodes; nodes: of the first of its four rows */
@@ -1449,23 +1452,17 @@ static void ranges(const float *nodes, int64_t width, int64_t n, float *least, f
     }
 }
 
-/* By how much cubics may miss, by all differences that count for a row of cells */
-NOT_INLINE void weigh(const float *a0, const float *a1, const float *d0, const float *d1, const float *d2,
-                      const float *d3, int64_t n, float scale, float *__restrict missed) {
-    int64_t j;
-    for (j = 0; j < n; j++)
-        missed[j] = scale * (greater(a0[j], a1[j]) + greater(greater(d0[j], d1[j]), greater(d2[j], d3[j])));
-}
-
-/* Of one coordinate: adds to the squares of both, and to whether they are near the image, 1 or 0 */
-NOT_INLINE void judge(const float *of, const float *low, const float *high, int64_t n, float not_border, float not_zeros,
-                      float *__restrict missed, float *__restrict near) {
+/* Of one coordinate: adds to the squares of both, by which cubics may miss, and to whether they are near the image, 1 or
+ * 0; scale: of the fourth differences across and down */
+NOT_INLINE void judge(const float *across, const float *down, float scale, const float *low, const float *high, int64_t n,
+                      float not_border, float not_zeros, float *__restrict missed, float *__restrict near) {
     int64_t j;
     for (j = 0; j < n; j++) {
+        const float of = scale * (across[j] + down[j]);
         const float reach = MARGIN + OVERSHOOT * (high[j] - low[j]);
         const float is_near = (high[j] + reach > -1 ? 1.0f : 0.0f) * (low[j] - reach < 1 ? 1.0f : 0.0f);
         /* beyond the border, one coordinate does not matter, but the other one does */
-        missed[j] += greater(is_near, not_border) * of[j] * of[j];
+        missed[j] += greater(is_near, not_border) * of * of;
         near[j] *= greater(is_near, not_zeros);
     }
 }
@@ -1476,40 +1473,36 @@ int32_t THIS(classify)(const Classification *given) {
     const float limit = (float)(given->tolerance * given->tolerance);
     const float half[2] = {(float)(given->source_width / 2), (float)(given->source_height / 2)};
     const float not_border = given->padding != BORDER, not_zeros = given->padding != ZEROS;
-    float *lines[8], *across[2][2], *down[2][4];
+    float *lines[9], *kept[2][2][4];
     int64_t b, i, j, c, k, made;
     int32_t most = 0;
-    for (k = 0; k < 8; k++) lines[k] = given->scratch + k * area;
-    for (c = 0; c < 2; c++) {
-        for (k = 0; k < 2; k++) across[c][k] = given->scratch + (8 + 2 * c + k) * area;
-        for (k = 0; k < 4; k++) down[c][k] = given->scratch + (12 + 4 * c + k) * area;
-    }
+    for (k = 0; k < 9; k++) lines[k] = given->scratch + k * area;
+    for (k = 0; k < 16; k++) kept[k / 8][k / 4 % 2][k % 4] = given->scratch + (9 + k) * area;
     for (b = 0; b < given->count; b++) {
         int32_t *cells = given->cells + b * given->rows * n;
         for (i = 0, made = 0; i < given->rows; i++) {
             const uint8_t *m = given->mapped + b * given->mapped_stride + (i + 1) * width + 1;
             const float *planes = given->nodes + b * given->node_strides[0];
-            float *missed = lines[6], *near = lines[7];
-            /* at the lines of corners that this row is the first to look at */
+            float *missed = lines[0], *near = lines[1];
+            /* the lines of corners that this row is the first to look at */
             for (; made <= given->rows && made < i + 3; made++)
                 for (c = 0; c < 2; c++) {
                     const float *nodes = planes + c * given->node_strides[1] + made * width;
-                    misses_down(nodes, width, n, lines[0], down[c][made & 3]);
+                    misses(nodes, width, n, lines[2], kept[c][0][made % 4], kept[c][1][made % 4]);
                 }
             for (j = 0; j < n; j++) missed[j] = 0, near[j] = 1;
             for (c = 0; c < 2; c++) {
                 const float *nodes = planes + c * given->node_strides[1] + i * width;
-                const float *d0 = down[c][(i > 0 ? i - 1 : 0) & 3], *d1 = down[c][i & 3], *d2 = down[c][(i + 1) & 3];
-                const float *d3 = down[c][(i + 2 < given->rows ? i + 2 : given->rows) & 3];
-                const float *a0 = across[c][i & 1], *a1 = across[c][(i + 1) & 1];
-                float *missed_of = lines[5];
-                if (i == 0) misses_across(nodes, width, n, lines[0], across[c][0]);
-                misses_across(nodes + width, width, n, lines[0], across[c][(i + 1) & 1]);
-                ranges(nodes + width + 1, width, n, lines[1], lines[2], lines[3], lines[4]);
-                weigh(a0, a1, d0, d1, d2, d3, n, SAFETY * CUBIC * half[c], missed_of);
-                judge(missed_of, lines[3], lines[4], n, not_border, not_zeros, missed, near);
+                for (k = 0; k < 2; k++) {
+                    float **of = kept[c][k];
+                    windows(of[(i > 0 ? i - 1 : 0) % 4], of[i % 4], of[(i + 1) % 4],
+                            of[(i + 2 < given->rows ? i + 2 : given->rows) % 4], n, lines[3 + k]);
+                }
+                ranges(nodes + width + 1, width, n, lines[5], lines[6], lines[7], lines[8]);
+                judge(lines[3], lines[4], SAFETY * CUBIC * half[c], lines[7], lines[8], n, not_border, not_zeros, missed,
+                      near);
             }
-            uint8_t *sums = (uint8_t *)lines[0];
+            uint8_t *sums = (uint8_t *)lines[2];
             for (j = 0; j < n + 3; j++) sums[j] = m[j] + m[j + width] + m[j + 2 * width] + m[j + 3 * width];
             for (j = 0; j < n; j++) {
                 const int sum = sums[j] + sums[j + 1] + sums[j + 2] + sums[j + 3];

@@ -58,7 +58,7 @@ typedef struct {
     double source_height, source_width, tolerance;
     int32_t padding; /* that is to be sampled with: what lies off the image then matters, or does not */
     int32_t *cells; /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, or 0 where positions are to be exact */
-    float *scratch; /* 20 (columns + 8) */
+    float *scratch; /* 25 (columns + 8) */
 } Classification;
 
 #endif

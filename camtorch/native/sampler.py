@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch._threads import spread, thread_count
+from camtorch.native import memory
 from camtorch.native.library import library
 
 EMPTY, CUBIC, TODO = -2, -1, 0
@@ -22,7 +23,6 @@ _TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
 _BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
-_HUGE = 1 << 22  # bytes of a result from which on it is asked for in large pages
 
 
 class _Job(ctypes.Structure):
@@ -199,13 +199,7 @@ def layout(images: Tensor) -> torch.memory_format:
 
 def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
     """(count, C, *size) of the dtype of images (_, C, H, W), and with the channels last in memory if they have them."""
-    shape = (count, images.shape[1], *size)
-    result = torch.empty(shape, dtype=images.dtype, device="cpu", memory_format=layout(images))
-    native = library()
-    if native is not None and result.nbytes >= _HUGE:
-        # small pages, each new to the process, would take as long as all else
-        native.camtorch_large_pages(c_void_p(result.data_ptr()), c_int64(result.nbytes))
-    return result
+    return memory.empty((count, images.shape[1], *size), images.dtype, layout(images))
 
 
 def classify(
@@ -237,7 +231,7 @@ def classify(
         return None
     rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(len(nodes), rows, columns, dtype=torch.int32, device="cpu")
-    scratch = torch.empty(20 * (columns + 8), dtype=torch.float32, device="cpu")
+    scratch = torch.empty(25 * (columns + 8), dtype=torch.float32, device="cpu")
     given = _Classification(
         nodes.data_ptr(),
         nodes.stride()[:2],

@@ -400,10 +400,11 @@ def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
     Where the curvature steps within a cell, those at its corners may be none. At the ends of the lattice, where there
     are no five nodes, it is that at the corners.
     """
-    other = -3 - dim
-    d = nodes.narrow(other, 2, nodes.shape[other] - 4).diff(4, dim=dim).abs()
-    d = torch.cat((d.narrow(dim, 0, 1), d, d.narrow(dim, d.shape[dim] - 1, 1)), dim)
-    return _over_windows(_over_windows(d, dim, 4, torch.maximum), other, 2, torch.maximum)
+    d = nodes.narrow(-3 - dim, 2, nodes.shape[-3 - dim] - 4).diff(4, dim=dim).abs()
+    for axis in (-1, -2):
+        d = torch.cat((d.narrow(axis, 0, 1), d, d.narrow(axis, d.shape[axis] - 1, 1)), axis)
+        d = _over_windows(d, axis, 4, torch.maximum)
+    return d
 
 
 def _over_windows(values: Tensor, dim: int, width: int, pick: Callable) -> Tensor:

@@ -1,0 +1,70 @@
+"""Memory of large results, which is used again: to get what is new to a process takes as long as to sample."""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import weakref
+from contextlib import suppress
+
+import torch
+from torch import Tensor
+
+LIMIT = 1 << 27
+"""Bytes that are kept, at most, for results to come."""
+_LEAST = 1 << 22  # bytes of a result from which on it comes from here: the C library keeps what is smaller
+_PAGE = 1 << 21  # bytes of a large page: small ones, each new to the process, would take several times as long
+
+
+def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
+    """As `torch.empty`, on the CPU; a large one is of memory that is kept, where the system has large pages.
+
+    As long as it, a view of it, or an array on its memory lives, nobody else gets that. Its storage cannot be resized.
+    """
+    like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
+    size = -(-like.nbytes // _PAGE) * _PAGE
+    block = _block(size) if like.nbytes >= _LEAST else None
+    if block is None:
+        return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
+    memory = (ctypes.c_char * len(block)).from_buffer(block)  # which the storage holds, and nothing else
+    weakref.finalize(memory, _keep, block).atexit = False
+    storage = torch.frombuffer(memory, dtype=torch.uint8).untyped_storage()
+    # not a view, of which there are things that cannot be done
+    return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, like.shape, like.stride())
+
+
+def release() -> None:
+    """Give back to the system what is kept."""
+    _idle.clear()
+
+
+# No lock: a tensor may die wherever Python collects garbage, also within these functions. What they do to the list is
+# done at once. A fork's child has pages of its own.
+_idle: list[mmap.mmap] = []
+
+
+def _block(size: int) -> mmap.mmap | None:
+    """Of so many bytes: one that is kept, or a new one if the system has large pages, and so much memory."""
+    for block in tuple(_idle):
+        if len(block) == size:
+            try:
+                _idle.remove(block)
+            except ValueError:  # another thread has it
+                continue
+            return block
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return None
+    try:
+        block = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        block.madvise(mmap.MADV_HUGEPAGE)
+    except OSError:
+        return None
+    return block
+
+
+def _keep(block: mmap.mmap) -> None:
+    """Of what is kept, the oldest goes first."""
+    _idle.append(block)
+    while sum(map(len, tuple(_idle))) > LIMIT:
+        with suppress(IndexError):  # another thread was here
+            del _idle[0]
