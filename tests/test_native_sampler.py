@@ -847,6 +847,7 @@ def test_workers_of_a_loader(start):
 PEAK = """
 import torch
 import camtorch as ct
+from camtorch.native import memory
 
 
 def told(key):
@@ -862,6 +863,7 @@ def check(kind, count, size, dtype, tolerance, last, kept):
         images = images.contiguous(memory_format=torch.channels_last)
     if kept:
         warp(images[:1])
+    memory.release()
     before = told("VmRSS")
     with open("/proc/self/clear_refs", "w") as file:
         file.write("5")

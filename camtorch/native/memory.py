@@ -13,7 +13,6 @@ from torch import Tensor
 LIMIT = 1 << 27
 """Bytes that are kept, at most, for results to come."""
 _LEAST = 1 << 22  # bytes of a result from which on it comes from here: the C library keeps what is smaller
-_PAGE = 1 << 21  # bytes of a large page: small ones, each new to the process, would take several times as long
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
@@ -22,7 +21,7 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_forma
     As long as it, a view of it, or an array on its memory lives, nobody else gets that. Its storage cannot be resized.
     """
     like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
-    size = -(-like.nbytes // _PAGE) * _PAGE
+    size = -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE  # large pages within it, not beyond
     block = _block(size) if like.nbytes >= _LEAST else None
     if block is None:
         return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
@@ -56,7 +55,7 @@ def _block(size: int) -> mmap.mmap | None:
         return None
     try:
         block = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        block.madvise(mmap.MADV_HUGEPAGE)
+        block.madvise(mmap.MADV_HUGEPAGE)  # small ones, each new to the process, would take several times as long
     except OSError:
         return None
     return block
