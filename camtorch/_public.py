@@ -5,6 +5,7 @@ from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
 from camtorch.calibration.pnp import solve_pnp
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
+from camtorch.calibration.triangulate import triangulate
 from camtorch.camera import MODELS, Camera
 from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
@@ -92,4 +93,5 @@ __all__ = [
     "rectify",
     "save",
     "solve_pnp",
+    "triangulate",
 ]

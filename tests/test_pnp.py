@@ -239,6 +239,9 @@ def test_shapes():
     torch.testing.assert_close(
         ct.solve_pnp(cameras, target, pixels).extrinsics.matrix(), several.extrinsics.matrix(), rtol=1e-6, atol=1e-6
     )
+    empty = ct.solve_pnp(camera, target[:0], pixels[:0])
+    assert empty.extrinsics.batch_shape == empty.rms.shape == (0,)
+    assert not ct.solve_pnp(camera, target, pixels * torch.nan).valid.any()
     single = ct.solve_pnp(camera.float(), target.float(), pixels.float())
     assert single.rms.dtype == single.extrinsics.translation.dtype == torch.float32
     assert isinstance(one.extrinsics.rotation, torch.nn.Parameter)

@@ -1,0 +1,174 @@
+"""triangulate: points from cameras of any models, the optimum in pixels, and its derivatives."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+
+SIZE = (960, 1280)
+CAMERAS = [
+    ct.KannalaBrandt.from_fov(190, image_size=SIZE, distortion=torch.tensor([0.01, -0.004, 1e-3, 0.0]).double()),
+    ct.BrownConrady.from_fov(90, image_size=SIZE, distortion=torch.tensor([-0.1, 0.02, 1e-3, -5e-4]).double()),
+    ct.DoubleSphere.from_fov(150, image_size=SIZE).double(),
+]
+
+
+def rig(seed=0):
+    """Three cameras of different models, their poses, points, and the pixels of those that each sees."""
+    g = torch.Generator().manual_seed(seed)
+    cameras = [camera.requires_grad_(False) for camera in CAMERAS]
+    extrinsics = [
+        ct.Extrinsics(0.2 * torch.randn(3, generator=g).double(), torch.randn(3, generator=g).double()).requires_grad_(
+            False
+        )
+        for _ in cameras
+    ]
+    points = torch.randn(400, 3, generator=g).double() * 3 + torch.tensor([0.0, 0.0, 3.0])
+    pixels = []
+    for camera, pose in zip(cameras, extrinsics, strict=True):
+        found, valid = camera.project(pose(points))
+        pixels.append(torch.where((valid & camera.contains(found))[:, None], found, torch.nan))
+    return cameras, extrinsics, points, torch.stack(pixels)
+
+
+def rms_of(cameras, extrinsics, points, pixels):
+    squares = torch.stack(
+        [
+            (camera.project(pose(points))[0] - seen).square().sum(-1)
+            for camera, pose, seen in zip(cameras, extrinsics, pixels, strict=True)
+        ]
+    )
+    return squares.nanmean(0).sqrt()
+
+
+def test_exact_pixels_give_the_points():
+    cameras, extrinsics, points, pixels = rig()
+    found, rms, valid = ct.triangulate(cameras, extrinsics, pixels)
+    twice = (~pixels.isnan().any(-1)).sum(0) >= 2
+    assert 100 < int(twice.sum()) < 400
+    assert torch.equal(valid, twice)
+    torch.testing.assert_close(found[valid], points[valid], rtol=1e-9, atol=1e-9)
+    assert rms[valid].max() < 1e-8
+    assert torch.isinf(rms[~valid]).all()
+    assert torch.isfinite(found).all()
+    # some of them are beyond 90 degrees
+    behind = torch.stack([pose(points)[:, 2] < 0 for pose in extrinsics]) & ~pixels.isnan().any(-1)
+    assert (behind & valid).any()
+
+
+def test_the_reprojection_error_is_least():
+    cameras, extrinsics, points, pixels = rig()
+    pixels = pixels + torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
+    found, rms, valid = ct.triangulate(cameras, extrinsics, pixels)
+    here = rms_of(cameras, extrinsics, found, pixels)
+    torch.testing.assert_close(rms[valid], here[valid])
+    assert (rms <= rms_of(cameras, extrinsics, points, pixels))[valid].all()
+    for step in 1e-3 * torch.cat((torch.eye(3), -torch.eye(3))).double():
+        assert (rms_of(cameras, extrinsics, found + step, pixels) >= rms)[valid].all()
+
+
+def test_as_opencv_for_exact_pixels_of_pinholes():
+    cameras = [ct.Pinhole([700.0, 700, 640, 480]).double() for _ in range(2)]
+    extrinsics = [ct.Extrinsics([0.0, 0, 0], [0.0, 0, 0]).double(), ct.Extrinsics([0.0, 0.1, 0], [-0.5, 0, 0]).double()]
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0)).double() + torch.tensor([-0.5, -0.5, 2])
+    pixels = [c.project(e(points))[0].detach() for c, e in zip(cameras, extrinsics, strict=True)]
+    matrices = [(c.K @ e.matrix()[:3]).detach().numpy() for c, e in zip(cameras, extrinsics, strict=True)]
+    theirs = cv2.triangulatePoints(*matrices, *(p.numpy().T for p in pixels))
+    found, _, valid = ct.triangulate(cameras, extrinsics, [p.numpy() for p in pixels])
+    assert valid.all()
+    np.testing.assert_allclose(found.detach().numpy(), (theirs[:3] / theirs[3]).T, atol=1e-9)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-3])
+def test_parallel_and_diverging_rays_are_invalid(apart):
+    camera = ct.Pinhole([700.0, 700, 640, 480]).double().requires_grad_(False)
+    poses = ct.Extrinsics(torch.zeros(2, 3).double(), torch.tensor([[0.0, 0, 0], [-1, 0, 0]]).double())
+    ray = torch.tensor([[0.1, 0.2, 1.0], [0.1 + apart, 0.2, 1.0]]).double()
+    pixels = camera.project(ray)[0][:, None].repeat(1, 2, 1)
+    pixels[1, 1, 0] -= 10.0  # and a point that is seen well
+    points, rms, valid = ct.triangulate(camera, poses, pixels)
+    assert valid.tolist() == [False, True]
+    assert torch.isfinite(points).all()
+    assert torch.isinf(rms[0])
+
+
+def test_gradients_are_those_of_the_optimum():
+    cameras, extrinsics, _, pixels = rig()
+    seen = (~pixels.isnan().any(-1)).all(0).nonzero()[:3, 0]
+    pixels = pixels[:, seen] + torch.randn(3, 3, 2, generator=torch.Generator().manual_seed(1)).double()
+    camera, pose = cameras[0], extrinsics[1]
+    inputs = [
+        w.detach().clone().requires_grad_()
+        for w in (pixels, camera.intrinsics, camera.distortion, pose.rotation, pose.translation)
+    ]
+
+    def located(pixels, intrinsics, distortion, rotation, translation):
+        mine = [ct.KannalaBrandt(intrinsics, distortion, image_size=SIZE), *cameras[1:]]
+        poses = [extrinsics[0], ct.Extrinsics(rotation, translation), extrinsics[2]]
+        points, rms, valid = ct.triangulate(mine, poses, pixels)
+        assert valid.all()
+        return points, rms
+
+    assert torch.autograd.gradcheck(located, inputs, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
+
+
+def test_invalid_points_have_no_gradient():
+    cameras, extrinsics, _, pixels = rig()
+    pixels.requires_grad_()
+    points, rms, valid = ct.triangulate(cameras, extrinsics, pixels)
+    (points.sum() + rms[valid].sum()).backward()
+    gradient = pixels.grad
+    assert torch.isfinite(gradient).all()
+    assert not gradient[:, ~valid].any()
+    assert gradient[:, valid].any()
+
+
+def test_shapes():
+    cameras, extrinsics, points, pixels = rig()
+    expected = ct.triangulate(cameras, extrinsics, pixels)
+    found = ct.triangulate(cameras, extrinsics, pixels.view(3, 20, 20, 2))
+    assert found.points.shape == (20, 20, 3)
+    assert found.rms.shape == found.valid.shape == (20, 20)
+    torch.testing.assert_close(found.points.flatten(0, 1), expected.points)
+    one = int(expected.valid.nonzero()[0, 0])
+    alone = ct.triangulate(cameras, extrinsics, pixels[:, one])
+    assert alone.points.shape == (3,)
+    torch.testing.assert_close(alone.points, points[one])
+    empty = ct.triangulate(cameras, extrinsics, pixels[:, :0])
+    assert empty.points.shape == (0, 3)
+    single = ct.triangulate([c.float() for c in rig()[0]], [e.float() for e in rig()[1]], pixels.float())
+    assert single.points.dtype == single.rms.dtype == torch.float32
+    for camera in CAMERAS:
+        camera.double()
+
+
+def test_one_camera_that_moves():
+    camera, (_, _, points, _) = CAMERAS[0], rig()
+    poses = ct.Extrinsics(torch.zeros(4, 3).double(), torch.randn(4, 3).double())
+    pixels = torch.stack([camera.project(pose(points))[0] for pose in poses]).detach()
+    for cameras in (camera, [camera] * 4):
+        for extrinsics in (poses, list(poses)):
+            found, _, valid = ct.triangulate(cameras, extrinsics, pixels)
+            torch.testing.assert_close(found[valid], points[valid])
+            assert valid.double().mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        (lambda c, e, p: (c[:2], e, p), ValueError, "as many cameras as extrinsics"),
+        (lambda c, e, p: (c, e, p[:2]), ValueError, "as many cameras as extrinsics"),
+        (lambda c, e, p: (c[:1], e[:1], p[:1]), ValueError, "two cameras at least"),
+        (lambda c, e, p: (c, e, p[..., 0]), ValueError, "pixels must be"),
+        (lambda c, e, p: (c, e, [p[0], p[1], p[2][:5]]), ValueError, "one shape"),
+        (lambda c, e, p: (e, e, p), TypeError, "cameras must be Camera"),
+        (lambda c, e, p: (c, c, p), TypeError, "extrinsics must be Extrinsics"),
+        (lambda c, e, p: ([ct.Pinhole(torch.ones(2, 4))] * 3, e, p), ValueError, "no batch dims"),
+    ],
+)
+def test_bad_arguments(change, error, says):
+    cameras, extrinsics, _, pixels = rig()
+    with pytest.raises(error, match=rf"triangulate: .*{says}"):
+        ct.triangulate(*change(cameras, extrinsics, pixels))
