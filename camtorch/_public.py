@@ -4,6 +4,7 @@ from camtorch import augment, io
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
 from camtorch.calibration.pnp import solve_pnp
+from camtorch.calibration.report import write_report
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.calibration.triangulate import triangulate
 from camtorch.camera import MODELS, Camera
@@ -94,4 +95,5 @@ __all__ = [
     "save",
     "solve_pnp",
     "triangulate",
+    "write_report",
 ]

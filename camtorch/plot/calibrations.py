@@ -35,10 +35,11 @@ if TYPE_CHECKING:
 
 _CELLS = 14  # of the coverage, along the longer side
 _ARROWS = 15_000  # which is as many as an image has room for
+_DENSE = 3000  # corners, that are drawn finer
 _LATTICE = 96  # of the map of uncertainty, along the longer side
 _AZIMUTHS = 16
-_BANDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # px
 _MOST_BANDS = 8
+_FINE_STEPS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10)
 
 
 class Sightings(NamedTuple):
@@ -72,6 +73,12 @@ class Sightings(NamedTuple):
         x, y, z = np.moveaxis(self.points, -1, 0)
         found: np.ndarray = np.where(self.seen, np.arctan2(np.hypot(x, y), z), np.nan)
         return found
+
+    @property
+    def reach(self) -> float:
+        """Radians from the axis of the furthest inlier, but for one in 200, which may be wrong; 0 without any."""
+        angles = np.sort(self.angles[self.seen & self.inliers])
+        return float(angles[math.ceil(0.995 * len(angles)) - 1]) if len(angles) else 0.0
 
     @property
     def rms(self) -> np.ndarray:
@@ -123,7 +130,7 @@ def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
     steps = np.ceil(len(colours) * np.sqrt(counts / max(counts.max(), 1)))
     cmap, norm = ListedColormap([PALE, *colours]), BoundaryNorm(np.arange(len(colours) + 2) - 0.5, len(colours) + 1)
     ax.pcolormesh(edges[1], edges[0], steps, cmap=cmap, norm=norm, zorder=0.5, edgecolors="#ffffff", linewidth=0.6)
-    _dots(ax, pixels[_thinned(len(pixels))], INK, 1.6 if len(pixels) < 3000 else 0.9)
+    _dots(ax, pixels[_thinned(len(pixels))], INK, 0.9 if len(pixels) > _DENSE else 1.6)
     _crosses(ax, shots)
     share = _covered(calibration, counts)
     ax.set_title(f"{len(pixels):,} corners in {100 * share:.0f} % of the image")
@@ -150,13 +157,18 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
     pixels, errors, lengths = shots.pixels[use], shots.errors[use], shots.lengths[use]
     few = _thinned(len(lengths), lengths)
     pixels, errors, lengths = pixels[few], errors[few], lengths[few]
-    most = _round_up(float(np.quantile(lengths, 0.98))) if len(lengths) else 1.0
-    longer = magnification(0.045 * max(height, width) / most)
-    scale = _scale("residuals", np.linspace(0, most, len(level_colours("residuals")) + 1))
+    count = len(level_colours("residuals"))
+    usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 1.0
+    most = count * _round_up(usual / count, _FINE_STEPS)
+    room = 3 * math.sqrt(height * width / max(len(lengths), 1)) / max(height, width)  # for each, of the longer side
+    longer = magnification(min(0.045, max(0.02, room)) * max(height, width) / most)
+    scale = _scale("residuals", np.linspace(0, most, count + 1))
+    dense = len(lengths) > _DENSE
     place = np.minimum(len(scale.colours) - 1, (lengths / most * len(scale.colours)).astype(int))
     for i, colour in enumerate(scale.colours):
-        here = place == i
-        _segments(ax, pixels[here], pixels[here] + longer * errors[here], colour, zorder=2 + i / 10)
+        start, along = pixels[place == i], longer * errors[place == i]
+        _strokes(ax, np.stack((start, start + along), 1), colour, 0.6 if dense else 0.9, 2 + i / 10)
+        _dots(ax, start, colour, 1.2 if dense else 2.0, 2 + i / 10)
     _crosses(ax, shots)
     _bar(ax, scale, "px", open_end=bool((lengths > most).any()))
     times = f", {longer:,} times as long" if longer > 1 else ""
@@ -254,10 +266,9 @@ def view(calibration: Calibration, number: int, ax: Axes | None = None, *, image
     pixels, errors = shots.pixels[index][use], shots.errors[index][use]
     usual = float(np.quantile(shots.lengths[index][use], 0.9)) if use.any() else 1.0
     longer = magnification(0.03 * max(height, width) / max(usual, 1e-9))
-    size = 4.5 if use.sum() < 150 else 2.5
-    u, v = pixels.T
-    ax.plot(u, v, "o", markersize=size, markerfacecolor="none", markeredgecolor=COLOURS[0], markeredgewidth=0.9)
-    _segments(ax, pixels, pixels + longer * errors, COLOURS[3], zorder=4, dots=False)
+    size, thick = (6.5, 1.3) if use.sum() < 150 else (4.0, 0.9)
+    ax.plot(*pixels.T, "o", markersize=size, markerfacecolor="none", markeredgecolor=COLOURS[0], markeredgewidth=thick)
+    _strokes(ax, np.stack((pixels, pixels + longer * errors), 1), COLOURS[3], thick, 4)
     _crosses(ax, shots, index)
     times = f", residuals {longer:,} times as long" if longer > 1 else ""
     ax.set_title(f"view {number}, rms {shots.rms[index]:.3g} px{times}")
@@ -303,8 +314,9 @@ def uncertainty(calibration: Calibration, ax: Axes | None = None, *, distance: f
 def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """The distance from the principal point over the angle from the axis, and what is known of it.
 
-    Shaded are the angles that the corners have, with their histogram at the bottom. The band is the uncertainty of a
-    projection at infinity, drawn wider by the factor that the legend says; dots end the curve where its rays do.
+    Shaded are the angles that the corners have but for one in 200, with the histogram of all at the bottom. The band is
+    the uncertainty of a projection at infinity, drawn wider by the factor that the legend says. The curve ends with the
+    image, or with the rays.
 
     Args:
         calibration: of a camera.
@@ -320,7 +332,7 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     inside = valid & camera.contains(pixels)
     radius = torch.linalg.vector_norm(pixels - camera.intrinsics[2:], dim=-1)
     seen = np.degrees(shots.angles[shots.seen & shots.inliers])
-    known = float(seen.max()) if len(seen) else 0.0
+    known = math.degrees(shots.reach)
     ax.axvspan(0, known, color=PALE, zorder=0)
     some = inside.any(-1)
     middle = torch.where(inside, radius, torch.nan).nanmean(-1)[some].double()
@@ -338,7 +350,7 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     if len(x):
         ax.plot(x[-1:], y[-1:], "o", color=COLOURS[0], markersize=4.5, zorder=3)
     if len(seen):
-        edges = np.arange(0, known + 2.5, 2.5)
+        edges = np.arange(0, seen.max() + 2.5, 2.5)
         counts = np.histogram(seen, edges)[0]
         ax.bar(
             edges[:-1],
@@ -350,7 +362,7 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
             zorder=1,
             label="corners",
         )
-    ax.set_xlim(0, 1.06 * max(float(x[-1]) if len(x) else 1.0, known, 1e-3))
+    ax.set_xlim(0, 1.06 * max(float(x[-1]) if len(x) else 1.0, float(seen.max(initial=1e-3))))
     ax.set_ylim(0, top)
     ax.set_xlabel("angle from the axis, degrees")
     ax.set_ylabel("distance from the principal point, px")
@@ -379,8 +391,9 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     size = float(np.abs(extent).max())
     if some:
         ends = float(rms[some].min()), float(rms[some].max())
-        step = max(_round_up(max(ends[1] - ends[0], 1e-9) / len(level_colours("residuals"))), 1e-9)
-        bounds = math.floor(ends[0] / step) * step + step * np.arange(len(level_colours("residuals")) + 1)
+        count = len(level_colours("residuals"))
+        step = _round_up((ends[1] - ends[0]) / (count - 1) + 1e-9, _FINE_STEPS)
+        bounds = math.floor(ends[0] / step) * step + step * np.arange(count + 1)
         scale = _scale("residuals", bounds)
         place = [max(0, min(len(scale.colours) - 1, int((rms[i] - bounds[0]) / step))) for i in some]
         faces = PolyCollection(
@@ -466,23 +479,12 @@ def _thinned(count: int, lengths: np.ndarray | None = None) -> np.ndarray:
     return np.concatenate((longest, np.sort(others)[evenly]))
 
 
-def _segments(ax: Axes, start: np.ndarray, end: np.ndarray, colour: str, *, zorder: float, dots: bool = True) -> None:
-    """Lines, and dots where they start, each as one path: thousands of them make a small file."""
-    if not len(start):
-        return
-    width = 0.9 if len(start) < 3000 else 0.6
-    _strokes(ax, np.stack((start, end), 1), colour, width, zorder)
-    if dots:
-        _dots(ax, start, colour, 2.0 if len(start) < 3000 else 1.2, zorder)
-
-
 def _dots(ax: Axes, places: np.ndarray, colour: str, size: float, zorder: float = 2.0) -> None:
-    if len(places):
-        _strokes(ax, np.stack((places, places), 1), colour, size, zorder)
+    _strokes(ax, np.stack((places, places), 1), colour, size, zorder)
 
 
 def _strokes(ax: Axes, ends: np.ndarray, colour: str, width: float, zorder: float) -> None:
-    """(K, 2, 2) lines with round ends."""
+    """(K, 2, 2) lines with round ends, as one path: thousands of them make a small file."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -519,10 +521,10 @@ def _bands(values: np.ndarray) -> np.ndarray:
     return np.array(bounds)
 
 
-def _round_up(value: float) -> float:
-    """The next of 1, 2, 3, 5, 10, ..."""
+def _round_up(value: float, steps: tuple[float, ...] = (1, 2, 5, 10)) -> float:
+    """The next of such steps times a power of ten."""
     power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
-    return min((n * power for n in (1, 2, 3, 5, 10) if n * power >= value * (1 - 1e-9)), default=10 * power)
+    return min((n * power for n in steps if n * power >= value * (1 - 1e-9)), default=10 * power)
 
 
 def _worst(calibration: Calibration, pixels: Tensor, inside: Tensor) -> np.ndarray:

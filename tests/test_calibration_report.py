@@ -1,0 +1,222 @@
+"""The report of a calibration: complete, in one file that needs no other, whatever the names are."""
+
+import base64
+import io
+import os
+import re
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from boards import opencv_left, seen_by
+from PIL import Image
+
+import camtorch as ct
+
+matplotlib = pytest.importorskip("matplotlib")
+matplotlib.use("Agg")
+
+from camtorch.calibration.svg import Plots  # noqa: E402
+
+SECTIONS = ("coverage", "residuals", "worst", "uncertainty", "parameters")
+VOID = {"meta", "img", "br", "path", "use", "circle", "rect"}
+HOSTILE = "<script>alert('$x^2$ & \"y\"')</script>\u202e\x07\udc80.jpg"
+
+
+class Page(HTMLParser):
+    """Elements of a page: (tag, attributes) in order, ids, references and the text outside of styles."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.open, self.text = [], [], ""
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID or tag in ("path", "circle", "use", "rect"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += "" if self.open[-1:] == ["style"] else data
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    def values(self, key):
+        return [attributes[key] for _, attributes in self.elements if key in attributes]
+
+
+def read(path):
+    return Page(path.read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    corners, _ = opencv_left()
+    pixels = corners.image_points[:6].clone()
+    pixels[4, 20:24] += 9.0
+    return ct.calibrate(
+        "brown_conrady", corners.object_points, pixels, image_size=corners.image_size, loss="huber", loss_scale=0.3
+    )
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    """Photographs of the kinds that a report takes; two cannot be read."""
+    folder = tmp_path_factory.mktemp("images")
+    grey = np.full((480, 640), 90, np.uint8)
+    Image.fromarray(grey).save(folder / "a.png")
+    (folder / "broken.jpg").write_text("no photograph")
+    colour = np.stack((grey, grey, grey), -1)
+    return [
+        folder / "a.png",
+        str(folder / "broken.jpg"),
+        folder / "missing.jpg",
+        grey,
+        torch.from_numpy(colour).movedim(-1, 0) / 255,
+        Image.fromarray(grey.astype(np.uint16) * 256),
+    ]
+
+
+@pytest.fixture(scope="module")
+def page(calibration, images, tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    names = [f"{number} {HOSTILE}" for number in range(6)]
+    ct.write_report(calibration, path, images=images, names=names, title=HOSTILE)
+    assert path.stat().st_size < 1e6
+    assert [file.name for file in path.parent.iterdir()] == ["report.html"]
+    return read(path)
+
+
+def test_all_is_there(page, calibration):
+    ids = page.values("id")
+    assert len(ids) == len(set(ids))
+    assert set(SECTIONS) <= set(ids)
+    assert [element["href"] for element in page.all("a")][: len(SECTIONS)] == [f"#{section}" for section in SECTIONS]
+    for text in (f"{calibration.rms:.3g}", f"{calibration.sigma:.3g}", "324 corners, 4 outliers"):
+        assert text in page.text
+    for name, std in zip(calibration.parameter_names, calibration.std.tolist(), strict=True):
+        assert re.search(rf"{name}[\u2212\d.e-]+{std:.2g}", page.text)
+    assert calibration.verdict.split(".")[0] in page.text
+    for text in calibration.warnings:
+        assert text in page.text
+
+
+def test_it_needs_nothing_else(page):
+    for reference in (*page.values("src"), *page.values("href"), *page.values("xlink:href")):
+        assert reference.startswith(("#", "data:image/jpeg;base64,"))
+    assert not page.all("script")
+    assert not page.all("link")
+    (policy,) = (meta["content"] for meta in page.all("meta") if "http-equiv" in meta)
+    assert policy.startswith("default-src 'none'")
+
+
+def test_references_within_it_lead_somewhere(page):
+    ids = set(page.values("id"))
+    links = [reference[1:] for reference in page.values("href") if reference.startswith("#")]
+    clips = [found for value in page.values("clip-path") for found in re.findall(r"url\(#(.*?)\)", value)]
+    assert set(links) <= ids
+    assert set(clips) <= ids
+    assert clips
+
+
+def test_no_name_becomes_markup(page):
+    shown = HOSTILE.replace("\x07", "�").replace("\udc80", "?")
+    assert page.text.count(shown) >= 2 + 6 + 6  # title, a row and a photograph of each view
+    assert not page.all("script")
+
+
+def test_photographs_of_all_kinds_are_within(page):
+    assert len(page.all("img")) == 4
+    assert page.text.count("no photograph: ") == 2
+    for picture in page.all("img"):
+        data = base64.b64decode(picture["src"].partition(",")[2])
+        with Image.open(io.BytesIO(data)) as image:
+            assert image.size == (640, 480)
+            assert abs(np.asarray(image.convert("L"), int) - 90).max() <= (165 if image.mode == "L" else 2)
+
+
+def test_colours_follow_the_page(page):
+    text = "".join(page.values("style"))
+    assert "var(--p" in text
+    assert not re.findall(r"#[0-9a-f]{6}", text)
+
+
+@pytest.fixture
+def no_plots(monkeypatch):
+    """Drawing takes a second."""
+    monkeypatch.setattr(Plots, "draw", lambda *_, **__: ("<svg></svg>", "a title, and more"))
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_without_photographs_views_have_numbers(calibration, tmp_path):
+    ct.write_report(calibration, tmp_path / "report.html")
+    page = read(tmp_path / "report.html")
+    assert "view 4" in page.text
+    assert not page.all("img")
+    assert "640 x 480" in page.text
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_a_report_is_replaced_as_a_whole(calibration, images, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text("before")
+    wrong = [*images[:3], np.zeros((10, 20), np.uint8), *images[4:]]
+    with pytest.raises(ValueError, match="20 x 10 pixels, and those of the camera have 640 x 480"):
+        ct.write_report(calibration, path, images=wrong)
+    assert path.read_text() == "before"
+    assert os.listdir(tmp_path) == ["report.html"]
+
+
+def test_the_door(calibration, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="2 images for 6 views"):
+        ct.write_report(calibration, tmp_path / "report.html", images=[None, None])
+    with pytest.raises(ValueError, match="1 names for 6 views"):
+        ct.write_report(calibration, tmp_path / "report.html", names=["a"])
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"pip install 'camtorch\[plot\]'"):
+        ct.write_report(calibration, tmp_path / "report.html")
+    assert not os.listdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def rig():
+    camera = ct.KannalaBrandt([300.0, 300, 320, 240], [0.01, 0, 0, 0], image_size=(480, 640)).requires_grad_(False)
+    corners, rotations, translations = seen_by(camera, 8, noise=0.1)
+    mount = ct.Extrinsics([0.0, 0.1, 0.0], [-0.1, 0.0, 0.0]).double().requires_grad_(False)
+    there = corners.object_points @ rotations.mT + translations[:, None]
+    seen, valid = camera.double().project(mount(there))
+    seen = torch.where((valid & camera.contains(seen))[..., None], seen, torch.nan)
+    seen[torch.isfinite(seen).all(-1).sum(-1) < 6] = torch.nan
+    points = {"left": corners.image_points, HOSTILE: seen}
+    models, sizes = (dict.fromkeys(points, value) for value in ("kannala_brandt", (480, 640)))
+    return ct.calibrate_rig(models, corners.object_points, points, image_sizes=sizes)
+
+
+@pytest.mark.slow
+def test_of_a_rig_each_camera_has_its_part(rig, tmp_path):
+    path = tmp_path / "report.html"
+    names = [f"shot {number}" for number in range(8)]
+    ct.write_report(rig, path, images={"left": [None] * 8}, names=names)
+    page = read(path)
+    ids = page.values("id")
+    assert len(ids) == len(set(ids))
+    assert {f"camera-{i}-{section}" for i in range(2) for section in SECTIONS} <= set(ids)
+    assert "shot 3" in page.text
+    assert not page.all("script")
+    baseline = float(rig.rig.extrinsics[HOSTILE].translation.detach().norm())
+    assert f"{baseline:.3f}" in page.text
+    with pytest.raises(TypeError, match="mapping from the names"):
+        ct.write_report(rig, path, images=[None] * 8)
+    with pytest.raises(ValueError, match="'middle'; the rig has 'left'"):
+        ct.write_report(rig, path, images={"middle": [None] * 8})
