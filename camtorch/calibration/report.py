@@ -20,6 +20,7 @@ from torch import Tensor
 from camtorch import plot
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.svg import Plots, palette
+from camtorch.calibration.verdict import ROUGH, Survey
 from camtorch.io.writing import replacing
 from camtorch.plot.calibrations import Sightings, sightings
 from camtorch.projection.rays import image_lattice
@@ -44,7 +45,7 @@ _TONES = {
     "bad": ("Not to be used", "M6 6l12 12M18 6L6 18"),
 }
 _SENTENCE = re.compile(r"(?<=\.)\s(?=[A-Z])")
-_NEXT = re.compile(r"\s(?=Next\b)")  # of a verdict: where it says what to do, which has a line of its own
+_NEXT = re.compile(r"\s(?=Next\b|More views\b)")  # of a verdict: where it says what to do, which has a line of its own
 _INTRINSICS = {
     "fx": "focal length across, px",
     "fy": "focal length down, px",
@@ -133,7 +134,7 @@ class _Shots:
     @property
     def tone(self) -> str:
         """Good, care or bad."""
-        if not self.calibration.converged:
+        if not self.calibration.converged or Survey(self.calibration).good_within(ROUGH)[1] == 0:
             return "bad"
         return "care" if self.calibration.warnings else "good"
 

@@ -93,16 +93,12 @@ class Sightings(NamedTuple):
 def sightings(calibration: Calibration) -> Sightings:
     """Of the views that have corners."""
     found = calibration.observations
-    inliers = torch.zeros_like(found.seen)
-    for row, number in zip(inliers, calibration.views, strict=True):
-        flags = calibration.inliers[number].flatten()
-        row[: len(flags)] = flags
     placed = (found.pixels, calibration.point_residuals, calibration.extrinsics(found.points))
     known = [torch.where(found.seen[..., None], t, torch.nan) for t in placed]
     some = found.seen.any(-1)
     numbers = tuple(number for number, has in zip(calibration.views, some.tolist(), strict=True) if has)
     pixels, errors, points = (t[some].double().numpy(force=True) for t in known)
-    return Sightings(numbers, pixels, errors, inliers[some].numpy(force=True), points)
+    return Sightings(numbers, pixels, errors, calibration.point_inliers[some].numpy(force=True), points)
 
 
 def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
