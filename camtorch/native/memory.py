@@ -12,17 +12,18 @@ from torch import Tensor
 
 LIMIT = 1 << 27
 """Bytes that are kept, at most, for results to come."""
-_LEAST = 1 << 22  # bytes of a result from which on it comes from here: the C library keeps what is smaller
+LEAST = 1 << 22
+"""Bytes of a result from which on it is worth while: the C library keeps what is smaller."""
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
-    """As `torch.empty`, on the CPU; a large one is of memory that is kept, where the system has large pages.
+    """As `torch.empty`, on the CPU, of at least `LEAST` bytes, and of memory that is kept where there are large pages.
 
     As long as it, a view of it, or an array on its memory lives, nobody else gets that. Its storage cannot be resized.
     """
     like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
     size = -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE  # large pages within it, not beyond
-    block = _block(size) if like.nbytes >= _LEAST else None
+    block = _block(size)
     if block is None:
         return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
     memory = (ctypes.c_char * len(block)).from_buffer(block)  # which the storage holds, and nothing else

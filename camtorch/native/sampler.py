@@ -199,7 +199,13 @@ def layout(images: Tensor) -> torch.memory_format:
 
 def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
     """(count, C, *size) of the dtype of images (_, C, H, W), and with the channels last in memory if they have them."""
-    return memory.empty((count, images.shape[1], *size), images.dtype, layout(images))
+    shape, dtype = (count, images.shape[1], *size), images.dtype
+    make = memory.empty if math.prod(shape) * dtype.itemsize >= memory.LEAST else _empty
+    return make(shape, dtype, layout(images))
+
+
+def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
+    return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
 
 
 def classify(
