@@ -80,7 +80,7 @@ def test_results_are_without_a_graph_but_go_on_learning(left):
     assert bool((camera.distortion.grad.abs() * left.std[4:] < 1e-6).all())
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def test_the_same_bit_for_bit_and_without_autograd(left):
     again = calibrate(LEFT)
     assert_close(values(again), values(left), **exactly)
@@ -213,6 +213,10 @@ def test_a_fisheye_past_its_plane():
     assert found.rms <= 0.4816
     poses = calibrate(test, model=found.camera, fixed="all")
     assert poses.rms <= 0.4747
+    _, rms, valid = ct.solve_pnp(found.camera, test.object_points.expand(7, -1, -1), test.image_points)
+    assert valid.all()
+    seen = (~test.image_points.isnan().any(-1)).sum(-1)
+    assert float(((rms.detach().square() * seen).sum() / seen.sum()).sqrt()) == pytest.approx(poses.rms, rel=1e-6)
 
 
 @slow

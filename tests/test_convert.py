@@ -447,3 +447,11 @@ def test_wild_cameras_become_something_finite(key, data):
     source = data.draw(drawn(key, wild=True))
     result = source.convert(data.draw(st.sampled_from(KEYS)))
     check(source, result)
+
+
+def test_conversions_without_autograd():
+    camera = ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640))
+    known = camera.convert("double_sphere")
+    for context in (torch.no_grad(), torch.inference_mode()):
+        with context:
+            assert torch.equal(camera.convert("double_sphere").camera.distortion, known.camera.distortion)

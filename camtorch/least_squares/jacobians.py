@@ -67,11 +67,11 @@ def sensor_jacobians(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> 
 
 def _backward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
     """Twice backward, whatever the number of coefficients, of which each point has its own."""
-    with torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad():
         shape = rays.shape[:-1]
-        # contiguous planes, or torch's operations take several times as long
-        planes = [w.contiguous().requires_grad_() for w in rays.detach().unbind(-1)]
-        own = [c.expand(shape).contiguous().requires_grad_() for c in columns(k.detach())]
+        # contiguous planes, or torch's operations take several times as long; copies, or they stay those of inference
+        planes = [_copied(w).requires_grad_() for w in rays.detach().unbind(-1)]
+        own = [_copied(c.expand(shape)).requires_grad_() for c in columns(k.detach())]
         points = _to_sensor(camera, own, planes)
         one, leaves = torch.ones(shape, dtype=rays.dtype, device=rays.device), [*planes, *own]
         slopes = [
@@ -81,6 +81,10 @@ def _backward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJ
     by_all = torch.stack([torch.stack(row, 1) for row in slopes], 1)
     points = SensorPoints(points.a.detach(), points.b.detach(), points.covered)
     return SensorJacobians(points, by_all[:, :, :3], by_all[:, :, 3:])
+
+
+def _copied(plane: Tensor) -> Tensor:
+    return plane.clone(memory_format=torch.contiguous_format)
 
 
 def _forward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
