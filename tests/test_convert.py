@@ -449,9 +449,8 @@ def test_wild_cameras_become_something_finite(key, data):
     check(source, result)
 
 
-def test_conversions_without_autograd():
+def test_conversion_in_inference_mode():
     camera = ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640))
     known = camera.convert("double_sphere")
-    for context in (torch.no_grad(), torch.inference_mode()):
-        with context:
-            assert torch.equal(camera.convert("double_sphere").camera.distortion, known.camera.distortion)
+    with torch.inference_mode():
+        assert torch.equal(camera.convert("double_sphere").camera.distortion, known.camera.distortion)
