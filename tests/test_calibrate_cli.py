@@ -78,6 +78,7 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypat
     assert out[1].startswith("kannala_brandt: rms 0.0")
     assert out[1].endswith(" px per coordinate, 8 views, 431 corners")
     assert [line.split()[0] for line in out[2:10]] == ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]
+    assert out[10].startswith("Good for ")
     assert out[-1] == "camera.yml: kannala_brandt"
     assert_near(found_camera(), fisheye(), 0.3)
     assert found_camera().image_size == (480, 640)
@@ -367,3 +368,19 @@ def test_damaged_files_of_corners(capsys, change, text):
     Path("corners.json").write_text(json.dumps(content))
     calibrate("--corners", "corners.json", expect=2)
     assert f"corners.json: {text}" in capsys.readouterr().err
+
+
+def test_what_is_said_to_python_is_said_in_options():
+    from camtorch.cli.calibrate import _in_options
+
+    names = ["a/left1.jpg", "a/left2.jpg", "a/left3.jpg"]
+    for text, expected in (
+        ('fixed=("p2", "k3") makes the rest more certain', "--fixed p2,k3 makes the rest more certain"),
+        ('hold it with fixed=("cx",)', "hold it with --fixed cx"),
+        ('with count=8 coefficients: loss="huber" keeps', "with --count 8 coefficients: --loss huber keeps"),
+        ("bend=True finds its shape", "--bend finds its shape"),
+        ("Views 0, 2 and 3 more fit worse", "Views left1.jpg, left3.jpg and 3 more fit worse"),
+        ("5 of them in view 1. Look at the views", "5 of them in view left2.jpg. Look at the views"),
+        ("Only 3 views: take 10", "Only 3 views: take 10"),
+    ):
+        assert _in_options(text, names) == expected

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -335,8 +336,23 @@ def _tell(found: Calibration, names: Sequence[str], head: str) -> None:
     bad = [f"{name} {errors[name]:.3g} px" for name in worst if errors[name] > _OUTLYING * found.rms]
     if bad:
         print(f"{head}views that fit badly: {', '.join(bad)}")
-    for warning in getattr(found, "warnings", ()):
-        note(f"{head}{warning}")
+    for warning in found.warnings:
+        note(f"{head}{_in_options(warning, names)}")
+    print(f"{head}{_in_options(found.verdict, names)}")
+
+
+def _in_options(text: str, names: Sequence[str]) -> str:
+    """A text for Python as one for the command line: options for arguments, the names of views for their numbers."""
+
+    def fixed(match: re.Match[str]) -> str:
+        return "--fixed " + ",".join(re.findall(r"\w+", match[1]))
+
+    def named(match: re.Match[str]) -> str:
+        return match[1] + re.sub(r"\d+", lambda number: Path(names[int(number[0])]).name, match[2])
+
+    text = re.sub(r"\bfixed=\(([^)]*)\)", fixed, text)
+    text = re.sub(r"\b(count|loss)=\"?(\w+)\"?", r"--\1 \2", text.replace("bend=True", "--bend"))
+    return re.sub(r"\b([Vv]iews? )(\d+(?:, \d+)*)", named, text)
 
 
 def _with_spread(value: float, std: float, width: int = 11) -> str:
