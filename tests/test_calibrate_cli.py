@@ -85,21 +85,27 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypat
     assert "fisheye_model: 1" in Path("camera.yml").read_text()
     # what was found is not searched for again, also where it is called and lies otherwise, in any order
     monkeypatch.setattr(searching, "detect", None)
-    before = Path("corners.json").read_bytes()
     for index in range(1, 9):
         Path(f"{9 - index}.png").write_bytes((photographs / f"view{index}.png").read_bytes())
     calibrate("[0-9].png", *words, "-o", "again.yml")
     assert torch.allclose(found_camera("again.yml").intrinsics, found_camera().intrinsics, rtol=1e-6)
-    # its folder may be moved as well; a square of another size changes nothing in images
-    Path("corners.json").write_bytes(before)
-    calibrate(photographs, *words[:-4], "--square", 0.06, *words[-4:], "-o", "large.json")
-    assert Path("corners.json").read_bytes() != before  # of another board, though seen at the same places
-    assert read_corners("corners.json").board == Chessboard(9, 6, 0.06)
-    assert torch.allclose(found_camera("large.json").intrinsics, found_camera().intrinsics, rtol=1e-6)
-    capsys.readouterr()
-    calibrate(photographs, "--board", "9x6", *words[4:], "-o", "kept.json")  # the size that is known
+
+
+def test_a_square_of_another_size_changes_nothing_in_images(monkeypatch, capsys):
+    monkeypatch.setattr(searching, "detect", None)
+    write_corners(corners_of(), "corners.json")
+    words = "--corners", "corners.json", "--model", "kannala_brandt", "--fixed", "k2,k3,k4", "--board", "9x6"
+    calibrate(*words, "--square", 0.06, "-o", "large.json")
     assert "squares of 60 mm" in capsys.readouterr().out
-    assert read_corners("corners.json").board == Chessboard(9, 6, 0.06)
+    calibrate(*words, "-o", "kept.json")  # the size that is known
+    assert "squares of 30 mm" in capsys.readouterr().out
+    assert torch.allclose(found_camera("large.json").intrinsics, found_camera("kept.json").intrinsics, rtol=1e-6)
+    corners = searching.found_corners(
+        {"": [Path("0.png")]}, Chessboard(9, 6, 0.06), Path("corners.json"), None, measured=True, force=False
+    )
+    assert corners.board == read_corners("corners.json").board == Chessboard(9, 6, 0.06)
+    assert corners.images[0].seen > 20  # though there is no such image
+    assert [image.path.name for image in read_corners("corners.json").images] == [f"{i}.png" for i in range(8)]
 
 
 def corners_of(board=BOARD, count=8, **more):
@@ -162,10 +168,9 @@ def test_what_is_left_out_has_a_reason(photographs, capsys):
 
 
 def test_a_wrong_size_of_the_board_is_named(photographs, capsys):
-    words = [photographs / f"view{index}.png" for index in (1, 2, 3)]
-    calibrate(*words, "--board", "10x7", "-o", "camera.yml", expect=2)
+    calibrate(photographs / "view1.png", "--board", "10x7", "-o", "camera.yml", expect=2)
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "a board was found in 0 of 3 images, and 3 are needed" in error
+    assert "a board was found in 0 of 1 images, and 3 are needed" in error
     assert "shows one of 9x6 inner corners: --board 9x6" in error
 
 
@@ -188,7 +193,9 @@ def two_cameras(board):
     return Corners(board, board.points(), images), turn, shift
 
 
-@pytest.mark.parametrize("board", [BOARD, Chessboard(7, 7, 0.03)], ids=["clear", "ambiguous"])
+@pytest.mark.parametrize(
+    "board", [pytest.param(BOARD, marks=pytest.mark.slow), Chessboard(7, 7, 0.03)], ids=["clear", "ambiguous"]
+)
 def test_a_pair_becomes_a_rig(capsys, board):
     corners, turn, shift = two_cameras(board)
     rng = np.random.default_rng(5)
@@ -293,10 +300,11 @@ def test_the_model_is_taken_that_predicts_best():
     assert errors["fisheye624"] >= 0.99 * errors["kannala_brandt"]
 
 
+@pytest.mark.slow
 def test_models_that_the_file_cannot_hold_are_not_tried(capsys, monkeypatch):
     from camtorch.calibration import selection
 
-    monkeypatch.setattr(selection, "CANDIDATES", (("brown_conrady", 5), ("kannala_brandt", 4), ("double_sphere", 2)))
+    monkeypatch.setattr(selection, "CANDIDATES", (("pinhole", 0), ("kannala_brandt", 1), ("double_sphere", 2)))
     write_corners(corners_of(count=5), "corners.json")
     calibrate("--corners", "corners.json", "-o", "camera.yml")
     captured = capsys.readouterr()

@@ -36,7 +36,7 @@ class CornersFileError(ValueError):
     """A file of corners that cannot be used. The text names the file, the place and the reason."""
 
 
-@dataclass
+@dataclass(eq=False)
 class ImageCorners:
     """What was found in one image."""
 
@@ -57,7 +57,7 @@ class ImageCorners:
         return int(np.isfinite(self.pixels[:, 0]).sum())
 
 
-@dataclass
+@dataclass(eq=False)
 class Corners:
     """What was found of a board in images."""
 

@@ -71,11 +71,16 @@ def found_corners(
             raise ValueError(f"{twice[0]}: is given as an image of two cameras")
     found = Corners(board, board.points(), _searched(places, board, known))
     if path is not None:
-        kept = _others(known, found.images)
-        if known is None or known.images != [*found.images, *kept]:
+        kept = Corners(board, found.points, [*found.images, *_others(known, found.images)])
+        if known is None or known.board != board or _told(known) != _told(kept):
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_corners(Corners(board, found.points, [*found.images, *kept]), path)
+            write_corners(kept, path)
     return found
+
+
+def _told(corners: Corners) -> list[tuple[object, ...]]:
+    """What a file says of images, but for the corners."""
+    return [(i.path.resolve(), i.camera, i.view, i.hash, i.reason, i.image_size) for i in corners.images]
 
 
 def _others(known: Corners | None, images: Sequence[ImageCorners]) -> list[ImageCorners]:
@@ -83,12 +88,16 @@ def _others(known: Corners | None, images: Sequence[ImageCorners]) -> list[Image
     if known is None:
         return []
     hashes, paths = {image.hash for image in images}, {image.path.resolve() for image in images}
-    return [one for one in known.images if one.hash not in hashes and one.path.resolve() not in paths]
+    return [one for one in known.images if not (one.hash and one.hash in hashes) and one.path.resolve() not in paths]
 
 
 def _searched(places: Sequence[tuple[str, str, Path]], board: Board, known: Corners | None) -> list[ImageCorners]:
     """What images show, by camera, view and path; those that are known by what is in them are not searched again."""
-    there = {image.hash: image for image in (known.images if known else ()) if image.hash}
+    there: dict[str | Path, ImageCorners] = {}
+    for image in known.images if known else ():
+        there[image.path.resolve()] = image
+        if image.hash:
+            there[image.hash] = image
     found: dict[int, ImageCorners] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         waiting: dict[Future[ImageCorners], int] = {}
@@ -109,14 +118,19 @@ def _searched(places: Sequence[tuple[str, str, Path]], board: Board, known: Corn
     return [found[number] for number in range(len(places))]
 
 
-def _searched_one(path: Path, board: Board, known: Mapping[str, ImageCorners]) -> ImageCorners:
-    nothing = np.full((len(board.points()), 2), np.nan)
+def _searched_one(path: Path, board: Board, known: Mapping[str | Path, ImageCorners]) -> ImageCorners:
+    """By the file's content; by its path where corners come from elsewhere, or the image is gone."""
+    nothing, at_path = np.full((len(board.points()), 2), np.nan), known.get(path.resolve())
+    if at_path is not None and not at_path.hash:
+        return replace(at_path, path=path)
     try:
         digest = hash_of(path)
         if digest in known:
             return replace(known[digest], path=path)
         grey = read_grey(path)
     except (images.ImageFileError, OSError) as error:
+        if isinstance(error, FileNotFoundError) and at_path is not None:
+            return replace(at_path, path=path)
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
         return ImageCorners(path, None, nothing, reason)
     found = detect(board, grey)
