@@ -43,6 +43,7 @@ from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
 from camtorch.warp.dewarp import Dewarp
+from camtorch.warp.reproject import Reproject
 from camtorch.warp.warp import Warp
 
 __all__ = [
@@ -75,6 +76,7 @@ __all__ = [
     "Pinhole",
     "PositiveFocal",
     "Rectification",
+    "Reproject",
     "Rig",
     "RigCalibration",
     "Stereographic",

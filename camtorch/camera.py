@@ -30,6 +30,7 @@ from camtorch._tracing import FAKE_MODE, has_tangent, is_concrete
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
+from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.projection.explanation import explain, unusable
 from camtorch.projection.ops import CLASSES, register_camera
 from camtorch.projection.project import Project
@@ -504,6 +505,35 @@ class Camera(BatchedModule):
         """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W)."""
         grid = self.pixel_grid()
         return self.unproject(grid.expand(*self.batch_shape, *grid.shape))
+
+    def backproject(self, depth: Numbers, kind: Literal["z", "distance"] = "z") -> tuple[Tensor, Tensor]:
+        """The points of the camera frame that the pixels of a depth map show.
+
+        Args:
+            depth: (B, 1, H, W) of the camera's image_size, or (H, W), in any unit of length; floating point.
+            kind: what it holds: "z", the coordinate along the optical axis, as depth cameras give it, or "distance"
+                from the camera, which lenses past 90 degrees need.
+
+        Returns:
+            points (*B, H, W, 3) in that unit, and valid (*B, H, W) bool: the depth is finite and positive, the pixel
+            has a ray, and for "z" the ray goes ahead. A camera without batch dims gives (B, H, W, 3) of B maps. What
+            is not valid is (0, 0, 0) and has no gradient.
+
+        Raises:
+            ValueError: another shape, integers, an unknown kind.
+        """
+        owner = f"{type(self).__name__}.backproject"
+        depth = as_depth(depth, kind, self._size("backproject"), owner, self.intrinsics.device)
+        count = self.batch_shape.numel()
+        if self.batch_shape and (depth.ndim != 4 or len(self.batch_shape) > 1 or len(depth) not in (1, count)):
+            shape = tuple(self.batch_shape)
+            raise ValueError(f"{owner}: depth must be (B, 1, H, W) for cameras {shape}; got {tuple(depth.shape)}")
+        if depth.ndim == 4 and depth.shape[1] != 1:
+            raise ValueError(f"{owner}: depth must be (B, 1, H, W); got shape {tuple(depth.shape)}")
+        rays, valid = self.rays()
+        depth = depth[:, 0] if depth.ndim == 4 else depth
+        scale, good = depth_scale(depth, rays, valid, kind)
+        return rays * scale[..., None], good
 
     @property
     def field_of_view(self) -> Tensor:

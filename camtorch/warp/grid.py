@@ -208,19 +208,25 @@ def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: 
     seen, mapped = source.project(turn(None if rotation is None else rotation.mT, rays, "rays"))
     del rays
     mapped = mapped & has_ray
-    if may_look(seen) and not in_graph(seen) and not in_transform():  # in the memory that is there
-        for plane, size in zip(seen.unbind(-1), source._size("Warp")[::-1], strict=True):
-            plane.mul_(2 / size).add_(1 / size - 1).clamp_(-_FAR, _FAR)
+    return to_positions(seen, mapped, source._size("Warp")), mapped
+
+
+def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
+    """Pixels (..., 2) of an image of a size as sampling positions, `OUTSIDE` where they are not mapped, (...).
+
+    Without a graph that happens in the memory of the pixels.
+    """
+    if may_look(seen) and not in_graph(seen) and not in_transform():
+        for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
+            plane.mul_(2 / side).add_(1 / side - 1).clamp_(-_FAR, _FAR)
         if not bool(mapped.all()):
             seen.masked_fill_(~mapped.unsqueeze(-1), OUTSIDE)
-        return seen, mapped
-    position = torch.stack(
-        [
-            (plane * (2 / size) + (1 / size - 1)).clamp(-_FAR, _FAR)
-            for plane, size in zip(seen.unbind(-1), source._size("Warp")[::-1], strict=True)
-        ]
-    )
-    return torch.where(mapped, position, OUTSIDE).movedim(0, -1), mapped
+        return seen
+    planes = [
+        (plane * (2 / side) + (1 / side - 1)).clamp(-_FAR, _FAR)
+        for plane, side in zip(seen.unbind(-1), size[::-1], strict=True)
+    ]
+    return torch.where(mapped, torch.stack(planes), OUTSIDE).movedim(0, -1)
 
 
 def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:

@@ -1,0 +1,49 @@
+"""Depth maps: what they may be, and how far along a pixel's ray they reach."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, as_values
+
+KINDS = ("z", "distance")
+
+
+def as_depth(depth: Numbers, kind: str, size: tuple[int, int], owner: str, device: torch.device) -> Tensor:
+    """A depth map (B, D, H, W) or (H, W) of a size, as users pass it.
+
+    Raises:
+        ValueError: another shape, integers, an unknown kind. TypeError: no numbers.
+    """
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ValueError(f'{owner}: kind must be "z" (along the optical axis) or "distance"; got {kind!r}')
+    depth = as_values(depth, "depth", owner, device)
+    if not depth.is_floating_point():
+        raise ValueError(
+            f"{owner}: depth must be floating point, in units of length; got {depth.dtype}. Millimetres in uint16 are "
+            "depth.astype(np.float32) / 1000 in metres"
+        )
+    if depth.ndim not in (2, 4) or depth.shape[-2:] != size:
+        hint = ". Maps (B, H, W) go in as depth[:, None]" if depth.ndim == 3 and depth.shape[-2:] == size else ""
+        raise ValueError(
+            f"{owner}: depth must be (B, 1, H, W) or (H, W) of the camera's image_size {size}; got "
+            f"{tuple(depth.shape)}{hint}"
+        )
+    return depth
+
+
+def depth_scale(depth: Tensor, rays: Tensor, valid: Tensor, kind: str) -> tuple[Tensor, Tensor]:
+    """How far along unit rays the points of depths lie, (*B, H, W), and which of the depths count.
+
+    Args:
+        depth: (*B, H, W), or whatever broadcasts against the rays without their last dim.
+        rays: (*B, H, W, 3).
+        valid: (*B, H, W) bool.
+        kind: one of `KINDS`.
+    """
+    z = rays[..., 2]
+    ahead = valid & (z > 0) if kind == "z" else valid
+    good = ahead & torch.isfinite(depth) & (depth > 0)
+    length = torch.where(good, depth, 0.0)
+    return (length / torch.where(ahead, z, 1.0) if kind == "z" else length), good

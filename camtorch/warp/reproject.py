@@ -1,0 +1,207 @@
+"""Images of another camera at another place, by a depth map."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, as_batch
+from camtorch._module import GeometryModule, Memo
+from camtorch._tracing import in_graph, is_concrete, may_look
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.projection.depth import as_depth, depth_scale
+from camtorch.rotations import rotate_planes, rotation_matrix
+from camtorch.warp.grid import Sampling, to_positions
+from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
+from camtorch.warp.warp import as_sized
+
+_SNAP = 64  # roundings of the largest coordinate, within which a position is that of a pixel
+
+
+class Reproject(GeometryModule):
+    """The image that `target` would see, made from that of `source`, which stands elsewhere, by the target's depth.
+
+    The backward warp of depth networks and of stereo: each pixel of the target goes to its point, that to the source,
+    and takes what the source shows there. Differentiable in images, depth, extrinsics and both cameras.
+
+    Convention: images (B, C, H, W) of the source, depth (B, 1, H', W') of the target in the unit of the extrinsics.
+    Cameras and extrinsics of one batch dim go sample by sample with the images.
+
+    Args:
+        source: the camera of the given images.
+        target: the camera of the images to make, and of the depth.
+        extrinsics: source from target, `p_source = R p_target + t`.
+        mode: "bilinear", "nearest" or "bicubic", as `Warp` takes it.
+        padding_mode: "zeros", "border" or "reflection".
+        fill: the value of pixels that show nothing.
+
+    Raises:
+        ValueError: cameras without image_size, batch dims that do not fit, options that do not exist.
+        TypeError: no cameras, no extrinsics.
+    """
+
+    def __init__(
+        self,
+        source: Camera,
+        target: Camera,
+        extrinsics: Extrinsics,
+        *,
+        mode: Mode = "bilinear",
+        padding_mode: PaddingMode = "zeros",
+        fill: Fill = 0.0,
+    ):
+        super().__init__()
+        owner = "Reproject"
+        self.source, self.target = as_sized(source, "source", owner), as_sized(target, "target", owner)
+        if not isinstance(extrinsics, Extrinsics):
+            raise TypeError(
+                f"{owner}: extrinsics must be Extrinsics, source from target; got {type(extrinsics).__name__}"
+            )
+        self.extrinsics = extrinsics
+        self.mode = one_of(mode, MODES, "mode", owner)
+        self.padding_mode = one_of(padding_mode, PADDINGS, "padding_mode", owner)
+        self.fill = as_fill(fill, owner)
+        batch = as_batch(
+            owner,
+            source=(*source.batch_shape, 1),
+            target=(*target.batch_shape, 1),
+            extrinsics=(*extrinsics.batch_shape, 1),
+        )
+        if len(batch) > 1:
+            raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
+        self.batch_shape = batch
+        self._memo = Memo()
+
+    def forward(
+        self,
+        images: Tensor,
+        depth: Numbers,
+        kind: str = "z",
+        *,
+        source_depth: Numbers | None = None,
+        tolerance: float = 0.02,
+    ) -> tuple[Tensor, Tensor]:
+        """Images and where they show something.
+
+        Args:
+            images: (B, C, H, W) of the source's image_size, or features of that size.
+            depth: (B, 1, H', W') of the target, or (B, D, H', W'): D depths to try for each pixel; planes of one depth
+                each are `torch.linspace(near, far, D).view(1, D, 1, 1).expand(1, D, H', W')`.
+            kind: what depth holds: "z" along the optical axis, or "distance" from the camera.
+            source_depth: (B, 1, H, W) of the source, of the same kind: what it does not see, because something stands
+                before it, is not valid.
+            tolerance: by which part of it a point may lie behind the source's depth.
+
+        Returns:
+            images (B, C, H', W'), and valid (B, 1, H', W') bool: the depth counts, see `Camera.backproject`, and the
+            source sees the point on its image. Of D > 1 depths a sweep volume (B, C, D, H', W'), and (B, 1, D, H', W').
+
+        Raises:
+            ValueError: shapes that do not fit, an unknown kind. TypeError: no tensors.
+        """
+        owner = "Reproject"
+        size = self.source._size(owner)
+        if (
+            not isinstance(images, Tensor)
+            or images.is_complex()
+            or images.ndim != 4
+            or tuple(images.shape[-2:]) != size
+        ):
+            what = tuple(images.shape) if isinstance(images, Tensor) else type(images).__name__
+            raise ValueError(
+                f"{owner}: images must be a tensor (B, C, H, W) of the source's image_size {size}; got {what}"
+            )
+        given = as_depth(depth, kind, self.target._size(owner), owner, self.target.intrinsics.device)
+        given = given if given.ndim == 4 else given[None, None]
+        counts = {"images": len(images), "depth": len(given), "cameras": self.batch_shape.numel()}
+        count = max(counts.values())
+        if any(n not in (1, count) for n in counts.values()):
+            raise ValueError(f"{owner}: batches do not fit: {counts}")
+        seen, valid, far = self._seen(given, kind)
+        if source_depth is not None:
+            valid = valid & self._shows(seen, far, source_depth, kind, float(tolerance), owner)
+        rows, steps = seen.shape[0], seen.shape[1]
+        # an image that stays where it is, or is shifted by whole pixels, is copied to the bit
+        plain = steps == 1 and may_look(seen) and not in_graph(seen)
+        mode: Mode = "nearest" if plain and bool((seen == seen.round())[valid].all()) else self.mode
+        positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), size)
+        valid = valid & (positions.detach().abs() <= 1).all(-1).view(valid.shape)
+        where = Sampling(positions, valid.flatten(1, 2), None)
+        result = render(images, where, mode, self.padding_mode, self.fill)
+        valid = valid.expand(max(rows, len(result)), *valid.shape[1:])[:, None]
+        if steps == 1:
+            return result, valid[:, :, 0]
+        return result.unflatten(2, (steps, -1)), valid
+
+    if TYPE_CHECKING:
+        __call__ = forward  # whose types nn.Module does not tell
+
+    def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
+        """Pixels of the source (B, D, H', W', 2), whether there are some, and the depth at which it sees them."""
+        rays, has_ray = self._rays()
+        if rays.ndim == 3:
+            rays, has_ray = rays[None], has_ray[None]
+        scale, good = depth_scale(depth, rays[:, None], has_ray[:, None], kind)
+        rotation, shift = rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
+        if rotation.ndim == 2:
+            rotation, shift = rotation[None], shift[None]
+        lead = rays.shape[1:-1]
+        rows = max(len(rays), len(rotation))
+        turned = rotate_planes(rotation.to(rays.dtype), rays.flatten(1, -2).expand(rows, -1, -1).unbind(-1))
+        shift = shift.to(rays.dtype)
+        planes = [
+            torch.addcmul(t[:, None, None, None], p.view(-1, 1, *lead), scale)
+            for p, t in zip(turned, shift.unbind(-1), strict=True)
+        ]
+        points = torch.stack(planes, -1)
+        if self.source.batch_shape and len(points) != len(self.source.intrinsics):
+            points = points.expand(len(self.source.intrinsics), *points.shape[1:])
+        pixels, mapped = self.source.project(points)
+        far = points[..., 2] if kind == "z" else torch.linalg.vector_norm(points.detach(), dim=-1)
+        return _snapped(pixels), mapped & good, far
+
+    def _rays(self) -> tuple[Tensor, Tensor]:
+        """The target's, kept while nothing can learn."""
+        inputs = self.target.intrinsics, self.target.distortion
+        if (torch.is_grad_enabled() and any(map(in_graph, inputs))) or not all(map(is_concrete, inputs)):
+            return self.target.rays()
+        kept: tuple[Tensor, Tensor] = self._memo(inputs, (self.target.image_size,), self.target.rays)
+        return kept
+
+    def _shows(
+        self, seen: Tensor, far: Tensor, source_depth: Numbers, kind: str, tolerance: float, owner: str
+    ) -> Tensor:
+        """Whether the source's own depth lets it see points at its pixels."""
+        size = self.source._size(owner)
+        given = as_depth(source_depth, kind, size, f"{owner}: source_depth", seen.device).detach()
+        given = (given if given.ndim == 4 else given[None, None])[:, :1]
+        known = torch.isfinite(given) & (given > 0)
+        # between two depths the farther one, so that the rim of a foreground hides nothing behind it that is seen
+        given = torch.where(known, given, torch.inf)
+        pixels = seen.detach().flatten(1, -2)
+        near = [
+            (pixels[..., i] + step).round().long().clamp(0, side - 1)
+            for i, side in ((0, size[1]), (1, size[0]))
+            for step in (-0.5, 0.5)
+        ]
+        rows = given.expand(len(pixels), -1, -1, -1).flatten(1)
+        corners = [rows.gather(1, v * size[1] + u) for u in near[:2] for v in near[2:]]
+        furthest = torch.stack(corners).amax(0).view(seen.shape[:-1])
+        return far.detach() <= furthest * (1 + tolerance)
+
+    def extra_repr(self) -> str:
+        """The options."""
+        options: dict[str, Any] = {"mode": self.mode, "padding_mode": self.padding_mode, "fill": self.fill}
+        return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _snapped(pixels: Tensor) -> Tensor:
+    """Pixels that rounding moved off a pixel's centre go back there, with their gradient."""
+    near = pixels.detach().round()
+    off = near - pixels.detach()
+    limit = _SNAP * torch.finfo(pixels.dtype).eps * near.abs().amax(-1, keepdim=True).clamp(min=1)
+    off = torch.where(off.abs() <= limit, off, 0.0)
+    return pixels + off if in_graph(pixels) else pixels.add_(off)

@@ -1,0 +1,190 @@
+"""Depth: points of pixels, and images of other cameras at other places by a depth map."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+
+SIZE = (12, 16)
+
+
+def fisheye(dtype=torch.float64, size=SIZE):
+    height, width = size
+    intrinsics = [width / 3, width / 3 + 0.5, (width - 1) / 2, (height - 1) / 2]
+    camera = ct.KannalaBrandt(intrinsics, [0.02, -0.01, 0.001, 0.0], image_size=size)
+    return camera.to(dtype).requires_grad_(False)
+
+
+def pinhole(size=(10, 14)):
+    return ct.BrownConrady([15.0, 14, 6, 5], [-0.1, 0.02, 0, 0, 0], image_size=size).double().requires_grad_(False)
+
+
+def pose(turn=(0.03, -0.1, 0.05), shift=(0.1, -0.05, 0.08)):
+    return ct.Extrinsics(turn, shift).double().requires_grad_(False)
+
+
+def smooth(*shape, seed=0):
+    values = torch.rand(*shape, generator=torch.Generator().manual_seed(seed)).double()
+    return torch.nn.functional.avg_pool2d(values, 3, 1, 1)
+
+
+def depths(*shape, seed=1):
+    return 1 + 2 * torch.rand(*shape, generator=torch.Generator().manual_seed(seed)).double()
+
+
+def by_a_loop(images, depth, source, target, extrinsics, kind):
+    """What NumPy makes of it, pixel by pixel."""
+    matrix = extrinsics.matrix().numpy()
+    height, width = target.image_size
+    rows, columns = source.image_size
+    result, valid = np.zeros((*images.shape[:2], height, width)), np.zeros((len(images), height, width), bool)
+    for b in range(len(images)):
+        for v in range(height):
+            for u in range(width):
+                ray, found = target.unproject(torch.tensor([[float(u), float(v)]]).double())
+                ray, d = ray[0].numpy(), float(depth[b, 0, v, u])
+                point = ray * d / (ray[2] if kind == "z" else 1)
+                if not (found.item() and d > 0 and (kind != "z" or ray[2] > 0)):
+                    continue
+                seen, mapped = source.project(torch.from_numpy(matrix[:3, :3] @ point + matrix[:3, 3])[None])
+                x, y = seen[0].tolist()
+                if not mapped.item():
+                    continue
+                valid[b, v, u] = -0.5 <= x <= columns - 0.5 and -0.5 <= y <= rows - 0.5
+                for j in (math.floor(y), math.floor(y) + 1):
+                    for i in (math.floor(x), math.floor(x) + 1):
+                        if 0 <= j < rows and 0 <= i < columns:
+                            weight = (1 - abs(x - i)) * (1 - abs(y - j))
+                            result[b, :, v, u] += weight * images[b, :, j, i].numpy()
+    return result, valid
+
+
+@pytest.mark.parametrize("kind", ["z", "distance"])
+@pytest.mark.parametrize("wide", [True, False])
+def test_it_is_what_a_loop_makes(kind, wide):
+    source, target = (pinhole(), fisheye()) if wide else (fisheye(), pinhole())
+    images, depth = smooth(2, 3, *source.image_size), depths(2, 1, *target.image_size)
+    depth[0, 0, 3, 4], depth[1, 0, 2, 2] = -1.0, math.nan
+    result, valid = ct.Reproject(source, target, pose())(images, depth, kind)
+    expected, mask = by_a_loop(images, depth, source, target, pose(), kind)
+    torch.testing.assert_close(result, torch.from_numpy(expected), rtol=0, atol=1e-9)
+    assert torch.equal(valid[:, 0], torch.from_numpy(mask))
+    assert 0.05 < valid.double().mean() < 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_identity_gives_the_image_back_to_the_bit(dtype):
+    camera = fisheye(dtype, (120, 161))
+    stays = ct.Reproject(camera, camera, pose((0, 0, 0), (0, 0, 0)).to(dtype))
+    images = torch.rand(2, 3, 120, 161, dtype=dtype)
+    result, valid = stays(images, torch.rand(1, 1, 120, 161, dtype=dtype) + 1, "distance")
+    assert valid.all()
+    assert torch.equal(result, images)
+
+
+def test_a_sweep_is_its_planes_one_by_one():
+    moved = ct.Reproject(pinhole(), fisheye(), pose())
+    images = smooth(2, 5, 10, 14)
+    planes = torch.linspace(1, 8, 7).double().view(1, 7, 1, 1).expand(1, 7, *SIZE)
+    volume, valid = moved(images, planes, "distance")
+    assert volume.shape == (2, 5, 7, *SIZE)
+    assert valid.shape == (2, 1, 7, *SIZE)
+    for i in range(7):
+        one, here = moved(images, planes[:, i : i + 1], "distance")
+        torch.testing.assert_close(volume[:, :, i], one, rtol=0, atol=1e-12)
+        assert torch.equal(valid[:, :, i], here)
+
+
+@pytest.mark.parametrize("kind", ["z", "distance"])
+def test_gradients(kind):
+    source, target = pinhole((6, 7)), fisheye(size=(5, 6))
+    images, depth = smooth(1, 2, 6, 7), depths(1, 1, 5, 6)
+    turn, shift = torch.tensor([0.03, -0.1, 0.05]).double(), torch.tensor([0.1, -0.05, 0.08]).double()
+
+    def made(images, depth, turn, shift, k, intrinsics):
+        lens = type(source)(intrinsics, source.distortion, image_size=(6, 7))
+        sees = type(target)(target.intrinsics, k, image_size=(5, 6))
+        return ct.Reproject(lens, sees, ct.Extrinsics(turn, shift))(images, depth, kind)[0]
+
+    inputs = (images, depth, turn, shift, target.distortion.detach(), source.intrinsics.detach())
+    assert torch.autograd.gradcheck(made, [t.clone().requires_grad_() for t in inputs], atol=1e-4)
+
+
+def test_batches_of_poses_and_cameras():
+    turns, shifts = 0.1 * depths(3, 3, seed=2), 0.1 * depths(3, 3, seed=3)
+    images, depth = smooth(3, 2, 10, 14), depths(3, 1, *SIZE)
+    many = ct.Reproject(pinhole(), fisheye(), ct.Extrinsics(turns[:, :, None], shifts))(images, depth)
+    shared = ct.Reproject(pinhole(), fisheye(), ct.Extrinsics(turns[:, :, None], shifts))(images[:1], depth[:1])
+    for i in range(3):
+        one = ct.Reproject(pinhole(), fisheye(), ct.Extrinsics(turns[i], shifts[i]))
+        for whole, part in zip(many, one(images[i : i + 1], depth[i : i + 1]), strict=True):
+            torch.testing.assert_close(whole[i : i + 1], part)
+        torch.testing.assert_close(shared[0][i : i + 1], one(images[:1], depth[:1])[0])
+
+
+def test_what_stands_behind_something_is_not_seen():
+    camera = ct.Pinhole([40.0, 40, 31.5, 23.5], image_size=(48, 64)).requires_grad_(False)
+    beside = ct.Extrinsics([0.0, 0, 0], [-0.5, 0, 0]).requires_grad_(False)
+    depth = torch.full((1, 1, 48, 64), 4.0)
+    depth[..., 16:32, 28:36] = 1.0  # hides what is behind it
+    of_source = torch.full((1, 1, 48, 64), 4.0)
+    of_source[..., 16:32, 8:16] = 1.0  # 20 px to the left, where the wall moves by 5
+    images = torch.rand(1, 1, 48, 64)
+    _, anything = ct.Reproject(camera, camera, beside)(images, depth)
+    _, seen = ct.Reproject(camera, camera, beside)(images, depth, source_depth=of_source)
+    hidden = (anything & ~seen)[0, 0]
+    expected = torch.zeros(48, 64, dtype=torch.bool)
+    expected[16:32, 13:21] = True
+    assert (hidden & ~expected).sum() == 0
+    assert hidden.sum() > 0.7 * expected.sum()  # between two depths the farther one counts
+    assert seen[0, 0, 20, 30]
+
+
+@pytest.mark.parametrize("kind", ["z", "distance"])
+def test_backprojected_points_are_seen_at_their_pixels(kind):
+    camera = fisheye()
+    depth = depths(3, 1, *SIZE)
+    depth[0, 0, 0, 0], depth[1, 0, 5, 5], depth[2, 0, 6, 6] = 0.0, math.nan, math.inf
+    points, valid = camera.backproject(depth, kind)
+    assert points.shape == (3, *SIZE, 3)
+    assert points.isfinite().all()
+    pixels, _ = camera.project(points[valid])
+    torch.testing.assert_close(pixels, camera.pixel_grid().expand(3, -1, -1, -1)[valid], rtol=0, atol=1e-9)
+    found = points[..., 2] if kind == "z" else points.norm(dim=-1)
+    torch.testing.assert_close(found[valid], depth[:, 0][valid])
+    assert not valid[0, 0, 0]
+    assert not valid[1, 5, 5]
+    assert not valid[2, 6, 6]
+    one, _ = camera.backproject(depth[1, 0], kind)
+    torch.testing.assert_close(one, points[1])
+
+
+def test_backprojection_has_gradients():
+    camera = fisheye(size=(4, 5))
+    depth = depths(1, 1, 4, 5).requires_grad_()
+    assert torch.autograd.gradcheck(lambda d: camera.backproject(d)[0], depth)
+
+
+def test_bad_input_is_refused():
+    camera = fisheye()
+    moved = ct.Reproject(camera, camera, pose())
+    images = smooth(1, 1, *SIZE)
+    with pytest.raises(ValueError, match="kind"):
+        moved(images, depths(1, 1, *SIZE), "depth")
+    with pytest.raises(ValueError, match="1000 in metres"):
+        camera.backproject(np.zeros(SIZE, np.uint16))
+    with pytest.raises(ValueError, match=r"depth\[:, None\]"):
+        camera.backproject(torch.ones(2, *SIZE))
+    with pytest.raises(ValueError, match="image_size"):
+        moved(images, depths(1, 1, 3, 4))
+    with pytest.raises(ValueError, match="images"):
+        moved(images[0], depths(1, 1, *SIZE))
+    with pytest.raises(ValueError, match="batches"):
+        moved(images.expand(2, -1, -1, -1), depths(3, 1, *SIZE))
+    with pytest.raises(TypeError, match="source from target"):
+        ct.Reproject(camera, camera, torch.eye(4))
+    with pytest.raises(ValueError, match="image_size"):
+        ct.Reproject(ct.Pinhole([1.0, 1, 0, 0]), camera, pose())
