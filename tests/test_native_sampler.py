@@ -422,8 +422,8 @@ def classified():
     with pytest.MonkeyPatch.context() as patch:
         native = positions.classify
 
-        def checked(nodes, *others):
-            (cells, most), (expected, _) = native(nodes, *others), positions._classified(nodes, *others)
+        def checked(probed):
+            (cells, most), (expected, _) = native(probed), positions._classified(probed)
             off = cells != expected
             assert most == int((cells == sampler.TODO).sum((1, 2)).amax())
             # of what is to be exact roundings may decide, not of what there is

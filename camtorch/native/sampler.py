@@ -6,6 +6,7 @@ import ctypes
 import math
 from collections.abc import Sequence
 from ctypes import byref, c_double, c_int32, c_int64, c_void_p
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -208,30 +209,33 @@ def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_form
     return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
 
 
-def classify(
-    nodes: Tensor,
-    mapped: Tensor,
-    rim: Tensor,
-    size: tuple[int, int],
-    source: tuple[int, int],
-    tolerance: float,
-    padding: str,
-) -> tuple[Tensor, int] | None:
-    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`, or None without a library.
+class Probed(NamedTuple):
+    """What is known of a lattice by its nodes and by the rim of the target, and what is asked of its cells."""
 
-    Args:
-        nodes: (B, 2, n + 5, m + 5) of float32, the last two dims without gaps.
-        mapped: (B, n + 5, m + 5) bool, likewise.
-        rim: (B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the
-            bottom row, the left column, the right column.
-        size: (h, w) of the target.
-        source: (height, width) of the source.
-        tolerance: in pixels of the source.
-        padding: "zeros", "border" or "reflection", of what is to be sampled.
+    nodes: Tensor
+    """(B, 2, n + 5, m + 5), positions; the last two dims without gaps."""
+    mapped: Tensor
+    """(B, n + 5, m + 5) bool, likewise."""
+    rim: Tensor
+    """(B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the bottom
+    row, the left column, the right column."""
+    size: tuple[int, int]
+    """(h, w) of the target."""
+    source: tuple[int, int]
+    """(height, width) of the source."""
+    tolerance: float
+    """In pixels of the source."""
+    padding: str
+    """"zeros", "border" or "reflection", of what is to be sampled."""
+
+
+def classify(probed: Probed) -> tuple[Tensor, int] | None:
+    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`, or None without a library. Nodes are of float32.
 
     Returns:
         (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
     """
+    nodes, mapped, rim = probed[:3]
     native = library()
     if native is None:
         return None
@@ -248,10 +252,10 @@ def classify(
         len(nodes),
         rows,
         columns,
-        *size,
-        *map(float, source),
-        tolerance,
-        _PADDINGS[padding],
+        *probed.size,
+        *map(float, probed.source),
+        probed.tolerance,
+        _PADDINGS[probed.padding],
         cells.data_ptr(),
         scratch.data_ptr(),
     )

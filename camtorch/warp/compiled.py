@@ -50,11 +50,15 @@ def _positions(
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
+def _count(rotation: Tensor | None, *numbers: Tensor) -> int:
+    """How many cameras there are, of rotations (*B, 3, 3) and numbers (*B, n)."""
+    shapes = [t.shape[:-1] for t in numbers] + ([] if rotation is None else [rotation.shape[:-2]])
+    return math.prod(broadcast_shapes(*shapes))
+
+
 @_positions.register_fake
 def _(_, source, source_distortion, __, target, target_distortion, rotation, sizes, *_options):
-    shapes = [t.shape[:-1] for t in (source, source_distortion, target, target_distortion)]
-    shapes += [] if rotation is None else [rotation.shape[:-2]]
-    count = math.prod(broadcast_shapes(*shapes))
+    count = _count(rotation, source, source_distortion, target, target_distortion)
     dtype = torch.promote_types(source.dtype, target.dtype)
     dtype = dtype if rotation is None else torch.promote_types(dtype, rotation.dtype)
     planes = source.new_empty(count, 2, *sizes[2:], dtype=dtype)
@@ -146,9 +150,7 @@ def _warp(
 
 @_warp.register_fake
 def _(images, _, source, source_distortion, __, target, target_distortion, rotation, sizes, *options):
-    shapes = [t.shape[:-1] for t in (source, source_distortion, target, target_distortion)]
-    shapes += [] if rotation is None else [rotation.shape[:-2]]
-    count = math.prod(broadcast_shapes(*shapes))
+    count = _count(rotation, source, source_distortion, target, target_distortion)
     result = images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *sizes[2:])
     return result.contiguous(memory_format=_layout(options[-1]))
 

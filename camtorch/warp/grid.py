@@ -14,7 +14,7 @@ from torch import Tensor
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
-from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
+from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
 from camtorch.rotations import turn
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
@@ -280,10 +280,10 @@ def on_lattice(
     at_nodes, mapped_nodes = (t[:, 0].split(counts, 1)[0].unflatten(1, (n + 5, m + 5)) for t in (positions, mapped))
     lattice, rim = at_nodes.movedim(-1, 1), mapped[:, 0].split(counts, 1)[1]
     size = source._size("Warp")
-    single, classes = lattice.float(), None
-    if in_memory(single) and not is_recorded():
-        classes = classify(single, mapped_nodes, rim, (height, width), size, tolerance, padding)
-    cells, most = classes or _classified(lattice, mapped_nodes, rim, (height, width), size, tolerance, padding)
+    probed, classes = Probed(lattice, mapped_nodes, rim, (height, width), size, tolerance, padding), None
+    if in_memory(lattice) and not is_recorded():
+        classes = classify(probed._replace(nodes=lattice.float()))
+    cells, most = classes or _classified(probed)
     if not most:
         return Lattice(lattice, cells, like.new_empty(2, 0, _STEP, _STEP), (height, width))
     todo = cells == TODO
@@ -363,16 +363,9 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
     return torch.cat(parts, 1)
 
 
-def _classified(
-    nodes: Tensor,
-    mapped: Tensor,
-    rim: Tensor,
-    size: tuple[int, int],
-    source: tuple[int, int],
-    tolerance: float,
-    padding: str,
-) -> tuple[Tensor, int]:
+def _classified(probed: Probed) -> tuple[Tensor, int]:
     """What `classify` finds, by torch."""
+    nodes, mapped, rim, size, source, tolerance, padding = probed
     mapped = mapped[:, 1:-1, 1:-1]
     some, every = (
         _over_windows(_over_windows(mapped, -1, 4, pick), -2, 4, pick) for pick in (torch.logical_or, torch.logical_and)
