@@ -124,8 +124,12 @@ def test_corners_of_another_tool_need_no_image(capsys):
     assert content["board"] is None
     assert len(content["points"]) == 54
     assert set(content["images"][0]) == {"path", "view", "width", "height", "corners"}
-    calibrate("--corners", "corners.json", "--model", "kannala_brandt", "-o", "camera.yml")
-    assert "in 8 of 8 images of 640x480" in capsys.readouterr().out
+    words = "--corners", "corners.json", "--model", "kannala_brandt"
+    calibrate(*words, "-o", "camera.yml", "--report", "folder/report.html")
+    out = capsys.readouterr().out
+    assert "in 8 of 8 images of 640x480" in out
+    assert out.endswith("camera.yml: kannala_brandt\nfolder/report.html: the report\n")
+    assert "7.png" in Path("folder/report.html").read_text()
     assert_near(found_camera(), fisheye(), 0.5)
 
 
@@ -203,7 +207,10 @@ def test_a_pair_becomes_a_rig(capsys, board):
         for image in corners.images:  # as a detector may begin anywhere
             image.pixels = reordered(board, image.pixels[None], [int(rng.integers(board.symmetries))])[0]
     write_corners(corners, "corners.json")
-    calibrate("--corners", "corners.json", "--square", "30mm", "--model", "kannala_brandt", "-o", "rig.yml")
+    words = "--corners", "corners.json", "--square", "30mm", "--model", "kannala_brandt", "-o", "rig.yml"
+    calibrate(*words, *(() if board.symmetries > 1 else ("--report", "report.html")))
+    if board.symmetries == 1:
+        assert "right3.png" in Path("report.html").read_text()
     captured = capsys.readouterr()
     assert "left: chessboard" in captured.out
     assert "in 9 of 9 images of 640x480" in captured.out
@@ -335,6 +342,8 @@ def test_models_that_the_file_cannot_hold_are_not_tried(capsys, monkeypatch):
         ("a.png --board 9x6 -o camera.foo", "camera.foo: the name does not say the format"),
         ("a.png --board 9x6 -o a.png --force", "would overwrite a.png, which is read"),
         ("a.png --board 9x6 -o exists.json", "exists.json: exists already; --force"),
+        ("a.png --board 9x6 -o new.json --report exists.json", "exists.json: exists already; --force"),
+        ("a.png --board 9x6 -o new.json --report new.json", "must be different files"),
         ("a.png --board 9x6 -o new.json --corners new.json", "must be different files"),
         ("a.png --board 9x6 --corners exists.json", "exists.json: no file of corners"),
         ("a.png --board 8x6 --corners corners.json", "holds corners of chessboard, 9x6 inner corners"),

@@ -63,7 +63,14 @@ assert not hasattr(ct, "Pinhole2") and not hasattr(ct, "_public2")
 
 
 @pytest.mark.parametrize(
-    "first", ["import camtorch as ct", "from camtorch.camera import Camera", "import camtorch.io as io", "import torch"]
+    "first",
+    [
+        "import camtorch as ct",
+        "from camtorch.camera import Camera",
+        "from camtorch.calibration.report import write_report",
+        "import camtorch.io as io",
+        "import torch",
+    ],
 )
 def test_all_models_are_there_whatever_comes_first(first):
     assert python(f"{first}\nimport camtorch as ct\nprint(*ct.MODELS)").split() == list(ct.MODELS)

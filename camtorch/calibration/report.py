@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch import plot
+import camtorch.plot as plot
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.svg import Plots, palette
 from camtorch.calibration.verdict import ROUGH, Survey

@@ -39,7 +39,7 @@ def add(commands: Commands) -> None:
         "calibrate",
         help="calibrate a camera or a rig from photographs of a board",
         description="Calibrate a camera from photographs of a board: camtorch calibrate images/*.jpg --board 9x6 "
-        "--square 25mm -o camera.yml",
+        "--square 25mm -o camera.yml --report report.html",
         allow_abbrev=False,
     )
     command.set_defaults(run=run)
@@ -64,6 +64,9 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "--corners", type=parse_path, metavar="FILE", help="a .json to keep corners in, and to take them from"
     )
+    command.add_argument(
+        "--report", type=parse_path, metavar="FILE", help="an .html to look at: how far the result can be trusted"
+    )
     command.add_argument("--format", help="of OUT; by default what its name says, OpenCV's for .yml")
     add_output(command, "camera.json", "the calibration")
 
@@ -75,10 +78,12 @@ def run(arguments: argparse.Namespace) -> None:
 
     cameras = _cameras(arguments)
     given = tuple(path for paths in cameras.values() for path in paths)
-    path = arguments.output
-    targets.check(path, force=arguments.force, inputs=given if path.exists() else ())
-    if arguments.corners is not None and arguments.corners.absolute() == path.absolute():
-        raise ValueError("-o and --corners must be different files")
+    files = [path for path in (arguments.output, arguments.report, arguments.corners) if path is not None]
+    if len({path.absolute() for path in files}) < len(files):
+        raise ValueError("-o, --report and --corners must be different files")
+    for path in (arguments.output, arguments.report):
+        if path is not None:
+            targets.check(path, force=arguments.force, inputs=given if path.exists() else ())
     if arguments.corners is not None and not arguments.corners.exists():
         targets.check(arguments.corners, force=False)
     format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
@@ -386,3 +391,22 @@ def _write(
     path.parent.mkdir(parents=True, exist_ok=True)
     formats.save(found.rig if isinstance(found, RigCalibration) else found.camera, path, format)
     print(f"{path}: {f'{len(found.rig)} cameras' if isinstance(found, RigCalibration) else found.camera.key}")
+    if arguments.report is None:
+        return
+    from camtorch.calibration.report import write_report
+
+    arguments.report.parent.mkdir(parents=True, exist_ok=True)
+
+    def images_of(name: str) -> list[Path | None]:
+        images = (of_view.get(name) for of_view in views.values())
+        return [image.path if image is not None and image.path.exists() else None for image in images]
+
+    def names_of(name: str) -> list[str]:
+        return [of_view[name].path.name if name in of_view else view for view, of_view in views.items()]
+
+    if isinstance(found, RigCalibration):
+        images = {name: images_of(name) for name in found.cameras}
+        write_report(found, arguments.report, images=images, names={name: names_of(name) for name in images})
+    else:
+        write_report(found, arguments.report, images=images_of(""), names=names_of(""))
+    print(f"{arguments.report}: the report")
