@@ -322,6 +322,38 @@ def test_what_is_undetermined_is_huge_and_finite():
     assert not std[4:].any()
 
 
+def test_projections_are_known_where_parameters_are_not():
+    """A panorama that looks elsewhere, with its middle elsewhere, is the same camera."""
+    camera = ct.Cylindrical(torch.tensor([120.0, 120, 320, 240], **F64), image_size=(480, 640))
+    problem = Problem(camera)
+    noise = torch.tensor([NOISE], **F64)
+    loose, held = (
+        spread(adjust(problem.sights(noise=0.0), problem.state(), problem.free(*f), steps=0), type(camera), 0, noise)
+        for f in ((), ("cx",))
+    )
+    assert loose.std[0, 2] > 1e6 * loose.std[0, 0]
+    for distance in (0.4, math.inf):
+        assert torch.allclose(uncertainty(loose, PIXELS, distance), uncertainty(held, PIXELS, distance), rtol=1e-5)
+
+
+def test_of_calibrate():
+    corners, optima = opencv_left()
+    result = ct.calibrate("brown_conrady", corners.object_points, corners.image_points, image_size=corners.image_size)
+    assert torch.allclose(result.std, optima[5]["std"], rtol=1e-3)
+    # mrcal's noise is the root of the mean square, which does not count the parameters
+    share = result.rms / math.sqrt(2) / result.sigma
+    assert torch.allclose(share * result.uncertainty(PIXELS), torch.tensor([0.1353, 5.857, 2.640], **F64), rtol=1e-2)
+    assert torch.allclose(
+        share * result.uncertainty(PIXELS, 0.5), torch.tensor([0.0462, 5.878, 2.651], **F64), rtol=1e-2
+    )
+    held = ct.calibrate(
+        "brown_conrady", corners.object_points, corners.image_points, image_size=corners.image_size, fixed=("cx", "k3")
+    )
+    assert (held.std == 0).tolist() == [name in ("cx", "k3") for name in held.parameter_names]
+    assert not held.covariance[2].any()
+    assert bool((torch.linalg.eigvalsh(held.covariance) > -1e-12).all())
+
+
 def test_any_shape_of_pixels():
     problem = Problem(lens("double_sphere"))
     adjusted = adjust(problem.sights(), problem.state(), problem.free())

@@ -67,7 +67,7 @@ def test_good_data_have_no_warnings():
     assert result.warnings == []
     assert "!" not in repr(result)
     assert result.verdict.startswith("Good for measuring in the whole image, up to 4")
-    assert "More views would change little" in result.verdict
+    assert "It needs no more views" in result.verdict
 
 
 @pytest.mark.slow

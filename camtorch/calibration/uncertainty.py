@@ -15,6 +15,9 @@ from camtorch.camera import Camera, from_values
 from camtorch.least_squares.jacobians import sensor_jacobians
 
 _PIXELS = 1 << 15  # that are looked at together
+# Relative to the greatest singular value. Parameters of which a camera has one too many, as the turn of a panorama and
+# its principal point, are not known at all, and its projections are: what one over this times rounding leaves of them
+_LEAST = 1e-9
 
 
 class Spread(NamedTuple):
@@ -146,7 +149,7 @@ def shared_factor(equations: Equations) -> Tensor:
     scale = torch.linalg.vector_norm(triangle, dim=-2)
     scale = torch.where(scale > 0, scale, 1.0)
     _, sizes, axes = torch.linalg.svd(triangle / scale[:, None])
-    least = torch.finfo(sizes.dtype).eps * sizes[:, :1].clamp(min=torch.finfo(sizes.dtype).tiny)
+    least = _LEAST * sizes[:, :1].clamp(min=torch.finfo(sizes.dtype).tiny)
     return axes.mT / torch.maximum(sizes, least)[:, None] / scale[..., None]
 
 

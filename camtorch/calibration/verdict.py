@@ -344,10 +344,11 @@ def _parallel(survey: Survey) -> Iterator[str]:
 
 def _centre(survey: Survey) -> Iterator[str]:
     calibration = survey.calibration
-    std = max(calibration.std[2:4].tolist())
-    if std > _LOOSE_CENTRE * max(calibration.image_size):
+    std, longer = max(calibration.std[2:4].tolist()), max(calibration.image_size)
+    if std > _LOOSE_CENTRE * longer:
+        known = f"known to {std:.2g} px only" if std < longer else "as good as unknown"
         yield (
-            f"The principal point is known to {std:.2g} px only. Tilt the board to all sides, turn it by 90 degrees in "
+            f"The principal point is {known}. Tilt the board to all sides, turn it by 90 degrees in "
             'its plane, or hold it in the middle of the image with fixed=("cx", "cy")'
         )
 
@@ -582,7 +583,7 @@ def _next(survey: Survey) -> str:
         return f"Next:{tilt}"
     if survey.zones[4].uncertainty > FINE:
         return "Next, take more views, near and tilted: four times as many halve the uncertainty."
-    return "More views would change little: four times as many halve the uncertainty."
+    return "It needs no more views; four times as many would halve the uncertainty."
 
 
 @torch.no_grad()
