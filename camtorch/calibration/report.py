@@ -415,19 +415,19 @@ def _ranked(shots: _Shots) -> list[int]:
 
 
 def _views(shots: _Shots) -> str:
-    seen, ranked = shots.seen, _ranked(shots)
-    most = float(np.nan_to_num(seen.rms).max(initial=0.0)) or 1.0
+    seen, ranked, rms = shots.seen, _ranked(shots), shots.seen.rms
+    is_seen, most = seen.seen, float(np.nan_to_num(rms).max(initial=0.0)) or 1.0
     reach = 4 * float(shots.calibration.sigma) or 1.0
     rows = []
     for place, row in enumerate(ranked):
-        number, use = seen.numbers[row], seen.seen[row]
+        number, use = seen.numbers[row], is_seen[row]
         name = _label(shots.names[number])
         name = f'<a href="#{shots.prefix}view-{number}">{name}</a>' if place < _WORST else name
         out = int((use & ~seen.inliers[row]).sum())
         rows.append(
             f'<tr><th scope="row">{name}</th>'
-            f'<td class="bar"><i style="width:{100 * np.nan_to_num(seen.rms[row]) / most:.1f}%"></i></td>'
-            f'<td>{seen.rms[row]:.3g}</td><td class="narrow">{use.sum()}</td><td>{out or "&ndash;"}</td>'
+            f'<td class="bar"><i style="width:{100 * np.nan_to_num(rms[row]) / most:.1f}%"></i></td>'
+            f'<td>{rms[row]:.3g}</td><td class="narrow">{use.sum()}</td><td>{out or "&ndash;"}</td>'
             f'<td class="narrow">{_small_histogram(seen.errors[row][use], reach)}</td></tr>'
         )
     head = (

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from camtorch.plot.axes import COLOURS, GREY, INK, LEVELS, NO_RAYS, PALE, level_colours, require_pyplot
+from camtorch.plot.axes import COLOURS, GREY, INK, LEVELS, NO_RAYS, PALE, level_colours, require_matplotlib
 
 _WIDTH = 5.6  # inches, which a page shows as wide as a column
 _DARK = {
@@ -73,7 +73,7 @@ class Plots:
     """
 
     def __init__(self) -> None:
-        require_pyplot()
+        require_matplotlib()
         self._variables = {light: f"var({name})" for name, light, _ in palette()}
         self._numbers: Iterator[int] = itertools.count()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,21 +26,22 @@ LEVELS = {
 """Scales of few colours: matplotlib's map, the part of it from the palest colour to the darkest, how many."""
 
 
-def require_pyplot() -> ModuleType:
-    """The module, or an ImportError that says how to install it."""
+def require_matplotlib() -> None:
+    """Raise an ImportError that says how to install it, unless it is there."""
     try:
-        from matplotlib import pyplot
+        import matplotlib  # noqa: F401
     except ImportError:
         raise ImportError("plots need matplotlib: pip install 'camtorch[plot]'") from None
-    return pyplot
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
     """The Axes, or new ones in a figure of their own."""
     if ax is not None:
         return ax
-    new: Axes = require_pyplot().subplots(layout="constrained")[1]
-    return new
+    require_matplotlib()
+    from matplotlib import pyplot  # which chooses how figures are shown: not before it has to
+
+    return pyplot.subplots(layout="constrained")[1]
 
 
 def check_single(camera: Camera) -> None:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _CELLS = 14  # of the coverage, along the longer side
 _ARROWS = 15_000  # which is as many as an image has room for
+_BOARDS = 300
 _DENSE = 3000  # corners, that are drawn finer
 _LATTICE = 96  # of the map of uncertainty, along the longer side
 _AZIMUTHS = 16
@@ -331,7 +332,7 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     known = math.degrees(shots.reach)
     ax.axvspan(0, known, color=PALE, zorder=0)
     some = inside.any(-1)
-    middle = torch.where(inside, radius, torch.nan).nanmean(-1)[some].double()
+    middle = torch.where(valid, radius, torch.nan).nanmean(-1)[some].double()
     sigma = _worst(calibration, pixels, inside)[some.numpy(force=True)]
     x, y = np.degrees(angles[some].double().numpy(force=True)), middle.numpy(force=True)
     top = 1.08 * float(np.nanmax(y)) if len(y) else 1.0
@@ -370,6 +371,8 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
 def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """The boards as they stood before the camera, seen from its upper right, each in the colour of its rms.
 
+    Of more than 300 an even choice is drawn.
+
     Args:
         calibration: of a camera.
         ax: by default new ones.
@@ -382,7 +385,8 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     ax, shots = axes_or_new(ax), sightings(calibration)
     rms = shots.rms
     outlines = [_hull(_oblique(points[np.isfinite(points).all(-1)])) for points in shots.points]
-    some = [i for i, outline in enumerate(outlines) if len(outline) > 2 and math.isfinite(rms[i])]
+    known = [i for i, outline in enumerate(outlines) if len(outline) > 2 and math.isfinite(rms[i])]
+    some = known if len(known) <= _BOARDS else [known[i] for i in np.linspace(0, len(known) - 1, _BOARDS).astype(int)]
     extent = np.concatenate([outlines[i] for i in some]) if some else np.ones((1, 2))
     size = float(np.abs(extent).max())
     if some:
@@ -414,7 +418,8 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     ax.set_aspect("equal", adjustable="datalim")
     ax.margins(0.06)
     ax.set_axis_off()
-    ax.set_title(f"{len(some)} boards before the camera")
+    less = "" if len(some) == len(known) else f"{len(some)} of "
+    ax.set_title(f"{less}{len(known):,} board{'s' * (len(known) != 1)} before the camera")
     return ax
 
 

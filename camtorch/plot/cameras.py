@@ -23,7 +23,7 @@ from camtorch.plot.axes import (
     draw_frame,
     magnification,
     printable,
-    require_pyplot,
+    require_matplotlib,
     size_of,
     without_palest,
 )
@@ -245,7 +245,7 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
 
 def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") -> Figure:
     """What `camtorch show -o` draws: the distortion field, the radius curve, and the difference to another camera."""
-    require_pyplot()
+    require_matplotlib()
     from matplotlib.figure import Figure
 
     height, width = size_of(camera)
