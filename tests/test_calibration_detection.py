@@ -130,6 +130,13 @@ def test_too_little_of_a_board_has_a_reason():
     assert detect(board, image).reason.startswith("only ")
 
 
+def test_opencv_4_has_corners_of_charuco_half_a_pixel_off():
+    image, truth = photograph(BOARDS[1], fisheye(), (0.1, -0.3, 0.1), (-0.12, -0.1, 0.25))
+    corners = truth + np.random.default_rng(0).normal(0, 0.1, truth.shape)
+    for off in (0, 0.5):
+        assert np.allclose(detection._from_centres(cv2, image, corners + off), corners)
+
+
 def test_tags_may_be_turned_on_their_board():
     board = BOARDS[2]
     whole, points = np.full((900, 900), 255, np.uint8), board.points()[:, :2]

@@ -224,10 +224,17 @@ def _charuco(cv2: Any, board: Charuco, grey: NDArray[np.uint8]) -> Pixels | None
         corners, ids, *_ = detector.detectBoard(image)
         if ids is not None and len(ids) > count:
             most, count = np.full((len(board.points()), 2), np.nan), len(ids)
-            most[ids.ravel()] = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+            found = _from_centres(cv2, image, np.asarray(corners, np.float64).reshape(-1, 2))
+            most[ids.ravel()] = (found + 0.5) / scale - 0.5
         if count == len(board.points()):
             break
     return most
+
+
+def _from_centres(cv2: Any, image: NDArray[np.uint8], corners: Pixels) -> Pixels:
+    """ChArUco's corners with integers at pixels' centres: OpenCV 4 has them half a pixel further right and down."""
+    moved = np.median(_refined(cv2, image, corners, 3) - corners, axis=0)
+    return corners + np.rint(2 * moved) / 2
 
 
 def _aprilgrid(cv2: Any, board: AprilGrid, grey: NDArray[np.uint8]) -> Pixels | None:
