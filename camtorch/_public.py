@@ -43,6 +43,7 @@ from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
 from camtorch.warp.dewarp import Dewarp
+from camtorch.warp.plane import BirdsEye, PlaneWarp
 from camtorch.warp.reproject import Reproject
 from camtorch.warp.warp import Warp
 
@@ -51,6 +52,7 @@ __all__ = [
     "FOV",
     "MODELS",
     "UCM",
+    "BirdsEye",
     "BrownConrady",
     "Calibration",
     "Camera",
@@ -74,6 +76,7 @@ __all__ = [
     "OCamCalib",
     "OrthographicFisheye",
     "Pinhole",
+    "PlaneWarp",
     "PositiveFocal",
     "Rectification",
     "Reproject",

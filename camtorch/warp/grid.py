@@ -198,6 +198,11 @@ def _pixels(rows: range, width: int, like: Tensor) -> Tensor:
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
+def pixels_of_rows(target: Camera, rows: range) -> Tensor:
+    """(len(rows), W', 2): the centres of a target's pixels, in the dtype to compute positions in."""
+    return _pixels(rows, target._size("Warp")[1], _like(target))
+
+
 def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `Exact`."""
     if pixels.ndim == 3:

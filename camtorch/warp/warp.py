@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -79,6 +79,8 @@ class Warp(GeometryModule):
         TypeError: source or target is not a Camera.
     """
 
+    is_an_operator: ClassVar[bool] = True
+    """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
     source: Camera
     target: Camera
     rotation: Tensor | None
@@ -161,7 +163,7 @@ class Warp(GeometryModule):
         sampled = self._checked(images, mode, padding_mode, fill)
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
-        if torch.compiler.is_compiling() and not learns and compiled.takes(images, inputs):
+        if self.is_an_operator and torch.compiler.is_compiling() and not learns and compiled.takes(images, inputs):
             options = self.tolerance, self.antialias, self._reach(sampled[1]), *sampled
             return compiled.warped(images, self.source, self.target, self.rotation, *options)
         if self._is_long() and not (learns or in_graph(images)):

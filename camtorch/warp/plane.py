@@ -1,0 +1,298 @@
+"""Images of a plane: from where another camera stands, or from above."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from camtorch._arguments import Numbers, as_batch, as_real, as_values
+from camtorch._tracing import in_graph, is_concrete
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.models import Pinhole
+from camtorch.rotations import rotate_planes, rotation_matrix
+from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, scaled, to_positions
+from camtorch.warp.sampling import Fill, Mode, PaddingMode
+from camtorch.warp.warp import Warp
+
+_GRAZING = 1e-9  # the cosine of a ray to the plane's normal from which on it does not meet the plane
+
+
+class PlaneWarp(Warp):
+    """The image that `target` would see of a plane, made from the image of `source`, which stands elsewhere.
+
+    What lies on the plane is where it should be; what rises above it is smeared, as in every image of that kind. For
+    pinholes it is the homography K_s (R + t n^T / d) K_t^-1; for other cameras it is exact as well. Points and boxes
+    move along. Differentiable in both cameras, the extrinsics, the normal and the distance.
+
+    A pixel is valid where its ray meets the plane ahead, and the source sees that point, on its image and from the same
+    side of the plane as the target.
+
+    Args:
+        source: the camera of the given images.
+        target: the camera of the images to make.
+        extrinsics: source from target, `p_source = R p_target + t`.
+        normal: (3,) or (B, 3) of the plane `normal . X = distance` in the target's frame, of any length but zero.
+        distance: a number or (B,), in the unit of the extrinsics; not zero.
+        mode, padding_mode, fill, antialias: as `Warp` takes them.
+
+    Raises:
+        ValueError: a plane through one of the cameras, or one that the source sees from the other side; shapes that do
+            not fit, and as `Warp`. TypeError: no cameras, no extrinsics.
+    """
+
+    is_an_operator = False
+
+    def __init__(
+        self,
+        source: Camera,
+        target: Camera,
+        extrinsics: Extrinsics,
+        normal: Numbers,
+        distance: Numbers,
+        *,
+        mode: Mode = "bilinear",
+        padding_mode: PaddingMode = "zeros",
+        fill: Fill = 0.0,
+        antialias: bool = False,
+    ):
+        super().__init__(
+            source, target, mode=mode, padding_mode=padding_mode, fill=fill, antialias=antialias, tolerance=0.0
+        )
+        owner = type(self).__name__
+        if not isinstance(extrinsics, Extrinsics):
+            raise TypeError(f"{owner}: extrinsics must be Extrinsics; got {type(extrinsics).__name__}")
+        self.extrinsics = extrinsics
+        normal, distance = as_real(normal, "normal", owner), as_real(distance, "distance", owner)
+        if normal.ndim not in (1, 2) or normal.shape[-1] != 3 or distance.ndim > 1:
+            raise ValueError(
+                f"{owner}: normal must be (3,) or (B, 3) and distance a number or (B,); got {tuple(normal.shape)} and "
+                f"{tuple(distance.shape)}"
+            )
+        shapes = {"source": source.batch_shape, "target": target.batch_shape, "extrinsics": extrinsics.batch_shape}
+        shapes |= {"normal": normal.shape[:-1], "distance": distance.shape}
+        self.batch_shape = as_batch(owner, **{name: (*shape, 1) for name, shape in shapes.items()})
+        for name, value in (("normal", normal), ("distance", distance)):
+            if isinstance(value, nn.Parameter):
+                self.register_parameter(name, value)
+            else:
+                self.register_buffer(name, value if in_graph(value) else value.detach().clone())
+        self._check(owner)
+
+    normal: Tensor
+    distance: Tensor
+
+    def _check(self, owner: str) -> None:
+        """Raise a ValueError where the plane goes through a camera, or between them."""
+        plane = self.plane
+        if not all(map(is_concrete, plane)):
+            return
+        _, shift, normal, distance = (t.detach().double() for t in plane)
+        rotation = plane[0].detach().double()
+        place = -(rotation.mT @ shift[..., None])[..., 0]
+        of_source = distance - (normal * place).sum(-1)
+        if not bool(torch.isfinite(normal).all() & (torch.linalg.vector_norm(normal, dim=-1) > 0).all()):
+            raise ValueError(f"{owner}: normal must be finite and not zero; got {self.normal.tolist()}")
+        if not bool((torch.isfinite(distance) & (distance != 0)).all()):
+            raise ValueError(f"{owner}: the plane goes through the target; distance is {self.distance.tolist()}")
+        if not bool((of_source * distance > 0).all()):
+            raise ValueError(
+                f"{owner}: the source, at {place.tolist()} in the target's frame, does not stand on the same side of "
+                "the plane as the target; are the extrinsics source from target?"
+            )
+
+    @property
+    def plane(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Source from target (*B, 3, 3) and (*B, 3), and the plane in the target's frame, (*B, 3) and (*B,)."""
+        return self._of_one_dtype(rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation)
+
+    def _of_one_dtype(self, rotation: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        dtype = torch.promote_types(rotation.dtype, self.normal.dtype)
+        return rotation.to(dtype), shift.to(dtype), self.normal.to(dtype), self.distance.to(dtype)
+
+    def _inputs(self) -> list[Tensor]:
+        return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation, self.normal, self.distance]
+
+    # -- where the images are sampled
+
+    def _learned(self) -> Sampling:
+        return self._of_rows(range(self.target._size("Warp")[0]))
+
+    def _whole(self, padding: PaddingMode) -> Sampling:
+        return self._of_rows(range(self.target._size("Warp")[0]))
+
+    def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
+        if not self.antialias:
+            return self._of_rows(rows)
+        # the scale is that between neighbours
+        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
+        return self._of_rows(around).part(slice(rows.start - around.start, rows.stop - around.start))
+
+    def _of_rows(self, rows: range) -> Sampling:
+        pixels = pixels_of_rows(self.target, rows)
+        rays, has_ray = self.target.unproject(pixels.expand(*self.target.batch_shape, *pixels.shape))
+        if rays.ndim == 3:
+            rays, has_ray = rays[None], has_ray[None]
+        seen, mapped = self.source.project(self._as_batch(_carried(rays, *self.plane)))
+        mapped = mapped & has_ray & _ahead(rays, *self.plane[2:])
+        grid = to_positions(seen, mapped, self.source._size("Warp"))
+        return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
+
+    def _as_batch(self, points: Tensor) -> Tensor:
+        """One for each of the source's batch."""
+        count = self.source.batch_shape.numel()
+        return points.expand(count, *points.shape[1:]) if self.source.batch_shape and len(points) == 1 else points
+
+    # -- labels
+
+    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        rays, has_ray = self.source.unproject(pixels)
+        rotation, shift, normal, distance = self.plane
+        # the plane as the source has it
+        of_source = (rotation @ normal[..., None])[..., 0]
+        far = distance + (of_source * shift).sum(-1)
+        back = rotation.mT
+        moved = _carried(rays, back, -(back @ shift[..., None])[..., 0], of_source, far)
+        seen, mapped = self.target.project(moved)
+        valid = mapped & has_ray & _ahead(rays, of_source, far)
+        return torch.where(valid.unsqueeze(-1), seen, -1.0), valid
+
+    def transform_rays(self, rays: Tensor) -> Tensor:
+        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
+        rays = as_values(rays, "rays", type(self).__name__, self.source.intrinsics.device)
+        if rays.ndim == 0 or rays.shape[-1] != 3:
+            raise ValueError(f"{type(self).__name__}: rays must be (B, *N, 3); got shape {tuple(rays.shape)}")
+        rotation = self.plane[0].mT.to(rays.dtype)
+        return _turned(rotation, rays)
+
+    def inverse(self) -> Warp:
+        """The warp from target to source, of the same plane. What lay outside the image stays lost."""
+        rotation, shift, normal, distance = self.plane
+        of_source = (rotation @ normal[..., None])[..., 0]
+        back = Extrinsics.from_matrix(rotation, shift).inverse()
+        options: dict[str, Any] = {name: value for name, value in self.options.items() if name != "tolerance"}
+        far = distance + (of_source * shift).sum(-1)
+        return PlaneWarp(self.target, self.source, back, of_source, far, **options)
+
+
+def _turned(rotation: Tensor, rays: Tensor) -> Tensor:
+    """Rotations (*B, 3, 3) applied to (B, *N, 3) or (*N, 3)."""
+    if rotation.ndim == 2:
+        return torch.stack(rotate_planes(rotation, rays.unbind(-1)), -1)
+    rows = rays.expand(len(rotation), *rays.shape[1:]) if len(rays) == 1 else rays
+    planes = rows.flatten(1, -2).unbind(-1)
+    return torch.stack(rotate_planes(rotation, planes), -1).view(max(len(rows), len(rotation)), *rows.shape[1:])
+
+
+def _carried(rays: Tensor, rotation: Tensor, shift: Tensor, normal: Tensor, distance: Tensor) -> Tensor:
+    """Directions in which another camera sees the points where rays (B, *N, 3) meet a plane: (R + t n^T / d) ray."""
+    batch = torch.broadcast_shapes(rotation.shape[:-2], shift.shape[:-1], normal.shape[:-1], distance.shape)
+    matrix = rotation + (shift / distance[..., None])[..., :, None] * normal[..., None, :]
+    return _turned(matrix.expand(*batch, 3, 3).to(rays.dtype), rays)
+
+
+def _ahead(rays: Tensor, normal: Tensor, distance: Tensor) -> Tensor:
+    """Whether rays (B, *N, 3) meet the plane."""
+    normal, distance = normal.detach(), distance.detach()
+    unit = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True) * distance.sign()[..., None]
+    unit = unit.to(rays.dtype)
+    if unit.ndim == 2:
+        unit = unit.view(len(unit), *[1] * (rays.ndim - 2), 3)
+    return (rays.detach() * unit).sum(-1) > _GRAZING
+
+
+class BirdsEye(PlaneWarp):
+    """The ground from above, to scale, made from the image of a camera: a `PlaneWarp` of the plane z = 0.
+
+    Rows go from the largest y to the smallest, so that +y is up in the image, columns from the smallest x to the
+    largest; pixel (0, 0) is the middle of its cell. Any lens will do, past 90 degrees too.
+
+    Args:
+        camera: of the given images.
+        extrinsics: camera from ground, whose z axis points up; the camera stands above it.
+        x: (from, to), what the image shows across, in units of the ground.
+        y: (from, to), what it shows from bottom to top.
+        resolution: units of the ground per pixel.
+        mode, padding_mode, fill, antialias: as `Warp` takes them.
+
+    Raises:
+        ValueError: a camera on or below the ground, ranges that do not ascend, a resolution that is not positive, and
+            as `Warp`. TypeError: no camera, no extrinsics.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        extrinsics: Extrinsics,
+        *,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        resolution: float,
+        mode: Mode = "bilinear",
+        padding_mode: PaddingMode = "zeros",
+        fill: Fill = 0.0,
+        antialias: bool = False,
+    ):
+        for name, ends in (("x", x), ("y", y)):
+            if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
+                raise ValueError(f"BirdsEye: {name} must be (from, to), ascending; got {ends!r}")
+        if not (math.isfinite(resolution) and resolution > 0):
+            raise ValueError(f"BirdsEye: resolution must be positive units of the ground per pixel; got {resolution}")
+        size = tuple(round((ends[1] - ends[0]) / resolution) for ends in (y, x))
+        if min(size) < 1:
+            raise ValueError(f"BirdsEye: x {x} and y {y} at {resolution} units per pixel make no image")
+        # a camera that looks straight down from one unit above the origin
+        like = camera.intrinsics.detach() if isinstance(camera, Camera) else torch.zeros(1)
+        focal = 1 / resolution
+        down = Pinhole(
+            nn.Parameter(like.new_tensor([focal, focal, -x[0] * focal - 0.5, y[1] * focal - 0.5]), requires_grad=False),
+            image_size=(size[0], size[1]),
+        )
+        super().__init__(
+            camera,
+            down,
+            extrinsics,
+            (0.0, 0.0, 1.0),
+            1.0,
+            mode=mode,
+            padding_mode=padding_mode,
+            fill=fill,
+            antialias=antialias,
+        )
+        self.x, self.y, self.resolution = (float(x[0]), float(x[1])), (float(y[0]), float(y[1])), float(resolution)
+
+    def _check(self, owner: str) -> None:
+        """Raise a ValueError where the camera is not above the ground."""
+        place = self.extrinsics.position.detach()
+        if is_concrete(place) and not bool((place[..., 2] > 0).all()):
+            raise ValueError(
+                f"{owner}: the camera stands at {place.tolist()} on the ground, whose z points up; it has to be above. "
+                "Are the extrinsics camera from ground?"
+            )
+
+    @property
+    def plane(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Camera from the one that looks down, and the ground in the frame of that."""
+        rotation, shift = rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
+        # ground from it: x right, y down is -y, z down is -z, from (0, 0, 1)
+        flip = rotation.new_tensor([1.0, -1.0, -1.0])
+        return self._of_one_dtype(rotation * flip, shift + rotation[..., 2])
+
+    @property
+    def grid_points(self) -> Tensor:
+        """(H, W, 2) the ground's x and y in the middle of each pixel."""
+        return self.to_ground(self.target.pixel_grid())
+
+    def to_ground(self, pixels: Tensor) -> Tensor:
+        """Pixels (..., 2) of the image from above to x and y on the ground."""
+        u, v = pixels.unbind(-1)
+        step = self.resolution
+        return torch.stack((self.x[0] + (u + 0.5) * step, self.y[1] - (v + 0.5) * step), -1)
+
+    def from_ground(self, points: Tensor) -> Tensor:
+        """The other way: x and y on the ground, (..., 2), to pixels."""
+        x, y = points.unbind(-1)
+        return torch.stack(((x - self.x[0]) / self.resolution - 0.5, (self.y[1] - y) / self.resolution - 0.5), -1)

@@ -1,0 +1,193 @@
+"""Planes: what pinholes make of them is a homography, and for every camera a point of the plane lands where it is."""
+
+import math
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.rotations import rotation_matrix
+
+TURN, SHIFT = torch.tensor([0.05, -0.1, 0.03]).double(), torch.tensor([0.2, -0.1, 0.15]).double()
+NORMAL, DISTANCE = torch.tensor([0.1, 0.3, 1.0]).double(), 2.5
+
+
+def pinholes():
+    source = ct.Pinhole([90.0, 95, 62, 50], image_size=(100, 120)).double().requires_grad_(False)
+    target = ct.Pinhole([70.0, 72, 55, 41], image_size=(80, 110)).double().requires_grad_(False)
+    return source, target
+
+
+def pose():
+    return ct.Extrinsics(TURN, SHIFT).requires_grad_(False)
+
+
+def wide(size=(480, 640)):
+    """190 degrees."""
+    height, width = size
+    focal = width / 2 / math.radians(95)
+    camera = ct.KannalaBrandt([focal, focal, (width - 1) / 2, (height - 1) / 2], [0.01, -0.002, 0, 0], image_size=size)
+    return camera.double().requires_grad_(False)
+
+
+def above_ground(height=2.0, pitch=35.0):
+    """Camera from ground: it looks along y, and down by an angle."""
+    level = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()
+    down = rotation_matrix(torch.tensor([math.radians(pitch), 0, 0]).double())
+    rotation = down @ level
+    return ct.Extrinsics.from_matrix(rotation, -rotation @ torch.tensor([0.5, -1.0, height]).double()).requires_grad_(
+        False
+    )
+
+
+def test_of_pinholes_it_is_the_homography():
+    source, target = pinholes()
+    warp = ct.PlaneWarp(source, target, pose(), NORMAL, DISTANCE)
+    homography = source.K @ (rotation_matrix(TURN) + SHIFT[:, None] * NORMAL / DISTANCE) @ torch.linalg.inv(target.K)
+    pixels = target.pixel_grid()
+    rows = torch.cat((pixels, torch.ones_like(pixels[..., :1])), -1) @ homography.mT
+    expected = rows[..., :2] / rows[..., 2:]
+    grid = warp.grid()[0]
+    seen = ((grid + 1) * torch.tensor([120.0, 100.0]).double() - 1) / 2
+    torch.testing.assert_close(seen, expected, rtol=0, atol=1e-6)
+    inside = source.contains(expected)
+    assert inside.double().mean() > 0.2
+    back, valid = warp.transform_points(expected[inside])
+    assert valid.all()
+    torch.testing.assert_close(back, pixels[inside], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_points_of_the_plane_land_where_they_are(exchanged):
+    source, target = wide(), pinholes()[1]
+    extrinsics = pose()
+    warp = ct.PlaneWarp(source, target, extrinsics, NORMAL, DISTANCE)
+    generator = torch.Generator().manual_seed(0)
+    across = torch.randn(500, 2, generator=generator).double()
+    depth = (DISTANCE - across @ NORMAL[:2]) / NORMAL[2]
+    points = torch.cat((across, depth[:, None]), -1)
+    in_target, one = target.project(points)
+    in_source, other = source.project(extrinsics(points))
+    both = one & other & target.contains(in_target) & source.contains(in_source)
+    assert both.sum() > 100
+    warp = warp.inverse().inverse() if exchanged else warp
+    moved, valid = warp.transform_points(in_source[both])
+    assert valid.all()
+    torch.testing.assert_close(moved, in_target[both], rtol=0, atol=1e-7)
+    there, valid = warp.inverse().transform_points(in_target[both])
+    torch.testing.assert_close(there, in_source[both], rtol=0, atol=1e-7)
+
+
+def test_beyond_the_horizon_nothing_is_valid():
+    source, target = wide(), wide((60, 80))
+    floor = ct.PlaneWarp(source, target, pose(), (0.0, 1.0, 0.0), 1.5)
+    rays, has_ray = target.rays()
+    mask = floor.valid_mask()[0, 0]
+    below = has_ray & (rays[..., 1] > 1e-6)
+    seen, mapped = source.project(pose()(rays * 1.5 / torch.where(below, rays[..., 1:2].squeeze(-1), 1.0)[..., None]))
+    assert torch.equal(mask, below & mapped & source.contains(seen))
+    assert 0.1 < mask.double().mean() < 0.6
+    images = torch.rand(1, 3, 480, 640).double()
+    assert (floor(images)[0, :, ~below] == 0).all()
+    sky, valid = floor.transform_points(torch.tensor([[319.5, 20.0]]).double())
+    assert not valid.any()
+    assert sky.tolist() == [[-1, -1]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_chessboard_on_the_floor_lies_on_its_grid(dtype):
+    camera, extrinsics = wide((1080, 1440)), above_ground()
+    eye = ct.BirdsEye(camera.to(dtype), extrinsics.to(dtype), x=(-2, 3), y=(0, 4), resolution=0.01)
+    assert eye.target.image_size == (400, 500)
+    assert eye.grid_points.shape == (400, 500, 2)
+    torch.testing.assert_close(
+        eye.grid_points[0, 0].double(), torch.tensor([-1.995, 3.995]).double(), rtol=0, atol=1e-6
+    )
+    torch.testing.assert_close(
+        eye.grid_points[-1, -1].double(), torch.tensor([2.995, 0.005]).double(), rtol=0, atol=1e-5
+    )
+    corners = torch.cartesian_prod(torch.arange(-1.5, 2.6, 0.25), torch.arange(0.5, 3.6, 0.25)).to(dtype)
+    ground = torch.nn.functional.pad(corners, (0, 1))
+    pixels, seen = camera.project(extrinsics(ground))
+    assert seen.all()
+    moved, valid = eye.transform_points(pixels)
+    assert valid.all()
+    torch.testing.assert_close(moved, eye.from_ground(corners), rtol=0, atol=1e-2 if dtype == torch.float32 else 1e-7)
+    torch.testing.assert_close(eye.to_ground(moved), corners, rtol=0, atol=1e-4)
+
+
+def test_the_image_from_above_is_what_lies_there():
+    camera, extrinsics = wide((1080, 1440)), above_ground()
+
+    def scene(points):
+        return 0.5 + 0.25 * (torch.sin(3 * points[..., 0]) + torch.cos(4 * points[..., 1]))
+
+    rays, valid = camera.rays()
+    rotation, place = extrinsics.matrix()[:3, :3], extrinsics.position
+    rays = rays @ rotation
+    hits = valid & (rays[..., 2] < -1e-3)
+    ground = place[:2] - rays[..., :2] * (place[2] / torch.where(hits, rays[..., 2], -1.0))[..., None]
+    image = torch.where(hits, scene(ground), 0.0)[None, None]
+    eye = ct.BirdsEye(camera, extrinsics, x=(-2, 3), y=(0, 4), resolution=0.02)
+    assert eye.valid_mask().all()
+    torch.testing.assert_close(eye(image)[0, 0], scene(eye.grid_points), rtol=0, atol=2e-3)
+
+
+def test_poses_cameras_and_planes_learn():
+    source, target = pinholes()
+    source, target = source.resize(8, 10).requires_grad_(True), target.resize(6, 7).requires_grad_(True)
+    images = torch.nn.functional.avg_pool2d(torch.rand(1, 1, 10, 12).double(), 3, 1)
+
+    def made(turn, shift, normal, distance, focal):
+        lens = ct.Pinhole(focal, image_size=(8, 10))
+        return ct.PlaneWarp(lens, target, ct.Extrinsics(turn, shift), normal, distance)(images)
+
+    inputs = (TURN, SHIFT, NORMAL, torch.tensor(DISTANCE).double(), source.intrinsics.detach())
+    assert torch.autograd.gradcheck(made, [t.clone().requires_grad_() for t in inputs], atol=1e-4)
+
+
+def test_a_batch_goes_one_by_one():
+    source, target = wide(), pinholes()[1]
+    turns, distances = torch.stack((TURN, 2 * TURN, -TURN)), torch.tensor([2.5, 3.0, 4.0]).double()
+    images = torch.rand(3, 2, 480, 640).double()
+    many = ct.PlaneWarp(source, target, ct.Extrinsics(turns[..., None], SHIFT).requires_grad_(False), NORMAL, distances)
+    result, mask = many(images), many.valid_mask()
+    pixels = torch.tensor([[300.0, 200], [320, 280]]).double().expand(3, 2, 2)
+    moved, _ = many.transform_points(pixels)
+    for i in range(3):
+        one = ct.PlaneWarp(source, target, ct.Extrinsics(turns[i], SHIFT).requires_grad_(False), NORMAL, distances[i])
+        torch.testing.assert_close(result[i : i + 1], one(images[i : i + 1]), rtol=0, atol=1e-9)
+        assert torch.equal(mask[i : i + 1], one.valid_mask())
+        torch.testing.assert_close(moved[i], one.transform_points(pixels[i])[0])
+
+
+def test_it_is_kept_until_something_changes_and_compiles():
+    source, target = pinholes()
+    extrinsics = pose()
+    warp = ct.PlaneWarp(source, target, extrinsics, NORMAL, DISTANCE)
+    images = torch.rand(1, 1, 100, 120).double()
+    before = warp(images)
+    torch.testing.assert_close(torch.compile(warp, backend="aot_eager")(images), before, rtol=0, atol=1e-9)
+    with torch.no_grad():
+        extrinsics.translation += 0.2
+    assert (warp(images) - before).abs().max() > 1e-3
+
+
+def test_bad_planes_are_refused():
+    source, target = pinholes()
+    with pytest.raises(ValueError, match="through the target"):
+        ct.PlaneWarp(source, target, pose(), NORMAL, 0.0)
+    with pytest.raises(ValueError, match="same side"):
+        ct.PlaneWarp(source, target, ct.Extrinsics([0.0, 0, 0], [0, 0, -5.0]).double(), (0.0, 0, 1), 2.0)
+    with pytest.raises(ValueError, match="normal"):
+        ct.PlaneWarp(source, target, pose(), (0.0, 0, 0), 1.0)
+    with pytest.raises(ValueError, match="normal must be"):
+        ct.PlaneWarp(source, target, pose(), (0.0, 1.0), 1.0)
+    with pytest.raises(TypeError, match="Extrinsics"):
+        ct.PlaneWarp(source, target, torch.eye(4), NORMAL, 1.0)
+    with pytest.raises(ValueError, match="above"):
+        ct.BirdsEye(wide(), above_ground(height=-1.0), x=(-1, 1), y=(0, 1), resolution=0.1)
+    with pytest.raises(ValueError, match="ascending"):
+        ct.BirdsEye(wide(), above_ground(), x=(1, -1), y=(0, 1), resolution=0.1)
+    with pytest.raises(ValueError, match="resolution"):
+        ct.BirdsEye(wide(), above_ground(), x=(-1, 1), y=(0, 1), resolution=0.0)
