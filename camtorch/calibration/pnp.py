@@ -23,8 +23,9 @@ _LEAST = 4  # points
 _FEW = 5  # points, that may have minima far from where they start
 _WORSE, _MUCH_WORSE = 4.0, 100.0  # times the cost of the best start, beyond which none became the best; of few points
 _THIN = 0.1  # of the extent of points: what is thinner may have the minima of a plane
-_STEPS, _DAMPING = 60, 1e-8  # the first damping: a start is nearly the optimum
-_SETTLED = 1e-8  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
+_STEPS, _FEW_STEPS = 60, 12  # at most; towards a minimum that is rarely the better one
+_DAMPING = 1e-8  # at first: a start is nearly the optimum
+_SETTLED = 1e-7  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
 _NOTHING = 1e-9  # px, that rounding may leave
 _LOST = 1e3  # px, that a point without a pixel counts as where starts are compared
 
@@ -159,37 +160,49 @@ def _solved(task: _Task) -> tuple[Tensor, Tensor]:
     squares = (seen_at.view(*shape, 2) - pixels[:, None]).square().sum(-1)
     costs = (torch.where(mapped.view(shape), squares, _LOST**2) * weights[:, None]).sum(-1)
     costs = torch.where(starts.valid, costs, torch.inf)
-    few = (weights > 0).sum(-1) <= _FEW
-    most = torch.where(few, _MUCH_WORSE, _WORSE) * costs.amin(-1)
-    rows, which = ((costs <= most[:, None]) & (costs < torch.inf)).nonzero(as_tuple=True)
-    found = _refined(task, rows, starts.rotations[rows, which], starts.translations[rows, which])
-    costs = torch.full_like(costs, torch.inf)
-    rotations, translations = starts.rotations.clone(), starts.translations.clone()
-    costs[rows, which], rotations[rows, which], translations[rows, which] = found
     best, every = costs.argmin(-1), torch.arange(len(costs), device=costs.device)
-    cost, rotations, translations = costs[every, best], rotations[every, best], translations[every, best]
+    found = _refined(task, every, starts.rotations[every, best], starts.translations[every, best])
+    found = found.only(starts.valid[every, best])
+    few = (weights > 0).sum(-1) <= _FEW
+    others = costs.scatter(1, best[:, None], torch.inf).amin(-1)
+    for those, factor, steps in ((few, _MUCH_WORSE, _STEPS), (~few, _WORSE, _FEW_STEPS)):
+        (rows,) = (those & (others <= factor * costs.amin(-1)) & (others < torch.inf)).nonzero(as_tuple=True)
+        which = 1 - best[rows]
+        found = found.or_better(
+            rows, _refined(task, rows, starts.rotations[rows, which], starts.translations[rows, which], steps)
+        )
     # of so few points on a plane the other minimum may be one of pixels, and none of rays
     (rows,) = (few & starts.valid[:, 0] & ~starts.valid[:, 1]).nonzero(as_tuple=True)
-    if len(rows):
-        flat, *mirrored = _mirrored(points[rows], weights[rows], rotations[rows], translations[rows])
-        rows = rows[flat]
-        found = _refined(task, rows, *(t[flat] for t in mirrored))
-        better = found.costs < cost[rows]
-        rows = rows[better]
-        cost[rows], rotations[rows], translations[rows] = (t[better] for t in found)
-    return torch.cat((rotation_vector(rotations), translations), -1), torch.isfinite(cost)
+    mirrored = _mirrored(points[rows], weights[rows], found.rotations[rows], found.translations[rows])
+    rows, rotations, translations = (t[mirrored.flat] for t in (rows, *mirrored[1:]))
+    found = found.or_better(rows, _refined(task, rows, rotations, translations))
+    return torch.cat((rotation_vector(found.rotations), found.translations), -1), torch.isfinite(found.costs)
 
 
-class _Refined(NamedTuple):
-    """Costs (R,), infinite where no minimum was found, rotations (R, 3, 3) and translations (R, 3)."""
+class _Found(NamedTuple):
+    """Minima: costs (R,), infinite where there is none, rotations (R, 3, 3) and translations (R, 3)."""
 
     costs: Tensor
     rotations: Tensor
     translations: Tensor
 
+    def only(self, valid: Tensor) -> _Found:
+        """Those of valid rows."""
+        return self._replace(costs=torch.where(valid, self.costs, torch.inf))
 
-def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor) -> _Refined:
+    def or_better(self, rows: Tensor, other: _Found) -> _Found:
+        """With the minima of some rows, where they are lower, in the place of those here."""
+        better = other.costs < self.costs[rows]
+        whole = _Found(*(t.clone() for t in self))
+        for mine, its in zip(whole, other, strict=True):
+            mine[rows[better]] = its[better]
+        return whole
+
+
+def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor, steps: int = _STEPS) -> _Found:
     """The minima that starts (R, ...) for some rows of the task lead to."""
+    if len(rows) == 0:
+        return _Found(translations[:, 0], rotations, translations)
     points, pixels, weights = (t.detach()[rows, None] for t in task[1:4])
     parameters = torch.cat(task.camera._tensors, -1).detach()
     parameters = parameters[None] if parameters.ndim == 1 else parameters[rows]
@@ -207,16 +220,25 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor)
         problem.flat(start),
         tolerance=_SETTLED / (2 * counts - 6).clamp(min=1),
         tiny=_NOTHING**2 * counts,
-        steps=_STEPS,
+        going=counts >= _LEAST,
+        steps=steps,
         damping=_DAMPING,
     )
     complete = (problem.look(0, found.state).valid | (weights == 0)).all(-1)[:, 0]
     rotations, translations = found.state[:2]
-    return _Refined(torch.where(found.converged & complete, found.cost, torch.inf), rotations[:, 0], translations[:, 0])
+    return _Found(torch.where(found.converged & complete, found.cost, torch.inf), rotations[:, 0], translations[:, 0])
 
 
-def _mirrored(points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor) -> tuple[Tensor, ...]:
-    """Whether points are nearly on a plane, and poses whose normals of it mirror those given at the line of sight."""
+class _Mirrored(NamedTuple):
+    """Whether points are nearly on a plane, and poses whose normals of it mirror those of others."""
+
+    flat: Tensor
+    rotations: Tensor
+    translations: Tensor
+
+
+def _mirrored(points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor) -> _Mirrored:
+    """Mirrored at the line of sight to the points' middle."""
     share = weights / weights.sum(-1, keepdim=True)
     centre = (share[..., None] * points).sum(-2)
     centred = points - centre[:, None]
@@ -228,4 +250,4 @@ def _mirrored(points: Tensor, weights: Tensor, rotations: Tensor, translations: 
         for v in (normalize(middle, dim=-1), normal)
     )
     mirrored = across_sight @ rotations @ in_plane
-    return flat, mirrored, middle - (mirrored @ centre[..., None])[..., 0]
+    return _Mirrored(flat, mirrored, middle - (mirrored @ centre[..., None])[..., 0])

@@ -120,6 +120,11 @@ def _frame(direction: Tensor) -> Tensor:
     return torch.stack((first, torch.linalg.cross(direction, first), direction), -1)
 
 
+def _sight(rays: Tensor, weights: Tensor) -> Tensor:
+    """(B, 3): the direction in the middle of rays (B, N, 3)."""
+    return normalize((weights[..., None] * rays).sum(-2), dim=-1)
+
+
 def _products(vectors: Tensor) -> Tensor:
     """(B, N, 6): the products of two components of (B, N, 3), in the order of `_PAIRS`."""
     x, y, z = vectors.unbind(-1)
@@ -135,20 +140,25 @@ def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
     return across[:, index[:, :, None, None], index]
 
 
-def _homography(local: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
-    """(B, 3, 3): of the plane's points (x, y, 1) to their rays, by the least algebraic error."""
-    # as pixels are, by R. Hartley, rays are brought apart: those of a narrow view are nearly the same
-    moment = (weights[..., None] * rays).mT @ rays
-    trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1)
-    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
-    spread, _ = torch.linalg.cholesky_ex(moment + _LEAST * trace.clamp(min=_TINY)[:, None, None] * eye)
-    apart = normalize(rays @ torch.linalg.solve_triangular(spread, eye.expand_as(spread), upper=False).mT, dim=-1)
-    plane = torch.cat((local[..., :2], torch.ones_like(local[..., :1])), -1)
-    normal = _moments(apart, plane, weights).transpose(2, 3).reshape(-1, 9, 9)
-    _, vectors = torch.linalg.eigh(normal)
-    homography = spread @ vectors[..., 0].view(-1, 3, 3)
-    ahead = (weights * (rays * (plane @ homography.mT)).sum(-1).sign()).sum(-1)
-    return torch.where(ahead[:, None, None] < 0, -homography, homography)
+def _homography(sight: Tensor, distances: _Distances) -> Tensor:
+    """(B, 3, 3): of the plane's points (x, y, 1) to their rays, by the least distances at the scale that is seen best.
+
+    sight: (B, 3) about where the points are.
+    """
+    # the first two columns' entries across the line of sight and, of which narrow views tell little, along it
+    frame = _frame(sight)
+    basis = torch.stack((frame.mT, torch.zeros_like(frame)), -1)
+    basis = torch.stack((basis, basis.flip(-1)), 2).flatten(1, 2)
+    basis = torch.nn.functional.pad(basis, (0, 1)).flatten(2)
+    small = basis @ distances.form @ basis.mT
+    scale = small.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+    eye = torch.eye(2, dtype=small.dtype, device=small.device)
+    along = torch.linalg.solve_ex(small[:, 4:, 4:] + (_LEAST * scale + _TINY) * eye, small[:, 4:, :4])[0]
+    across = torch.linalg.eigh(small[:, :4, :4] - small[:, :4, 4:] @ along).eigenvectors[..., :1]
+    entries = basis.mT @ torch.cat((across, -along @ across), 1)
+    entries = torch.where((distances.to_depth[:, None] @ entries) < 0, -entries, entries)
+    columns = entries.view(-1, 3, 3)[..., :2]
+    return torch.cat((columns, distances.to_translation @ entries), -1)
 
 
 class _Distances(NamedTuple):
@@ -195,9 +205,9 @@ class _Distances(NamedTuple):
         costs = self.of_rotations(rotations)
         damping = torch.full_like(costs, 1e-2)
         eye = torch.eye(3, dtype=costs.dtype, device=costs.device)
-        turns = torch.linalg.cross(eye[:, None], eye[None]).mT
+        turns = torch.linalg.cross(eye[:, None], eye[None]).mT.flatten(0, 1)
         for _ in range(steps):
-            slopes = (turns @ rotations[:, :, None]).flatten(3)
+            slopes = (turns @ rotations).unflatten(2, (3, 3)).flatten(3)
             mapped = (slopes.flatten(1, 2) @ self.form).view_as(slopes)
             gradient = mapped @ rotations.flatten(2)[..., None]
             normal = mapped @ slopes.mT
@@ -214,12 +224,12 @@ class _Distances(NamedTuple):
 
 def _planar_rotations(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
     """(B, 2, 3, 3): of points in the plane z = 0 around its origin."""
-    return distances.descended(_planar_starts(local, rays, weights), _STEPS)
+    return distances.descended(_planar_starts(rays, weights, distances), _STEPS)
 
 
-def _planar_starts(local: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
+def _planar_starts(rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
     """(B, 2, 3, 3): the rotations that the homography leaves."""
-    homography = _homography(local, rays, weights)
+    homography = _homography(_sight(rays, weights), distances)
     frame = _frame(normalize(homography[..., 2], dim=-1))
     # across the line of sight the columns of the rotation are known up to the distance, and the larger singular value
     # of that part of a rotation is one
@@ -239,7 +249,7 @@ def _planar_starts(local: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
 
 def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
     """(B, 2, 3, 3): of points that are not on a plane, whose main axes are the coordinates'."""
-    frame = _frame(normalize((weights[..., None] * rays).sum(-2), dim=-1))
+    frame = _frame(_sight(rays, weights))
     linear = torch.linalg.eigh(distances.form).eigenvectors[..., 0].view(-1, 1, 3, 3)
     linear = torch.where(distances.depths(linear)[..., None, None] < 0, -linear, linear)
     # from afar, the two rows across the line of sight in units of the distance
@@ -247,7 +257,7 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
     rows = normalize(rows / (weights[..., None] * local.square()).sum(-2).clamp(min=_TINY)[:, None], dim=-1)
     from_afar = frame @ torch.cat((rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])), 1)
     nearest = _nearest_rotation(torch.cat((linear, from_afar[:, None]), 1))
-    planar = _planar_starts(local, rays, weights)
+    planar = _planar_starts(rays, weights, distances)
     rotations = torch.cat((nearest, planar, frame[:, None] @ _right_turns(frame)), 1)
 
     def costs(rotations: Tensor) -> Tensor:

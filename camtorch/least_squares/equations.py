@@ -108,15 +108,15 @@ class System:
 
 def triangle_of_few(rows: Tensor) -> Tensor:
     """(..., L, L + 1): a triangle of rows (..., M, L + 1), of few columns that are well apart."""
-    matrix, right = rows[..., :-1], rows[..., -1:]
-    squares = matrix.mT @ matrix
+    products = rows.mT @ rows
+    squares, right = products[..., :-1, :-1], products[..., :-1, -1:]
     scale = squares.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(scale > 0, scale, 1.0).rsqrt()
     scaled = squares * scale[..., None] * scale[..., None, :]
     # a view in which nothing is seen, or too little, stays where it is
     scaled = scaled + torch.diag_embed(torch.full_like(scale, 1e-14))
     lower, _ = torch.linalg.cholesky_ex(scaled)
-    turned = torch.linalg.solve_triangular(lower, scale[..., None] * (matrix.mT @ right), upper=False)
+    turned = torch.linalg.solve_triangular(lower, scale[..., None] * right, upper=False)
     return torch.cat((lower.mT / scale[..., None, :], turned), -1)
 
 
