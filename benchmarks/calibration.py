@@ -1,8 +1,9 @@
 """Calibration: a camera from views of a chessboard, and poses of a known camera, beside OpenCV.
 
 The views are made: a board of 9 by 6 corners about random pixels of a camera, tilted up to 40 degrees, each corner with
-0.2 px of noise. All start from nothing: no focal length is given. The time of OpenCV's calibrateCamera grows with the
-third power of the number of views, so that it takes part up to 50 of them.
+0.2 px of noise. All start from nothing: no focal length is given. camtorch always finds the covariances as well; of
+OpenCV that is calibrateCameraExtended, whose time grows with more than the number of views, so that it takes part up to
+200 of them, as does its fisheye calibration, which has no covariances.
 
 What is required is judged by the fastest rounds.
 """
@@ -32,12 +33,13 @@ from camtorch.rotations import rotation_matrix
 MODELS = ("brown_conrady", "kannala_brandt")
 VIEWS, QUICK_VIEWS = (10, 50, 200, 2000), (10, 20)
 POSES, QUICK_POSES = 1000, 20
-MOST_FOR_OPENCV = 50
 COLUMNS, ROWS, SQUARE, NOISE = 9, 6, 0.025, 0.2
 _SECONDS = {200: 1.0, 2000: 10.0}  # that so many views may take
 _POSE_SECONDS = 0.1
 _LINEAR = 1.3  # times as much for each of ten times as many views
 CALIBRATE, POSE = "calibrate", "solve_pnp"
+EXTENDED = "OpenCV, covariances"
+_MOST = 200  # views, for the slow ones
 
 
 class Views(NamedTuple):
@@ -99,23 +101,22 @@ def _ours(key: str, made: Views, device: torch.device) -> ct.Calibration:
     return ct.calibrate(key, made.board.to(device), made.pixels.to(device), image_size=cameras.SIZE)
 
 
-def _opencv(key: str, made: Views) -> float:
-    """OpenCV's rms."""
+def _peers(key: str, made: Views) -> dict[str, Callable[[], float]]:
+    """By contestant, what gives OpenCV's rms."""
     boards, pixels, size = [made.board.numpy()] * len(made.pixels), [*made.pixels.numpy()], cameras.SIZE[::-1]
+    few = len(made.pixels) <= _MOST
     if key == "kannala_brandt":
         flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW  # without the first it ends 21 px off
         rows = [[points[None] for points in views] for views in (boards, pixels)]
-        rms, *_ = cv2.fisheye.calibrate(*rows, size, None, None, flags=flags)
-    else:
-        singles = [[points.astype(np.float32) for points in views] for views in (boards, pixels)]
-        rms, *_ = cv2.calibrateCamera(*singles, size, None, None)
-    return float(rms)
+        return {OPENCV: lambda: cv2.fisheye.calibrate(*rows, size, None, None, flags=flags)[0]} if few else {}
+    singles = [[points.astype(np.float32) for points in views] for views in (boards, pixels)]
+    plain = {OPENCV: lambda: cv2.calibrateCamera(*singles, size, None, None)[0]}
+    return plain | ({EXTENDED: lambda: cv2.calibrateCameraExtended(*singles, size, None, None)[0]} if few else {})
 
 
 def _calibrations(key: str, made: Views, options: Options) -> list[Record]:
     runs: dict[str, Callable[[], object]] = {OURS: partial(_ours, key, made, options.device)}
-    if len(made.pixels) <= MOST_FOR_OPENCV:
-        runs[OPENCV] = partial(_opencv, key, made)
+    runs |= _peers(key, made)
     return measure(f"{key}, {CALIBRATE}", f"V = {len(made.pixels)}", runs, options)
 
 
@@ -123,9 +124,7 @@ def _errors(key: str, made: Views) -> list[Record]:
     column = f"V = {len(made.pixels)}"
     progress(f"{key}, {CALIBRATE}, {column}: errors")
     records = [Record(key, OURS, column, "rms", _ours(key, made, made.pixels.device).rms)]
-    if len(made.pixels) <= MOST_FOR_OPENCV:
-        records.append(Record(key, OPENCV, column, "rms", _opencv(key, made)))
-    return records
+    return records + [Record(key, name, column, "rms", rms()) for name, rms in _peers(key, made).items()]
 
 
 def _memory(key: str, made: Views, options: Options) -> list[Record]:
