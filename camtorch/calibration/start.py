@@ -26,10 +26,11 @@ _TRIED = {
     0.5: (8.0, 14.0, 22.0, 32.0, 44.0, 56.0, 68.0, 80.0, 92.0, 104.0, 116.0),
     0.65: (8.0, 14.0, 22.0, 32.0, 44.0, 56.0, 68.0, 80.0, 92.0, 104.0),
 }
-_VIEWS, _POINTS = 24, 64  # that the search looks at
+_VIEWS, _POINTS = 24, 100  # that the search looks at
 _KEPT = 5  # of the lenses tried
 _ROUNDS = 4  # of poses
 _BAD = 2.0  # times the usual error: a view whose pose may be spoilt
+_IN_DOUBT = 4.0  # times the usual error of the better pose: the other one may be it
 _HANDFULS, _HANDFUL = 48, 6  # of corners, of which a pose is made where outliers spoil that of all
 _CHANGED = 0.9  # of the usual error of a view before: then another round is worth it
 _TRIMMED = 0.8  # of the views decide: others may be spoilt
@@ -290,28 +291,39 @@ def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
 def _turned(lens: _Lens, some: Observations, image_size: tuple[int, int]) -> _Lens:
     """With the best of the poses that each view may have under a single camera: a plane has two that look alike."""
     camera = _camera(lens.model, lens.parameters, image_size)
-    lens = lens._replace(boards=_resampled(camera, lens.boards, some))
+    old = _resampled(camera, lens.boards, some)
     rays, has_ray = (t[0] for t in _rays(camera, some))
-    errors = _errors(camera, lens.boards, some)[0]
-    weights = torch.where(has_ray, 1 / (1 + (errors / lens.scale).square()), 0.0)
+    errors = _errors(camera, old, some)
+    weights = torch.where(has_ray, 1 / (1 + (errors[0] / lens.scale).square()), 0.0)
     found = poses_from_rays(some.points, rays, weights)
-    # each pose of each view is a problem of its own
-    pairs = zip(lens.boards, found[:2], strict=True)
-    boards = Poses(*(torch.cat((old[0, :, None], new), 1).flatten(0, 1)[:, None] for old, new in pairs))
-    many = 1 + found.rotations.shape[1]
-    sight = Sight(lens.model, *(t[0].repeat_interleave(many, 0)[:, None] for t in _sight(lens.model, some)[1:]))
-    free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool),), (False,))
-    ended = adjust(
-        [sight],
-        _state(lens.parameters, boards),
-        free,
-        loss="cauchy",
-        loss_scale=lens.scale,
-        steps=_STEPS,
+    first, second = (Poses(*(t[None, :, i] for t in found[:2])) for i in range(2))
+    usual, other, others = (_errors(camera, poses, some)[0].nanmedian(-1).values for poses in (old, first, second))
+    first = _chosen(usual <= other, old, first)
+    (rows,) = (others <= _IN_DOUBT * torch.minimum(usual, other)).nonzero(as_tuple=True)
+    if len(rows) == 0:
+        return lens._replace(boards=first)
+    # each is a problem of its own
+    both = Poses(*(torch.cat((a[0, rows], b[0, rows]))[:, None] for a, b in zip(first, second, strict=True)))
+    sight = Sight(
+        lens.model, *(t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None] for t in _sight(lens.model, some)[1:])
     )
-    best = ended.cost.view(-1, many).argmin(-1)
-    best = best + many * torch.arange(len(best), device=best.device)
-    return lens._replace(boards=Poses(*(t[best].transpose(0, 1) for t in ended.state.boards)))
+    free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool),), (False,))
+    state = _state(lens.parameters, both)
+    ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_STEPS)
+    a, b = (
+        Poses(*(t[part].transpose(0, 1) for t in ended.state.boards))
+        for part in (slice(len(rows)), slice(len(rows), None))
+    )
+    better = _chosen(ended.cost[: len(rows)] <= ended.cost[len(rows) :], a, b)
+    return lens._replace(boards=Poses(*(t.index_copy(1, rows, new) for t, new in zip(first, better, strict=True))))
+
+
+def _chosen(which: Tensor, a: Poses, b: Poses) -> Poses:
+    """Of poses (1, V) those of a where which, bool (V,)."""
+    return Poses(
+        torch.where(which[:, None, None], a.rotations, b.rotations),
+        torch.where(which[:, None], a.translations, b.translations),
+    )
 
 
 def _refined(
