@@ -1,0 +1,137 @@
+"""Calibrations that start from nothing end where those end that start from the truth."""
+
+import math
+import random
+
+import boards
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.calibration.observations import Observations
+from camtorch.calibration.start import poses_for, start_from_nothing
+
+SIZE = (480, 640)
+DISTORTION = {
+    "pinhole": None,
+    "brown_conrady": (-0.28, 0.08, 1e-3, -5e-4, 0.02),
+    "kannala_brandt": (-0.04, 0.01, -0.004, 0.0005),
+    "fisheye62": (0.02, -0.01, 0.003, -5e-4, 1e-4, -1e-5, 1e-3, -8e-4),
+    "fisheye624": (0.02, -0.01, 0.003, -5e-4, 1e-4, -1e-5, 1e-3, -8e-4, 1e-3, -5e-4, 8e-4, 2e-4),
+    "double_sphere": (-0.2, 0.58),
+    "eucm": (0.62, 1.2),
+    "mei": (0.9, -0.1, 0.05, 5e-4, -3e-4),
+    "ucm": (0.63,),
+    "fov": (0.9,),
+    "division": (-0.2,),
+    "equisolid": (-0.03, 0.01, 0.002, -0.001),
+    "stereographic": (-0.1, 0.02, -0.003, 2e-4),
+    "f_theta": (0.02, -0.03, 0.005),
+    "thin_prism_fisheye": (-0.03, 0.01, 5e-4, -3e-4, -0.003, 4e-4, 1e-3, -5e-4),
+}
+
+
+def a_camera(key, degrees, seed=0):
+    """Of a field of view, with its principal point off the middle and pixels that are not quite square."""
+    rng = random.Random(seed)
+    camera = ct.MODELS[key].from_fov(degrees, image_size=SIZE, **_distortion(key))
+    fx, fy, cx, cy = camera.intrinsics.detach().double().tolist()
+    intrinsics = [fx, fy * rng.uniform(0.99, 1.01), cx + rng.uniform(-15, 15), cy + rng.uniform(-10, 10)]
+    return ct.MODELS[key](torch.tensor(intrinsics, dtype=torch.float64), image_size=SIZE, **_distortion(key))
+
+
+def _distortion(key):
+    values = DISTORTION[key]
+    return {} if values is None else {"distortion": torch.tensor(values, dtype=torch.float64)}
+
+
+def seen_by(camera, degrees, views, noise, seed):
+    """Views of a board that takes a third to two thirds of the image."""
+    wide = math.radians(min(degrees, 90.0))
+    reach = 0.12 / math.tan(wide / 4)
+    seen, rotations, translations = boards.seen_by(
+        camera, views, noise=noise, near=0.9 * reach, far=2 * reach, tilt=50.0, seed=seed
+    )
+    whole = (~seen.image_points.isnan().any(-1)).sum(-1) >= 20
+    return seen._replace(image_points=seen.image_points[whole]), rotations[whole], translations[whole]
+
+
+def check(key, degrees, views=14, noise=0.3, seed=0):
+    camera = a_camera(key, degrees, seed)
+    seen, _, _ = seen_by(camera, degrees, views, noise, seed)
+    options = {"image_size": SIZE, "count": len(camera.distortion_names)}
+    found = ct.calibrate(key, *seen[:2], **options)
+    best = ct.calibrate(key, *seen[:2], start=camera, image_size=SIZE)
+    assert found.converged
+    # a search may end in a place that is better than the one next to the truth
+    assert found.rms <= best.rms * (1 + 1e-6)
+    assert found.rms < 1.1 * noise * 2**0.5
+
+
+@pytest.mark.parametrize(
+    ("key", "degrees"),
+    [("pinhole", 40), ("kannala_brandt", 190)],
+)
+def test_nothing_has_to_be_known(key, degrees):
+    check(key, degrees)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("key", DISTORTION)
+def test_nothing_has_to_be_known_of_any_model(key, seed):
+    widest = {"pinhole": 115, "brown_conrady": 85, "fov": 150, "division": 150, "f_theta": 180}.get(key, 195)
+    check(key, random.Random(f"{key}{seed}").uniform(30, widest), noise=(0.1, 0.8)[seed], seed=seed)
+
+
+def test_gross_errors_do_not_lead_astray():
+    camera = a_camera("kannala_brandt", 120)
+    seen, _, _ = seen_by(camera, 120, 8, 0.3, 1)
+    generator = torch.Generator().manual_seed(0)
+    wrong = torch.rand(seen.image_points.shape[:2], generator=generator) < 0.15
+    pixels = seen.image_points + wrong[..., None] * 60 * torch.randn(seen.image_points.shape, generator=generator)
+    pixels = pixels.double().clamp(0, SIZE[0] - 1)
+    options = {"image_size": SIZE, "loss": "cauchy"}
+    found = ct.calibrate("kannala_brandt", seen.object_points, pixels, **options)
+    best = ct.calibrate(camera, seen.object_points, pixels, **options)
+    torch.testing.assert_close(found.camera.intrinsics, best.camera.intrinsics, rtol=1e-6, atol=0)
+
+
+def test_what_is_fixed_stays():
+    camera = ct.BrownConrady(
+        torch.tensor([500.0, 500, 319.5, 239.5]), torch.tensor([-0.3, 0.1, 0, 0, 0]), image_size=SIZE
+    )
+    seen, _, _ = seen_by(camera, 65, 10, 0.2, 2)
+    found = ct.calibrate("brown_conrady", *seen[:2], image_size=SIZE, fixed=("cx", "cy", "p1", "p2", "k3"))
+    assert found.camera.intrinsics[2:].tolist() == [319.5, 239.5]
+    assert found.camera.distortion[2:].tolist() == [0, 0, 0]
+    assert found.rms < 0.35
+
+
+def test_a_model_that_does_not_reach_says_so():
+    seen = boards.ov_plane("train")
+    with pytest.raises(ValueError, match=r"BrownConrady has no pixels for \d+ of \d+ corners.*degrees"):
+        ct.calibrate("brown_conrady", *seen[:2], image_size=seen.image_size)
+
+
+def test_the_better_of_two_poses_that_look_alike():
+    camera = a_camera("pinhole", 12).requires_grad_(False)
+    seen, rotations, _ = seen_by(camera, 12, 30, 0.05, 3)
+    known = ~seen.image_points.isnan().any(-1)
+    points = seen.object_points.expand(len(known), -1, -1)
+    observations = Observations(points, seen.image_points.nan_to_num(0.0), known)
+    state = poses_for(camera.intrinsics[None], observations, ct.Pinhole, SIZE)
+    cosine = (state.boards.rotations[0][..., 2] * rotations[..., 2]).sum(-1)
+    assert float(cosine.amin()) > math.cos(math.radians(3))
+
+
+def test_wide_lenses_of_few_views():
+    camera = a_camera("kannala_brandt", 185).requires_grad_(False)
+    seen, _, _ = seen_by(camera, 185, 5, 0.2, 4)
+    known = ~seen.image_points.isnan().any(-1)
+    points = seen.object_points.expand(len(known), -1, -1)
+    observations = Observations(points, seen.image_points.nan_to_num(0.0), known)
+    state = start_from_nothing(observations, ct.KannalaBrandt, 2, SIZE, fixed=("cx", "cy"))
+    assert state.parameters[0].shape == (1, 6)
+    assert state.parameters[0][0, 2:4].tolist() == [319.5, 239.5]
+    assert abs(float(state.parameters[0][0, 0] / camera.fx) - 1) < 0.1
