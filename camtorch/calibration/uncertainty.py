@@ -145,8 +145,9 @@ def shared_factor(equations: Equations) -> Tensor:
     triangle = equations.shared[:, :-1, :-1]
     if not triangle.shape[-1]:
         return triangle
-    # the columns differ by many orders of magnitude
-    scale = torch.linalg.vector_norm(triangle, dim=-2)
+    # the columns differ by many orders of magnitude, also before what poses make up for is taken out of them
+    own = equations.view[..., -triangle.shape[-1] - 1 : -1].square().sum((1, 2))
+    scale = (own + triangle.square().sum(-2)).sqrt()
     scale = torch.where(scale > 0, scale, 1.0)
     _, sizes, axes = torch.linalg.svd(triangle / scale[:, None])
     least = _LEAST * sizes[:, :1].clamp(min=torch.finfo(sizes.dtype).tiny)
