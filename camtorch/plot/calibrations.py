@@ -504,7 +504,8 @@ def _crosses(ax: Axes, shots: Sightings, index: int | None = None) -> None:
     if out.any():
         u, v = shots.pixels[out].T
         label = f"{len(u):,} outlier{'s' * (len(u) > 1)}"
-        ax.plot(u, v, "x", color=COLOURS[1], markersize=4, markeredgewidth=1, label=label, zorder=5, linestyle="none")
+        size, thick = (4, 1.0) if index is None else (7, 1.6)
+        ax.plot(u, v, "x", color=COLOURS[1], markersize=size, markeredgewidth=thick, label=label, zorder=5)
         ax.legend(loc="lower right", framealpha=0.8, handletextpad=0.2)
 
 
