@@ -73,7 +73,7 @@ def attempts(camera, fov, count, points, kind, noise, seed):
         found, rms, valid = ct.solve_pnp(camera, target, pixels)
         torch.testing.assert_close(rms_of(camera, found, target, pixels)[valid], rms[valid])
         near_truth = rms_of(camera, ct.Extrinsics.from_matrix(rotation, t), target, pixels)
-    return valid & (rms <= near_truth)
+    return valid & (rms <= near_truth + 1e-8)
 
 
 @pytest.mark.parametrize("kind", ["planar", "space"])
@@ -84,12 +84,12 @@ def test_noisy_pixels_are_explained_better_than_by_the_truth(kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["planar", "space"])
-@pytest.mark.parametrize("fov", [10, 30, 60, 90, 130, 170, 190])
+@pytest.mark.parametrize("fov", [10, 90, 190])
 def test_thousands_of_poses_end_in_the_optimum(fov, kind):
     good = [
         attempts(lens(fov), fov, 100, points, kind, noise, points)
-        for points in (4, 5, 6, 8, 12, 20, 50)
-        for noise in (0.0, 0.1, 0.5, 1.0)
+        for points in (4, 5, 8, 50)
+        for noise in (0.0, 0.1, 1.0)
     ]
     assert torch.cat(good).double().mean() > 0.998
 
