@@ -182,6 +182,27 @@ class Rig(nn.Module):
             raise ValueError(f"Rig: no camera and no image is called {name!r}; there are {shown}")
         return found
 
+    def between(self, left: str, right: str) -> Extrinsics:
+        """Right from left, `p_right = R p_left + t`: what `rectify` takes.
+
+            ct.rectify(rig["left"], rig["right"], rig.between("left", "right"))
+
+        Composed anew from `extrinsics` at each call; where these learn, gradients reach them.
+
+        Args:
+            left: the name of a camera, or of an image, whose pose the rig has.
+            right: that of another.
+
+        Raises:
+            ValueError: no such camera, or it has no pose.
+        """
+        for name in (left, right):
+            self.camera_of(name)
+            if name not in self.extrinsics:
+                posed = ", ".join(map(repr, list(self.extrinsics)[:_SHOWN])) or "none"
+                raise ValueError(f"Rig: {name!r} has no pose in rig.extrinsics; there is {posed}")
+        return self.extrinsics[right].compose(self.extrinsics[left].inverse())
+
     def __getitem__(self, name: str) -> Camera:
         """The same as `camera_of`, but that an unknown name is a KeyError."""
         try:

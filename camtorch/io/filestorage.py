@@ -10,7 +10,7 @@ from xml.parsers import expat
 
 from camtorch.io._errors import CameraFileError
 from camtorch.io.record import repeated
-from camtorch.io.writing import number
+from camtorch.io.writing import number, replacing
 
 Value = float | list[list[float]]
 """A number, or the rows of a matrix."""
@@ -64,6 +64,26 @@ def as_xml(values: dict[str, Value]) -> str:
             lines += [f"  <cols>{len(value[0])}</cols>", "  <dt>d</dt>", "  <data>"]
             lines.append(f"    {_words(value, ' ')}</data></{key}>")
     return "\n".join([*lines, "</opencv_storage>"]) + "\n"
+
+
+_TEXTS = {".yml": as_yaml, ".yaml": as_yaml, ".json": as_json, ".xml": as_xml}
+
+
+def text_for(path: str | os.PathLike[str], values: dict[str, Value]) -> str:
+    """The text of a file whose name says YAML, JSON or XML; of any other name YAML."""
+    return _TEXTS.get(os.path.splitext(os.fspath(path))[1].lower(), as_yaml)(values)
+
+
+def write(path: str | os.PathLike[str], values: dict[str, Value]) -> None:
+    """Write a file that `cv2.FileStorage` reads, whole or not at all.
+
+    Raises:
+        ValueError: a name that says none of YAML, JSON and XML.
+    """
+    if os.path.splitext(os.fspath(path))[1].lower() not in _TEXTS:
+        raise ValueError(f"{os.fspath(path)}: files of OpenCV are called .yml, .json or .xml")
+    with replacing(path) as (file,):
+        file.write(text_for(path, values).encode())
 
 
 # -- reading XML: a mapping in <opencv_storage>, sequences as words or as elements called _

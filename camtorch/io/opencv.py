@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
-from camtorch.io.filestorage import Value, as_json, as_xml, as_yaml
+from camtorch.io.filestorage import Value, text_for
 from camtorch.io.parsing import read_mapping
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
@@ -40,6 +39,7 @@ _OTHER_LENS = re.compile(r"(?i:distortion_?model|camera_?model)")
 _FISHEYE_COUNT = 4  # of cv2.fisheye, and one of the counts of cv2.calibrateCamera
 _LONGEST_KEY = 200
 _PAIRS = (["1", "2"], ["left", "right"])
+_POSES = (("R", "T"), ("rvec", "tvec"), ("om", "T"))  # a matrix, or a rotation vector
 
 
 class AmbiguousModelWarning(UserWarning):
@@ -84,7 +84,7 @@ def matches(keys: dict) -> bool:
 
 
 def parse(record: Record, model: str | None = None) -> Rig:
-    """The cameras of a file, called by the ends of their keys; `X2 = R X1 + T` of a pair."""
+    """The cameras of a file, called by the ends of their keys; `X2 = R X1 + T` of a pair, R also as a vector `om`."""
     file = _File(record)
     names = sorted(file.by_name(_MATRIX), key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     if not names:
@@ -92,9 +92,10 @@ def parse(record: Record, model: str | None = None) -> Rig:
     record.few(len(names))
     cameras = {name or "camera": file.camera(model, name) for name in names}
     extrinsics = {}
-    if names in _PAIRS and (("R" in record and "T" in record) or ("rvec" in record and "tvec" in record)):
+    keys = next((keys for keys in _POSES if all(key in record for key in keys)), None)
+    if names in _PAIRS and keys is not None:
         here = poses.pose(record, [0.0] * 3, [0.0] * 3)
-        there = file.pose("R", "T") if "R" in record else file.pose_by_vectors("rvec", "tvec")
+        there = file.pose(*keys) if keys[0] == "R" else file.pose_by_vectors(*keys)
         extrinsics = dict(zip(names, (here, there), strict=True))
     return Rig(cameras, extrinsics)
 
@@ -268,8 +269,7 @@ def render(rig: Rig, path: str) -> str:
     for name, end in zip(names, ends, strict=True):
         _add_camera(lossy, values, name, rig.cameras[name], end)
     _add_pose(lossy, values, rig, sorted(zip(ends, names, strict=True)))
-    suffix = os.path.splitext(str(path))[1].lower()
-    return {".json": as_json, ".xml": as_xml}.get(suffix, as_yaml)(values)
+    return text_for(path, values)
 
 
 def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str) -> None:

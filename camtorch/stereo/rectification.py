@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
@@ -12,6 +13,7 @@ from camtorch._arguments import Numbers, as_batch, as_image_size, as_values
 from camtorch._module import GeometryModule, Memo
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
+from camtorch.io.filestorage import Value, write
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
 from camtorch.projection.rays import image_lattice
 from camtorch.rotations import rotation_matrix
@@ -289,6 +291,20 @@ class Rectification(GeometryModule):
             )
         ).view(4, 4)
         return {"R1": frame.left, "R2": frame.right, "P1": first, "P2": first + shift, "Q": q}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file for `cv2.FileStorage`, .yml, .json or .xml: what `opencv` gives, the R and T of the pair, and
+        image_width and image_height of the rectified images.
+
+        Raises:
+            ValueError: as `opencv`; another suffix. OSError: it cannot be written.
+        """
+        matrices, pose = self.opencv(), self.extrinsics.matrix()
+        height, width = self.camera_left._size("Rectification.save")
+        values: dict[str, Value] = {"image_width": width, "image_height": height}
+        for name, matrix in {"R": pose[:3, :3], "T": pose[:3, 3:], **matrices}.items():
+            values[name] = matrix.detach().double().tolist()
+        write(path, values)
 
     def extra_repr(self) -> str:
         """How the images lie."""
