@@ -43,7 +43,7 @@ def seen_by(camera, board, turn, shift, noise, rng):
 def photographs(tmp_path_factory):
     """A folder of photographs of a chessboard."""
     folder = tmp_path_factory.mktemp("photographs")
-    for index, (turn, shift) in enumerate(poses(BOARD), 1):
+    for index, (turn, shift) in enumerate(poses(BOARD, 6), 1):
         image, _ = photograph(BOARD, fisheye(), turn.tolist(), shift.tolist(), seed=index)
         Image.fromarray(image).save(folder / f"view{index}.png")
     return folder
@@ -74,9 +74,9 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypat
     calibrate(photographs, *words, "-o", "camera.yml")
     captured = capsys.readouterr()
     out = captured.out.splitlines()
-    assert out[0] == "chessboard, 9x6 inner corners, squares of 30 mm: in 8 of 8 images of 640x480, 431 corners"
+    assert out[0] == "chessboard, 9x6 inner corners, squares of 30 mm: in 6 of 6 images of 640x480, 323 corners"
     assert out[1].startswith("kannala_brandt: rms 0.0")
-    assert out[1].endswith(" px per coordinate, 8 views, 431 corners")
+    assert out[1].endswith(" px per coordinate, 6 views, 323 corners")
     assert [line.split()[0] for line in out[2:10]] == ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]
     assert out[10].startswith("Good for ")
     assert out[-1] == "camera.yml: kannala_brandt"
@@ -85,7 +85,7 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypat
     assert "fisheye_model: 1" in Path("camera.yml").read_text()
     # what was found is not searched for again, also where it is called and lies otherwise, in any order
     monkeypatch.setattr(searching, "detect", None)
-    for index in range(1, 9):
+    for index in range(1, 7):
         Path(f"{9 - index}.png").write_bytes((photographs / f"view{index}.png").read_bytes())
     calibrate("[0-9].png", *words, "-o", "again.yml")
     assert torch.allclose(found_camera("again.yml").intrinsics, found_camera().intrinsics, rtol=1e-6)
@@ -151,7 +151,7 @@ def test_what_is_left_out_has_a_reason(photographs, capsys):
         Path(f"{index}.png").write_bytes((photographs / f"view{index}.png").read_bytes())
     Image.new("L", (640, 480)).save("5.png")
     Path("6.png").write_text("no image")
-    Path("7.png").write_bytes((photographs / "view7.png").read_bytes()[:2000])
+    Path("7.png").write_bytes((photographs / "view5.png").read_bytes()[:2000])
     with Image.open("1.png") as image:
         image.resize((960, 720)).save("8.png")
     words = ".", "none.png", "--board", "9x6", "--model", "kannala_brandt", "--fixed", "k3,k4", "-o", "camera.json"
@@ -171,6 +171,7 @@ def test_what_is_left_out_has_a_reason(photographs, capsys):
     assert captured.out.count("held") == 2
 
 
+@pytest.mark.slow
 def test_a_wrong_size_of_the_board_is_named(photographs, capsys):
     calibrate(photographs / "view1.png", "--board", "10x7", "-o", "camera.yml", expect=2)
     error = capsys.readouterr().err.splitlines()[-1]

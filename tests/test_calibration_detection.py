@@ -55,7 +55,9 @@ def test_chessboards_keep_their_order_however_they_are_turned():
         assert np.abs(detect(board, image).pixels - truth).max() < 0.6
 
 
-@pytest.mark.parametrize(("columns", "rows", "symmetries"), [(7, 5, 2), (6, 6, 4), (5, 5, 2)])
+@pytest.mark.parametrize(
+    ("columns", "rows", "symmetries"), [(7, 5, 2), (6, 6, 4), pytest.param(5, 5, 2, marks=pytest.mark.slow)]
+)
 def test_ambiguous_chessboards_begin_near_the_top_left(columns, rows, symmetries):
     board = Chessboard(columns, rows, 0.03)
     assert board.symmetries == symmetries
