@@ -42,9 +42,11 @@ from camtorch.native.library import native_available
 from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
+from camtorch.warp import views
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.plane import BirdsEye, PlaneWarp
 from camtorch.warp.reproject import Reproject
+from camtorch.warp.surround import Surround, surround
 from camtorch.warp.warp import Warp
 
 __all__ = [
@@ -83,6 +85,7 @@ __all__ = [
     "Rig",
     "RigCalibration",
     "Stereographic",
+    "Surround",
     "Tabulated",
     "ThinPrismFisheye",
     "TiedFocal",
@@ -99,6 +102,8 @@ __all__ = [
     "rectify",
     "save",
     "solve_pnp",
+    "surround",
     "triangulate",
+    "views",
     "write_report",
 ]

@@ -13,15 +13,15 @@ from camtorch._tracing import in_graph, is_concrete
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.models import Pinhole
-from camtorch.rotations import rotate_planes, rotation_matrix
-from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, scaled, to_positions
+from camtorch.rotations import rotation_matrix
 from camtorch.warp.sampling import Fill, Mode, PaddingMode
+from camtorch.warp.surface import SurfaceWarp, turned
 from camtorch.warp.warp import Warp
 
 _GRAZING = 1e-9  # the cosine of a ray to the plane's normal from which on it does not meet the plane
 
 
-class PlaneWarp(Warp):
+class PlaneWarp(SurfaceWarp):
     """The image that `target` would see of a plane, made from the image of `source`, which stands elsewhere.
 
     What lies on the plane is where it should be; what rises above it is smeared, as in every image of that kind. For
@@ -43,8 +43,6 @@ class PlaneWarp(Warp):
         ValueError: a plane through one of the cameras, or one that the source sees from the other side; shapes that do
             not fit, and as `Warp`. TypeError: no cameras, no extrinsics.
     """
-
-    is_an_operator = False
 
     def __init__(
         self,
@@ -116,49 +114,18 @@ class PlaneWarp(Warp):
     def _inputs(self) -> list[Tensor]:
         return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation, self.normal, self.distance]
 
-    # -- where the images are sampled
+    # -- the surface
 
-    def _learned(self) -> Sampling:
-        return self._of_rows(range(self.target._size("Warp")[0]))
+    def _to_source(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        return _carried(rays, *self.plane), _ahead(rays, *self.plane[2:])
 
-    def _whole(self, padding: PaddingMode) -> Sampling:
-        return self._of_rows(range(self.target._size("Warp")[0]))
-
-    def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
-        if not self.antialias:
-            return self._of_rows(rows)
-        # the scale is that between neighbours
-        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
-        return self._of_rows(around).part(slice(rows.start - around.start, rows.stop - around.start))
-
-    def _of_rows(self, rows: range) -> Sampling:
-        pixels = pixels_of_rows(self.target, rows)
-        rays, has_ray = self.target.unproject(pixels.expand(*self.target.batch_shape, *pixels.shape))
-        if rays.ndim == 3:
-            rays, has_ray = rays[None], has_ray[None]
-        seen, mapped = self.source.project(self._as_batch(_carried(rays, *self.plane)))
-        mapped = mapped & has_ray & _ahead(rays, *self.plane[2:])
-        grid = to_positions(seen, mapped, self.source._size("Warp"))
-        return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
-
-    def _as_batch(self, points: Tensor) -> Tensor:
-        """One for each of the source's batch."""
-        count = self.source.batch_shape.numel()
-        return points.expand(count, *points.shape[1:]) if self.source.batch_shape and len(points) == 1 else points
-
-    # -- labels
-
-    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        rays, has_ray = self.source.unproject(pixels)
+    def _to_target(self, rays: Tensor) -> tuple[Tensor, Tensor]:
         rotation, shift, normal, distance = self.plane
         # the plane as the source has it
         of_source = (rotation @ normal[..., None])[..., 0]
         far = distance + (of_source * shift).sum(-1)
         back = rotation.mT
-        moved = _carried(rays, back, -(back @ shift[..., None])[..., 0], of_source, far)
-        seen, mapped = self.target.project(moved)
-        valid = mapped & has_ray & _ahead(rays, of_source, far)
-        return torch.where(valid.unsqueeze(-1), seen, -1.0), valid
+        return _carried(rays, back, -(back @ shift[..., None])[..., 0], of_source, far), _ahead(rays, of_source, far)
 
     def transform_rays(self, rays: Tensor) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
@@ -166,7 +133,7 @@ class PlaneWarp(Warp):
         if rays.ndim == 0 or rays.shape[-1] != 3:
             raise ValueError(f"{type(self).__name__}: rays must be (B, *N, 3); got shape {tuple(rays.shape)}")
         rotation = self.plane[0].mT.to(rays.dtype)
-        return _turned(rotation, rays)
+        return turned(rotation, rays)
 
     def inverse(self) -> Warp:
         """The warp from target to source, of the same plane. What lay outside the image stays lost."""
@@ -178,20 +145,11 @@ class PlaneWarp(Warp):
         return PlaneWarp(self.target, self.source, back, of_source, far, **options)
 
 
-def _turned(rotation: Tensor, rays: Tensor) -> Tensor:
-    """Rotations (*B, 3, 3) applied to (B, *N, 3) or (*N, 3)."""
-    if rotation.ndim == 2:
-        return torch.stack(rotate_planes(rotation, rays.unbind(-1)), -1)
-    rows = rays.expand(len(rotation), *rays.shape[1:]) if len(rays) == 1 else rays
-    planes = rows.flatten(1, -2).unbind(-1)
-    return torch.stack(rotate_planes(rotation, planes), -1).view(max(len(rows), len(rotation)), *rows.shape[1:])
-
-
 def _carried(rays: Tensor, rotation: Tensor, shift: Tensor, normal: Tensor, distance: Tensor) -> Tensor:
     """Directions in which another camera sees the points where rays (B, *N, 3) meet a plane: (R + t n^T / d) ray."""
     batch = torch.broadcast_shapes(rotation.shape[:-2], shift.shape[:-1], normal.shape[:-1], distance.shape)
     matrix = rotation + (shift / distance[..., None])[..., :, None] * normal[..., None, :]
-    return _turned(matrix.expand(*batch, 3, 3).to(rays.dtype), rays)
+    return turned(matrix.expand(*batch, 3, 3).to(rays.dtype), rays)
 
 
 def _ahead(rays: Tensor, normal: Tensor, distance: Tensor) -> Tensor:

@@ -1,0 +1,71 @@
+"""Warps between cameras that stand at different places, by a surface that both see."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from camtorch.rotations import rotate_planes
+from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, scaled, to_positions
+from camtorch.warp.sampling import PaddingMode
+from camtorch.warp.warp import Warp
+
+
+class SurfaceWarp(Warp):
+    """A `Warp` whose cameras see the same points of a surface, which says where rays of one meet those of the other.
+
+    Positions are exact, and full-size: no lattice.
+    """
+
+    is_an_operator = False
+
+    def _to_source(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays of the target (B, *N, 3) to directions in which the source sees their points, and whether there are."""
+        raise NotImplementedError
+
+    def _to_target(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """The other way."""
+        raise NotImplementedError
+
+    def _learned(self) -> Sampling:
+        return self._of_rows(range(self.target._size("Warp")[0]))
+
+    def _whole(self, padding: PaddingMode) -> Sampling:
+        return self._learned()
+
+    def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
+        if not self.antialias:
+            return self._of_rows(rows)
+        # the scale is that between neighbours
+        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
+        return self._of_rows(around).part(slice(rows.start - around.start, rows.stop - around.start))
+
+    def _of_rows(self, rows: range) -> Sampling:
+        pixels = pixels_of_rows(self.target, rows)
+        rays, has_ray = self.target.unproject(pixels.expand(*self.target.batch_shape, *pixels.shape))
+        if rays.ndim == 3:
+            rays, has_ray = rays[None], has_ray[None]
+        directions, met = self._to_source(rays)
+        count = self.source.batch_shape.numel()
+        if self.source.batch_shape and len(directions) == 1:
+            directions = directions.expand(count, *directions.shape[1:])
+        seen, mapped = self.source.project(directions)
+        mapped = mapped & has_ray & met
+        grid = to_positions(seen, mapped, self.source._size("Warp"))
+        return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
+
+    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        rays, has_ray = self.source.unproject(pixels)
+        directions, met = self._to_target(rays)
+        seen, mapped = self.target.project(directions)
+        valid = mapped & has_ray & met
+        return torch.where(valid.unsqueeze(-1), seen, -1.0), valid
+
+
+def turned(rotation: Tensor, rays: Tensor) -> Tensor:
+    """Matrices (*B, 3, 3) applied to (B, *N, 3) or (*N, 3)."""
+    if rotation.ndim == 2:
+        return torch.stack(rotate_planes(rotation, rays.unbind(-1)), -1)
+    rows = rays.expand(len(rotation), *rays.shape[1:]) if len(rays) == 1 else rays
+    planes = rows.flatten(1, -2).unbind(-1)
+    return torch.stack(rotate_planes(rotation, planes), -1).view(max(len(rows), len(rotation)), *rows.shape[1:])

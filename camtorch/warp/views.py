@@ -1,0 +1,194 @@
+"""A wide image as several pinhole images, and back: the faces of a cube, or a ring of views around."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+
+from camtorch._arguments import as_whole
+from camtorch._module import GeometryModule
+from camtorch.camera import Camera
+from camtorch.models import Pinhole
+from camtorch.projection.rays import slopes_at_axis
+from camtorch.rotations import mount_rotation
+from camtorch.warp.sampling import Mode
+from camtorch.warp.warp import Warp, as_sized
+
+__all__ = ["FACES", "Views", "cube", "ring"]
+
+FACES = ("front", "right", "back", "left", "up", "down")
+"""Of a cube, as the camera sees them from within; its own axis goes through the middle of the front."""
+_HALF = 0.5  # px, that a view reaches beyond the middle of its outermost pixels
+_EDGE = 1e-3  # px
+_OVERLAP = 1.25  # the width of a view in a ring over the step to the next one
+
+
+class Views(GeometryModule):
+    """Pinhole views of one camera's image: what `cube` and `ring` make.
+
+    `views(images)` makes them, `views.back(...)` puts what a network made of them together again. `warps[i]` moves
+    points and boxes to view i, `warps[i].inverse()` back; `rotations[i]` is `ray_view = R ray_camera`.
+
+    Args:
+        camera: of the wide images.
+        view: the pinhole camera of every view.
+        rotations: (N, 3, 3), `ray_view = R ray_camera`.
+        names: of the views.
+        mode: as `Warp` takes it.
+    """
+
+    rotations: Tensor
+
+    def __init__(
+        self, camera: Camera, view: Pinhole, rotations: Tensor, names: tuple[str, ...], mode: Mode = "bilinear"
+    ):
+        super().__init__()
+        self.camera, self.view, self.names = as_sized(camera, "camera", "Views"), view, names
+        self.register_buffer("rotations", rotations, persistent=False)
+        self.warps = nn.ModuleList([Warp(camera, view, rotation, mode=mode) for rotation in rotations])
+        self.backs = nn.ModuleList(
+            [Warp(view, camera, rotation.mT, mode=mode, padding_mode="border") for rotation in rotations]
+        )
+
+    def __len__(self) -> int:
+        """The number of views."""
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[Warp]:
+        """Over the warps."""
+        return iter(self.warps)  # type: ignore[arg-type]
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, N, C, S, S)."""
+        return torch.stack([warp(images) for warp in self.warps], 1)
+
+    def valid_masks(self) -> Tensor:
+        """(1, N, 1, S, S) bool: what of each view the camera sees."""
+        return torch.stack([warp.valid_mask() for warp in self], 1)
+
+    @torch.no_grad()
+    def weights(self) -> Tensor:
+        """(N, H, W): the part that each view has in each pixel of the wide image; where any has one, they add up to 1.
+
+        It falls linearly to the border of a view.
+        """
+        rays, has_ray = self.camera.rays()
+        height, width = self.view._size("Views")
+        parts = []
+        for rotation in self.rotations:
+            pixels, valid = self.view.project((rays @ rotation.mT.to(rays.dtype)).to(self.view.intrinsics.dtype))
+            inner = torch.minimum(pixels.amin(-1), (pixels.new_tensor([width - 1.0, height - 1.0]) - pixels).amin(-1))
+            # a ray between two faces is on both
+            near = valid & has_ray & (inner > -_HALF - _EDGE)
+            parts.append(torch.where(near, (inner + _HALF).clamp(min=_EDGE), 0.0))
+        whole = torch.stack(parts)
+        total = whole.sum(0)
+        return whole / torch.where(total > 0, total, 1.0)
+
+    def back(self, views: Tensor) -> tuple[Tensor, Tensor]:
+        """Views, or what was made of them, in the wide image.
+
+        Args:
+            views: (B, N, C, S, S).
+
+        Returns:
+            (B, C, H, W) of the same dtype, integers rounded, and valid (1, 1, H, W) bool: some view shows the pixel.
+
+        Raises:
+            ValueError: another shape.
+        """
+        size = self.view._size("Views")
+        if views.ndim != 5 or views.shape[1] != len(self) or tuple(views.shape[-2:]) != size:
+            raise ValueError(
+                f"Views: views must be (B, {len(self)}, C, {size[0]}, {size[1]}); got {tuple(views.shape)}"
+            )
+        weights = self.weights()
+        result = None
+        for i, warp in enumerate(self.backs):
+            image = views[:, i] if views.dtype.is_floating_point else views[:, i].float()
+            part = warp(image) * weights[i].to(image.dtype)
+            result = part if result is None else result + part
+        assert result is not None
+        valid = (weights.sum(0) > 0)[None, None]
+        if not views.dtype.is_floating_point:
+            result = result.round()
+        return result.to(views.dtype), valid
+
+    def extra_repr(self) -> str:
+        """The views."""
+        return f"{', '.join(self.names)}"
+
+
+def cube(camera: Camera, size: int | None = None, *, mode: Mode = "bilinear") -> Views:
+    """The six faces of a cube about a camera, of 90 degrees each: front, right, back, left, up, down.
+
+    Args:
+        camera: of the wide images, with image_size.
+        size: pixels along the sides of a face; as fine in its middle as the image at the axis by default.
+        mode: as `Warp` takes it.
+    """
+    size = _size(camera, size, math.pi / 2, "cube")
+    angles = torch.tensor([[0, 0], [90, 0], [180, 0], [-90, 0], [0, 90], [0, -90]], dtype=torch.float64)
+    rotations = mount_rotation(angles[:, 0], angles[:, 1], torch.zeros(6, dtype=torch.float64))
+    return _views(camera, size, math.pi / 2, rotations, FACES, mode)
+
+
+def ring(
+    camera: Camera,
+    count: int,
+    *,
+    fov: float | None = None,
+    size: int | None = None,
+    pitch: float = 0.0,
+    mode: Mode = "bilinear",
+) -> Views:
+    """Views side by side from left to right, over what a camera sees.
+
+    Args:
+        camera: of the wide images, with image_size.
+        count: of the views.
+        fov: radians, of a view; by default a quarter more than the step from one to the next.
+        size: pixels along the sides of a view; as fine in its middle as the image at the axis by default.
+        pitch: degrees that all look up.
+        mode: as `Warp` takes it.
+
+    Raises:
+        ValueError: no views, or a field of view that no pinhole has.
+    """
+    count = as_whole(count, "count", "ring")
+    if count < 1:
+        raise ValueError(f"ring: count must be at least 1; got {count}")
+    seen = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max())
+    step = seen / count
+    wide = min(_OVERLAP * step, math.radians(150)) if fov is None else float(fov)
+    if not 0 < wide < math.pi:
+        raise ValueError(f"ring: fov must be radians between 0 and pi; got {fov}")
+    yaws = torch.rad2deg((torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * step)
+    rotations = mount_rotation(yaws, torch.full_like(yaws, pitch), torch.zeros_like(yaws))
+    size = _size(camera, size, wide, "ring")
+    return _views(camera, size, wide, rotations, tuple(f"{yaw:.4g} degrees" for yaw in yaws.tolist()), mode)
+
+
+def _size(camera: Camera, size: int | None, fov: float, owner: str) -> int:
+    as_sized(camera, "camera", owner)
+    if camera.batch_shape:
+        raise ValueError(f"{owner}: takes one camera; got batch_shape={tuple(camera.batch_shape)}")
+    if size is not None:
+        size = as_whole(size, "size", owner)
+        if size < 1:
+            raise ValueError(f"{owner}: size must be at least 1; got {size}")
+        return size
+    with torch.no_grad():
+        slope = slopes_at_axis(camera.optics, camera.distortion[None])
+        focal = float((camera.intrinsics[:2] * slope[0]).max())
+    return max(2, round(2 * focal * math.tan(fov / 2)))
+
+
+def _views(camera: Camera, size: int, fov: float, rotations: Tensor, names: tuple[str, ...], mode: Mode) -> Views:
+    focal, centre = size / 2 / math.tan(fov / 2), (size - 1) / 2
+    intrinsics = camera.intrinsics.detach().new_tensor([focal, focal, centre, centre])
+    view = Pinhole(nn.Parameter(intrinsics, requires_grad=False), image_size=(size, size))
+    return Views(camera, view, rotations.to(intrinsics), names, mode)

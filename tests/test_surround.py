@@ -1,0 +1,165 @@
+"""Several cameras in one image, and one wide image as several pinhole ones: seamless, and back again."""
+
+import math
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.rotations import rotation_matrix
+
+LEVEL = torch.tensor(
+    [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]
+).double()  # camera from a rig whose z points up: it looks along y
+
+
+def wide(size=(360, 480), degrees=190):
+    height, width = size
+    focal = width / 2 / math.radians(degrees / 2)
+    camera = ct.KannalaBrandt([focal, focal, (width - 1) / 2, (height - 1) / 2], [0.01, 0, 0, 0], image_size=size)
+    return camera.double().requires_grad_(False)
+
+
+def about(axis, degrees):
+    return rotation_matrix(torch.tensor(axis).double() * math.radians(degrees))
+
+
+def car(pitch=30.0):
+    """Four wide cameras around a car: front, right, back and left."""
+    places = {
+        "front": (0.0, 2, 0.7, 0),
+        "right": (1.0, 0, 1, -90),
+        "back": (0.0, -2, 0.9, 180),
+        "left": (-1.0, 0, 1, 90),
+    }
+    extrinsics = {}
+    for name, (x, y, z, yaw) in places.items():
+        rotation = about([1.0, 0, 0], pitch) @ LEVEL @ about([0, 0, 1.0], -yaw)
+        shift = -rotation @ torch.tensor([x, y, z]).double()
+        extrinsics[name] = ct.Extrinsics.from_matrix(rotation, shift).requires_grad_(False)
+    return ct.Rig({name: wide() for name in places}, extrinsics)
+
+
+def floor(points):
+    return 0.5 + 0.2 * (torch.sin(1.5 * points[..., 0]) + torch.cos(2 * points[..., 1]))
+
+
+def sky(rays):
+    return 0.5 + 0.4 * torch.sin(4 * rays).prod(-1)
+
+
+def of_floor(camera, extrinsics):
+    rays, valid = camera.rays()
+    matrix = extrinsics.matrix()
+    rays, place = rays @ matrix[:3, :3], extrinsics.position
+    hits = valid & (rays[..., 2] < -1e-3)
+    points = place[:2] - rays[..., :2] * (place[2] / torch.where(hits, rays[..., 2], -1.0))[..., None]
+    return torch.where(hits, floor(points), 0.0)[None, None]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.uint8])
+def test_four_cameras_from_above_have_no_seams(dtype):
+    rig = car()
+    around = ct.surround(rig, x=(-4, 4), y=(-5, 5), resolution=0.04)
+    images = {name: of_floor(camera, rig.extrinsics[name]) for name, camera in rig.items()}
+    if dtype == torch.uint8:
+        images = {name: (255 * image).round().to(dtype) for name, image in images.items()}
+    result, valid = around(images)
+    assert result.dtype == dtype
+    points = around.warp("front").grid_points
+    assert valid[0, 0].double().mean() > 0.95
+    scale = 255 if dtype == torch.uint8 else 1
+    error = (result.double() / scale - floor(points)).abs()[valid]
+    # a grey level, where a floor far away is enlarged too
+    assert float(error.quantile(0.99)) < 1 / 255
+    weights = torch.stack(list(around.weights().values()))
+    torch.testing.assert_close(weights.sum(0)[valid], torch.ones_like(weights.sum(0)[valid]))
+    assert (weights.sum(0)[~valid] == 0).all()
+    # but for corners at which the fields of view of two cameras only just meet
+    jump = (weights[..., 1:, :] - weights[..., :-1, :]).abs()[:, valid[..., 1:, :] & valid[..., :-1, :]]
+    assert float((jump > 0.2).double().mean()) < 1e-3
+
+
+@pytest.mark.parametrize("distance", [math.inf, 30.0])
+def test_a_panorama_is_what_lies_around(distance):
+    rig = car(pitch=0)
+    target = ct.Equirectangular([100.0, 100, 313.5, 156.5], image_size=(314, 628)).double().requires_grad_(False)
+    target = target.resize(157, 314)
+    # the panorama looks along its own z: turned so that this is the rig's y
+    turned = {
+        name: ct.Extrinsics.from_matrix(pose.matrix()[:3, :3] @ LEVEL.mT, pose.translation)
+        for name, pose in rig.extrinsics.items()
+    }
+    rig = ct.Rig(dict(rig.items()), {name: pose.requires_grad_(False) for name, pose in turned.items()})
+    around = ct.surround(rig, target, distance=distance)
+    images = []
+    for name, camera in rig.items():
+        rays, _ = camera.rays()
+        pose = rig.extrinsics[name]
+        rays = rays @ pose.matrix()[:3, :3]
+        if math.isfinite(distance):
+            along = (rays * pose.position).sum(-1, keepdim=True)
+            inside = along.square() + distance**2 - pose.position.square().sum()
+            rays = torch.nn.functional.normalize(pose.position + rays * (inside.sqrt() - along), dim=-1)
+        images.append(sky(rays)[None, None])
+    result, valid = around(images)
+    rays, _ = target.rays()
+    assert valid.double().mean() > 0.7
+    torch.testing.assert_close(result[valid], sky(rays)[None, None][valid], rtol=0, atol=0.02)
+
+
+def test_a_wide_image_goes_to_a_cube_and_back():
+    camera = wide((480, 640))
+    rays, valid = camera.rays()
+    image = torch.stack([sky(rays), sky(rays.flip(-1)), sky(-rays)])[None]
+    faces = ct.views.cube(camera)
+    assert faces.names == ("front", "right", "back", "left", "up", "down")
+    made = faces(image)
+    assert made.shape == (1, 6, 3, *faces.view.image_size)
+    again, shown = faces.back(made)
+    assert torch.equal(shown[0, 0], valid)
+    # at the rim of the image a face has no neighbours to interpolate between
+    inner = (camera.pixel_grid() - camera.pixel_grid().mean((0, 1))).norm(dim=-1) < 230
+    noise = (again - image)[..., inner].square().mean()
+    assert 10 * math.log10(1 / float(noise)) > 40
+    pixel, seen = faces.warps[1].transform_points(camera.project(torch.tensor([[1.0, 0.1, 0.2]]).double())[0])
+    assert seen.all()
+    torch.testing.assert_close(pixel, faces.view.project(torch.tensor([[-0.2, 0.1, 1.0]]).double())[0])
+
+
+def test_a_ring_of_views_and_back():
+    camera = wide((480, 640), 170)
+    rays, _ = camera.rays()
+    image = sky(rays)[None, None]
+    views = ct.views.ring(camera, 3)
+    assert len(views) == 3
+    again, shown = views.back(views(image))
+    middle = torch.zeros_like(shown)
+    middle[..., 200:280, 20:-20] = True
+    assert shown[middle].all()
+    assert (again - image)[middle].abs().max() < 0.01
+    labels = (255 * views(image)).round().to(torch.uint8)
+    assert views.back(labels)[0].dtype == torch.uint8
+
+
+def test_bad_rigs_and_targets_are_refused():
+    rig, camera = car(), wide()
+    with pytest.raises(ValueError, match="target"):
+        ct.surround(rig)
+    with pytest.raises(ValueError, match="target"):
+        ct.surround(rig, camera, x=(-1, 1))
+    with pytest.raises(ValueError, match="extrinsics"):
+        ct.surround(ct.Rig({"a": camera}), camera)
+    with pytest.raises(ValueError, match="distance"):
+        ct.surround(rig, camera, distance=1.0)
+    with pytest.raises(TypeError, match="Rig"):
+        ct.surround([camera], camera)
+    around = ct.surround(rig, camera)
+    with pytest.raises(ValueError, match="front"):
+        around({"front": torch.rand(1, 1, 360, 480)})
+    with pytest.raises(ValueError, match="4 cameras"):
+        around([torch.rand(1, 1, 360, 480)])
+    with pytest.raises(ValueError, match="count"):
+        ct.views.ring(camera, 0)
+    with pytest.raises(ValueError, match="views must be"):
+        ct.views.cube(camera).back(torch.rand(1, 5, 3, 4, 4))
