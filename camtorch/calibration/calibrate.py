@@ -20,7 +20,8 @@ from camtorch.calibration.observations import Layout, Observations, Points, as_o
 from camtorch.calibration.start import poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import Spread, noise_under, spread, uncertainty
 from camtorch.calibration.verdict import check_determined, verdict, warnings
-from camtorch.camera import MODELS, Camera
+from camtorch.camera import Camera
+from camtorch.camera import as_model as as_kind
 from camtorch.extrinsics import Extrinsics
 from camtorch.rotations import rotation_vector
 
@@ -69,12 +70,7 @@ def as_model(
         if start is not None:
             raise ValueError(f"{owner}: model is a camera to start from already; got start={start!r} as well")
         start, model = model, type_before_parametrizations(model)
-    if isinstance(model, str):
-        if model not in MODELS:
-            raise ValueError(f"{owner}: no model has the key {model!r}; there are {', '.join(sorted(MODELS))}")
-        model = MODELS[model]
-    if not (isinstance(model, type) and issubclass(model, Camera)):
-        raise TypeError(f"{owner}: model must be a class of cameras, its key, or a camera; got {model!r}")
+    model = as_kind(model, owner)
     if start is not None:
         start = _as_start(start, model, owner)
         if count is not None and count != start.distortion.shape[-1]:
@@ -135,7 +131,8 @@ class Calibration:
     """The standard deviation of a coordinate of a pixel: sqrt(sum of squares / (2 N - parameters)). With a robust loss
     that of the inliers."""
     residuals: Any
-    """Projected minus observed, in the shape or the list form of the image points, NaN where unseen."""
+    """Projected minus observed, in the shape or the list form of the image points; NaN where nothing was seen, and
+    where a camera that did not converge has no pixel for what was."""
     inliers: Any
     """Bool, in the same form: the residual is shorter than max(3 loss_scale, 3 sigma of the inliers)."""
     parameter_names: tuple[str, ...]
@@ -384,7 +381,7 @@ def result_of(
         extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations),
         rms=float((whole.square().sum() / seen.seen.sum().clamp(min=1)).sqrt()),
         sigma=float(noise.sigma),
-        residuals=layout.restore(residuals),
+        residuals=layout.restore(torch.where(adjusted.valid[camera][0][..., None], residuals, torch.nan)),
         inliers=layout.restore(noise.inliers),
         parameter_names=asked.names,
         spread=found,
