@@ -47,8 +47,11 @@ _ALONG = {
     "eucm": ("beta", (0.5, 1.0, 2.0)),
     "mei": ("xi", (0.0, 1.0, 2.0, 4.0)),
 }
-_LOW_ORDER = 4  # coefficients that a start of many has: with all of them it may fold just beyond the corners
+# Numbers of coefficients of further starts: with all of them a lens may fold just beyond the corners, and no step goes
+# across a fold
+_LOW_ORDERS = (1, 4)
 _REACH = 1.1  # how much further than the data a start shall reach
+_ERRS = 1.5  # times the scale of another lens: a model that does not fit
 _LOST = 0.01  # the part of the corners without a pixel, with which a model is the wrong one
 
 
@@ -82,14 +85,15 @@ def start_from_nothing(
     Raises:
         ValueError: corners lie further from the axis than the model reaches.
     """
-    few = _few(observations)
+    few = _few(observations, image_size)
     lens = _unified(few, image_size, fixed)
+    usual = lens.scale
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # what keeps the shape that it starts with takes that of a good lens
         lens = _refined(lens, few, KannalaBrandt, 4, image_size, fixed, ("cauchy", lens.scale)).row(0)
     lens = _refined(lens, few, model, count, image_size, fixed, (loss, loss_scale))
-    _check_reach(lens.row(0), few, image_size)
+    _check_reach(lens.row(0), few, image_size, usual)
     state = poses_for(lens.parameters[:1], observations, model, image_size, lens.scale)
     if len(lens.parameters) == 1:
         return state
@@ -188,24 +192,34 @@ def _camera(model: type[Camera], parameters: Tensor, image_size: tuple[int, int]
     return from_values(model._model, parameters[:, :4], parameters[:, 4:], image_size)
 
 
-def _few(observations: Observations) -> Observations:
-    """Of many views those with the most corners, of many points as many as are enough."""
-    views_, number = observations.seen.shape
-    if views_ > _VIEWS:
+def _few(observations: Observations, image_size: tuple[int, int]) -> Observations:
+    """Of many views those with the most corners; of many corners enough, evenly from the image's middle outwards."""
+    if len(observations.seen) > _VIEWS:
         observations = observations.of(observations.seen.sum(-1).argsort(descending=True)[:_VIEWS].sort().values)
-    if number > _POINTS:
-        index = torch.linspace(0, number - 1, _POINTS, device=observations.seen.device).round().long()
-        observations = observations._replace(
-            points=observations.points[:, index],
-            pixels=observations.pixels[:, index],
-            seen=observations.seen[:, index],
-        )
-    return observations
+    points, pixels, seen = observations
+    if seen.shape[1] <= _POINTS:
+        return observations
+    distances = torch.linalg.vector_norm(pixels - _middle(image_size, pixels), dim=-1)
+    order = torch.where(seen, distances, torch.inf).argsort(-1)
+    share = torch.linspace(0, 1, _POINTS, dtype=pixels.dtype, device=pixels.device)
+    index = order.gather(-1, (share * (seen.sum(-1, keepdim=True) - 1).clamp(min=0)).round().long())
+    once = torch.ones_like(index, dtype=torch.bool)
+    once[:, 1:] = index.diff(dim=-1) != 0
+    return observations._replace(
+        points=torch.take_along_dim(points, index[..., None], 1),
+        pixels=torch.take_along_dim(pixels, index[..., None], 1),
+        seen=seen.gather(-1, index) & once,
+    )
+
+
+def _middle(image_size: tuple[int, int], like: Tensor) -> Tensor:
+    """(2,) of the image."""
+    return like.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
 
 
 def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> _Lens:
     """The unified camera that explains best what was seen."""
-    centre = few.pixels.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
+    centre = _middle(image_size, few.pixels)
     reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
     tried = [(alpha, math.radians(degrees)) for alpha, angles in _TRIED.items() for degrees in angles]
     radii = [math.sin(theta) / (alpha + (1 - alpha) * math.cos(theta)) for alpha, theta in tried]
@@ -365,8 +379,7 @@ def _fitted(
         more = starts[:1].repeat(len(values), 1)
         more[:, names.index(along)] = more.new_tensor(values)
         sets.append((more, [*held, along]))
-    if len(names) > _LOW_ORDER + 1:
-        sets.append((starts[:1], [*held, *names[_LOW_ORDER:]]))
+    sets += [(starts[:1], [*held, *names[order:]]) for order in _LOW_ORDERS if len(names) > order and not values]
     seen = least_squares.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
     template = _camera(model, torch.cat((slopes[0], ideal))[None], image_size)
     is_held = torch.tensor([name in held for name in names], dtype=torch.bool, device=slopes.device)
@@ -389,12 +402,16 @@ def _distinct(parameters: Tensor) -> Tensor:
     return parameters[~(~apart.any(-1)).tril(-1).any(-1)]
 
 
-def _check_reach(lens: _Lens, few: Observations, image_size: tuple[int, int]) -> None:
-    """Raise a ValueError where the model has no pixel for many of the corners."""
+def _check_reach(lens: _Lens, few: Observations, image_size: tuple[int, int], usual: float) -> None:
+    """Raise a ValueError where the model has no pixel for many of the corners, or for some and errs with the others.
+
+    usual: px, the scale of another lens.
+    """
     points = lens.boards.moved(few.points)
     _, valid = _camera(lens.model, lens.parameters, image_size).project(points.flatten(1, 2))
     lost = few.seen & ~valid.view(few.seen.shape)
-    if int(lost.sum()) > _LOST * int(few.seen.sum()):
+    most = _LOST * int(few.seen.sum()) if lens.scale <= _ERRS * usual else 0
+    if int(lost.sum()) > most:
         furthest = math.degrees(float(angles_from_axis(points)[0][few.seen].amax()))
         raise ValueError(
             f"calibrate: {lens.model.__name__} has no pixels for {int(lost.sum())} of {int(few.seen.sum())} corners, "
