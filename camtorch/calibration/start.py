@@ -87,13 +87,13 @@ def start_from_nothing(
     """
     few = _few(observations, image_size)
     lens = _unified(few, image_size, fixed)
-    usual = lens.scale
+    first = lens
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # what keeps the shape that it starts with takes that of a good lens
         lens = _refined(lens, few, KannalaBrandt, 4, image_size, fixed, ("cauchy", lens.scale)).row(0)
     lens = _refined(lens, few, model, count, image_size, fixed, (loss, loss_scale))
-    _check_reach(lens.row(0), few, image_size, usual)
+    _check_reach(lens.row(0), few, image_size, first)
     state = poses_for(lens.parameters[:1], observations, model, image_size, lens.scale)
     if len(lens.parameters) == 1:
         return state
@@ -402,17 +402,20 @@ def _distinct(parameters: Tensor) -> Tensor:
     return parameters[~(~apart.any(-1)).tril(-1).any(-1)]
 
 
-def _check_reach(lens: _Lens, few: Observations, image_size: tuple[int, int], usual: float) -> None:
+def _check_reach(lens: _Lens, few: Observations, image_size: tuple[int, int], other: _Lens) -> None:
     """Raise a ValueError where the model has no pixel for many of the corners, or for some and errs with the others.
 
-    usual: px, the scale of another lens.
+    other: a lens that reaches them.
     """
-    points = lens.boards.moved(few.points)
-    _, valid = _camera(lens.model, lens.parameters, image_size).project(points.flatten(1, 2))
+    points = lens.boards.moved(few.points).flatten(1, 2)
+    _, valid = _camera(lens.model, lens.parameters, image_size).project(points)
     lost = few.seen & ~valid.view(few.seen.shape)
-    most = _LOST * int(few.seen.sum()) if lens.scale <= _ERRS * usual else 0
+    most = _LOST * int(few.seen.sum()) if lens.scale <= _ERRS * other.scale else 0
     if int(lost.sum()) > most:
-        furthest = math.degrees(float(angles_from_axis(points)[0][few.seen].amax()))
+        inliers = few.seen & (
+            _errors(_camera(other.model, other.parameters, image_size), other.boards, few)[0] < _OUTLIER * other.scale
+        )
+        furthest = math.degrees(float(angles_from_axis(other.boards.moved(few.points))[0][inliers].amax()))
         raise ValueError(
             f"calibrate: {lens.model.__name__} has no pixels for {int(lost.sum())} of {int(few.seen.sum())} corners, "
             f"seen up to about {furthest:.0f} degrees from the axis; kannala_brandt and other fisheye models do"
