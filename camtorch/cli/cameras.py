@@ -1,4 +1,4 @@
-"""What the command line reads: the cameras of a calibration file, by the options --name and --from-model."""
+"""What the command line reads: the cameras of a calibration file, by the options that say which and of what model."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from camtorch.camera import Camera
 from camtorch.cli.terminal import note
+from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, opencv
 from camtorch.rig import Rig
 
@@ -105,18 +106,73 @@ def read_camera_of(image: Path, size: tuple[int, int], arguments: argparse.Names
     Raises:
         ValueError: as `read_camera`; no file is given, or it is for another size and is not to be scaled.
     """
+    return read_posed(image, size, arguments)[0]
+
+
+def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
+    """As `read_camera_of`, and the camera's pose, None where its file has none."""
     path: Path | None = arguments.camera
     if path is None:
         raise ValueError(
             f"{image}: which camera took it? --camera FILE, its calibration, says so: an image alone does not tell"
         )
-    camera = read_camera(path, arguments.name, arguments.from_model)
+    rig = read_rig(path, arguments.name, arguments.from_model)
+    name, camera = _only(path, rig)
+    camera = _single(path, name, camera)
+    return _fitting(camera, path, image, size, arguments.rescale), rig.extrinsics.get(name)
+
+
+def read_pair(
+    images: tuple[Path, Path], sizes: tuple[tuple[int, int], tuple[int, int]], arguments: argparse.Namespace
+) -> Rig:
+    """The two cameras, left and right, that took images of these (height, width), by the options of `add_pair`.
+
+    Raises:
+        ValueError: as `read_camera_of`; it does not say which two cameras, or one has no pose.
+    """
+    path: Path | None = arguments.camera
+    if path is None:
+        raise ValueError(f"{images[0]}: which cameras took the pair? --camera RIG, their calibration, says so")
+    rig = read_rig(path, model=arguments.from_model)
+    names = _two_names(path, rig, arguments.left_camera, arguments.right_camera)
+    cameras = {}
+    for name, image, size in zip(names, images, sizes, strict=True):
+        camera = _single(path, name, rig.camera_of(name))
+        cameras[name] = _fitting(camera, path, image, size, arguments.rescale)
+        if name not in rig.extrinsics:
+            raise ValueError(f"{path}: {name} has no pose, so how the cameras stand to each other is not known")
+    return Rig(cameras, {name: rig.extrinsics[name] for name in names})
+
+
+def _two_names(path: Path, rig: Rig, left: str | None, right: str | None) -> tuple[str, str]:
+    for name in filter(None, (left, right)):
+        if name not in rig:
+            raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig)}")
+    if left is not None and left == right:
+        raise ValueError(f"{path}: --left-camera and --right-camera are both {left!r}")
+    if left is not None and right is not None:
+        return left, right
+    if len(rig) != 2:
+        there = f"{len(rig)} cameras" if len(rig) > 1 else "one camera"
+        raise ValueError(
+            f"{path}: {there}, not two; --left-camera and --right-camera say which of {', '.join(rig)} took the images"
+        )
+    first, second = rig
+    return (second, first) if left == second or right == first else (first, second)
+
+
+def _fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:
+    """The camera of a file for an image of that (height, width).
+
+    Raises:
+        ValueError: it is for another size and is not to be scaled.
+    """
     if camera.image_size is None:
         camera.image_size = size
         note(f"{path} states no image size; taken to be for {_shown(size)}, as {image} is")
     elif camera.image_size != size:
         reason = _not_scaled(size, camera.image_size)
-        if reason or not arguments.rescale:
+        if reason or not rescale:
             raise ValueError(
                 f"{image} is {_shown(size)}, but the camera in {path} is for {_shown(camera.image_size)}; "
                 f"{reason or '--rescale scales the camera to the image'}"

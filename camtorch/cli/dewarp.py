@@ -7,13 +7,9 @@ import math
 from typing import TYPE_CHECKING
 
 from camtorch.cli.options import add_output, add_photograph, parse_path, parse_size
-from camtorch.cli.terminal import progress
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from camtorch.cli.options import Commands
-    from camtorch.warp.warp import Warp
 
 
 _TOLERANCE = 0.001
@@ -51,6 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
     import torch
 
     from camtorch.cli import cameras, images
+    from camtorch.cli.warping import warped
     from camtorch.warp.dewarp import Dewarp
 
     fov = arguments.fov
@@ -70,7 +67,7 @@ def run(arguments: argparse.Namespace) -> None:
             image_size=arguments.size,
             tolerance=_TOLERANCE,
         )
-        result, filled = _warped(warp, image)
+        result, filled = warped(warp, image, "dewarping")
         del image
         lattice = (camera.resize(64, 64).pixel_grid() + 0.5) * torch.tensor([columns / 64, rows / 64]) - 0.5
         shown = float(warp.transform_points(lattice)[1].double().mean())
@@ -83,18 +80,3 @@ def run(arguments: argparse.Namespace) -> None:
         f"wide, {width}x{height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; {100 * filled:.1f} % of it is "
         f"filled and shows {100 * shown:.0f} % of the photograph"
     )
-
-
-def _warped(warp: Warp, image: Tensor) -> tuple[Tensor, float]:
-    """The warped image, by strips, and the filled part of it."""
-    import torch
-
-    height, width = warp.target.height, warp.target.width
-    # as image files have it, channels last: they need no copy
-    result = torch.empty(height, width, len(image), dtype=image.dtype).permute(2, 0, 1)
-    filled, show = 0, progress("dewarping")
-    for rows, part, valid in warp.strips(image[None]):
-        result[:, rows] = part[0]
-        filled += int(valid.sum())
-        show(rows.stop / height)
-    return result, filled / (height * width)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
 
-_LARGEST_SIDE = 32768
+LARGEST_SIDE = 32768
+"""Pixels."""
 
 
 def parse_path(text: str) -> Path:
@@ -25,8 +26,8 @@ def parse_size(text: str) -> tuple[int, int]:
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() and len(side) < 9 for side in sides):
         raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT, as in 1280x720")
     width, height = map(int, sides)
-    if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
-        raise argparse.ArgumentTypeError(f"{text!r}: each side must be 1 to {_LARGEST_SIDE} pixels")
+    if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
+        raise argparse.ArgumentTypeError(f"{text!r}: each side must be 1 to {LARGEST_SIDE} pixels")
     return height, width
 
 
@@ -51,9 +52,16 @@ def add_photograph(command: argparse.ArgumentParser) -> None:
     command.add_argument("--camera", type=parse_path, metavar="FILE", help="its calibration, of any format")
     _add_from_model(command, "--model")
     command.add_argument("--name", help="which camera, in a file with several")
-    command.add_argument(
-        "--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio"
-    )
+    _add_rescale(command)
+
+
+def add_pair(command: argparse.ArgumentParser) -> None:
+    """The calibration of a pair of images."""
+    command.add_argument("--camera", type=parse_path, metavar="RIG", help="its calibration with both poses, any format")
+    command.add_argument("--left-camera", metavar="NAME", help="the camera of LEFT; by default the first of two")
+    command.add_argument("--right-camera", metavar="NAME", help="that of RIGHT; by default the second of two")
+    _add_from_model(command)
+    _add_rescale(command)
 
 
 def add_calibration(command: argparse.ArgumentParser, of_name: str = "which camera, in a file with several") -> None:
@@ -69,6 +77,12 @@ def _add_from_model(command: argparse.ArgumentParser, *others: str) -> None:
         *others,
         metavar="KEY",
         help="the model in the file, where that does not say it: kannala_brandt, brown_conrady ...",
+    )
+
+
+def _add_rescale(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio"
     )
 
 

@@ -245,14 +245,15 @@ class Rectification(GeometryModule):
             for d in (least, most):
                 like = camera.intrinsics.new_full((1, *camera._size("depth_range")), float(d))
                 points, good = self._points(self._pixels(), like)
-                depth = points[..., 2] if self.projection == "perspective" else self._across(points)
+                depth = points[..., 2] if self.projection == "perspective" else self.distance(points)
                 depths.append(depth[good])
         found = torch.cat(depths)
         ends = [float(found.min()), float(found.max())] if len(found) else [math.inf, math.inf]
         crosses = least <= 0 <= most
         return ends[0], math.inf if crosses else ends[1]
 
-    def _across(self, points: Tensor) -> Tensor:
+    def distance(self, points: Tensor) -> Tensor:
+        """Of points (..., 3) of the frame of the rectified left camera, from the baseline: depth in a panorama."""
         return torch.hypot(points[..., 0 if self.vertical else 1], points[..., 2])
 
     @torch.no_grad()
@@ -263,7 +264,7 @@ class Rectification(GeometryModule):
         if self.projection != "latlon":
             return focal * baseline / depth
         rays, has_ray = camera.unproject(self._pixels())
-        along, across = rays[..., 1 if self.vertical else 0], self._across(rays)
+        along, across = rays[..., 1 if self.vertical else 0], self.distance(rays)
         angle = torch.atan2(along, across)
         return (focal * (angle - torch.atan(torch.tan(angle) - baseline / depth)))[has_ray.expand(angle.shape)]
 

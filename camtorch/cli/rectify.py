@@ -1,0 +1,333 @@
+"""The command `camtorch rectify`: a pair of photographs whose rows correspond, and what is far from what is near."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from camtorch.cli.options import add_output, add_pair, parse_path, parse_range, parse_size
+from camtorch.cli.terminal import note
+
+if TYPE_CHECKING:
+    from PIL import Image
+    from torch import Tensor
+
+    from camtorch.cli.options import Commands
+    from camtorch.rig import Rig
+    from camtorch.stereo.rectification import Rectification
+
+_NEAR, _FAR = 3.0, 100.0
+"""Depths in baselines, of which disparities and points are by default."""
+_FRACTIONS, _UNKNOWN = 256, 0
+"""Of a pixel in a PNG of disparities, as in KITTI's, and what stands where none is known."""
+_DEEPEST = 65535
+_LINES = 24  # over the longer side of a picture
+
+
+def add(commands: Commands) -> None:
+    """Add the command to a command line."""
+    command = commands.add_parser(
+        "rectify",
+        help="rectify a stereo pair; disparities and points of it",
+        description="Rectify a stereo pair: camtorch rectify left.jpg right.jpg --camera rig.json -o out. The folder "
+        "OUT gets left.png and right.png, whose rows correspond, pair.png, both beside each other with lines along "
+        "rows, rectified.json, their cameras, and in perspective opencv.yml: R1, R2, P1, P2, Q.",
+        allow_abbrev=False,
+    )
+    command.set_defaults(run=run)
+    command.add_argument("left", type=parse_path, metavar="LEFT", help="the left camera's image")
+    command.add_argument("right", type=parse_path, metavar="RIGHT", help="the right camera's, of the same moment")
+    add_pair(command)
+    images = command.add_argument_group("rectified images")
+    images.add_argument(
+        "--projection",
+        choices=("perspective", "latlon", "cylindrical"),
+        default="perspective",
+        help="perspective (the default) goes to some 120 degrees; latlon and cylindrical, about the baseline, further",
+    )
+    images.add_argument(
+        "--fov", type=parse_range, metavar="DEGREES", help="of view, horizontal, or horizontal,vertical; else what fits"
+    )
+    images.add_argument("--size", type=parse_size, metavar="WxH", help="else what loses no detail")
+    images.add_argument("--vertical", action="store_true", help="LEFT is the upper of two: columns correspond")
+    images.add_argument(
+        "--align",
+        choices=("mean", "opencv"),
+        default="mean",
+        help="mean: look where both cameras look on average (the default); opencv: halve their rotation, as it does",
+    )
+    depth = command.add_argument_group('depth, with OpenCV: pip install "camtorch[stereo]"')
+    depth.add_argument(
+        "--disparity",
+        nargs="?",
+        type=parse_path,
+        const=Path(),
+        metavar="FILE",
+        help="pixels of disparity: a .png of 16 bits, 256 times as many, 0 where unknown, or an .npy, NaN where "
+        "unknown; OUT/disparity.png by default. And OUT/disparity_colours.png to look at",
+    )
+    depth.add_argument(
+        "--points", type=parse_path, metavar="FILE.ply", help="coloured points, in the left camera's frame and unit"
+    )
+    depth.add_argument(
+        "--depth",
+        nargs=2,
+        type=float,
+        metavar=("NEAR", "FAR"),
+        help=f"the depths to look for, in the unit of RIG's poses; FAR may be inf; else {_NEAR:g} to {_FAR:g} times "
+        "the distance of the cameras for points, and what is farther too for disparities",
+    )
+    add_output(command, "rectified", "the folder of the new images")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carry it out."""
+    import torch
+
+    from camtorch.cli import images
+    from camtorch.cli.cameras import read_pair
+    from camtorch.cli.warping import warped
+    from camtorch.stereo.matching import opencv
+    from camtorch.stereo.rectification import rectify
+
+    folder: Path = arguments.output
+    fov = _fov(arguments)
+    _check_depth(arguments)
+    _check_targets(arguments)
+    matches = arguments.disparity is not None or arguments.points is not None
+    if matches:
+        opencv()
+    taken = (arguments.left, arguments.right)
+    (left, turned_left), (right, turned_right) = map(images.read, taken)
+    if len(left) != len(right) or left.dtype != right.dtype:
+        raise ValueError(f"{taken[0]} and {taken[1]} are images of different kinds: convert one")
+    if any(turned not in (None, 1) for turned in (turned_left, turned_right)):
+        note("by their Exif tags images are to be shown turned; they are taken as stored, as calibrations know them")
+    sizes = [(image.shape[-2], image.shape[-1]) for image in (left, right)]
+    rig = read_pair(taken, (sizes[0], sizes[1]), arguments)
+    first, second = rig
+    with torch.no_grad():
+        rectification = rectify(
+            rig[first],
+            rig[second],
+            rig.between(first, second),
+            projection=arguments.projection,
+            fov=fov,
+            image_size=arguments.size,
+            vertical=arguments.vertical,
+            align=arguments.align,
+        )
+        limits = _limits(rectification, arguments) if matches else (0.0, 0.0)
+        left, filled_left = warped(rectification.left, left, "rectifying the left image")
+        right, filled_right = warped(rectification.right, right, "rectifying the right image")
+        both = float(rectification.valid_masks()[2].double().mean())
+        for name, image in (("left", left), ("right", right)):
+            images.write(folder / f"{name}.png", images.from_tensor(image))
+        images.write(folder / "pair.png", _picture(left, right, arguments.vertical))
+        _write_cameras(folder, rig, rectification)
+        _tell(rectification, rig, folder, (filled_left, filled_right, both))
+        if matches:
+            _match(rectification, (left, right), limits, arguments)
+
+
+def _check_depth(arguments: argparse.Namespace) -> None:
+    if arguments.depth is None:
+        return
+    near, far = arguments.depth
+    if not 0 < near < far:
+        raise ValueError(f"--depth takes NEAR and FAR, 0 < NEAR < FAR; got {near:g} {far:g}")
+    if arguments.disparity is None and arguments.points is None:
+        raise ValueError("--depth is for --disparity and --points")
+
+
+def _fov(arguments: argparse.Namespace) -> float | tuple[float, float] | None:
+    """In radians.
+
+    Raises:
+        ValueError: angles that the projection does not reach.
+    """
+    if arguments.fov is None:
+        return None
+    angles = arguments.fov if isinstance(arguments.fov, tuple) else (arguments.fov,)
+    for i, angle in enumerate(angles):
+        along = (i == 1) == arguments.vertical
+        most = 180 if along or arguments.projection == "perspective" else 360
+        if not 0 < angle < most:
+            side = ("horizontal", "vertical")[i]
+            hint = "; --projection latlon goes further" if arguments.projection == "perspective" else ""
+            raise ValueError(
+                f"--fov must be above 0 and below {most} degrees, {side}, for {arguments.projection}; got {angle:g}"
+                f"{hint}"
+            )
+    radians = [math.radians(angle) for angle in angles]
+    return radians[0] if len(radians) == 1 else (radians[0], radians[1])
+
+
+def _check_targets(arguments: argparse.Namespace) -> None:
+    """Refuse before the work what could not be written after it; fill in where disparities go."""
+    from camtorch.cli import images, targets
+
+    folder: Path = arguments.output
+    if arguments.disparity == Path():
+        arguments.disparity = folder / "disparity.png"
+    names = ["left.png", "right.png", "pair.png", "rectified.json"]
+    names += ["opencv.yml"] if arguments.projection == "perspective" else []
+    names += ["disparity_colours.png"] if arguments.disparity is not None else []
+    files = [folder / name for name in names]
+    for path, suffixes in ((arguments.disparity, (".png", ".npy")), (arguments.points, (".ply",))):
+        if path is not None:
+            if path.suffix.lower() not in suffixes:
+                raise ValueError(f"{path}: must be called {' or '.join(suffixes)}")
+            files.append(path)
+    if len({path.absolute() for path in files}) < len(files):
+        raise ValueError(f"{arguments.disparity}: is the name of another result")
+    for path in files:
+        check = images.check_target if path.suffix == ".png" else targets.check
+        check(path, force=arguments.force, inputs=(arguments.left, arguments.right, arguments.camera))
+
+
+def _limits(rectification: Rectification, arguments: argparse.Namespace) -> tuple[float, float]:
+    """The disparities to look for.
+
+    Raises:
+        ValueError: some that the file of disparities does not hold.
+    """
+    near, far = arguments.depth or (_NEAR * abs(float(rectification.baseline)), math.inf)
+    least, most = rectification.disparity_range(near, far)
+    path = arguments.disparity
+    if path is not None and path.suffix.lower() == ".png":
+        advice = "; name an .npy, which holds them"
+        if float(rectification.baseline) < 0:
+            raise ValueError(f"{path}: the right camera stands on the left, so disparities are negative{advice}")
+        if most >= _DEEPEST // _FRACTIONS:
+            raise ValueError(
+                f"{path}: disparities go to {most:.0f} px, a .png to {_DEEPEST // _FRACTIONS}{advice}; or look for "
+                f"less near things, by --depth, or make the images smaller, by --size"
+            )
+    return least, most
+
+
+def _write_cameras(folder: Path, rig: Rig, rectification: Rectification) -> None:
+    """Of the rectified images: where they are in the rig, and what OpenCV's users take."""
+    from camtorch.extrinsics import Extrinsics
+    from camtorch.io.formats import save
+    from camtorch.rig import Rig
+
+    turns = (rectification.rotation_left, rectification.rotation_right)
+    cameras = (rectification.camera_left, rectification.camera_right)
+    poses = {
+        name: Extrinsics.from_matrix(turn, [0.0] * 3).compose(rig.extrinsics[name])
+        for name, turn in zip(rig, turns, strict=True)
+    }
+    save(Rig(dict(zip(rig, cameras, strict=True)), poses), folder / "rectified.json")
+    if rectification.projection == "perspective":
+        rectification.save(folder / "opencv.yml")
+
+
+def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: tuple[float, float, float]) -> None:
+    camera = rectification.camera_left
+    fx, fy, cx, cy = camera.intrinsics.tolist()
+    across, down = (math.degrees(angle) for angle in camera.field_of_view[:2].tolist())
+    lines = "columns" if rectification.vertical else "rows"
+    left, right, both = (100 * part for part in parts)
+    print(
+        f"{folder}: {' and '.join(rig[name].key for name in rig)} rectified to {rectification.projection}, "
+        f"{across:.1f} x {down:.1f} degrees, {camera.width}x{camera.height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} "
+        f"cy {cy:.6g}; {lines} correspond, baseline {float(rectification.baseline):.6g}; {left:.0f} % of left.png and "
+        f"{right:.0f} % of right.png are filled, {both:.0f} % of both"
+    )
+
+
+def _match(
+    rectification: Rectification,
+    pair: tuple[Tensor, Tensor],
+    limits: tuple[float, float],
+    arguments: argparse.Namespace,
+) -> None:
+    """Disparities and points of a rectified pair, as files."""
+    import numpy as np
+    from PIL import Image
+
+    from camtorch.cli import images
+    from camtorch.io.writing import replacing
+    from camtorch.stereo.matching import match
+    from camtorch.stereo.point_cloud import write_ply
+
+    disparity, known = match(rectification, *pair, *limits)
+    path: Path | None = arguments.disparity
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix.lower() == ".npy":
+            with replacing(path) as (file,):
+                np.save(file, disparity.numpy())
+        else:
+            parts = (disparity.nan_to_num(_UNKNOWN) * _FRACTIONS).round().clamp(0, _DEEPEST)
+            images.write(path, Image.fromarray(parts.numpy().astype(np.uint16)))
+        coloured = arguments.output / "disparity_colours.png"
+        images.write(coloured, _coloured(disparity, known))
+        part = 100 * float(known.double().mean())
+        print(
+            f"{path}: disparities from {limits[0]:.1f} to {limits[1]:.1f} px, known in {part:.0f} % of left.png; "
+            f"{coloured}: their picture"
+        )
+    if arguments.points is not None:
+        baseline = abs(float(rectification.baseline))
+        near, far = arguments.depth or (_NEAR * baseline, _FAR * baseline)
+        points, valid = rectification.disparity_to_points(disparity, known)
+        depth = points[..., 2] if rectification.projection == "perspective" else rectification.distance(points)
+        valid = valid & (depth >= near) & (depth <= far)
+        write_ply(
+            arguments.points,
+            points[valid] @ rectification.rotation_left.to(points.dtype),
+            _of_colours(pair[0]).permute(1, 2, 0)[valid],
+        )
+        print(f"{arguments.points}: {int(valid.sum())} points at depths of {near:.4g} to {far:.4g}")
+
+
+def _of_colours(image: Tensor) -> Tensor:
+    """(3, H, W) uint8 of an image as `images.read` has it."""
+    import torch
+
+    colours = image[:3] if len(image) > 2 else image[:1].expand(3, -1, -1)
+    if colours.dtype != torch.uint8:
+        colours = (colours.double() * (255 / max(float(colours.double().max()), 1.0))).round().byte()
+    return colours
+
+
+def _picture(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
+    """Both images beside each other, or one above the other, with lines along what corresponds."""
+    import torch
+    from PIL import ImageDraw
+
+    from camtorch._drawing import BOX, GAZE, POINT
+    from camtorch.cli import images
+
+    whole = torch.cat((_of_colours(left), _of_colours(right)), 1 if vertical else 2)
+    picture = images.from_tensor(whole)
+    draw = ImageDraw.Draw(picture)
+    width, height = picture.size
+    side = width if vertical else height
+    step = max(side / _LINES, 4.0)
+    for i in range(int(side / step)):
+        at = round((i + 0.5) * step)
+        ends = (at, 0, at, height) if vertical else (0, at, width, at)
+        draw.line(ends, fill=(POINT, BOX, GAZE)[i % 3], width=max(1, round(side / 720)))
+    return picture
+
+
+def _coloured(disparity: Tensor, known: Tensor) -> Image.Image:
+    """Near things red, far ones blue, unknown ones black."""
+    import numpy as np
+    from PIL import Image
+
+    from camtorch.stereo.matching import opencv
+
+    cv2 = opencv()
+    found = disparity[known].abs().numpy()
+    low, high = np.quantile(found, (0.01, 0.99)) if len(found) else (0.0, 1.0)
+    scaled = (disparity.abs().nan_to_num(0.0).numpy() - low) / max(high - low, 1e-6)
+    levels = np.rint(255 * scaled.clip(0, 1)).astype(np.uint8)
+    colours = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]
+    return Image.fromarray(np.where(known.numpy()[..., None], colours, 0).astype(np.uint8))

@@ -1,0 +1,101 @@
+"""Disparities of rectified images, by OpenCV's semi-global matching."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from camtorch.stereo.rectification import Rectification
+
+_BLOCK = 5  # pixels, the side of what is compared
+_STEP = 16  # the matcher's disparities are 16ths, and as many pixels are the least range of them
+_ROUNDING = 1e-6  # px, by which a disparity may be off zero
+
+
+def opencv() -> Any:
+    """The module `cv2`.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise ImportError('disparities need OpenCV: pip install "camtorch[stereo]"') from None
+    return cv2
+
+
+def match(
+    rectification: Rectification, left: Tensor, right: Tensor, least: float, most: float
+) -> tuple[Tensor, Tensor]:
+    """Disparities of the rectified left image.
+
+    Args:
+        rectification: of one pair; where its columns correspond, disparities lie along them.
+        left: (C, H, W) uint8 or uint16, what `rectification.left` made; a fourth channel is left out.
+        right: likewise.
+        least: the least disparity to look for, in pixels, negative where the right camera stands to the left.
+        most: the greatest.
+
+    Returns:
+        (H, W) float32 disparities, NaN where none is known, and where one is: both cameras see what is there.
+
+    Raises:
+        ImportError: no OpenCV.
+    """
+    cv2 = opencv()
+    images = [_arranged(image, rectification.vertical) for image in _of_bytes(left, right)]
+    start = math.floor(least + _ROUNDING)
+    count = _STEP * max(1, math.ceil((math.ceil(most - _ROUNDING) - start + 1) / _STEP))
+    # the matcher leaves out columns from where it could look past the image
+    before, after = max(start + count, 0), max(-start, 0)
+    padded = [cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in images]
+    channels = 1 if images[0].ndim == 2 else images[0].shape[2]
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=start,
+        numDisparities=count,
+        blockSize=_BLOCK,
+        P1=8 * channels * _BLOCK**2,
+        P2=32 * channels * _BLOCK**2,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+    )
+    raw = matcher.compute(*padded)[:, before : before + images[0].shape[1]]
+    raw = np.ascontiguousarray(raw.T if rectification.vertical else raw)
+    disparity = torch.from_numpy(raw.astype(np.float32) / _STEP)
+    seen_left, seen_right, _ = (mask[0, 0] for mask in rectification.valid_masks())
+    known = (disparity >= start) & seen_left & _seen(seen_right, disparity, rectification.vertical)
+    return torch.where(known, disparity, torch.nan), known
+
+
+def _of_bytes(*images: Tensor) -> list[NDArray[np.uint8]]:
+    """(H, W, C) of images of one scale."""
+    most = max(float(image.max()) for image in images)
+    arrays = [image[: 3 if len(image) > 2 else 1].permute(1, 2, 0).numpy() for image in images]
+    if all(array.dtype == np.uint8 for array in arrays):
+        return arrays
+    return [np.rint(array * (255 / max(most, 1.0))).astype(np.uint8) for array in arrays]
+
+
+def _arranged(image: NDArray[np.uint8], vertical: bool) -> NDArray[np.uint8]:
+    """With rows that correspond, one channel as (H, W)."""
+    turned = image.transpose(1, 0, 2) if vertical else image
+    return np.ascontiguousarray(turned[..., 0] if turned.shape[2] == 1 else turned)
+
+
+def _seen(mask: Tensor, disparity: Tensor, vertical: bool) -> Tensor:
+    """Whether the right camera sees what a disparity says."""
+    dim = 0 if vertical else 1
+    places = torch.arange(disparity.shape[dim]).unsqueeze(1 - dim) - disparity
+    nearest = places.round().long()
+    inside = (nearest >= 0) & (nearest < disparity.shape[dim])
+    return inside & mask.gather(dim, nearest.clamp(0, disparity.shape[dim] - 1))
