@@ -206,7 +206,7 @@ def _limits(rectification: Rectification, arguments: argparse.Namespace) -> tupl
                 f"{path}: disparities go to {most:.0f} px, a .png to {_DEEPEST // _FRACTIONS}{advice}; or look for "
                 f"less near things, by --depth, or make the images smaller, by --size"
             )
-    return least, most
+    return round(least, 6) + 0.0, most  # infinity is a rounding error off zero
 
 
 def _write_cameras(folder: Path, rig: Rig, rectification: Rectification) -> None:

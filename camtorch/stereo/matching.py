@@ -79,10 +79,10 @@ def match(
 
 def _of_bytes(*images: Tensor) -> list[NDArray[np.uint8]]:
     """(H, W, C) of images of one scale."""
-    most = max(float(image.max()) for image in images)
     arrays = [image[: 3 if len(image) > 2 else 1].permute(1, 2, 0).numpy() for image in images]
     if all(array.dtype == np.uint8 for array in arrays):
         return arrays
+    most = max(float(array.max()) for array in arrays)
     return [np.rint(array * (255 / max(most, 1.0))).astype(np.uint8) for array in arrays]
 
 

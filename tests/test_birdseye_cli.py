@@ -1,0 +1,109 @@
+"""`camtorch birdseye`: the ground in its scale, by a pose of a file or by height and pitch."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import camtorch as ct
+from camtorch.cli.main import main
+
+RANGES = ["--x", "-2", "2", "--y", "0.5", "4.5", "--resolution", "0.02"]
+HEIGHT, PITCH = 1.5, 35.0
+
+
+def lens():
+    camera = ct.KannalaBrandt([80.0, 80, 119.5, 89.5], [0.01, 0.0, 0.0, 0.0], image_size=(180, 240))
+    return camera.double().requires_grad_(False)
+
+
+def pose():
+    """Camera from ground, of one that looks along y and down."""
+    down = ct.Extrinsics([math.radians(90 + PITCH), 0.0, 0.0], [0.0] * 3).double()
+    rotation = down.matrix()[:3, :3]
+    return ct.Extrinsics.from_matrix(rotation, -rotation @ torch.tensor([0, 0, HEIGHT]).double())
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A floor of squares of half a unit, seen by a fisheye."""
+    monkeypatch.chdir(tmp_path)
+    camera, extrinsics = lens(), pose()
+    fine = camera.resize(720, 960)
+    rays = fine.unproject(fine.pixel_grid())[0] @ extrinsics.matrix()[:3, :3]
+    far = -HEIGHT / rays[..., 2].clamp(max=-1e-6)
+    x, y = (far[..., None] * rays)[..., :2].unbind(-1)
+    squares = (((2 * x).floor() + (2 * y).floor()) % 2 == 0) & (rays[..., 2] < -1e-3)
+    seen = torch.nn.functional.avg_pool2d(255.0 * squares[None, None], 4)[0, 0]
+    Image.fromarray(seen.round().byte().numpy()).save("floor.png")
+    ct.save(camera, "camera.json")
+    ct.save(ct.Rig({"front": camera}, {"front": extrinsics}), "posed.json")
+    return tmp_path
+
+
+def command(*words, expect=0):
+    assert main(["birdseye", *map(str, words)]) == expect
+
+
+def test_squares_of_the_floor_are_squares_of_its_size(folder, capsys):
+    command("floor.png", "--camera", "posed.json", *RANGES, "-o", "above.png")
+    command("floor.png", "--camera", "camera.json", "--height", HEIGHT, "--pitch", PITCH, *RANGES, "-o", "same.png")
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == (
+        "above.png: the ground from above, x -2 to 2 and y 0.5 to 4.5 at 0.02 a pixel, 200x200, by kannala_brandt, "
+        "1.5 above; 100.0 % of it is filled"
+    )
+    above, same = (np.array(Image.open(f"{name}.png")).astype(float) for name in ("above", "same"))
+    assert np.abs(above - same).max() <= 1
+    # columns go along x, rows from the largest y to the smallest
+    x = -2 + 0.02 * (np.arange(200) + 0.5)
+    y = 4.5 - 0.02 * (np.arange(200) + 0.5)
+    cells = np.floor(2 * x)[None] + np.floor(2 * y)[:, None]
+    truth = 255 * (cells % 2 == 0)
+    inner = (np.abs((2 * x) % 1 - 0.5) < 0.35)[None] & (np.abs((2 * y) % 1 - 0.5) < 0.35)[:, None]
+    near = inner & (y < 2.5)[:, None]
+    assert np.abs(above - truth)[near].max() < 60
+    assert np.abs(above - truth)[near].mean() < 5
+
+
+def test_a_pitch_is_down(folder):
+    command("floor.png", "--camera", "camera.json", "--height", 1, "--pitch", 90, *RANGES, "-o", "down.png")
+    command("floor.png", "--camera", "camera.json", "--height", 1, *RANGES, "-o", "level.png")
+    # straight down: the middle of the image is the origin, which lies below the camera
+    small = ["--x", "-0.1", "0.1", "--y", "-0.1", "0.1", "--resolution", "0.2"]
+    command("floor.png", "--camera", "camera.json", "--height", 1, "--pitch", 90, *small, "-o", "origin.png")
+    middle = np.array(Image.open("floor.png")).astype(float)[89:91, 119:121].mean()
+    assert np.array(Image.open("origin.png"))[0, 0] == pytest.approx(middle, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ([*RANGES], "floor.png: which camera took it? --camera FILE"),
+        (["--camera", "camera.json", *RANGES], "camera.json: no pose, so where the ground is is not known; --height"),
+        (["--camera", "camera.json", "--pitch", "3", *RANGES], "--pitch needs --height"),
+        (["--camera", "camera.json", "--height", "0", *RANGES], "--height must be above 0; got 0"),
+        (["--camera", "camera.json", "--height", "1", "--pitch", "91", *RANGES], "at most 90 degrees"),
+        (["--camera", "camera.json", "--x", "1", "0", *RANGES[3:]], "--x takes FROM and TO, ascending; got 1 0"),
+        (["--camera", "camera.json", *RANGES[:6], "--resolution", "0"], "--resolution must be above 0"),
+        (["--camera", "camera.json", *RANGES[:6], "--resolution", "1e-5"], "make 400000x400000 pixels"),
+        (["--camera", "camera.json", *RANGES[:6]], "required: --resolution"),
+        (["--camera", "below.json", *RANGES], "on the ground, whose z points up; it has to be above"),
+        (["--camera", "camera.json", "--height", "1", *RANGES, "-o", "floor.png"], "would overwrite floor.png"),
+        (["--camera", "camera.json", "--height", "1", *RANGES, "-o", "camera.json"], "camera.json: would overwrite"),
+        (["--camera", "posed.json", *RANGES, "-o", "a.ico"], "a.ico: .ico: icons"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(folder, capsys, words, text):
+    below = ct.Extrinsics([0.0] * 3, [0.0, 0.0, 1.0])
+    ct.save(ct.Rig({"front": lens()}, {"front": below}), "below.json")
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    command("floor.png", *words, expect=2)
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert text in captured.err
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    assert not Path("birdseye.png").exists()
