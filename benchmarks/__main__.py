@@ -13,7 +13,7 @@ try:
     import cv2
     import torch
 
-    from benchmarks import augment, calibration, cameras, images, load, machine, points, scaling
+    from benchmarks import augment, calibration, cameras, images, load, machine, points, scaling, stereo
     from benchmarks.options import Options, progress
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
@@ -23,6 +23,7 @@ SUBJECTS = {
     "images": images,
     "augment": augment,
     "calibration": calibration,
+    "stereo": stereo,
     "load": load,
     "scaling": scaling,
 }
@@ -79,7 +80,8 @@ def _parser() -> argparse.ArgumentParser:
         choices=tuple(cameras.COEFFICIENTS),
         default=[],
         metavar="KEY",
-        help=f"only these models; of {', '.join(cameras.COEFFICIENTS)}. images, calibration and scaling have a few",
+        help=f"only these models; of {', '.join(cameras.COEFFICIENTS)}. images, calibration, stereo and scaling have "
+        "a few",
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
     parser.add_argument("--threads", type=_positive, default=2, help="of torch and of OpenCV (default: 2)")
