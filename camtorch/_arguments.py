@@ -119,7 +119,7 @@ def as_image_size(value: Any, owner: str) -> tuple[int, int] | None:
 
 
 def as_whole(value: Any, name: str, owner: str) -> int:
-    """A whole number of pixels.
+    """A whole number.
 
     Raises:
         TypeError: it is none.
@@ -127,7 +127,7 @@ def as_whole(value: Any, name: str, owner: str) -> int:
     try:
         return operator.index(value)
     except TypeError:
-        raise TypeError(f"{owner}: {name} must be a whole number of pixels; got {value!r}") from None
+        raise TypeError(f"{owner}: {name} must be a whole number; got {value!r}") from None
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:

@@ -289,3 +289,35 @@ def test_bad_arguments(changes, words):
     with pytest.raises(ValueError, match=words) as caught:
         ct.calibrate(given.pop("model"), given.pop("object_points"), given.pop("image_points"), **given)
     assert "calibrate" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fixed": None}, "fixed must be names"),
+        ({"fixed": {"cx": 320.0}}, "fixed must be names"),
+        ({"loss": "huber", "loss_scale": "1"}, "loss_scale must be a number"),
+        ({"bend": "no"}, "bend must be True or False"),
+        ({"progress": "bar"}, "progress must be a function"),
+        ({"model": ct.Camera}, "takes a camera model"),
+    ],
+)
+def test_arguments_of_other_types(changes, words):
+    given = {"model": "pinhole", "image_size": LEFT.image_size, **changes}
+    with pytest.raises(TypeError, match=f"^calibrate:? {words}"):
+        ct.calibrate(given.pop("model"), LEFT.object_points, LEFT.image_points, **given)
+
+
+def test_a_million_coefficients():
+    with pytest.raises(ValueError, match="here 100 at most; got count=1000000000"):
+        calibrate(LEFT, model="kannala_brandt", count=10**9)
+
+
+def test_contexts_of_torch(left):
+    """Tensors that are made inside lie where those lie that came in."""
+    with torch.device("meta"):
+        found = calibrate(LEFT)
+        assert str(found) == str(left)
+    with torch.inference_mode():
+        assert str(calibrate(LEFT)) == str(left)
+    assert_close(values(found), values(left), **exactly)

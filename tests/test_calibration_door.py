@@ -108,6 +108,11 @@ def test_integers_and_half_precision_are_numbers():
     same(as_observations(BOARD, half, SIZE, OWNER), REPEATED, half)
 
 
+def test_boards_far_from_their_origin():
+    far = BOARD + np.array([1e6, 0, 0])
+    same(as_observations(far, VIEWS, SIZE, OWNER), np.repeat(far[None], 5, 0), VIEWS)
+
+
 def test_what_is_given_is_not_changed():
     image_points, points = torch.from_numpy(VIEWS).double(), torch.from_numpy(BOARD).double()
     image_points[0, 3] = torch.nan
@@ -231,6 +236,8 @@ BAD = {
         ["object_points", "finite"],
     ),
     "a board without a corner": (np.where(BOARD[-1] == BOARD, np.nan, BOARD), VIEWS, ["object_points", "finite"]),
+    "a strange unit": (BOARD.astype(float) * 1e200, VIEWS, ["object_points reach 2e+199", "unit"]),
+    "no values": (BOARD, torch.from_numpy(VIEWS).to("meta"), ["image_points", "meta"]),
     "normalised": (BOARD, VIEWS / 640, ["normalised"]),
     "normalised about the middle": (BOARD, VIEWS / 320 - 1, ["normalised"]),
     "outside": (BOARD, VIEWS * 3, ["corners of image_points lie outside", "(480, 640)", "reach"]),

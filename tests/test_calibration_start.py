@@ -125,6 +125,16 @@ def test_the_better_of_two_poses_that_look_alike():
     assert float(cosine.amin()) > math.cos(math.radians(3))
 
 
+def test_poses_are_looked_at_again_by_the_camera_that_was_found():
+    """Pixels twice as high as wide: the search from nothing takes them as square, and a view's other pose with it."""
+    intrinsics = a_camera("pinhole", 60, 2).intrinsics.detach() * torch.tensor([1.0, 2, 1, 1])
+    camera = ct.Pinhole(intrinsics, image_size=SIZE)
+    seen, _, _ = seen_by(camera, 60, 10, 0.3, 2)
+    found = ct.calibrate("pinhole", *seen[:2], image_size=SIZE)
+    assert found.converged
+    assert found.rms < 0.45
+
+
 def test_wide_lenses_of_few_views():
     camera = a_camera("kannala_brandt", 185).requires_grad_(False)
     seen, _, _ = seen_by(camera, 185, 5, 0.2, 4)

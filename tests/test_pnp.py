@@ -193,7 +193,7 @@ def test_bad_rows_are_invalid_and_leave_the_others_alone():
     target[1] = target[1, :, :1]  # a line
     target[2] = torch.inf
     pixels[3] = pixels[3, :1]  # one pixel
-    target[4] = 0
+    target[4] = 1e200  # too large to be squared
     target.requires_grad_(), pixels.requires_grad_()
     extrinsics, rms, valid = ct.solve_pnp(camera, target, pixels)
     assert not valid[[0, 1, 2, 4]].any()
@@ -206,6 +206,18 @@ def test_bad_rows_are_invalid_and_leave_the_others_alone():
         assert torch.isfinite(given.grad).all()
         assert not given.grad[[0, 1, 2, 4]].any()
         assert given.grad[5].any()
+
+
+def test_objects_far_from_their_origin():
+    """Of coordinates of a map, whose rounding is a hundredth of a micrometre."""
+    camera = lens(60)
+    target, rotation, _, pixels = scenes(camera, 60, 6, 6, "space")
+    moved = target + torch.tensor([4e5, 5e6, 300.0])
+    expected = ct.solve_pnp(camera, target, pixels)
+    found = ct.solve_pnp(camera, moved, pixels)
+    assert found.valid.all()
+    torch.testing.assert_close(rotation_matrix(found.extrinsics.rotation), rotation, rtol=0, atol=1e-7)
+    torch.testing.assert_close(found.extrinsics(moved), expected.extrinsics(target), rtol=0, atol=1e-7)
 
 
 def test_shapes():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings as python_warnings
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from camtorch._arguments import as_whole
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations
-from camtorch.calibration.start import poses_for, start_from_nothing
+from camtorch.calibration.start import other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import Spread, noise_under, spread, uncertainty
 from camtorch.calibration.verdict import check_determined, verdict, warnings
 from camtorch.camera import Camera
@@ -27,8 +27,10 @@ from camtorch.rotations import rotation_vector
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 STEPS = 300
+_MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
+_SECOND_LOOKS = 3  # at the poses
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,13 @@ def as_model(
             raise ValueError(f"{owner}: count={count}, and the start has {start.distortion.shape[-1]} coefficients")
         count = start.distortion.shape[-1]
     count = model.default_count if count is None else as_whole(count, "count", owner)
-    names = model.names_of(count) if count >= 0 else None
+    names = model.names_of(count) if 0 <= count <= _MANY else None
     if names is None:
-        raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}; got count={count}")
+        limit = f", here {_MANY} at most" if count > _MANY else ""
+        raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}{limit}; got count={count}")
     names = (*INTRINSICS, *names)
+    if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
+        raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
     unknown = [name for name in fixed if name not in names]
     if unknown:
@@ -89,7 +94,7 @@ def as_model(
         )
     if start is None and {"fx", "fy"} & set(fixed):
         raise ValueError(f"{owner}: a focal length is held at its value of the start; give start=a camera")
-    return Model(model, count, start, torch.tensor([name not in fixed for name in names]))
+    return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
 
 def _as_start(start: Camera, model: type[Camera], owner: str) -> Camera:
@@ -105,12 +110,22 @@ def _as_start(start: Camera, model: type[Camera], owner: str) -> Camera:
     return start
 
 
-def as_loss(loss: str | None, loss_scale: float, owner: str) -> None:
-    """Refuse what is no loss."""
+def as_options(
+    loss: str | None, loss_scale: float, bend: bool, progress: Callable[[int, float], None] | None, owner: str
+) -> None:
+    """Refuse what is no loss, no flag and no function."""
     if loss is not None and loss not in LOSSES:
         raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {loss!r}")
-    if not (math.isfinite(loss_scale) and loss_scale > 0):
+    try:
+        finite = math.isfinite(loss_scale)
+    except TypeError:
+        raise TypeError(f"{owner}: loss_scale must be a number of pixels; got {loss_scale!r}") from None
+    if not (finite and loss_scale > 0):
         raise ValueError(f"{owner}: loss_scale must be positive pixels; got {loss_scale}")
+    if not isinstance(bend, bool):
+        raise TypeError(f"{owner}: bend must be True or False; got {bend!r}")
+    if progress is not None and not callable(progress):
+        raise TypeError(f"{owner}: progress must be a function of the step and the cost; got {progress!r}")
 
 
 @dataclass(repr=False)
@@ -255,16 +270,15 @@ def calibrate(
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
     asked = as_model(model, count, start, fixed, owner)
-    as_loss(loss, loss_scale, owner)
+    as_options(loss, loss_scale, bend, progress, owner)
     # about its middle a pose's turn and its shift keep apart
     middle = middle_of([seen])
     centred = seen.about(middle)
     first = first_state(centred, asked, layout.image_size, loss, loss_scale)
-    sight = Sight(asked.kind, centred.points[None], centred.pixels[None], centred.seen[None].double())
     free = Free((asked.free.to(seen.pixels.device),), (False,), bend=bend)
     told = None if progress is None else lambda number, cost: progress(number, float(cost))
-    adjusted = adjust([sight], first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
-    check_determined(adjusted, [asked.kind], [asked.names], [sight], owner)
+    adjusted = adjusted_alone(centred, asked, first, free, layout.image_size, loss, loss_scale, progress=told)
+    check_determined(adjusted, [asked.kind], [asked.names], [sight_of(centred, asked)], owner)
     free_parameters = free_count(adjusted, [seen.seen])
     noise = noise_of(adjusted.residuals[0][0], seen.seen, adjusted.valid[0][0], loss, loss_scale, free_parameters)
     result = result_of(adjusted, 0, asked, seen, middle, layout, noise, (object_points, image_points))
@@ -293,6 +307,37 @@ def first_state(
         )
     given = (t.detach().to(seen.pixels).reshape(1, -1) for t in (asked.start.intrinsics, asked.start.distortion))
     return poses_for(torch.cat(tuple(given), -1), seen, asked.kind, image_size)
+
+
+def sight_of(seen: Observations, asked: Model) -> Sight:
+    """What a camera sees, as one problem."""
+    return Sight(asked.kind, seen.points[None], seen.pixels[None], seen.seen[None].to(seen.pixels))
+
+
+def adjusted_alone(
+    seen: Observations,
+    asked: Model,
+    first: State,
+    free: Free,
+    image_size: tuple[int, int],
+    loss: str | None,
+    loss_scale: float,
+    progress: Callable[[int, Tensor], None] | None = None,
+) -> Adjusted:
+    """The optimum for one camera near a state, and with other poses where those are better by the camera found."""
+
+    def optimum(state: State) -> Adjusted:
+        sight = sight_of(seen, asked)
+        return adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=progress)
+
+    adjusted = optimum(first)
+    for _ in range(_SECOND_LOOKS):
+        other = other_poses(adjusted.state, seen, asked.kind, image_size)
+        again = adjusted if other is adjusted.state else optimum(other)
+        if not bool(again.cost < adjusted.cost):
+            break
+        adjusted = again
+    return adjusted
 
 
 class Noise(NamedTuple):

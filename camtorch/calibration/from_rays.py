@@ -65,6 +65,8 @@ def fit(
             f"{owner}: pixels must be (*N, 2) and rays (*N, 3), or (*B, *N, 3); got pixels "
             f"{tuple(given_pixels.shape)} and rays {tuple(given_rays.shape)}"
         )
+    if given_rays.numel() == 0:
+        raise ValueError(f"{owner}: a camera takes {_LEAST} rays at least; got rays {tuple(given_rays.shape)}")
     batch = given_rays.shape[: given_rays.ndim - 1 - dims]
     seen = _observations(given_pixels, given_rays, weights, dims, owner)
     counted = (seen.weights > 0).sum(-1)

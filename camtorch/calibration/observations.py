@@ -18,6 +18,8 @@ Points: TypeAlias = "Numbers | Sequence[Numbers | None]"
 
 _LEAST_CORNERS = 4
 _FLAT = 1e-5  # the width of a set of points over its length, below which it is a line
+_ROUNDING = 1e-11  # of coordinates, which a board's origin far away leaves of its points
+_LEAST_UNIT, _MOST_UNIT = 1e-30, 1e30
 _NORMALISED = 3.0  # pixels that none of an image's coordinates exceeds if they are no pixels
 _RIM = 0.02  # of the longer side: further outside the image no corner is found
 _MANY_OUTSIDE = 0.2  # of all corners, more than a robust loss would be asked to bear
@@ -327,6 +329,8 @@ def _as_float64(value: Any, name: str, owner: str) -> Tensor:
         raise ValueError(f"{owner}: {name} must be rows of as many numbers; got {_brief(value)}: {error}") from None
     if value.is_complex() or value.dtype == torch.bool:
         raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
+    if value.is_meta:
+        raise ValueError(f"{owner}: {name} is on the device meta, and has no values")
     return value.detach().to(torch.float64)
 
 
@@ -410,10 +414,13 @@ def _check_boards(points: Tensor, seen: Tensor, owner: str) -> None:
     weights = seen[..., None].double()
     count = weights.sum(1, keepdim=True).clamp(min=1)
     known = torch.where(seen[..., None], points, 0.0)
+    reach = float(known.abs().amax())
+    if reach > 0 and not _LEAST_UNIT < reach < _MOST_UNIT:
+        raise ValueError(f"{owner}: object_points reach {reach:.3g}; give them in a unit near the size of the board")
     offsets = (known - known.sum(1, keepdim=True) / count) * weights
     spread = torch.linalg.eigvalsh(offsets.mT @ offsets).clamp(min=0).sqrt()  # (V, 3) ascending
     has = seen.any(-1)
-    dot = has & (spread[:, 2] <= _FLAT * known.abs().amax((1, 2)))
+    dot = has & (spread[:, 2] <= _ROUNDING * known.abs().amax((1, 2)))
     line = has & (spread[:, 1] <= _FLAT * spread[:, 2])
     if bool((dot | line).any()):
         view = _first(dot | line)

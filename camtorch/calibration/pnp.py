@@ -77,7 +77,9 @@ def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weight
     mean = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
     # of a perfect fit the root has no derivative
     rms = torch.where(valid & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), torch.where(valid, 0.0, torch.inf))
-    rotation, translation = unknowns.to(task.dtype).view(*task.batch, 6).split(3, -1)
+    rotation, translation = unknowns.split(3, -1)
+    translation = translation - (rotation_matrix(rotation) @ task.middles[..., None])[..., 0]
+    rotation, translation = (t.to(task.dtype).view(*task.batch, 3) for t in (rotation, translation))
     return Pose(
         Extrinsics(rotation[..., None], translation), rms.to(task.dtype).view(task.batch), valid.view(task.batch)
     )
@@ -87,10 +89,11 @@ class _Task(NamedTuple):
     """B rows, float64, with graphs where there are: what is unseen has weight 0 and is finite."""
 
     camera: Camera  # of B rows, or of none for all
-    points: Tensor  # (B, N, 3)
+    points: Tensor  # (B, N, 3) about their middles
     pixels: Tensor  # (B, N, 2)
     weights: Tensor  # (B, N)
     rays: Tensor  # (B, N, 3)
+    middles: Tensor  # (B, 3) of the points as they were passed, which may lie far from the origin
     batch: torch.Size
     dtype: torch.dtype
 
@@ -131,14 +134,17 @@ class _Task(NamedTuple):
         rows = rows_of(camera, batch)
         with torch.no_grad():
             rays, seen = rows.unproject(seen_at)
-            # a sum shows what is not finite
-            seen = seen & torch.isfinite(points.sum(-1) + given)
+            # a sum shows what is not finite, and these powers what would not be
+            seen = seen & torch.isfinite(points.square().sum(-1).square() + given)
+            counts = (seen & (given > 0))[..., None]
+            middles = torch.where(counts, points, 0.0).sum(-2) / counts.sum(-2).clamp(min=1)
         return cls(
             rows,
-            torch.where(seen[..., None], points, 0.0),
+            torch.where(seen[..., None], points - middles[:, None], 0.0),
             torch.where(seen[..., None], seen_at, 0.0),
             torch.where(seen, given, 0.0),
             rays,
+            middles,
             batch,
             dtype,
         )

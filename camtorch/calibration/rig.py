@@ -17,13 +17,15 @@ from camtorch.calibration.calibrate import (
     STEPS,
     Calibration,
     Model,
-    as_loss,
+    adjusted_alone,
     as_model,
+    as_options,
     first_state,
     free_count,
     middle_of,
     noise_of,
     result_of,
+    sight_of,
 )
 from camtorch.calibration.observations import Observations, Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
@@ -147,7 +149,7 @@ def calibrate_rig(
     """
     owner = "calibrate_rig"
     seen, layouts = as_rig_observations(object_points, image_points, image_sizes, models, owner)
-    as_loss(loss, loss_scale, owner)
+    as_options(loss, loss_scale, bend, progress, owner)
     names = list(seen)
     for given in (count, start, fixed):
         stray = [name for name in given if name not in seen] if isinstance(given, Mapping) else []
@@ -161,10 +163,7 @@ def calibrate_rig(
     ]
     middle = middle_of(seen.values())
     centred = [s.about(middle) for s in seen.values()]
-    sights = [
-        Sight(m.kind, s.points[None], s.pixels[None], s.seen[None].to(s.pixels))
-        for m, s in zip(asked, centred, strict=True)
-    ]
+    sights = [sight_of(s, m) for m, s in zip(asked, centred, strict=True)]
     alone = [
         _alone(m, s, loss, loss_scale, layout.image_size)
         for m, s, layout in zip(asked, centred, layouts.values(), strict=True)
@@ -244,9 +243,8 @@ def _alone(
     has_pose = seen.seen.sum(-1) >= _LEAST
     some = seen.of(has_pose)
     first = first_state(some, asked, image_size, loss, loss_scale)
-    sight = Sight(asked.kind, some.points[None], some.pixels[None], some.seen[None].to(some.pixels))
     free = Free((asked.free.to(some.pixels.device),), (False,))
-    state = adjust([sight], first, free, loss=loss, loss_scale=loss_scale, steps=STEPS).state
+    state = adjusted_alone(some, asked, first, free, image_size, loss, loss_scale).state
     boards = Poses(*(t[0] for t in Poses.none(1, len(has_pose), some.pixels)))
     for whole, part in zip(boards, state.boards, strict=True):
         whole[has_pose] = part[0]

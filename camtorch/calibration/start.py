@@ -52,6 +52,8 @@ _ALONG = {
 _LOW_ORDERS = (1, 4)
 _REACH = 1.1  # how much further than the data a start shall reach
 _ERRS = 1.5  # times the scale of another lens: a model that does not fit
+_DOUBTED = 50  # views whose poses are looked at again
+_OTHER = 0.05  # radians, or of the distance, between two poses that are two minima
 _LOST = 0.01  # the part of the corners without a pixel, with which a model is the wrong one
 
 
@@ -125,6 +127,30 @@ def poses_for(
     return _turned(_Lens(model, parameters, boards, scale), observations, image_size).state
 
 
+def other_poses(state: State, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
+    """An optimum, B = 1, with other poses of the views that another one fits better; itself where there is none.
+
+    While the camera was not known, a view may have taken the wrong one of the two poses that a plane seems to have, or
+    have been led astray by outliers.
+    """
+    parameters = state.parameters[0]
+    errors = _errors(_camera(model, parameters, image_size), state.boards, observations)[0]
+    # views whose errors are greater than those of many others
+    rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
+    boards = Poses(*(t[:, rows] for t in state.boards))
+    lens = _Lens(model, parameters, boards, max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
+    others = _turned(lens, observations.of(rows), image_size).boards
+    cosine = ((boards.rotations * others.rotations).sum((-1, -2)) - 1) / 2
+    shift = torch.linalg.vector_norm(others.translations - boards.translations, dim=-1)
+    is_other = (cosine < math.cos(_OTHER)) | (shift > _OTHER * torch.linalg.vector_norm(boards.translations, dim=-1))
+    if not bool(is_other.any()):
+        return state
+    chosen = _chosen(is_other[0], others, boards)
+    return state._replace(
+        boards=Poses(*(t.index_copy(1, rows, new) for t, new in zip(state.boards, chosen, strict=True)))
+    )
+
+
 class _Lens(NamedTuple):
     """Cameras of a model, parameters (B, 4 + n), with poses (B, V) of the boards."""
 
@@ -185,7 +211,7 @@ def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
     """All parameters but those that are held, or that never learn."""
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
     learns = [name not in fixed and model.fit_bounds.get(name, ()) is not None for name in names]
-    return Free((torch.tensor(learns),), (False,))
+    return Free((torch.tensor(learns, device="cpu"),), (False,))
 
 
 def _camera(model: type[Camera], parameters: Tensor, image_size: tuple[int, int]) -> Camera:
@@ -270,10 +296,10 @@ def _resampled(camera: Camera, boards: Poses, some: Observations) -> Poses:
     (bad,) = (usual > _BAD * usual.median().clamp(min=_LEAST_SCALE)).nonzero(as_tuple=True)
     if len(bad) == 0:
         return boards
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator("cpu").manual_seed(0)
     many = some.of(bad.repeat_interleave(_HANDFULS))
     rays, has_ray = (t[0] for t in _rays(camera, many))
-    chances = torch.rand(has_ray.shape, generator=generator).to(rays.device).masked_fill(~has_ray, -1.0)
+    chances = torch.rand(has_ray.shape, generator=generator, device="cpu").to(rays.device).masked_fill(~has_ray, -1.0)
     least = chances.topk(min(_HANDFUL, has_ray.shape[1])).values[:, -1:]
     found = poses_from_rays(many.points, rays, (has_ray & (chances >= least)).to(rays.dtype))
     tried = Poses(found.rotations[None, :, 0], found.translations[None, :, 0])
@@ -321,7 +347,7 @@ def _turned(lens: _Lens, some: Observations, image_size: tuple[int, int]) -> _Le
     sight = Sight(
         lens.model, *(t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None] for t in _sight(lens.model, some)[1:])
     )
-    free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool),), (False,))
+    free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     state = _state(lens.parameters, both)
     ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_STEPS)
     a, b = (

@@ -65,7 +65,7 @@ class Survey:
         self.shape = max(1, round(height / cell)), max(1, round(width / cell))
         low, high = image_edges(calibration.image_size, self.parameters)
         steps = [
-            (torch.arange(count).to(low) + 0.5) / count * (high[i] - low[i]) + low[i]
+            (torch.arange(count, device=low.device).to(low) + 0.5) / count * (high[i] - low[i]) + low[i]
             for i, count in ((1, self.shape[0]), (0, self.shape[1]))
         ]
         self.pixels = torch.stack(torch.meshgrid(*steps, indexing="ij")[::-1], -1)
@@ -143,7 +143,7 @@ class Survey:
 
         In some models a coefficient does nearly what the parameter called focal length does.
         """
-        with torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad():
             p = self.parameters.detach().clone().requires_grad_()
             x, y = (p.new_zeros(1, 1).requires_grad_() for _ in range(2))
             chart, lens = self.calibration.spread.model.optics(columns(p[None, 4:]))
@@ -163,8 +163,8 @@ class Survey:
         low, high = image_edges(self.calibration.image_size, self.corners)
         places = ((self.corners - low) / (high - low) * 3).long().clamp(0, 2)
         result = []
-        for i, band in enumerate(torch.arange(self.shape[0]).tensor_split(3)):
-            for j, part in enumerate(torch.arange(self.shape[1]).tensor_split(3)):
+        for i, band in enumerate(torch.arange(self.shape[0], device="cpu").tensor_split(3)):
+            for j, part in enumerate(torch.arange(self.shape[1], device="cpu").tensor_split(3)):
                 here = self.uncertainty[band][:, part]
                 known = here[~here.isnan()]
                 result.append(

@@ -86,7 +86,7 @@ def minimise(
     rows = torch.arange(len(state[0]), device=state[0].device)
     cost = problem.cost(state, rows)
     state = tuple([t.clone() for t in state])
-    tolerance, tiny = (torch.as_tensor(t).to(cost).expand_as(cost) for t in (tolerance, tiny))
+    tolerance, tiny = (torch.as_tensor(t, device=cost.device).to(cost).expand_as(cost) for t in (tolerance, tiny))
     weights = torch.full_like(cost, damping)
     growth = torch.full_like(cost, 4.0)
     converged = cost <= tiny

@@ -46,7 +46,9 @@ def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
 
 def ray_fan(angles: Tensor, azimuths: int) -> Tensor:
     """(*C, K) angles from the axis -> (*C, K, azimuths, 3) rays, evenly around it; none where panoramas are cut."""
-    return polar_rays(angles[..., None], (torch.arange(azimuths).to(angles) + 0.25) * (2 * math.pi / azimuths))
+    return polar_rays(
+        angles[..., None], (torch.arange(azimuths, device=angles.device).to(angles) + 0.25) * (2 * math.pi / azimuths)
+    )
 
 
 def polar_rays(angles: Tensor, azimuths: Tensor) -> Tensor:
