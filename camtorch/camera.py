@@ -44,6 +44,17 @@ if TYPE_CHECKING:
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
+_ELSEWHERE = {
+    "opencv": "brown_conrady",
+    "plumb_bob": "brown_conrady",
+    "radtan": "brown_conrady",
+    "fisheye": "kannala_brandt",
+    "opencv_fisheye": "kannala_brandt",
+    "equidistant": "kannala_brandt",
+    "omnidir": "mei",
+}
+"""What OpenCV, ROS, Kalibr and COLMAP call some of them."""
+
 
 class Camera(BatchedModule):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
@@ -713,7 +724,7 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     """
     if isinstance(model, str):
         if model not in MODELS:
-            keys = {name.lower(): key for key, cls in MODELS.items() for name in (key, cls.__name__)}
+            keys = {name.lower(): key for key, cls in MODELS.items() for name in (key, cls.__name__)} | _ELSEWHERE
             close = difflib.get_close_matches(model.lower(), keys, 1)
             meant = f"did you mean {keys[close[0]]!r}? Known" if close else "known"
             raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")

@@ -130,6 +130,7 @@ def area(line):
         ("--board 9x6 --square 50mm -o b.pdf", "500 x 350 mm does not fit on paper of 297 x 210 mm"),
         ("--board 9x6 --square 3ft -o b.pdf", "'3ft' is no length above 0"),
         ("--board 9x6 --square=-3 -o b.pdf", "'-3' is no length above 0"),
+        ("--board 9x6 --square 24 -o b.pdf", "'24' would be metres: 24mm, or 24m if it is that large"),
         ("--board 9x6 --paper a9 -o b.pdf", "'a9' is no paper: a4, a3"),
         ("--board 9x6 --paper 20x20mm -o b.pdf", "a square would be less than a millimetre"),
         ("--board 9x6 --spacing 0.3 -o b.pdf", "--spacing is for --type aprilgrid; this is a chessboard"),

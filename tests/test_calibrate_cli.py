@@ -1,6 +1,7 @@
 """From photographs on the command line to a camera's file."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -177,6 +178,10 @@ def test_a_wrong_size_of_the_board_is_named(photographs, capsys):
     error = capsys.readouterr().err.splitlines()[-1]
     assert "a board was found in 0 of 1 images, and 3 are needed" in error
     assert "shows one of 9x6 inner corners: --board 9x6" in error
+    corners = corners_of(Chessboard(8, 5, 0.03), count=1)  # in one image a part of the board was taken for the whole
+    missed = ImageCorners(photographs / "view1.png", (480, 640), np.full((40, 2), np.nan), "no board found")
+    with pytest.raises(ValueError, match=r"in 1 of 2 images.* shows one of 9x6 inner corners: --board 9x6"):
+        searching.usable_views(replace(corners, images=[*corners.images, missed]))
 
 
 def two_cameras(board):
@@ -336,7 +341,8 @@ def test_models_that_the_file_cannot_hold_are_not_tried(capsys, monkeypatch):
         ("--rig cam0=a.png --board 9x6", "--rig takes several cameras"),
         ("--left a.png --right a.png --board 9x6", "a.png: is given as an image of two cameras"),
         ("a.png --board 9x6 --match name", "--match is for --left and --right, or --rig"),
-        ("a.png --board 9x6 --model lens", "--model: 'lens' is none; there are brown_conrady"),
+        ("a.png --board 9x6 --model lens", "--model: there is no camera model 'lens'; known are brown_conrady"),
+        ("a.png --board 9x6 --model fisheye", "did you mean 'kannala_brandt'?"),
         ("a.png --board 9x6 --model fisheye62 -o camera.yml", "-o camera.json holds every model"),
         ("a.png --board 9x6 --model fisheye62 --count 3", "--count: fisheye62 takes n = 8"),
         ("a.png --board 9x6 --count 3", "--count is for a --model"),

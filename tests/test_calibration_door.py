@@ -285,6 +285,8 @@ def test_sizes_of_images():
         as_observations(BOARD, VIEWS, [SIZE, SIZE, (720, 1280), SIZE, SIZE], OWNER)
     with refuses("image_size", "positive", "(480, 0)"):
         as_observations(BOARD, VIEWS, (480, 0), OWNER)
+    with refuses("image_size", "image.shape[:2]", "array of shape (480, 640)"):
+        as_observations(BOARD, VIEWS, np.zeros(SIZE, np.uint8), OWNER)
     with refuses("image_size", "(480.5, 640)", error=TypeError):
         as_observations(BOARD, VIEWS, (480.5, 640), OWNER)
 

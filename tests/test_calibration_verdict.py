@@ -166,9 +166,10 @@ def test_a_bent_board():
     bulge = torch.stack((0 * x, 0 * x, 5e-4 * (1 - x * x) - 2e-4 * (1 - y * y)), -1)
     _, pixels = views(narrow(), *all_over(20), points=board + bulge)
     result = ct.calibrate("brown_conrady", board, pixels, image_size=SIZE)
-    found = [float(w) for w in re.findall(r"by ([\de.-]+) along its x and ([\de.-]+)", one(result.warnings, "bent"))[0]]
+    shares = r"by ([\d.]+) % of its length along its x and ([\d.]+) % along its y"
+    found = [float(share) for share in re.findall(shares, one(result.warnings, "bent"))[0]]
     # by the linear problem
-    assert found == pytest.approx([5e-4, 2e-4], rel=0.3)
+    assert found == pytest.approx([100 * 5e-4 / (8 * 0.025), 100 * 2e-4 / (5 * 0.025)], rel=0.3)
 
 
 def test_outliers_and_bad_views():

@@ -327,6 +327,8 @@ def test_what_the_name_does_not_say_is_asked_for(tmp_path):
         ct.load(tmp_path / "a.yaml", "ply")
     with pytest.raises(TypeError, match="takes a Rig or a Camera; got list"):
         ct.save([camera()], tmp_path / "a.json")
+    with pytest.raises(TypeError, match=r"got Conversion, whose \.camera it takes"):
+        ct.save(camera().convert("kannala_brandt"), tmp_path / "a.json")
     with pytest.raises(ValueError, match="a rig without cameras"):
         ct.save(ct.Rig({}), tmp_path / "a.json")
     ct.save(load("ros_plumb_bob.yaml"), tmp_path / "a.yaml")

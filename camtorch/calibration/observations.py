@@ -339,6 +339,11 @@ def _as_size(value: Any, name: str, owner: str) -> tuple[int, int]:
     if value is None:
         raise ValueError(f"{owner}: {name} is missing: (height, width) in pixels, as image.shape[:2]")
     if isinstance(value, (Tensor, np.ndarray)):
+        if value.ndim > 2 or value.shape[-1:] != (2,):
+            raise ValueError(
+                f"{owner}: {name} must be (height, width), as image.shape[:2]; got an array of shape "
+                f"{tuple(value.shape)}"
+            )
         value = value.tolist()
     if isinstance(value, (list, tuple)) and value and all(isinstance(side, (list, tuple)) for side in value):
         sizes = sorted({tuple(side) for side in value})

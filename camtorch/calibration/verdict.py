@@ -422,11 +422,12 @@ def _pattern(survey: Survey) -> Iterator[str]:
     least = max(_GAIN, (_CERTAIN * calibration.sigma) ** 2 / max(float(calibration.adjusted.cost[0]), 1e-300))
     is_bent = bend[2] > least and share < 2 * _PATTERN_SHARE and len(survey.seen) >= _FEW_VIEWS
     if is_bent:
-        x, y = (f"{abs(value):.2g}" for value in bend[:2])
+        points = calibration.observations.points[survey.seen]
+        sides = (points.amax(0) - points.amin(0))[:2].tolist()
+        x, y = (_percent(abs(value) / side) for value, side in zip(bend[:2], sides, strict=True))
         yield (
-            f"The board seems to be bent, by {x} along its x and {y} along its y, in the unit of its points: the "
-            f"squares of the residuals would fall by {_percent(bend[2])}. bend=True finds its shape; a stiff board is "
-            "better"
+            f"The board seems to be bent, by {x} of its length along its x and {y} along its y: the squares of the "
+            f"residuals would fall by {_percent(bend[2])}. bend=True finds its shape; a stiff board is better"
         )
     if more is not None and more[1] > max(least, _PATTERN_SHARE * share):
         yield (

@@ -22,6 +22,8 @@ def parse_length(text: str) -> float:
         length = math.nan
     if not 0 < length < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is no length above 0, as 30mm, 3cm, 1in or, in metres, 0.03")
+    if not unit and length >= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} would be metres: {text}mm, or {text}m if it is that large")
     return length
 
 

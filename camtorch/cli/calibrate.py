@@ -154,7 +154,7 @@ def _writable(
         ValueError: the name does not say the format; it holds no camera of the model.
     """
     from camtorch.calibration.selection import CANDIDATES
-    from camtorch.camera import MODELS
+    from camtorch.camera import MODELS, as_model
     from camtorch.io import CameraFileError, formats
 
     def failure(key: str, count: int) -> CameraFileError | None:
@@ -182,9 +182,7 @@ def _writable(
                 f"{path}: {format or path.suffix} holds none of the models that are tried; --model says one"
             )
         return format, held
-    if model not in MODELS:
-        raise ValueError(f"--model: {model!r} is none; there are {', '.join(sorted(MODELS))}")
-    kind = MODELS[model]
+    kind = as_model(model, "--model")
     count = kind.default_count if count is None else count
     if kind.names_of(count) is None:
         raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")

@@ -189,15 +189,17 @@ def _shown(size: tuple[int, int] | None) -> str:
 
 
 def _advice(corners: Corners) -> str:
-    """What may be wrong, where nothing at all was found."""
-    board = corners.board
-    if not isinstance(board, Chessboard) or any(image.seen for image in corners.images):
+    """What may be wrong, where hardly anything was found."""
+    board, some = corners.board, any(image.seen for image in corners.images)
+    if not isinstance(board, Chessboard):
         return ""
-    searched = [image for image in corners.images if image.image_size and image.path.exists()][:_TRIED_ANEW]
-    for columns, rows in ((board.columns - 1, board.rows - 1), (board.columns + 1, board.rows + 1)):
-        if min(columns, rows) < Chessboard.least:
+    unseen = [image for image in corners.images if image.image_size and not image.seen and image.path.exists()]
+    searched = unseen[:_TRIED_ANEW]
+    for more in (-1, 1):
+        columns, rows = board.columns + more, board.rows + more
+        if min(columns, rows) < Chessboard.least or (some and more < 0):  # a smaller one may be a part of this one
             continue
         for image in searched:
             if not detect(Chessboard(columns, rows), read_grey(image.path)).reason:
                 return f"; {image.path} shows one of {columns}x{rows} inner corners: --board {columns}x{rows}"
-    return f"; does it have {board.columns}x{board.rows} inner corners, where four squares meet?"
+    return "" if some else f"; does it have {board.columns}x{board.rows} inner corners, where four squares meet?"

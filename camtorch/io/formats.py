@@ -127,7 +127,9 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
     if isinstance(rig, Camera):
         rig = Rig({"camera": rig})
     if not isinstance(rig, Rig):
-        raise TypeError(f"save takes a Rig or a Camera; got {type(rig).__name__}")
+        part = next((name for name in ("camera", "rig") if isinstance(getattr(rig, name, None), (Camera, Rig))), None)
+        hint = f", whose .{part} it takes" if part else ""
+        raise TypeError(f"save takes a Rig or a Camera; got {type(rig).__name__}{hint}")
     path = _path(path, "save")
     if not rig.cameras:
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
