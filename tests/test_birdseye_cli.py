@@ -1,6 +1,7 @@
 """`camtorch birdseye`: the ground in its scale, by a pose of a file or by height and pitch."""
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,20 +28,27 @@ def pose():
     return ct.Extrinsics.from_matrix(rotation, -rotation @ torch.tensor([0, 0, HEIGHT]).double())
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
     """A floor of squares of half a unit, seen by a fisheye."""
-    monkeypatch.chdir(tmp_path)
-    camera, extrinsics = lens(), pose()
+    folder, camera, extrinsics = tmp_path_factory.mktemp("floor"), lens(), pose()
     fine = camera.resize(720, 960)
     rays = fine.unproject(fine.pixel_grid())[0] @ extrinsics.matrix()[:3, :3]
     far = -HEIGHT / rays[..., 2].clamp(max=-1e-6)
     x, y = (far[..., None] * rays)[..., :2].unbind(-1)
     squares = (((2 * x).floor() + (2 * y).floor()) % 2 == 0) & (rays[..., 2] < -1e-3)
-    seen = torch.nn.functional.avg_pool2d(255.0 * squares[None, None], 4)[0, 0]
-    Image.fromarray(seen.round().byte().numpy()).save("floor.png")
-    ct.save(camera, "camera.json")
-    ct.save(ct.Rig({"front": camera}, {"front": extrinsics}), "posed.json")
+    image = torch.nn.functional.avg_pool2d(255.0 * squares[None, None], 4)[0, 0]
+    Image.fromarray(image.round().byte().numpy()).save(folder / "floor.png")
+    ct.save(camera, folder / "camera.json")
+    ct.save(ct.Rig({"front": camera}, {"front": extrinsics}), folder / "posed.json")
+    return folder
+
+
+@pytest.fixture
+def folder(seen, tmp_path, monkeypatch):
+    for path in seen.iterdir():
+        shutil.copy(path, tmp_path)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 

@@ -135,6 +135,7 @@ def test_disparities_and_points_of_a_wall(folder, capsys, projection):
     assert "% of left.png; out/disparity_colours.png: their picture" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_depths_limit_points(folder, capsys):
     for near, far, some in ((2, 4, True), (5, "inf", False)):
         words = ["--points", "cloud.ply", "--depth", near, far, "-o", "out", "--force"]
@@ -179,6 +180,7 @@ def test_cameras_above_each_other(tmp_path, monkeypatch):
     assert opened("out/pair.png").shape == (320, 120, 3)
 
 
+@pytest.mark.slow
 def test_deep_images_stay_deep(folder):
     for name in ("left", "right"):
         grey = opened(f"{name}.png").mean(2)
