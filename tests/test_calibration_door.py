@@ -360,6 +360,8 @@ def test_bad_rigs(changes, words):
 def test_a_rig_is_made_of_mappings():
     with refuses("image_points", "names of cameras", "list", error=TypeError):
         as_rig_observations(BOARD, [VIEWS, VIEWS], SIZES, MODELS, OWNER)
+    with refuses("names of cameras must be strings", "0, 1", error=TypeError):
+        as_rig_observations(BOARD, {0: VIEWS, 1: VIEWS}, {0: SIZE, 1: SIZE}, {0: None, 1: None}, OWNER)
 
 
 def test_cameras_linked_by_another():

@@ -158,3 +158,14 @@ def test_names_that_no_camera_has_are_refused():
     pixels, _, _ = seen(views=10)
     with pytest.raises(ValueError, match="middle"):
         calibrated(pixels, fixed={"middle": "all"})
+
+
+@pytest.mark.slow
+def test_a_single_view_names_the_camera_that_it_leaves_open():
+    pixels, _, _ = seen(12)
+    view = int((~pixels["right"].isnan().any(-1)).sum(-1).argmax())
+    others = torch.arange(12) != view
+    pixels["right"][others] = torch.nan
+    models = {"left": "kannala_brandt", "right": "pinhole"}
+    with pytest.raises(ValueError, match=r"^calibrate_rig: right: a single view of this board leaves"):
+        calibrated(pixels, models=models)

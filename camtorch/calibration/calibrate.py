@@ -278,7 +278,7 @@ def calibrate(
     free = Free((asked.free.to(seen.pixels.device),), (False,), bend=bend)
     told = None if progress is None else lambda number, cost: progress(number, float(cost))
     adjusted = adjusted_alone(centred, asked, first, free, layout.image_size, loss, loss_scale, progress=told)
-    check_determined(adjusted, [asked.kind], [asked.names], [sight_of(centred, asked)], owner)
+    check_determined(adjusted, [asked.kind], [asked.names], [sight_of(centred, asked)], [owner])
     free_parameters = free_count(adjusted, [seen.seen])
     noise = noise_of(adjusted.residuals[0][0], seen.seen, adjusted.valid[0][0], loss, loss_scale, free_parameters)
     result = result_of(adjusted, 0, asked, seen, middle, layout, noise, (object_points, image_points))

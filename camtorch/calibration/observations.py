@@ -373,6 +373,9 @@ def _names(arguments: Mapping[str, Mapping[str, Any]], owner: str) -> list[str]:
     names = list(first[1])
     if not names:
         raise ValueError(f"{owner}: {first[0]} names no camera")
+    strange = [name for name in names if not isinstance(name, str)]
+    if strange:
+        raise TypeError(f"{owner}: names of cameras must be strings; got {_several([repr(name) for name in strange])}")
     for argument, mapping in others:
         for missing, there, where in (
             ([n for n in names if n not in mapping], first[0], argument),

@@ -181,7 +181,8 @@ def calibrate_rig(
             strict=True,
         )
     )
-    check_determined(adjusted, [a.kind for a in asked], [a.names for a in asked], sights, owner)
+    owners = [f"{owner}: {name}" for name in names]
+    check_determined(adjusted, [a.kind for a in asked], [a.names for a in asked], sights, owners)
     noise = noise_of(residuals, used, valid, loss, loss_scale, parameters)
     each = noise.inliers.split([len(s.seen) for s in seen.values()])
     cameras = {

@@ -593,7 +593,7 @@ def check_determined(
     models: Sequence[type[Camera]],
     names: Sequence[Sequence[str]],
     sights: Sequence[Sight],
-    owner: str,
+    owners: Sequence[str],
 ) -> None:
     """Refuse a problem in which the single view of a camera leaves it open.
 
@@ -605,12 +605,12 @@ def check_determined(
         models: of the cameras.
         names: of their parameters.
         sights: what they saw.
-        owner: the function that asks, for messages.
+        owners: the function that asks, and which of the cameras it is, for messages.
 
     Raises:
         ValueError: it is open, with what to do.
     """
-    for c, (model, of, sight) in enumerate(zip(models, names, sights, strict=True)):
+    for c, (model, of, sight, owner) in enumerate(zip(models, names, sights, owners, strict=True)):
         noise = adjusted.cost.new_full((1,), _USUAL_NOISE)
         found = spread(adjusted, model, c, noise)
         seen = sight.weights[0] > 0
