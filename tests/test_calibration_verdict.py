@@ -187,6 +187,18 @@ def test_outliers_and_bad_views():
     assert "loss=" not in text
 
 
+def test_pixels_are_written_without_exponents():
+    from camtorch.calibration.verdict import _px
+
+    assert [_px(value) for value in (0.0512, 9.94, 99.4, 99.6, 512.3)] == [
+        "0.051 px",
+        "9.9 px",
+        "99 px",
+        "100 px",
+        "512 px",
+    ]
+
+
 @pytest.mark.slow
 def test_noise_that_is_no_noise():
     board, pixels = views(narrow(), *all_over(20), noise=3.0)

@@ -346,7 +346,7 @@ def _centre(survey: Survey) -> Iterator[str]:
     calibration = survey.calibration
     std, longer = max(calibration.std[2:4].tolist()), max(calibration.image_size)
     if std > _LOOSE_CENTRE * longer:
-        known = f"known to {std:.2g} px only" if std < longer else "as good as unknown"
+        known = f"known to {_px(std)} only" if std < longer else "as good as unknown"
         yield (
             f"The principal point is {known}. Tilt the board to all sides, turn it by 90 degrees in "
             'its plane, or hold it in the middle of the image with fixed=("cx", "cy")'
@@ -469,7 +469,7 @@ def _bad_views(survey: Survey) -> Iterator[str]:
         rest = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
         yield (
             f"View{'s' * (len(bad) > 1)} {', '.join(numbers)}{rest} fit{'s' * (len(bad) == 1)} worse than the others, "
-            f"up to {float(rms[bad].amax()):.2g} px where {usual:.2g} px is usual: look at the corners there, or leave "
+            f"up to {_px(float(rms[bad].amax()))} where {_px(usual)} is usual: look at the corners there, or leave "
             f"{'them' if len(bad) > 1 else 'it'} out"
         )
 
@@ -650,7 +650,7 @@ def _fixed(names: Sequence[str]) -> str:
 
 
 def _px(value: float) -> str:
-    return f"{value:.2g} px"
+    return f"{value:.0f} px" if 99.5 <= value < 1e6 else f"{value:.2g} px"
 
 
 def _percent(share: float) -> str:
