@@ -97,6 +97,12 @@ class Marks:
         r = _SHARP * radius
         self._draw.ellipse((x - r, y - r, x + r, y + r), fill, outline, round(_SHARP * width))
 
+    def line(
+        self, start: Sequence[float] | Tensor, end: Sequence[float] | Tensor, width: float, colour: Colour
+    ) -> None:
+        """A straight line."""
+        self._draw.line((*self._place(start), *self._place(end)), fill=colour, width=round(_SHARP * width))
+
     def point(self, at: Sequence[float] | Tensor, weight: float = 1.0) -> None:
         """A keypoint, on any ground; likewise boxes and arrows: the weight is that of lines."""
         self.circle(at, 2.7 * weight, fill=WHITE)

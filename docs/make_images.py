@@ -58,7 +58,7 @@ def overview() -> Image.Image:
 if __name__ == "__main__":
     overview().save(HERE / "overview.jpg", quality=88)
     full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]
-    for words in (["augment", *full], ["demo"]):
-        path = HERE / f"{words[0]}.jpg"
+    for words in (["augment", *full], ["demo"], ["demo", "stereo"], ["demo", "surround"]):
+        path = HERE / f"{words[1] if words[0] == 'demo' and words[1:] else words[0]}.jpg"
         main([*words, "-o", str(path), "--force"])
         Image.open(path).save(path, quality=85)

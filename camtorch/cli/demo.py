@@ -23,9 +23,10 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "subject",
         nargs="?",
-        choices=("room", "training"),
+        choices=("room", "stereo", "surround", "training"),
         default="room",
-        help="room: dewarp a room seen by five lenses (the default); training: teach networks with augmentation",
+        help="room: dewarp a room seen by five lenses (the default); stereo: measure it by two fisheyes (with OpenCV); "
+        "surround: a car park from above, by four; training: teach networks with augmentation",
     )
     add_output(command, "demo.png", "the image")
 
@@ -43,9 +44,15 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"the demo comes with the repository, not with the installed package: {GET_IT}")
     images.check_target(arguments.output, force=arguments.force)
     # not before: what is installed may be without it
-    from camtorch.demo import dewarping, training
+    from camtorch.demo import dewarping, stereo, surround, training
 
-    if arguments.subject == "training":
+    if arguments.subject == "stereo":
+        image = stereo.drawing(*stereo.run(_line))
+        caption = "what the cameras see, rectified, the distances found in it, and the points"
+    elif arguments.subject == "surround":
+        image = surround.drawing(surround.run(_line))
+        caption = "what the cameras see, and the ground from above"
+    elif arguments.subject == "training":
         image = training.drawing(training.run(_line))
         caption = "what each network learned from, and what it finds behind the fisheye"
     else:

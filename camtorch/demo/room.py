@@ -1,17 +1,19 @@
 """Images of a sunlit room that is a formula: every ray has a colour, every edge and corner a known place.
 
-Convention: the room's frame is x right, y down, z forward, in metres; every camera stands at its origin.
+Convention: the room's frame is x right, y down, z forward, in metres; cameras stand at its origin unless told
+otherwise.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
 from camtorch.demo import walls
+from camtorch.demo.exposure import expose
 
 Planes = tuple[Tensor, ...]
 _CHUNK = 1 << 17
@@ -75,7 +77,7 @@ def _hit(origin: Planes, ray: Planes) -> tuple[Tensor, Tensor, Tensor]:
     return distance, what, normal
 
 
-def _light(origin: Planes, ray: Planes, mirror: bool = True) -> Tensor:
+def _light(origin: Planes, ray: Planes, mirror: bool = True, rough: bool = False) -> Tensor:
     """(3, N) linear light that comes from the first surface along each ray; `mirror` follows it once more."""
     distance, what, normal = _hit(origin, ray)
     point = tuple(o + distance * r for o, r in zip(origin, ray, strict=True))
@@ -85,8 +87,10 @@ def _light(origin: Planes, ray: Planes, mirror: bool = True) -> Tensor:
         albedo[:, here], glow[:, here], gloss[here] = walls.surface(
             kind, tuple(c[here] for c in point), tuple(c[here] for c in ray)
         )
+    if rough:
+        albedo = albedo * walls.grain(point)
     light = albedo * _irradiance(point, normal) + glow
-    if mirror:
+    if mirror and not rough:
         here = (gloss > 0).nonzero()[:, 0]
         n, r = [c[here] for c in normal], [c[here] for c in ray]
         facing = sum(a * b for a, b in zip(n, r, strict=True))
@@ -133,52 +137,64 @@ def _irradiance(point: Planes, normal: Tensor) -> Tensor:
 # -- what the outside sees
 
 
-def radiance(rays: Tensor) -> Tensor:
-    """(..., 3) colours in [0, 1], ready for a screen, of rays (..., 3) from the origin."""
-    flat = rays.reshape(-1, 3).to(torch.float32)
-    flat = torch.where(flat.abs() < 1e-9, 1e-9, flat)
-    colours = torch.empty_like(flat)
+Place = tuple[float, float, float]
+_MIDDLE: Place = (0.0, 0.0, 0.0)
+
+
+def _chunks(rays: Tensor, place: Place) -> Iterator[tuple[slice, Planes, Planes]]:
+    """Parts of rays (N, 3) from a place, with their origins."""
+    flat = torch.where(rays.abs() < 1e-9, 1e-9, rays.to(torch.float32))
     for start in range(0, len(flat), _CHUNK):
-        ray = flat[start : start + _CHUNK].T.contiguous().unbind(0)
-        light = _light(tuple(torch.zeros_like(c) for c in ray), ray)
-        colours[start : start + _CHUNK] = (1 - torch.exp(-1.3 * light)).pow(1 / 2.2).T
+        part = slice(start, start + _CHUNK)
+        ray = flat[part].T.contiguous().unbind(0)
+        yield part, tuple(torch.full_like(r, c) for r, c in zip(ray, place, strict=True)), ray
+
+
+def radiance(rays: Tensor, place: Place = _MIDDLE, *, rough: bool = False) -> Tensor:
+    """(..., 3) colours in [0, 1], ready for a screen, of rays (..., 3) from a place."""
+    flat = rays.reshape(-1, 3)
+    colours = torch.empty(flat.shape)
+    for part, origin, ray in _chunks(flat, place):
+        colours[part] = (1 - torch.exp(-1.3 * _light(origin, ray, rough=rough))).pow(1 / 2.2).T
     return colours.reshape(rays.shape)
+
+
+def distances(rays: Tensor, place: Place = _MIDDLE) -> Tensor:
+    """(...) metres to the first surface along rays (..., 3) of length 1 from a place; infinite out of the window."""
+    flat = rays.reshape(-1, 3)
+    found = torch.empty(len(flat))
+    for part, origin, ray in _chunks(flat, place):
+        distance, what, _ = _hit(origin, ray)
+        x, y = (o + distance * r for o, r in zip(origin[:2], ray[:2], strict=True))
+        outside = (what == walls.BACK_WALL) & (walls.panes(x, y, 1e-5) > 0.5)
+        found[part] = torch.where(outside, torch.inf, distance)
+    return found.reshape(rays.shape[:-1])
 
 
 def visible(points: Tensor) -> Tensor:
     """(...) bool: nothing stands between the origin and a point (..., 3) on a surface."""
-    flat = points.reshape(-1, 3).to(torch.float32)
-    length = flat.norm(dim=-1)
-    ray = torch.where(flat.abs() < 1e-9, 1e-9, flat).div(length[:, None]).T.contiguous().unbind(0)
-    distance, _, _ = _hit(tuple(torch.zeros_like(c) for c in ray), ray)
-    return (distance > length - 2e-3).reshape(points.shape[:-1])
+    length = points.norm(dim=-1).to(torch.float32)
+    return distances(points.to(torch.float32) / length[..., None]) > length - 2e-3
 
 
-@torch.no_grad()
-def render(camera: Camera, rotation: Tensor | None = None, *, samples: int = 12) -> Tensor:
-    """The image (3, H, W) in [0, 1] that a camera at the origin takes of the room; black where it has no rays.
+def render(
+    camera: Camera,
+    rotation: Tensor | None = None,
+    *,
+    place: Place = _MIDDLE,
+    samples: int = 12,
+    rough: bool = False,
+) -> Tensor:
+    """The image (3, H, W) in [0, 1] that a camera takes of the room; black where it has no rays.
 
     Args:
         camera: with image_size and without batch dims.
         rotation: (3, 3), camera from walls.
-        samples: rays per pixel, spread over it as a lattice; their mean is the pixel, as on a sensor.
+        place: where it stands.
+        samples: rays per pixel.
+        rough: surfaces have a grain and reflect nothing, as those that stereo can measure.
     """
-    height, width = camera.height, camera.width
-    # Rays of the pixels' corners, interpolated within the pixel: off by 1 / (8 focal lengths) of a pixel, and
-    # the lens is inverted once for all samples
-    corners, valid = camera.unproject(camera.crop(0, 0, height + 1, width + 1).pixel_grid() - 0.5)
-    valid = (valid[1:, 1:] & valid[1:, :-1] & valid[:-1, 1:] & valid[:-1, :-1])[..., None]
-    rays = corners.to(torch.float32) if rotation is None else (corners @ rotation.to(corners)).to(torch.float32)
-    # the lattice's step is a golden section of its size: even over each axis and over the square
-    step = max(1, round(samples * 0.618))
-    while math.gcd(step, samples) > 1:
-        step += 1
-    image = torch.zeros(height, width, 3)
-    for i in range(samples):
-        across, down = (i + 0.5) / samples, (i * step % samples + 0.5) / samples
-        rows = torch.lerp(rays[:, :-1], rays[:, 1:], across)
-        image += torch.where(valid, radiance(torch.lerp(rows[:-1], rows[1:], down)), 0.0)
-    return (image / samples).permute(2, 0, 1)
+    return expose(camera, lambda rays: radiance(rays, place, rough=rough), rotation, samples=samples)
 
 
 def keypoints() -> Tensor:

@@ -105,6 +105,18 @@ def soft(a: Tensor, low: float | Tensor, high: float | Tensor, width: float | Te
     return torch.sigmoid((a - low) / width) * torch.sigmoid((high - a) / width)
 
 
+_WAVES = torch.nn.functional.normalize(torch.randn(24, 3, generator=torch.Generator().manual_seed(5)), dim=-1)
+_WAVES = _WAVES * 2 * math.pi / torch.logspace(math.log10(0.035), math.log10(0.4), 24)[:, None]
+
+
+def grain(point: tuple[Tensor, ...]) -> Tensor:
+    """(N): what part of their albedo points of rough plaster have: waves of 3.5 to 40 cm in all directions."""
+    total = torch.zeros_like(point[0])
+    for i, (a, b, c) in enumerate(_WAVES.tolist()):
+        total += torch.sin(a * point[0] + b * point[1] + c * point[2] + i)
+    return 0.82 + 0.16 * torch.tanh(total / 4)
+
+
 # -- what the surfaces look like: albedo (3, N) at positions on them
 
 
