@@ -253,3 +253,26 @@ def test_bad_input_is_refused():
         found.disparity_to_points(torch.zeros(64, 48))
     with pytest.raises(ValueError, match="perspective"):
         ct.rectify(left, right, extrinsics, projection="latlon").opencv()
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_it_is_a_graph_and_has_a_shape_on_meta(learns):
+    left, right, extrinsics = pair()
+    found = ct.rectify(left, right, extrinsics.requires_grad_(learns), image_size=(24, 32))
+    images = torch.rand(1, 1, 480, 640, dtype=torch.float64)
+    expected = found(images, images)
+    compiled = torch.compile(found, fullgraph=True, backend="eager")
+    exported = torch.export.export(found, (images, images)).module()
+    for program in (compiled, exported):
+        torch.testing.assert_close(program(images, images), expected, rtol=0, atol=1e-9)
+    assert [image.shape for image in found.to("meta")(images.to("meta"), images.to("meta"))] == [(1, 1, 24, 32)] * 2
+
+
+def test_what_is_valid_may_be_an_array():
+    found = fisheyes(image_size=(20, 20))
+    known = np.zeros((20, 20), bool)
+    known[3:7] = True
+    points, valid = found.disparity_to_points(np.full((20, 20), 2.0), known)
+    assert torch.equal(valid, torch.from_numpy(known))
+    assert (points[~valid] == 0).all()
+    assert (points[valid][:, 2] > 0).all()

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from camtorch._arguments import Numbers, as_batch, as_image_size, as_values
 from camtorch._module import GeometryModule, Memo
+from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.filestorage import Value, write
@@ -142,7 +143,7 @@ class Rectification(GeometryModule):
 
     # -- depth
 
-    def disparity_to_points(self, disparity: Numbers, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def disparity_to_points(self, disparity: Numbers, valid: Numbers | None = None) -> tuple[Tensor, Tensor]:
         """The points of the scene that have these disparities, in the frame of the rectified left camera.
 
         Args:
@@ -172,14 +173,15 @@ class Rectification(GeometryModule):
         batched = bool(self.extrinsics.batch_shape or camera.batch_shape)
         if batched and (d.ndim != 4 or len(d) not in (1, count, camera.batch_shape.numel())):
             raise ValueError(f"{owner}: disparity must be (B, 1, H, W) for {count} pairs; got {shape}")
-        if valid is not None and tuple(valid.shape) != shape:
-            raise ValueError(f"{owner}: valid must have the shape of disparity, {shape}; got {tuple(valid.shape)}")
+        known = None if valid is None else torch.as_tensor(valid, device=d.device)
+        if known is not None and tuple(known.shape) != shape:
+            raise ValueError(f"{owner}: valid must have the shape of disparity, {shape}; got {tuple(known.shape)}")
         rows = d.reshape(-1, *size)
         points, good = self._points(self._pixels(), rows)
         good = good.reshape(*(shape if not batched else (len(good), 1, *size)))
         points = points.reshape(*good.shape, 3)
-        if valid is not None:
-            good = good & valid.to(torch.bool)
+        if known is not None:
+            good = good & known.to(torch.bool)
         return torch.where(good[..., None], points, 0.0), good
 
     def _pixels(self) -> Tensor:
@@ -390,7 +392,7 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
     rotation = rotation_matrix(extrinsics.rotation.double())
     translation = extrinsics.translation.double()
     length = torch.linalg.vector_norm(translation, dim=-1)
-    if not bool((length > 0).all()):
+    if is_concrete(length) and not bool((length > 0).all()):
         raise ValueError(f"{owner}: the cameras stand at one place; extrinsics.translation is {translation.tolist()}")
     axis = 1 if vertical else 0
     if align == "opencv":
@@ -413,7 +415,7 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
     along = toward * sign[..., None]
     ahead = view - (view * along).sum(-1, keepdim=True) * along
     size = torch.linalg.vector_norm(ahead, dim=-1)
-    if not bool((size > _PARALLEL).all()):
+    if is_concrete(size) and not bool((size > _PARALLEL).all()):
         raise ValueError(
             f"{owner}: the cameras look along their baseline, or away from each other: no direction lies before both"
         )
