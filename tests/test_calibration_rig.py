@@ -102,6 +102,13 @@ def test_a_camera_of_a_result_sees_its_corners_through_its_own_poses():
         )
 
 
+@pytest.mark.slow
+def test_views_of_different_moments_are_asked_about():
+    pixels = seen()[0]
+    with pytest.warns(UserWarning, match="by all cameras at the same moment"):
+        assert not calibrated(pixels | {"right": pixels["right"].roll(1, 0)}).converged
+
+
 def test_cameras_that_are_linked_by_a_third_one():
     pixels, _, _ = seen(views=30)
     pixels["right"][:15] = math.nan

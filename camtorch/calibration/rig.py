@@ -218,7 +218,8 @@ def calibrate_rig(
     )
     if not result.converged:
         python_warnings.warn(
-            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its warnings",
+            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its "
+            "warnings, and whether each view was taken by all cameras at the same moment",
             stacklevel=2,
         )
     return result
