@@ -255,7 +255,7 @@ def test_bad_input_is_refused():
         ct.rectify(left, right, extrinsics, projection="latlon").opencv()
 
 
-@pytest.mark.parametrize("learns", [False, True])
+@pytest.mark.parametrize("learns", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_it_is_a_graph_and_has_a_shape_on_meta(learns):
     left, right, extrinsics = pair()
     found = ct.rectify(left, right, extrinsics.requires_grad_(learns), image_size=(24, 32))
@@ -276,3 +276,20 @@ def test_what_is_valid_may_be_an_array():
     assert torch.equal(valid, torch.from_numpy(known))
     assert (points[~valid] == 0).all()
     assert (points[valid][:, 2] > 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_ten_thousand_rigs_have_positive_focal_lengths(projection):
+    generator = torch.Generator().manual_seed(7)
+    turn = 0.2 * torch.randn(10000, 3, generator=generator, dtype=torch.float64)
+    shift = torch.randn(10000, 3, generator=generator, dtype=torch.float64) * torch.tensor([-1, 0.3, 0.3]).double()
+    shift[:, 0] += shift[:, 0].sign()  # nobody looks along the baseline
+    extrinsics = ct.Extrinsics(turn, shift).requires_grad_(False)
+    found = ct.rectify(fisheye(), fisheye(), extrinsics, projection=projection, image_size=(48, 64))
+    camera, frame = found.camera_left, found.frame
+    assert camera.intrinsics.shape == (10000, 4)
+    assert camera.intrinsics.isfinite().all()
+    assert (camera.intrinsics[:, :2] > 0).all()
+    assert frame.left.isfinite().all()
+    assert frame.right.isfinite().all()
