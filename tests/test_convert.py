@@ -133,7 +133,7 @@ def test_close_conversions(make_source, target, options, limit):
     assert float(result.valid_fraction) > 0.999 or "max_angle" in options
 
 
-@pytest.mark.parametrize("p", [0.0, 1e-6, 1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("p", [0.0, 1e-6, *(pytest.param(p, marks=pytest.mark.slow) for p in (1e-5, 1e-4)), 1e-3])
 def test_a_table_of_a_lens_that_is_nearly_radial(p):
     """The fewer pixels determine a node, the less may what is not radial pull at it."""
     lens = torch.tensor([-0.1, 0, p, -p, 0], **F64)

@@ -116,7 +116,9 @@ print(peak() - before)
         ("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60),
         # the result, the grid (96 MB, in float32), and what is made of one image
         ("warp(images)", "fill=3, tolerance=0.01", 4, 4 * 36 + 96 + 150),
-        ("warp(images)", "antialias=True, tolerance=0.01", 4, 4 * 36 + 96 + 48 + 400),
+        pytest.param(
+            *("warp(images)", "antialias=True, tolerance=0.01", 4, 4 * 36 + 96 + 48 + 400), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_memory_beyond_the_images(act, options, count, bound):

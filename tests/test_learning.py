@@ -4,11 +4,13 @@ import json
 import math
 from pathlib import Path
 
+import pytest
 import torch
 
 import camtorch as ct
 
 
+@pytest.mark.slow
 def test_adam_calibrates_a_camera_on_real_corners():
     data = json.loads((Path(__file__).parent / "files" / "corners_opencv_left.json").read_text())
     corners, board, rotation, translation, matrix = (
