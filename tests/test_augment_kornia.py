@@ -654,7 +654,12 @@ def test_copies_and_pickles():
 
 
 @pytest.mark.parametrize(
-    ("cls", "p"), [(adapter.RandomMount, 1.0), (adapter.RandomLens, 1.0), (adapter.RandomCamera, 0.5)]
+    ("cls", "p"),
+    [
+        pytest.param(adapter.RandomMount, 1.0, marks=pytest.mark.slow),
+        pytest.param(adapter.RandomLens, 1.0, marks=pytest.mark.slow),
+        (adapter.RandomCamera, 0.5),
+    ],
 )
 def test_compiled_without_a_break(cls, p):
     torch.compiler.reset()
@@ -685,7 +690,7 @@ class Faces(Dataset):
         return image[0], keypoints[0], self.seq[0].last.rotation[0]
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_workers(context):
     expected = [torch.stack(parts) for parts in zip(*map(Faces().__getitem__, range(4)), strict=True)]
     with warnings.catch_warnings():

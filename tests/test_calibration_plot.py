@@ -20,6 +20,8 @@ from matplotlib.patches import PathPatch  # noqa: E402
 from camtorch import plot  # noqa: E402
 from camtorch.plot import calibrations  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 ALL = (
     plot.coverage,
     plot.residuals,

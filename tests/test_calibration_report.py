@@ -20,6 +20,8 @@ matplotlib.use("Agg")
 
 from camtorch.calibration.svg import Plots  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 SECTIONS = ("coverage", "residuals", "worst", "uncertainty", "parameters")
 VOID = {"meta", "img", "br", "path", "use", "circle", "rect"}
 HOSTILE = "<script>alert('$x^2$ & \"y\"')</script>\u202e\x07\udc80.jpg"

@@ -84,6 +84,7 @@ def test_nothing_has_to_be_known_of_any_model(key, seed):
     check(key, random.Random(f"{key}{seed}").uniform(30, widest), noise=(0.1, 0.8)[seed], seed=seed)
 
 
+@pytest.mark.slow
 def test_gross_errors_do_not_lead_astray():
     camera = a_camera("kannala_brandt", 120)
     seen, _, _ = seen_by(camera, 120, 8, 0.3, 1)
@@ -135,6 +136,7 @@ def test_poses_are_looked_at_again_by_the_camera_that_was_found():
     assert found.rms < 0.45
 
 
+@pytest.mark.slow
 def test_wide_lenses_of_few_views():
     camera = a_camera("kannala_brandt", 185).requires_grad_(False)
     seen, _, _ = seen_by(camera, 185, 5, 0.2, 4)

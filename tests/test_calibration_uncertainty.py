@@ -11,6 +11,8 @@ from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
 from camtorch.calibration.uncertainty import noise_under, spread, uncertainty
 from camtorch.rotations import rotation_matrix
 
+pytestmark = pytest.mark.slow
+
 F64 = {"dtype": torch.float64}
 NOISE = 0.2  # px
 LENSES = {

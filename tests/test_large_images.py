@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import camtorch as ct
+from camtorch import _threads
 from camtorch.warp import sampling, warp
 
 SIZE = (90, 120)
@@ -55,6 +56,21 @@ def test_strips_are_the_rows_of_the_whole(rows, antialias):
         assert [part.start for part, _, _ in strips] == [0, *(part.stop for part, _, _ in strips)][:-1]
         assert torch.equal(torch.cat([part for _, part, _ in strips], 2), one(given))
         assert torch.equal(torch.cat([valid for _, _, valid in strips], 2), one.valid_mask())
+
+
+def test_strips_agree_while_cores_come_and_go(monkeypatch):
+    """Kept pyramids are of the same parts of the images whether or not there are cores for torch's threads."""
+    crowded = iter([True, False] * 1000)
+    monkeypatch.setattr(_threads._crowd, "meets", lambda *_: next(crowded))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        one = ct.Warp(*pair(), antialias=True, fill=3.0)
+        given = images(torch.uint8, 2)
+        strips = [part for _, part, _ in one.strips(given, rows=7)]
+        assert torch.equal(torch.cat(strips, 2), one(given))
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_strips_of_a_batch_of_cameras_and_of_one_image():

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._threads import as_cores_are_free
+from camtorch._threads import as_cores_are_free, thread_count
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
@@ -138,7 +138,8 @@ def _by_torch(
     where = where._replace(grid=where.grid.to(_wide(dtype)))
     plain = plain and not in_graph(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
-    step = count if wide or not plain else 1 if large else torch.get_num_threads()
+    # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
+    step = count if wide or not plain else 1 if large else thread_count()
     if not large and count <= step:
         levels = _levels(kept, 0, widen(images), finite)
         return narrow(_render(levels.images, where.grid, where, levels, mode, padding_mode, fill), dtype)
