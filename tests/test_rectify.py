@@ -59,9 +59,16 @@ def random_pair(seed, vertical=False):
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 300), marks=pytest.mark.slow)])
 def test_rows_correspond_and_disparities_give_the_points(projection, vertical, seeds):
     axis, across = (1, 0) if vertical else (0, 1)
+    refused = 0
     for seed in seeds:
         left, right, extrinsics, points = random_pair(seed, vertical)
-        found = ct.rectify(left, right, extrinsics, projection=projection, vertical=vertical)
+        try:
+            found = ct.rectify(left, right, extrinsics, projection=projection, vertical=vertical)
+        except ValueError as error:  # of a few narrow lenses that look apart
+            if "what both cameras see" not in str(error):
+                raise
+            refused += 1
+            continue
         camera = found.camera_left
         assert camera.intrinsics.isfinite().all()
         assert (camera.intrinsics[:2] > 0).all()
@@ -83,6 +90,7 @@ def test_rows_correspond_and_disparities_give_the_points(projection, vertical, s
         # a pixel's rounding counts in the ratio of coordinate and disparity
         condition = one.abs().amax(-1) / disparity.abs() + camera.intrinsics[:2].max() / disparity.abs()
         assert (error < 1e-13 * condition.clamp(min=1e3)).all()
+    assert refused <= 0.02 * len(seeds)
 
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
