@@ -58,7 +58,7 @@ def batches(context, arrays=False):
 
 # with threads, Python 3.12 and later warn of every fork
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-@pytest.mark.parametrize("arrays", [False, True])
+@pytest.mark.parametrize("arrays", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_workers_differ_and_runs_repeat(arrays):
     if "fork" not in torch.multiprocessing.get_all_start_methods():
         pytest.skip("this system cannot fork")

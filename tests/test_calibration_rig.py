@@ -87,6 +87,7 @@ def test_exact_corners_give_the_exact_rig():
     torch.testing.assert_close(rotation_matrix(found.boards.rotation.detach()), rotations, atol=1e-9, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_camera_of_a_result_sees_its_corners_through_its_own_poses():
     pixels, _, _ = seen(views=12)
     found = calibrated(pixels)
@@ -109,6 +110,7 @@ def test_views_of_different_moments_are_asked_about():
         assert not calibrated(pixels | {"right": pixels["right"].roll(1, 0)}).converged
 
 
+@pytest.mark.slow
 def test_cameras_that_are_linked_by_a_third_one():
     pixels, _, _ = seen(views=30)
     pixels["right"][:15] = math.nan
