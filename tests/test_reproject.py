@@ -80,7 +80,7 @@ def test_identity_gives_the_image_back_to_the_bit(dtype):
     camera = fisheye(dtype, (120, 161))
     stays = ct.Reproject(camera, camera, pose((0, 0, 0), (0, 0, 0)).to(dtype))
     images = torch.rand(2, 3, 120, 161, dtype=dtype)
-    result, valid = stays(images, torch.rand(1, 1, 120, 161, dtype=dtype) + 1, "distance")
+    result, valid = stays(images, depths(1, 1, 120, 161).to(dtype), "distance")
     assert valid.all()
     assert torch.equal(result, images)
 

@@ -18,7 +18,7 @@ from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
 from camtorch.warp.warp import as_sized
 
-_SNAP = {torch.float32: 8e-6, torch.float64: 1e-11}  # of a coordinate, within which a position is that of a pixel
+_SNAP = {torch.float32: 4e-3, torch.float64: 1e-8}  # px, within which rounding may have moved a pixel
 
 
 class Reproject(GeometryModule):
@@ -202,6 +202,5 @@ def _snapped(pixels: Tensor) -> Tensor:
     """Pixels that rounding moved off a pixel's centre go back there, with their gradient."""
     near = pixels.detach().round()
     off = near - pixels.detach()
-    limit = _SNAP.get(pixels.dtype, 0.0) * near.abs().amax(-1, keepdim=True).clamp(min=1)
-    off = torch.where(off.abs() <= limit, off, 0.0)
+    off = torch.where(off.abs() <= _SNAP.get(pixels.dtype, 0.0), off, 0.0)
     return pixels + off if in_graph(pixels) else pixels.add_(off)
