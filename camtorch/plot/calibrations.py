@@ -102,6 +102,13 @@ def sightings(calibration: Calibration) -> Sightings:
     return Sightings(numbers, pixels, errors, calibration.point_inliers[some].numpy(force=True), points)
 
 
+def _on_image(calibration: Calibration, ax: Axes | None) -> tuple[Axes, Sightings, tuple[int, int]]:
+    """Axes with the frame of the camera's image, what was seen on it, and its (height, width)."""
+    ax, size = axes_or_new(ax), size_of(calibration.camera)
+    draw_frame(ax, *size)
+    return ax, sightings(calibration), size
+
+
 def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """Where the image has corners: dots, on cells that are the darker the more corners they have; crosses are outliers.
 
@@ -116,9 +123,7 @@ def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
-    ax, shots = axes_or_new(ax), sightings(calibration)
-    height, width = size_of(calibration.camera)
-    draw_frame(ax, height, width)
+    ax, shots, (height, width) = _on_image(calibration, ax)
     rows, columns = _cells(height, width)
     pixels = shots.pixels[shots.seen & shots.inliers]
     edges = [np.linspace(-0.5, length - 0.5, count + 1) for length, count in ((height, rows), (width, columns))]
@@ -147,9 +152,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
     Raises:
         ImportError: no matplotlib.
     """
-    ax, shots = axes_or_new(ax), sightings(calibration)
-    height, width = size_of(calibration.camera)
-    draw_frame(ax, height, width)
+    ax, shots, (height, width) = _on_image(calibration, ax)
     use = shots.seen & shots.inliers
     pixels, errors, lengths = shots.pixels[use], shots.errors[use], shots.lengths[use]
     few = _thinned(len(lengths), lengths)
@@ -283,9 +286,7 @@ def uncertainty(calibration: Calibration, ax: Axes | None = None, *, distance: f
     Raises:
         ImportError: no matplotlib.
     """
-    ax, shots = axes_or_new(ax), sightings(calibration)
-    height, width = size_of(calibration.camera)
-    draw_frame(ax, height, width)
+    ax, shots, (height, width) = _on_image(calibration, ax)
     rows, columns = (max(2, round(_LATTICE * side / max(height, width))) + 1 for side in (height, width))
     pixels = image_lattice(calibration.camera, rows, columns).double()
     values = np.ma.masked_invalid(calibration.uncertainty(pixels, distance).double().numpy(force=True))
