@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera, from_values
+from camtorch.convert.least_squares import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise
@@ -181,12 +182,16 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Look(NamedTuple):
-    """What a camera makes of a state: residuals (B, V, N, 2), valid, weights of the squares and cost (B, V, N)."""
+    """What a camera makes of a state: residuals (B, V, N, 2), valid, weights of the squares and cost (B, V, N).
+
+    frames: the points in it, see `Bundle.points`.
+    """
 
     residuals: Tensor
     valid: Tensor
     weights: Tensor
     cost: Tensor
+    frames: tuple[Tensor, Tensor, Tensor]
 
 
 class Bundle:
@@ -214,21 +219,16 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
-        self.local = (
-            slice(0, 6) if free.boards == "poses" else slice(3, 6) if free.boards == "positions" else slice(0, 0)
-        )
+        self.width = {"poses": 6, "positions": 3, "": 0}[free.boards]
+        """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
-        self.unknowns = len(self.columns) + (self.local.stop - self.local.start) * int(views)
-        sides = zip(
-            *(_bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)), strict=True
-        )
+        self.unknowns = len(self.columns) + self.width * int(views)
+        sides = zip(*(bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)), strict=True)
         self.low, self.high = (
             self._of_columns(side, end) for side, end in zip(sides, (-torch.inf, torch.inf), strict=True)
         )
         # that of a focal length is for what goes wrong
-        self.is_bounded = any(
-            i >= 4 and camera.fit_bounds for c, i in self.columns for camera in self.cameras[c : c + 1]
-        )
+        self.is_bounded = any(c >= 0 and i >= 4 and self.cameras[c].fit_bounds for c, i in self.columns)
 
     # -- the state, flat
 
@@ -274,20 +274,17 @@ class Bundle:
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
         """What a camera makes of a state."""
         state, sight = self.state(flat), self.sight(c, rows)
-        points = self.points(c, state, sight)[2]
-        camera = self.fixed[c]
-        if camera is not None:
-            pixels, valid = camera.project(points)
-        else:
-            parameters = state.parameters[c]
+        frames = self.points(c, state, sight)
+        camera, parameters = self.fixed[c], state.parameters[c]
+        if camera is None:
             camera = self.cameras[c].with_tensors(intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
-            pixels, valid = camera.project(points)
+        pixels, valid = camera.project(frames[-1])
         seen = sight.weights > 0
         residuals = torch.where((valid & seen)[..., None], pixels - sight.pixels, 0.0)
         cost, slope = robust(self.loss, self.loss_scale, residuals.square().sum(-1))
         lost = robust(self.loss, self.loss_scale, torch.full_like(cost, _LOST**2))[0]
         cost = torch.where(valid, cost, lost) * sight.weights
-        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
+        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost, frames)
 
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
@@ -309,19 +306,15 @@ class Bundle:
         held = torch.zeros(len(rows), len(self.columns), dtype=torch.bool, device=flat[1].device)
         if self.is_bounded:
             # what would leave its bounds stays there, so that the others can move on
-            view, shared = equations.view[..., self._width :], equations.shared
+            view, shared = equations.view[..., self.width :], equations.shared
             slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
             values, low, high = self._of_columns(flat[5:], 0.0), self.low[rows], self.high[rows]
             held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
-        return System(equations, self._width, held)
-
-    @property
-    def _width(self) -> int:
-        return self.local.stop - self.local.start
+        return System(equations, self.width, held)
 
     def equations(self, flat: Sequence[Tensor], rows: Tensor | None = None) -> Equations:
         """The triangles of a state."""
-        state, width, total = self.state(flat), self._width, len(self.columns)
+        state, width, total = self.state(flat), self.width, len(self.columns)
         parts = []
         for c in range(len(self.sights)):
             block, at = self._rows_of(c, flat, state, rows)
@@ -345,7 +338,7 @@ class Bundle:
     def _rows_of(self, c: int, flat: Sequence[Tensor], state: State, rows: Tensor | None) -> tuple[Tensor, list[int]]:
         """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
         sight, look = self.sight(c, rows), self.look(c, flat, rows)
-        turned, first, points = self.points(c, state, sight)
+        turned, first, points = look.frames
         batch, views, count = points.shape[:3]
         parameters = state.parameters[c]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
@@ -356,9 +349,9 @@ class Bundle:
         by_point = found.by_ray.permute(0, 3, 1, 2).reshape(batch, views, count, 2, 3) * focal
         by_first = by_point if c == 0 else by_point @ state.mounts.rotations[:, c, None, None]
         columns = []
-        if self.local.start < 3 < self.local.stop:
+        if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
-        if self.local.stop:
+        if self.width:
             columns.append(by_first)
         at = []
         zero, one = torch.zeros_like(a), torch.ones_like(a)
@@ -386,11 +379,11 @@ class Bundle:
         state = self.state(flat)
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
-        if self._width == 6:
+        if self.width == 6:
             boards = Poses(
                 rotation_matrix(of_views[..., :3]) @ boards.rotations, boards.translations + of_views[..., 3:]
             )
-        elif self._width == 3:
+        elif self.width == 3:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = [p.clone() for p in state.parameters]
         turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
@@ -413,13 +406,3 @@ def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     made = from_values(model._model, parameters[0, :4], parameters[0, 4:], (1, 1))
     made._warned = True  # a step that is refused may have gone anywhere
     return made
-
-
-def _bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """The least and the greatest parameters (B, 4 + n); a focal length stays within a factor of 1000."""
-    low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
-    low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
-    for i, name in enumerate(camera.distortion_names, 4):
-        if name in camera.fit_bounds:
-            low[:, i], high[:, i] = camera.fit_bounds[name] or (parameters[:, i], parameters[:, i])
-    return low, high

@@ -58,7 +58,7 @@ def fit(
     for start in starts:
         focal = slopes[:, :2] / slopes_at_axis(camera.optics, start).clamp(min=_LEAST_SLOPE)
         parameters = torch.cat((focal, slopes[:, 2:], start), -1)
-        low, high = _bounds(camera, parameters, held)
+        low, high = bounds(camera, parameters, held)
         parameters = parameters.clamp(low, high)
         within = observations._replace(weights=torch.zeros_like(observations.weights))
         for _ in range(_ROUNDS):
@@ -82,7 +82,7 @@ def refine_minimax(camera: Camera, observations: Observations, parameters: Tenso
     Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time,
     approach what has the least largest error.
     """
-    low, high = _bounds(camera, parameters)
+    low, high = bounds(camera, parameters)
     covered = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
     observations = observations._replace(weights=covered)
     best, weights = parameters, covered
@@ -112,7 +112,7 @@ def _distances(observations: Observations, camera: Camera, parameters: Tensor) -
     )
 
 
-def _bounds(camera: Camera, parameters: Tensor, held: Collection[str] = ()) -> tuple[Tensor, Tensor]:
+def bounds(camera: Camera, parameters: Tensor, held: Collection[str] = ()) -> tuple[Tensor, Tensor]:
     """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
     low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
     low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
