@@ -33,7 +33,7 @@ def fisheye():
 
 @functools.cache
 def rays_of(camera):
-    """(3, H, W) of a picture SHARP times as large, (0, 0, 0) where there is none."""
+    """(3, H, W) of an image SHARP times as large, (0, 0, 0) where there is none."""
     rays, valid = camera.resize(SHARP * camera.height, SHARP * camera.width).rays()
     return (rays * valid[..., None]).movedim(-1, 0).float().numpy()
 

@@ -157,7 +157,7 @@ def test_boards_stand_before_the_camera(calibration):
     ax = plot.boards(calibration, axes())
     faces, rims = (found for found in ax.collections if isinstance(found, PolyCollection))
     assert len(faces.get_paths()) == len(rims.get_paths()) == 7
-    # in the oblique picture what is in front of the camera lies to its right
+    # in the oblique view what is in front of the camera lies to its right
     assert all(path.vertices[:, 0].min() > 0 for path in faces.get_paths())
 
 

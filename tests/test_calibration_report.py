@@ -141,8 +141,8 @@ def test_no_name_becomes_markup(page):
 def test_photographs_of_all_kinds_are_within(page):
     assert len(page.all("img")) == 4
     assert page.text.count("no photograph: ") == 2
-    for picture in page.all("img"):
-        data = base64.b64decode(picture["src"].partition(",")[2])
+    for image in page.all("img"):
+        data = base64.b64decode(image["src"].partition(",")[2])
         with Image.open(io.BytesIO(data)) as image:
             assert image.size == (640, 480)
             assert abs(np.asarray(image.convert("L"), int) - 90).max() <= (165 if image.mode == "L" else 2)

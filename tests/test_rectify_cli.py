@@ -85,7 +85,7 @@ def cloud(path):
     return np.stack([points[name] for name in "xyz"], -1), points["colour"]
 
 
-def test_a_pair_its_cameras_and_their_pictures(folder, capsys):
+def test_a_pair_its_cameras_and_their_images(folder, capsys):
     command("left.png", "right.png", "--camera", "rig.json", "-o", "out")
     out = capsys.readouterr().out
     assert out.startswith("out: kannala_brandt and brown_conrady rectified to perspective, ")
@@ -132,7 +132,7 @@ def test_disparities_and_points_of_a_wall(folder, capsys, projection):
     wall = again[valid] @ found.rotation_left
     assert abs(float(wall[:, 2].median()) / DISTANCE - 1) < 0.01
     assert [path.name for path in sorted(Path("out").glob("*.png"))] == sorted([*IMAGES, "disparity.png"])
-    assert "% of left.png; out/disparity_colours.png: their picture" in capsys.readouterr().out
+    assert "% of left.png; out/disparity_colours.png: in colour" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -94,7 +94,7 @@ def test_the_car_park_comes_back():
 
 
 @pytest.mark.slow
-def test_one_picture_of_the_pair(tmp_path, monkeypatch, capsys):
+def test_one_image_of_the_pair(tmp_path, monkeypatch, capsys):
     pytest.importorskip("cv2")
     whole = stereo.run
     monkeypatch.setattr(stereo, "run", lambda report: whole(report, size=240, samples=1))

@@ -192,7 +192,7 @@ class Calibration:
         return self.adjusted.residuals[self.index][0]
 
     def uncertainty(self, pixels: Any, distance: float = math.inf) -> Tensor:
-        """How far the camera may be wrong about pixels, were it calibrated again from other pictures of such quality.
+        """How far the camera may be wrong about pixels, were it calibrated again from other images of such quality.
 
         The standard deviation in the worst direction of where a point is seen, with the poses of the boards in their
         own uncertainty: mrcal's mean-pcam.

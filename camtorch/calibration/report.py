@@ -283,13 +283,13 @@ class _Page:
             plot.view(shots.calibration, number, ax)
             ax.set_xlim(-0.5, width - 0.5)
             ax.set_ylim(height - 0.5, -0.5)
-            ax.lines[0].remove()  # the frame, which is the edge of the picture here
+            ax.lines[0].remove()  # the frame, which is the edge of the image here
 
         svg, title = self._plots.draw(draw, ratio=height / width, fill=True)
-        picture, trouble = _embedded(shots.images[number], (height, width), shots.names[number])
+        photograph, trouble = _embedded(shots.images[number], (height, width), shots.names[number])
         note = title.split(", ", 1)[1] + (f"; {trouble}" if trouble else "")
         caption = f"<figcaption>{_label(shots.names[number])}<small>{_text(note)}</small></figcaption>"
-        return f'<figure id="{shots.prefix}view-{number}"><div class="stack">{picture}{svg}</div>{caption}</figure>'
+        return f'<figure id="{shots.prefix}view-{number}"><div class="stack">{photograph}{svg}</div>{caption}</figure>'
 
     def _uncertainty(self, shots: _Shots) -> str:
         note = "Dashed: the outline of all corners. Were the camera calibrated again, a pixel would move by that much."
@@ -519,7 +519,7 @@ def _footer() -> str:
         "<footer><p>rms: the root of the mean squared length of the residuals, over all corners. Sigma: the standard "
         "deviation of one coordinate of a corner, from the residuals and the number of parameters. Residuals are "
         "projected minus observed. Uncertainty: where a point at a distance is seen, were the camera calibrated again "
-        "from other pictures of such quality; the standard deviation in the worst direction, with the poses of the "
+        "from other images of such quality; the standard deviation in the worst direction, with the poses of the "
         "boards free. Pixels count from the centre of the top-left one; the camera looks along z, x is right and y "
         "down.</p><p>Made by camtorch.</p></footer>"
     )
@@ -533,11 +533,11 @@ def _embedded(image: Any, size: tuple[int, int], name: str) -> tuple[str, str]:
     if image is None:
         return "", ""
     try:
-        picture = _reduced(image, size, name)
+        reduced = _reduced(image, size, name)
     except OSError as error:
         return "", f"no photograph: {error.strerror or error}"
     file = io.BytesIO()
-    picture.save(file, "JPEG", quality=_QUALITY, optimize=True)
+    reduced.save(file, "JPEG", quality=_QUALITY, optimize=True)
     data = base64.b64encode(file.getvalue()).decode()
     return f'<img alt="" src="data:image/jpeg;base64,{data}">', ""
 
@@ -559,9 +559,9 @@ def _reduced(image: Any, size: tuple[int, int], name: str) -> Image.Image:
     if image.mode.startswith(("I", "F")):  # deep grey
         values = np.asarray(image, np.float64)
         image = Image.fromarray((255 * values / max(values.max(), 1e-9)).clip(0, 255).astype(np.uint8))
-    picture = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
-    picture.thumbnail((_PHOTOGRAPH, _PHOTOGRAPH), reducing_gap=2.0)
-    return picture
+    reduced = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
+    reduced.thumbnail((_PHOTOGRAPH, _PHOTOGRAPH), reducing_gap=2.0)
+    return reduced
 
 
 def _from_array(image: Any) -> Image.Image:

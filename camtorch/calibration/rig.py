@@ -269,7 +269,7 @@ def _joined(names: list[str], sights: list[Sight], alone: list[_Alone], free: Fr
         if not bool((links > 0).any()):
             raise ValueError(
                 f"{owner}: no board is seen both by {', '.join(names[c] for c in known)} and by "
-                f"{', '.join(names[c] for c in rest)}; take pictures at the same time in which both see one"
+                f"{', '.join(names[c] for c in rest)}; take images at the same time in which both see one"
             )
         i, j = divmod(int(links.argmax()), len(rest))
         a, b = known[i], rest[j]

@@ -1,4 +1,4 @@
-"""A calibration from nothing: about which lens took pictures of known boards, and from where."""
+"""A calibration from nothing: about which lens took images of known boards, and from where."""
 
 from __future__ import annotations
 

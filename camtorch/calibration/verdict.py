@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from camtorch.camera import Camera
 
 FINE, ROUGH = 0.5, 3.0
-"""Px, the standard deviations of projections that are good enough to measure by, and to look at pictures."""
+"""Px, the standard deviations of projections that are good enough to measure by, and to look at images."""
 
 _CELLS, _PATTERN = 32, 8  # along the longer side: of the map of uncertainty, and of that of residuals
 _FEW_VIEWS = 6
 _ALIKE = math.radians(30)  # the largest angle between two boards
 _LOOSE_FOCAL, _LOOSE_CENTRE = 0.01, 0.005  # standard deviations: of a focal length, and of the longer side
 _BEYOND = math.radians(3)
-_FISHEYE, _RIM = math.radians(60), math.radians(8)  # beyond the corners of a fisheye its picture ends
+_FISHEYE, _RIM = math.radians(60), math.radians(8)  # beyond the corners of a fisheye its image ends
 _CORNER_NOISE = 1.0  # px, more than detectors leave
 _WORSE_VIEW = 3.0  # times the median of all views
 _PATTERN_SHARE = 0.3  # of the residuals
@@ -371,7 +371,7 @@ def _angles(survey: Survey) -> Iterator[str]:
     if lost > 0.001 and not survey.ends_in_the_dark:
         yield (
             f"The fitted lens ends inside the image: {_percent(lost)} of the pixels have no ray, beyond {_degrees(end)}"
-            f" from the axis, where corners reach {_degrees(reach)}. If the picture goes on there, take views with "
+            f" from the axis, where corners reach {_degrees(reach)}. If the image goes on there, take views with "
             "corners as far out as it shows anything, or a model with fewer coefficients or of a wider lens"
         )
     if end > reach + _BEYOND and survey.good_within(ROUGH)[0] < end:

@@ -23,7 +23,7 @@ _NEAR, _FAR = 3.0, 100.0
 _FRACTIONS, _UNKNOWN = 256, 0
 """Of a pixel in a PNG of disparities, as in KITTI's, and what stands where none is known."""
 _DEEPEST = 65535
-_LINES = 24  # over the longer side of a picture
+_LINES = 24  # over the longer side of the image of a pair
 
 
 def add(commands: Commands) -> None:
@@ -125,7 +125,7 @@ def run(arguments: argparse.Namespace) -> None:
         both = float(rectification.valid_masks()[2].double().mean())
         for name, image in (("left", left), ("right", right)):
             images.write(folder / f"{name}.png", images.from_tensor(image))
-        images.write(folder / "pair.png", _picture(left, right, arguments.vertical))
+        images.write(folder / "pair.png", _side_by_side(left, right, arguments.vertical))
         _write_cameras(folder, rig, rectification)
         _tell(rectification, rig, folder, (filled_left, filled_right, both))
         if matches:
@@ -270,7 +270,7 @@ def _match(
         part = 100 * float(known.double().mean())
         print(
             f"{path}: disparities from {limits[0]:.1f} to {limits[1]:.1f} px, known in {part:.0f} % of left.png; "
-            f"{coloured}: their picture"
+            f"{coloured}: in colour"
         )
     if arguments.points is not None:
         baseline = abs(float(rectification.baseline))
@@ -296,7 +296,7 @@ def _of_colours(image: Tensor) -> Tensor:
     return colours
 
 
-def _picture(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
+def _side_by_side(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
     """Both images beside each other, or one above the other, with lines along what corresponds."""
     import torch
     from PIL import ImageDraw
@@ -305,16 +305,16 @@ def _picture(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
     from camtorch.cli import images
 
     whole = torch.cat((_of_colours(left), _of_colours(right)), 1 if vertical else 2)
-    picture = images.from_tensor(whole)
-    draw = ImageDraw.Draw(picture)
-    width, height = picture.size
+    image = images.from_tensor(whole)
+    draw = ImageDraw.Draw(image)
+    width, height = image.size
     side = width if vertical else height
     step = max(side / _LINES, 4.0)
     for i in range(int(side / step)):
         at = round((i + 0.5) * step)
         ends = (at, 0, at, height) if vertical else (0, at, width, at)
         draw.line(ends, fill=(POINT, BOX, GAZE)[i % 3], width=max(1, round(side / 720)))
-    return picture
+    return image
 
 
 def _coloured(disparity: Tensor, known: Tensor) -> Image.Image:
