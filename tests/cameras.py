@@ -24,10 +24,14 @@ DISTINCT = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sp
 
 def slow_unless(quick, cases):
     """The cases of a dear test, as pytest takes them: those that are not `quick(case)` are marked slow."""
-    return [case if quick(case) else pytest.param(*case, marks=pytest.mark.slow) for case in cases]
+    values = [case if isinstance(case, tuple) else (case,) for case in cases]
+    return [
+        pytest.param(*value, marks=() if quick(case) else pytest.mark.slow)
+        for case, value in zip(cases, values, strict=True)
+    ]
 
 
-RARE_ARE_SLOW = [key if key in DISTINCT else pytest.param(key, marks=pytest.mark.slow) for key in KEYS]
+RARE_ARE_SLOW = slow_unless(DISTINCT.__contains__, KEYS)
 
 # Coefficients drawn, plausible and wild, by the first letters of their names: up to that size, or between two numbers
 RANGES = {
@@ -162,6 +166,8 @@ def one(key):
 # Every model with some of the others: all pairs would be too many
 PAIRS = [(key, KEYS[(i + step) % len(KEYS)]) for i, key in enumerate(KEYS) for step in (1, 0, 6)]
 REAL = [(key, name) for key in KEYS for name in real(key)]
+# For dear tests: the first calibration of each kind
+FEW_REAL = slow_unless(lambda case: case[0] in DISTINCT and case[1] == next(iter(real(case[0]))), REAL)
 
 
 def spread(key, dtype=torch.float64):

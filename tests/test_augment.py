@@ -70,7 +70,7 @@ def likes():
 # Every preset with some models, and some pairs of models: all would take minutes
 WITH_PRESETS = [(i, KEYS[(5 * i + j) % len(KEYS)]) for j in range(4) for i in range(len(PRESETS))]
 WITH_MODELS = [(len(PRESETS) + KEYS.index(like), key) for like, key in PAIRS]
-FEW = {*WITH_PRESETS[: len(PRESETS)], *WITH_MODELS[::3]}
+FEW = {*WITH_PRESETS[: len(PRESETS)], *WITH_MODELS[::9]}
 
 
 @pytest.mark.parametrize(("which", "key"), slow_unless(FEW.__contains__, WITH_PRESETS + WITH_MODELS))
@@ -522,6 +522,7 @@ def test_autocast_moves_nothing():
     torch.testing.assert_close(cast["image"], plain["image"], atol=1e-3, rtol=0)
 
 
+@pytest.mark.slow
 def test_compiled_in_one_graph():
     augmentation, batch = RandomCamera("dms130"), sample(2)
     batch = {k: batch[k] for k in ("image", "mask", "keypoints", "boxes", "gaze", "head_pose", "camera")}

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from cameras import KEYS, _limits, _summed, axis_slope, fan, make, one, pixel_lattice
+from cameras import DISTINCT, KEYS, _limits, _summed, axis_slope, fan, make, one, pixel_lattice, slow_unless
 
 import camtorch as ct
 from camtorch.augment.presets import PRESETS
@@ -73,7 +73,7 @@ def hard(camera, pixels, monkeypatch):
         return type(camera)(camera.intrinsics, camera.distortion, image_size=camera.image_size).unproject(pixels)
 
 
-@pytest.mark.parametrize("key", LENSES)
+@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, LENSES))
 @pytest.mark.parametrize("size", ["mild", "plausible", pytest.param("wild", marks=pytest.mark.slow)])
 def test_what_has_a_ray_is_what_a_hard_search_finds(key, size, monkeypatch):
     check(lenses(key, size), monkeypatch)

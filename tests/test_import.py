@@ -67,9 +67,14 @@ assert not hasattr(ct, "Pinhole2") and not hasattr(ct, "_public2")
     [
         "import camtorch as ct",
         "from camtorch.camera import Camera",
-        "from camtorch.calibration.report import write_report",
-        "import camtorch.io as io",
-        "import torch",
+        *(
+            pytest.param(first, marks=pytest.mark.slow)
+            for first in (
+                "from camtorch.calibration.report import write_report",
+                "import camtorch.io as io",
+                "import torch",
+            )
+        ),
     ],
 )
 def test_all_models_are_there_whatever_comes_first(first):
@@ -87,7 +92,9 @@ def test_a_pickled_camera_needs_no_import(tmp_path):
     assert python(code, str(tmp_path / "camera.pickle")) == "Pinhole(fx=1, fy=2, cx=3, cy=4)\n"
 
 
-@pytest.mark.parametrize("imports", ["import camtorch\nimport torch", "import torch\nimport camtorch"])
+@pytest.mark.parametrize(
+    "imports", ["import camtorch\nimport torch", pytest.param("import torch\nimport camtorch", marks=pytest.mark.slow)]
+)
 def test_exported_programs_load(tmp_path, imports):
     camera = ct.KannalaBrandt([300.0, 300, 320, 240], [0.02, -0.01, 0.003, -0.001]).requires_grad_(False)
 

@@ -129,7 +129,7 @@ print(peak() - before)
     ("act", "options", "count", "bound"),
     [
         ("for _ in warp.strips(images, rows=64): pass", "tolerance=0.01", 1, 60),
-        ("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60),
+        pytest.param("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60, marks=pytest.mark.slow),
         # the result, the grid (96 MB, in float32), and what is made of one image
         ("warp(images)", "fill=3, tolerance=0.01", 4, 4 * 36 + 96 + 150),
         pytest.param(

@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 from cameras import (
+    DISTINCT,
     KEYS,
     NOT_ANALYTIC,
     RANGES,
+    RARE_ARE_SLOW,
     REAL,
     axis_slope,
     constants,
@@ -17,6 +19,7 @@ from cameras import (
     one,
     pixel_lattice,
     real,
+    slow_unless,
     spread,
 )
 from hypothesis import given, settings
@@ -31,11 +34,15 @@ from camtorch.optics.lens import Lens
 
 EPS = torch.finfo(torch.float64).eps
 every_model = pytest.mark.parametrize("key", KEYS)
+distinct_models = pytest.mark.parametrize("key", RARE_ARE_SLOW)
 every_calibration = pytest.mark.parametrize(("key", "name"), REAL)
-drawn_models = pytest.mark.parametrize(
-    ("key", "wild"),
-    [(key, wild) for key in KEYS for wild in (False, True)[: 1 + (key in RANGES)]],
-    ids=lambda value: value if isinstance(value, str) else ("plausible", "wild")[value],
+drawn_models, few_drawn_models = (
+    pytest.mark.parametrize(
+        ("key", "wild"),
+        slow_unless(quick, [(key, wild) for key in KEYS for wild in (False, True)[: 1 + (key in RANGES)]]),
+        ids=lambda value: value if isinstance(value, str) else ("plausible", "wild")[value],
+    )
+    for quick in (lambda case: True, lambda case: case[0] in DISTINCT or not case[1])
 )
 both_precisions = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
@@ -116,7 +123,7 @@ def test_round_trips_of_calibrations(key, name):
     check_rays_return(camera, fan(end_degrees(camera)))
 
 
-@drawn_models
+@few_drawn_models
 @given(data=st.data())
 def test_round_trips_of_drawn_cameras(key, wild, data):
     camera = data.draw(drawn(key, wild))
@@ -156,7 +163,7 @@ def near_the_rim(camera, pixels):
     return camera.unproject(pixels + inwards / inwards.norm(dim=-1, keepdim=True).clamp(min=1))[1]
 
 
-@every_model
+@distinct_models
 @both_precisions
 def test_distance_does_not_matter(key, dtype):
     camera = one(key).to(dtype)
@@ -189,10 +196,14 @@ def learning(camera, intrinsics, distortion):
     return make(camera.key, intrinsics, distortion)
 
 
-derivative_cameras = pytest.mark.parametrize("camera_of", [one, spread])
+derivative_cameras = pytest.mark.parametrize(
+    ("key", "camera_of"),
+    slow_unless(
+        lambda case: case[1] is spread or case[0] in DISTINCT, [(key, of) for of in (one, spread) for key in KEYS]
+    ),
+)
 
 
-@every_model
 @derivative_cameras
 def test_derivatives_of_project(key, camera_of):
     camera = camera_of(key)
@@ -211,7 +222,6 @@ def test_derivatives_of_project(key, camera_of):
     assert gradgradcheck(project, inputs)
 
 
-@every_model
 @derivative_cameras
 def test_derivatives_of_unproject(key, camera_of):
     camera = camera_of(key)
@@ -360,7 +370,7 @@ def test_one_exploded_lens_leaves_the_others_alone(coefficient):
     torch.testing.assert_close(rays[0], alone)
 
 
-@every_model
+@distinct_models
 @both_precisions
 def test_pixels_far_beyond_every_image(key, dtype):
     """Valid only with the ray that projects there, at any distance."""
@@ -386,7 +396,7 @@ def test_bad_pixels(key, dtype):
     check_bad_rows(camera, "unproject", good, torch.tensor(bad_pixels(camera), dtype=dtype))
 
 
-@every_model
+@distinct_models
 @both_precisions
 @pytest.mark.parametrize("method", ["project", "unproject"])
 @settings(max_examples=10)
@@ -483,7 +493,7 @@ def test_fold_of_calibrations(key, name):
     check_no_shared_pixels(*check_fold(real(key)[name]))
 
 
-@drawn_models
+@few_drawn_models
 @settings(max_examples=3)  # the dearest law of all
 @given(data=st.data())
 def test_fold_of_drawn_cameras(key, wild, data):

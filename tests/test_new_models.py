@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from cameras import fan
+from cameras import fan, slow_unless
 from torch.autograd import gradcheck, gradgradcheck
 
 import camtorch as ct
@@ -186,7 +186,7 @@ def test_without_a_graph(model, method):
             torch.testing.assert_close(getattr(camera_of(model), method)(values)[0], expected)
 
 
-@every_camera
+@pytest.mark.parametrize("model", slow_unless((Waved, Backwards).__contains__, list(CAMERAS)))
 def test_traced(model):
     camera = camera_of(model)
     rays = fan(50)
