@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._tracing import has_tangent, in_graph, in_transform, is_concrete
+from camtorch._tracing import (
+    has_tangent,
+    in_graph,
+    in_transform,
+    is_concrete,
+    is_exporting,
+    is_fake,
+    keeps_graph,
+    set_aside,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -17,6 +27,24 @@ if TYPE_CHECKING:
 
 class GeometryModule(nn.Module):
     """A module whose tensors are geometry: Parameters, or tensors of a graph, never of less than float32."""
+
+    _own: dict[str, Tensor | None]
+    """The tensors that were registered, also while others stand in their place."""
+
+    def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
+        """As of `nn.Module`."""
+        super().register_parameter(name, param)
+        self._note(name)
+
+    def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
+        """As of `nn.Module`."""
+        super().register_buffer(name, tensor, persistent)
+        self._note(name)
+
+    def _note(self, name: str) -> None:
+        if not torch.compiler.is_compiling():
+            # a dict of its own: that of the module from which this one was copied may be the same
+            self.__dict__["_own"] = {**self.__dict__.get("_own", {}), name: getattr(self, name)}
 
     def hold(self, name: str, value: Tensor, shape: tuple[int, ...]) -> None:
         """Register plain values as a new Parameter of that shape, a Parameter or a tensor of a graph as it is.
@@ -48,6 +76,7 @@ class GeometryModule(nn.Module):
             for parameter in self.parameters(recurse=False):
                 if buffer is not None and buffer.is_meta and buffer.numel() == 0:
                     self._buffers[name] = torch.empty_like(buffer, device=parameter.device, dtype=parameter.dtype)
+                    self._note(name)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # network.half() must not round a principal point to whole pixels
@@ -57,7 +86,10 @@ class GeometryModule(nn.Module):
                 return tensor.to(moved.device)
             return moved
 
-        return super()._apply(at_least_float32, recurse)
+        super()._apply(at_least_float32, recurse)
+        for name in (*self._parameters, *self._buffers):
+            self._note(name)
+        return self
 
     def __getstate__(self) -> dict[str, Any]:
         # a tensor of a graph cannot be copied with its graph: the copy is a leaf
@@ -65,7 +97,47 @@ class GeometryModule(nn.Module):
         state["_buffers"] = {
             name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
         }
+        state["_own"] = {**self._parameters, **state["_buffers"]}
         return state
+
+
+def is_constant(module: nn.Module) -> bool:
+    """Whether a module is exported whose tensors are its own and do not learn, so that their values are known.
+
+    Those that it is given, by functional_call or as inputs of the program, are not.
+    """
+    if not is_exporting() or torch.compiler.is_dynamo_compiling():
+        return False
+    for part in module.modules():
+        own = part.__dict__.get("_own", {})
+        for name, tensor in (*part._parameters.items(), *part._buffers.items()):
+            known = own.get(name)
+            if tensor is None or tensor is known:
+                continue
+            if known is None or not is_fake(tensor) or is_fake(known) or keeps_graph(tensor):
+                return False
+            mode: Any = getattr(tensor, "fake_mode", None)
+            if mode.from_tensor(known, static_shapes=True) is not tensor:
+                return False
+    return True
+
+
+@contextmanager
+def with_values(module: nn.Module) -> Iterator[None]:
+    """Nothing is traced in here, and a module that `is_constant` has its own tensors, to make constants from."""
+    places: list[tuple[dict[str, Any], str, Tensor]] = []
+    for part in module.modules():
+        own = part.__dict__.get("_own", {})
+        places += [(tensors, name, own[name]) for tensors in (part._parameters, part._buffers) for name in tensors]
+    traced = [tensors[name] for tensors, name, _ in places]
+    with set_aside():
+        try:
+            for tensors, name, own in places:
+                tensors[name] = own
+            yield
+        finally:
+            for (tensors, name, _), tensor in zip(places, traced, strict=True):
+                tensors[name] = tensor
 
 
 class BatchedModule(GeometryModule):

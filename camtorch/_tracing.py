@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.utils._python_dispatch import _disable_current_modes
 
 FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE
 """The key of a FakeTensorMode among the modes that are under way."""
@@ -40,8 +44,11 @@ def _is_traced(tensor: Tensor) -> bool:
 
 
 def _is_fake(tensor: Tensor) -> bool:
-    if torch._C._get_dispatch_mode(FAKE_MODE) is not None:
-        return True
+    return torch._C._get_dispatch_mode(FAKE_MODE) is not None or is_fake(tensor)
+
+
+def is_fake(tensor: Tensor) -> bool:
+    """Whether a tensor is one of a FakeTensorMode, which has a shape and no values."""
     # not imported for its name alone: that takes a third of a second
     return type(tensor) is not Tensor and type(tensor).__name__ == "FakeTensor"
 
@@ -58,6 +65,39 @@ def in_memory(tensor: Tensor) -> bool:
 def is_recorded() -> bool:
     """Whether torch's operators are recorded, or a mode changes what they do: what goes past them would be lost."""
     return torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack() > 0
+
+
+is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
+"""Whether what is traced shall run elsewhere, where there are no operators of our own. Newer than torch 2.6."""
+
+
+def keeps_graph(*tensors: Tensor) -> bool:
+    """Whether derivatives by any of the tensors are to be recorded: not in a file for another runtime."""
+    if not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
+        return False
+    return not (is_exporting() and torch.onnx.is_in_onnx_export())
+
+
+@contextmanager
+def set_aside() -> Iterator[None]:
+    """Nothing is traced in here: what is made of values becomes a constant of the graph that is being recorded."""
+    flags = {name: getattr(torch.compiler, name, False) for name in ("_is_compiling_flag", "_is_exporting_flag")}
+    with torch._C.DisableTorchFunction(), _disable_current_modes(), torch.no_grad():
+        try:
+            for name in flags:
+                setattr(torch.compiler, name, False)
+            yield
+        finally:
+            for name, flag in flags.items():
+                setattr(torch.compiler, name, flag)
+
+
+def converted(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """The tensor in a dtype; what becomes a constant of an exported program is converted before it is one."""
+    if not is_exporting() or torch.compiler.is_dynamo_compiling() or is_fake(tensor):
+        return tensor.to(dtype)
+    with set_aside():
+        return tensor.to(dtype)
 
 
 def may_look(tensor: Tensor) -> bool:

@@ -11,13 +11,11 @@ from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import Memo
+from camtorch._tracing import is_exporting
 from camtorch.camera import Camera, from_values
 from camtorch.native.sampler import layout
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
-
-# an exported program is not bound to this operator, nor to the CPU; newer than torch 2.6
-is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
 
 
 def positions(

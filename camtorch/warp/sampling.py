@@ -12,7 +12,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._threads import as_cores_are_free, thread_count
-from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
+from camtorch._tracing import converted, in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.warp.grid import Lattice, Sampling
@@ -63,7 +63,7 @@ def render(
     dtype = images.dtype
     cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
     count = images.shape[0] if cameras == 1 else cameras
-    images = images.expand(count, -1, -1, -1)
+    images = images if cameras == 1 else images.expand(count, -1, -1, -1)
     if isinstance(where, Sampling) and mode == "nearest":
         where = where._replace(scale=None)
     if not dtype.is_floating_point:
@@ -135,7 +135,7 @@ def _by_torch(
         where = where.pixels
     if mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
         return _pick(images, where, padding_mode, fill)
-    where = where._replace(grid=where.grid.to(_wide(dtype)))
+    where = where._replace(grid=converted(where.grid, _wide(dtype)))
     plain = plain and not in_graph(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
@@ -297,7 +297,9 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
         (B, C, H', W'). On a CPU, and unless it is compiled, an infinite or NaN pixel has a part in those bicubic
         samples alone in which it has a weight.
     """
-    grid = grid.to(images.dtype).expand(images.shape[0], -1, -1, -1)
+    grid = grid.to(images.dtype)
+    if not (isinstance(images.shape[0], int) and len(grid) == len(images)):  # an exported program is to say no more
+        grid = grid.expand(images.shape[0], -1, -1, -1)
     if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
     if images.is_cpu and not any(in_graph(t) for t in (images, grid)) and not in_transform():

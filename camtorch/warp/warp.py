@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import as_values, broadcast_shapes
-from camtorch._module import GeometryModule, Memo
-from camtorch._tracing import in_graph, in_transform, is_concrete
+from camtorch._module import GeometryModule, Memo, is_constant, with_values
+from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, set_aside
 from camtorch.camera import Camera
 from camtorch.native.sampler import empty
 from camtorch.rotations import as_rotation, turn
@@ -118,6 +118,7 @@ class Warp(GeometryModule):
             )
         self.batch_shape = torch.Size(batch)
         self._memos, self._pinned = {padding: Memo() for padding in PADDINGS}, None
+        self._constants = Memo()
 
     @property
     def tolerance(self) -> float:
@@ -290,7 +291,7 @@ class Warp(GeometryModule):
 
     def _learns(self, inputs: list[Tensor]) -> bool:
         """Whether there is to be a graph of the grid that is not there yet."""
-        return torch.is_grad_enabled() and self._pinned is None and any(t.requires_grad for t in inputs)
+        return self._pinned is None and keeps_graph(*inputs)
 
     def _learned(self) -> Sampling:
         """With a graph."""
@@ -305,6 +306,8 @@ class Warp(GeometryModule):
 
     def _kept(self, inputs: list[Tensor], padding: PaddingMode | None = None) -> Sampling | Lattice:
         """Without a graph, until something changes; or what is pinned."""
+        if is_exporting() and not torch.compiler.is_dynamo_compiling() and (constant := self._constant(padding)):
+            return constant
         reach = self._reach(padding)
         if self._pinned is not None and (reach == self.padding_mode or isinstance(self._pinned, Sampling)):
             return self._pinned
@@ -314,9 +317,28 @@ class Warp(GeometryModule):
         kept: Sampling | Lattice = memo(inputs, options, lambda: self._whole(reach))
         return kept
 
+    def _constant(self, padding: PaddingMode | None) -> Sampling | None:
+        """The positions as a constant of an exported program, unless they depend on what it is given."""
+        if self._pinned is None and not is_constant(self):
+            return None
+
+        def whole() -> Sampling:
+            where = self._kept(inputs, padding)
+            grid, mapped, scale = where.pixels if isinstance(where, Lattice) else where
+            # a constant has memory of its own
+            grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in (grid, mapped))
+            return Sampling(grid, mapped, scale)
+
+        with set_aside() if self._pinned is not None else with_values(self):
+            inputs = self._inputs()
+            if self._pinned is not None:
+                return whole()
+            constant: Sampling = self._constants(inputs, (self._reach(padding), self.antialias, self.tolerance), whole)
+            return constant
+
     def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
         may = torch.compiler.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu
-        if may and not compiled.is_exporting():
+        if may and not is_exporting():
             where = self.source, self.target, self.rotation
             return self._with_scale(*compiled.positions(*where, self.tolerance, padding))
         return self._strip(range(self.target._size("Warp")[0]), padding)
