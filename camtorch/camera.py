@@ -102,6 +102,11 @@ class Camera(BatchedModule):
     """The coefficients that change sign when the scene is mirrored left to right."""
     odd_in_y: ClassVar[frozenset[str]] = frozenset()
     """Likewise top to bottom."""
+    quarter_turn: ClassVar[Mapping[str, str] | None] = {}
+    """The coefficients that others become when the image is turned clockwise by a quarter: {"p2": "-p1"} is p2 = -p1.
+
+    None: the model is not the same on its side.
+    """
     special_cases: ClassVar[tuple[tuple[str, tuple[str, ...]], ...]] = ()
     """The models that this one generalises: the key of each, and the names here of its coefficients in its order.
 
@@ -580,52 +585,108 @@ class Camera(BatchedModule):
     def crop(self, top: int, left: int, height: int, width: int) -> Self:
         """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside."""
         top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
-        return self._edited(shift=(-left, -top), size=(height, width))
+        return self._edited(((1, 0, -left), (0, 1, -top)), (height, width))
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """The camera of the image with that many more pixels on each side."""
         height, width = self._size("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
-        return self._edited(shift=(left, top), size=(height + top + bottom, width + left + right))
+        return self._edited(((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
 
     def resize(self, height: int, width: int) -> Self:
         """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False."""
         old_height, old_width = self._size("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
-        return self._edited(scale=(width / old_width, height / old_height), size=(height, width))
+        across, down = width / old_width, height / old_height
+        return self._edited(((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
 
     def hflip(self) -> Self:
         """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
-        return self._edited(mirror="x", size=self._size("hflip"))
+        height, width = self._size("hflip")
+        return self._edited(((-1, 0, width - 1), (0, 1, 0)), (height, width))
 
     def vflip(self) -> Self:
         """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
-        return self._edited(mirror="y", size=self._size("vflip"))
+        height, width = self._size("vflip")
+        return self._edited(((1, 0, 0), (0, -1, height - 1)), (height, width))
 
-    def _edited(
-        self,
-        *,
-        size: tuple[int, int],
-        shift: tuple[int, int] = (0, 0),
-        scale: tuple[float, float] = (1.0, 1.0),
-        mirror: str = "",
-    ) -> Self:
-        fx, fy, cx, cy = self.intrinsics.unbind(-1)
-        cx, cy = (cx + 0.5) * scale[0] - 0.5 + shift[0], (cy + 0.5) * scale[1] - 0.5 + shift[1]
-        odd: frozenset[str] = frozenset()
-        if mirror == "x":
-            cx, odd = size[1] - 1 - cx, self.odd_in_x
-        elif mirror == "y":
-            cy, odd = size[0] - 1 - cy, self.odd_in_y
-        intrinsics = torch.stack((fx * scale[0], fy * scale[1], cx, cy), -1)
-        sign = self.distortion.new_tensor([-1.0 if name in odd else 1.0 for name in self.distortion_names])
-        edited = self.with_tensors(intrinsics=intrinsics, distortion=self.distortion * sign)
+    def rot90(self, k: int = 1) -> Self:
+        """The camera that leans on its side: its image is this one's, turned counterclockwise k times, as torch.rot90.
+
+        It sees points turned likewise: `camera.rot90().project((y, -x, z))` is the turned pixel (v, W - 1 - u).
+
+        Raises:
+            ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
+        """
+        (height, width), turns = self._size("rot90"), as_whole(k, "k", "rot90") % 4
+        matrix = (
+            ((1, 0, 0), (0, 1, 0)),
+            ((0, 1, 0), (-1, 0, width - 1)),
+            ((-1, 0, width - 1), (0, -1, height - 1)),
+            ((0, -1, height - 1), (1, 0, 0)),
+        )[turns]
+        return self._edited(matrix, (width, height) if turns % 2 else (height, width))
+
+    def _edited(self, matrix: Sequence[Sequence[float]], size: tuple[int, int]) -> Self:
+        intrinsics, distortion = self._edited_numbers(self.intrinsics.new_tensor(matrix))
+        edited = self.with_tensors(intrinsics=intrinsics, distortion=distortion)
         edited.image_size = as_image_size(size, type(self).__name__)
         for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
             if isinstance(its, nn.Parameter) and not mine.requires_grad:
                 its.requires_grad = False
         return edited
+
+    def _edited_numbers(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """Intrinsics (*B, 4) and distortion (*B, n) of the camera of an edited image.
+
+        Args:
+            matrix: (*B, 2, 3), from pixels (u, v, 1) to those of the edited image: a quarter turn clockwise or none,
+                flips, scales, and a shift.
+
+        Raises:
+            ValueError: a quarter turn of a model that is not the same on its side.
+        """
+        dtype = torch.promote_types(matrix.dtype, self.intrinsics.dtype)
+        (a, b, left), (c, d, top) = (row.unbind(-1) for row in matrix.to(dtype).unbind(-2))
+        fx, fy, cx, cy = self.intrinsics.to(dtype).unbind(-1)
+        numbers = (
+            *(a.abs() * fx + b.abs() * fy, c.abs() * fx + d.abs() * fy),
+            *(a * cx + b * cy + left, c * cx + d * cy + top),
+        )
+        intrinsics = torch.stack(torch.broadcast_tensors(*numbers), -1).to(self.intrinsics.dtype)
+        return intrinsics, self._edited_distortion(a - b, c + d, b != 0)
+
+    def _edited_distortion(self, across: Tensor, down: Tensor, on_side: Tensor) -> Tensor:
+        """Coefficients after a quarter turn clockwise where it is on its side, (*B,) bool, and flips by signs (*B,)."""
+        k, names = self.distortion, self.distortion_names
+        if not is_concrete(on_side) or bool(on_side.any()):
+            k = torch.where(on_side.unsqueeze(-1), self._on_side(), k)
+        for sign, odd in ((across, self.odd_in_x), (down, self.odd_in_y)):
+            if not odd.isdisjoint(names):
+                is_odd = torch.tensor([name in odd for name in names], device=k.device)
+                k = torch.where(is_odd & (sign < 0).unsqueeze(-1), -k, k)
+        return k.clone() if k is self.distortion else k
+
+    def _on_side(self) -> Tensor:
+        """(*B, n): the coefficients when the image is turned clockwise by a quarter."""
+        names, turned = self.distortion_names, self.quarter_turn
+        if turned is None or not {*self.odd_in_x, *self.odd_in_y} <= turned.keys():
+            raise ValueError(
+                f"{type(self).__name__}: a quarter turn of the image has no camera of this model. "
+                "RandomMount(roll=...) turns the camera, and convert() gives one of another model"
+            )
+        if {"tau_x", "tau_y"} <= {*names} and is_concrete(self.distortion):
+            tilts = self.distortion[..., [names.index("tau_x"), names.index("tau_y")]]
+            if bool((tilts != 0).all(-1).any()):
+                raise ValueError(
+                    f"{type(self).__name__}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
+                    "quarter turn: the model tilts about one after the other"
+                )
+        source = [turned.get(name, name) for name in names]
+        index = [names.index(name.removeprefix("-")) for name in source]
+        sign = self.distortion.new_tensor([-1.0 if name.startswith("-") else 1.0 for name in source])
+        return self.distortion[..., index] * sign
 
     # -- another model
 

@@ -658,6 +658,38 @@ def test_flips(key, name):
 
 
 @every_model
+@pytest.mark.parametrize("turns", [1, 2, -1])
+def test_quarter_turns(key, turns):
+    camera = spread(key)
+    if "tau_x" in camera.distortion_names and turns % 2:
+        with pytest.raises(ValueError, match="tilted about both axes"):
+            camera.rot90(turns)
+        k = camera.distortion.detach().clone()
+        k[camera.distortion_names.index("tau_x")] = 0
+        camera = make(key, camera.intrinsics.detach(), k, image_size=camera.image_size)
+    if ct.MODELS[key].quarter_turn is None and turns % 2:
+        with pytest.raises(ValueError, match="a quarter turn of the image has no camera of this model"):
+            camera.rot90(turns)
+        return
+    turned = camera.rot90(turns)
+    assert turned.image_size == ((640, 480) if turns % 2 else (480, 640))
+    move = {
+        1: lambda u, v: (v, 639 - u),
+        2: lambda u, v: (639 - u, 479 - v),
+        -1: lambda u, v: (479 - v, u),
+    }[turns]
+    matrix = {1: [[0, 1], [-1, 0]], 2: [[-1, 0], [0, -1]], -1: [[0, -1], [1, 0]]}[turns]
+    points = fan(end_degrees(camera))
+    pixels, valid = camera.project(points)
+    rotated = torch.cat((points[..., :2] @ torch.tensor(matrix, dtype=points.dtype).T, points[..., 2:]), -1)
+    moved, still_valid = turned.project(rotated)
+    assert torch.equal(still_valid, valid)
+    expected = torch.stack(move(*pixels.unbind(-1)), -1)
+    assert ((moved - expected).norm(dim=-1)[valid] < pixel_limit(pixels[valid])).all()
+    torch.testing.assert_close(turned.rot90(-turns).distortion, camera.distortion, rtol=0, atol=0)
+
+
+@every_model
 def test_edits_of_a_batch(key):
     camera = spread(key)
     batched = make(key, camera.intrinsics.detach().expand(2, 4), camera.distortion.detach(), image_size=(480, 640))

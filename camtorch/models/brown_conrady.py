@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -35,6 +36,12 @@ class BrownConrady(Camera):
     fit_counts = (5, 8)
     odd_in_x = frozenset({"p2", "s1", "s2", "tau_y"})
     odd_in_y = frozenset({"p1", "s3", "s4", "tau_x"})
+    quarter_turn = MappingProxyType(
+        {
+            **{"p1": "p2", "p2": "-p1", "tau_x": "-tau_y", "tau_y": "tau_x"},
+            **{"s1": "-s3", "s2": "-s4", "s3": "s1", "s4": "s2"},
+        }
+    )
 
     @classmethod
     def names_of(cls, count: int) -> tuple[str, ...] | None:

@@ -19,6 +19,7 @@ class Equirectangular(Camera):
     """
 
     key = "equirectangular"
+    quarter_turn = None
 
     def __init__(self, intrinsics: TensorLike, *, image_size: tuple[int, int] | None = None) -> None:
         super().__init__(intrinsics, image_size=image_size)

@@ -1,6 +1,7 @@
 """Project Aria's Fisheye62: r = theta (1 + k0 theta^2 + ... + k5 theta^12), then tangential terms."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 from torch import Tensor
 
@@ -30,6 +31,7 @@ class Fisheye62(Camera):
     special_cases = (("kannala_brandt", distortion_names[:6]),)
     odd_in_x = frozenset({"p0"})
     odd_in_y = frozenset({"p1"})
+    quarter_turn = MappingProxyType({"p0": "-p1", "p1": "p0"})
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

@@ -1,6 +1,7 @@
 """Project Aria's Fisheye624: r = theta (1 + k0 theta^2 + ...), then tangential and thin-prism terms."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 from torch import Tensor
 
@@ -30,6 +31,7 @@ class Fisheye624(Camera):
     special_cases = (("fisheye62", distortion_names[:8]),)
     odd_in_x = frozenset({"p0", "s0", "s1"})
     odd_in_y = frozenset({"p1", "s2", "s3"})
+    quarter_turn = MappingProxyType({"p0": "-p1", "p1": "p0", "s0": "-s2", "s1": "-s3", "s2": "s0", "s3": "s1"})
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

@@ -20,6 +20,7 @@ class LatLon(Camera):
     """
 
     key = "latlon"
+    quarter_turn = None
 
     def __init__(self, intrinsics: TensorLike, *, image_size: tuple[int, int] | None = None) -> None:
         super().__init__(intrinsics, image_size=image_size)

@@ -1,6 +1,7 @@
 """The Mei camera, OpenCV's omnidir: (x, y) / (z + xi d), then radial and tangential distortion."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 from torch import Tensor
 
@@ -32,6 +33,7 @@ class Mei(Camera):
     fit_starts = tuple({"xi": xi} for xi in (0.0, 1.0, 2.0))
     odd_in_x = frozenset({"p2"})
     odd_in_y = frozenset({"p1"})
+    quarter_turn = MappingProxyType({"p1": "p2", "p2": "-p1"})
     defined_text = "xi > -1"
 
     @staticmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import torch
@@ -76,6 +77,7 @@ class OCamCalib(Camera):
     distortion_names = ("d", "e", "a1", "a2", "a3", "a4")
     default_count = 6
     odd_in_x = odd_in_y = frozenset({"d", "e"})
+    quarter_turn = MappingProxyType({"d": "-e", "e": "-d"})
     special_cases = (("division", ("a2", "a4", "a6")), ("pinhole", ()))
     fit_counts = (6, 8, 10)
 

@@ -1,6 +1,7 @@
 """COLMAP's thin-prism fisheye: theta (cos phi, sin phi) with radial, tangential and thin-prism terms."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -30,6 +31,7 @@ class ThinPrismFisheye(Camera):
     special_cases = (("kannala_brandt", ("k1", "k2", "k3", "k4")),)
     odd_in_x = frozenset({"p2", "sx1"})
     odd_in_y = frozenset({"p1", "sy1"})
+    quarter_turn = MappingProxyType({"p1": "p2", "p2": "-p1", "sx1": "-sy1", "sy1": "sx1"})
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

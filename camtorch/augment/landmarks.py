@@ -1,0 +1,202 @@
+"""Landmarks of faces and bodies that change places in a mirror: a left eye becomes a right one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import as_whole
+
+
+def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
+    """Of runs (first, last, total): landmark i of first ... last changes places with total - i; others stay."""
+    order = list(range(count))
+    for first, last, total in runs:
+        for i in range(first, last + 1):
+            order[i], order[total - i] = total - i, i
+    return tuple(order)
+
+
+LANDMARKS: dict[str, tuple[int, ...]] = {
+    "ibug68": _order(
+        68,
+        *((0, 7, 16), (17, 21, 43), (31, 32, 66)),  # jaw, brows, nostrils
+        *((36, 39, 81), (40, 41, 87)),  # upper and lower lids
+        *((48, 50, 102), (55, 56, 114), (60, 61, 124), (65, 65, 132)),  # outer and inner lips
+    ),
+    "wflw98": _order(
+        98,
+        *((0, 15, 32), (33, 37, 79), (38, 41, 88), (55, 56, 114)),
+        *((60, 64, 132), (65, 67, 140), (96, 96, 193)),  # lids, pupils
+        *((76, 78, 158), (83, 84, 170), (88, 89, 180), (93, 93, 188)),
+    ),
+    "lapa106": _order(
+        106,
+        *((0, 15, 32), (33, 37, 79), (38, 41, 88), (55, 59, 120)),
+        *((66, 70, 145), (71, 73, 153), (74, 74, 157), (104, 104, 209)),  # lids, their middles, pupils
+        *((84, 86, 174), (91, 92, 186), (96, 97, 196), (101, 101, 204)),
+    ),
+    "coco17": _order(17, *((i, i, 2 * i + 1) for i in range(1, 17, 2))),
+}
+"""Name -> for every landmark, the one that it changes places with, or itself: the 68 of iBUG (300-W, dlib), the 98 of
+WFLW, the 106 of LaPa (JD-landmark; InsightFace has 106 in another order), and the 17 keypoints of COCO."""
+
+TableLike = str | Sequence[int] | Sequence[Sequence[int]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Which landmarks change places."""
+
+    order: tuple[int, ...]
+    exact: bool
+    """Whether it is of just so many landmarks; pairs alone do not say."""
+
+    def of(self, count: int) -> tuple[int, ...] | None:
+        """For so many landmarks; None if it is of another number."""
+        if count == len(self.order):
+            return self.order
+        return None if self.exact or count < len(self.order) else self.order + tuple(range(len(self.order), count))
+
+
+def as_table(value: TableLike, owner: str) -> Table:
+    """The table that a name, an order, or a list of pairs says.
+
+    Raises:
+        ValueError: an unknown name, an order of which twice is not once around.
+    """
+    if isinstance(value, str):
+        if value not in LANDMARKS:
+            raise ValueError(
+                f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs; got {value!r}"
+            )
+        return Table(LANDMARKS[value], True)
+    items: list[Any] = list(value)
+    pairs: list[tuple[int, ...]] = []
+    if items and all(isinstance(item, Iterable) for item in items):
+        pairs = [tuple(as_whole(i, "landmarks", owner) for i in pair) for pair in items]
+        if any(len(pair) != 2 for pair in pairs):
+            raise ValueError(f"{owner}: landmarks must be pairs (left, right); got {value!r}")
+        used = [i for pair in pairs for i in pair]
+        order = list(range(max(used) + 1))
+        for one, other in pairs:
+            order[one], order[other] = other, one
+        fits = len(set(used)) == len(used) and min(used) >= 0
+    else:
+        order = [as_whole(i, "landmarks", owner) for i in items]
+        fits = sorted(order) == list(range(len(order))) and all(order[i] == k for k, i in enumerate(order))
+    if not fits or not order:
+        raise ValueError(
+            f"{owner}: landmarks must say for each one which it changes places with, so that twice is once around, or "
+            f"be pairs without any index twice; got {value!r}"
+        )
+    return Table(tuple(order), not pairs)
+
+
+_HOLD = ("keypoints", "landmarks", "points")  # kinds of fields that may be landmarks
+_LEFT, _RIGHT = "_left", "_right"
+
+
+class Mirroring:
+    """What a mirror changes beside places and directions: names of landmarks, of fields, and sides of heads.
+
+    Args:
+        landmarks: a table for all fields that may hold landmarks, or by their names; None: they keep their order.
+        lateral_axis: "x", "y" or "z" of a head's own frame, from one of its sides to the other.
+        swap_sides: whether fields `..._left` and `..._right` change places.
+        owner: the augmentation, for errors.
+    """
+
+    def __init__(
+        self,
+        landmarks: TableLike | Mapping[str, TableLike | None] | None,
+        lateral_axis: str,
+        swap_sides: bool,
+        owner: str,
+    ):
+        if lateral_axis not in ("x", "y", "z"):
+            raise ValueError(
+                f"{owner}: lateral_axis must be 'x', 'y' or 'z', of the head's frame; got {lateral_axis!r}"
+            )
+        self.given, self.lateral_axis, self.swap_sides, self.owner = landmarks, lateral_axis, bool(swap_sides), owner
+        self._named: dict[str, Table | None] | None = None
+        self._one: Table | None = None
+        if isinstance(landmarks, Mapping):
+            self._named = {name: None if t is None else as_table(t, owner) for name, t in landmarks.items()}
+        elif landmarks is not None:
+            self._one = as_table(landmarks, owner)
+
+    @property
+    def key(self) -> object:
+        """Equal for those that do the same."""
+        return self._named, self._one, self.lateral_axis, self.swap_sides
+
+    @property
+    def lateral(self) -> int:
+        """The number of the lateral axis."""
+        return "xyz".index(self.lateral_axis)
+
+    def order(self, name: str, kind: str, count: int) -> tuple[int, ...] | None:
+        """The order of `count` landmarks of a field in a mirror, or None if they keep theirs.
+
+        Raises:
+            ValueError: a table of another number.
+        """
+        table = self._named.get(name) if self._named is not None else self._one
+        if table is None:
+            return None
+        order = table.of(count)
+        # 3D points may be others
+        if order is None and (kind != "points" or self._named is not None):
+            raise ValueError(
+                f"{self.owner}: {name} holds {count} points, the table of landmarks {len(table.order)}. "
+                f"landmarks={{'keypoints': 'ibug68', {name!r}: None}} says it by field"
+            )
+        return order
+
+    def swapped(self, name: str, kind: str, value: Tensor, mirrored: Tensor, flags: bool = False) -> Tensor:
+        """Landmarks (B, N, ...) with those of mirrored rows, (B,) bool, in their order in a mirror."""
+        if kind not in _HOLD or value.ndim < (2 if flags else 3):
+            return value
+        order = self.order(name, kind, value.shape[1])
+        if order is None:
+            return value
+        other = value.index_select(1, torch.tensor(order, device=value.device))
+        return torch.where(_lifted(mirrored, value), other, value)
+
+    def sides(self, names: Iterable[str]) -> list[tuple[str, str]]:
+        """The fields that change places.
+
+        Raises:
+            ValueError: one has no other.
+        """
+        found = []
+        names = set(names)
+        for name in sorted(names) if self.swap_sides else ():
+            for mine, its in ((_LEFT, _RIGHT), (_RIGHT, _LEFT)):
+                if name.endswith(mine):
+                    other = name.removesuffix(mine) + its
+                    if other not in names:
+                        raise ValueError(
+                            f"{self.owner}: {name} has no {other} to change places with, and what is left becomes "
+                            "right in a mirror; swap_sides=False keeps the name"
+                        )
+                    found += [(name, other)] if mine == _LEFT else []
+        return found
+
+
+def _lifted(rows: Tensor, like: Tensor) -> Tensor:
+    return rows.to(like.device).reshape(-1, *[1] * (like.ndim - 1))
+
+
+def exchanged(one: Tensor | list[Tensor], other: Tensor | list[Tensor], rows: Tensor) -> tuple[object, object]:
+    """Two fields of a batch, with the chosen rows, (B,) bool, changed for each other's."""
+    if isinstance(one, Tensor) and isinstance(other, Tensor) and one.shape == other.shape:
+        chosen = _lifted(rows, one)
+        return torch.where(chosen, other, one), torch.where(chosen, one, other)
+    pairs = [(b, a) if r else (a, b) for a, b, r in zip(one, other, rows.tolist(), strict=True)]
+    return [a for a, _ in pairs], [b for _, b in pairs]
