@@ -11,6 +11,7 @@ from camtorch.camera import MODELS, Camera
 from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save
+from camtorch.mixed import Mixed
 from camtorch.models import (
     EUCM,
     FOV,
@@ -75,6 +76,7 @@ __all__ = [
     "KannalaBrandt",
     "LatLon",
     "Mei",
+    "Mixed",
     "OCamCalib",
     "OrthographicFisheye",
     "Pinhole",

@@ -6,7 +6,7 @@ import difflib
 import inspect
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import torch
@@ -93,6 +93,8 @@ class Camera(BatchedModule):
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
     """In words, what `defined` asks for."""
+    is_mixed: ClassVar[bool] = False
+    """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
     tensor_names = ("intrinsics", "distortion")
     intrinsics: Tensor
     distortion: Tensor
@@ -438,34 +440,26 @@ class Camera(BatchedModule):
         self, direction: type[Project] | type[Unproject], values: Tensor, name: str, size: int
     ) -> tuple[Tensor, Tensor]:
         """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
-        batch, intrinsics, distortion = self.batch_shape, self.intrinsics, self.distortion
+        batch, tensors = self.batch_shape, self._tensors
         lead, dims = batch, len(batch)
-        fit = isinstance(values, Tensor) and values.dtype == intrinsics.dtype == distortion.dtype
+        fit = isinstance(values, Tensor) and all(t.dtype == values.dtype for t in tensors)
         if not fit or values.ndim <= dims or values.shape[-1] != size or values.shape[:dims] != batch:
-            values, lead = as_points(values, name, size, batch, self._tensors, type(self).__name__)
+            values, lead = as_points(values, name, size, batch, tensors, type(self).__name__)
         shape = values.shape[:-1]
         rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
-        inputs = rows, _per_row(intrinsics, lead, rows), _per_row(distortion, lead, rows)
-        if _is_plain(inputs):
-            learns = rows.requires_grad or inputs[1].requires_grad or inputs[2].requires_grad
-            keeps = learns and torch.is_grad_enabled()
-            planes, valid = direction.apply(*inputs, self._cameras(*inputs[1:]), type(self), keeps)  # type: ignore[no-untyped-call]
-        else:
-            # what is compiled has no derivatives of derivatives
-            order = 1 if torch.compiler.is_compiling() else 2
-            known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
-            cameras = self._cameras(*inputs[1:]) if known else None
-            planes, valid = direction.traced(type(self), *inputs, cameras, order)
+        planes, valid = self._seen_by_rows(direction, rows, lead, tensors)
         return planes.reshape((len(planes), *shape)).movedim(0, -1), valid.reshape(shape)
+
+    def _seen_by_rows(
+        self, direction: type[Project] | type[Unproject], rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Planes (size, C, N), and valid (C, N), of rows (C, N, size); lead: the batch dims that C counts."""
+        intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
+        return evaluated(direction, type(self), (rows, intrinsics, distortion), self._cameras)
 
     def _cameras(self, intrinsics: Tensor, distortion: Tensor) -> Cameras:
         """The rows' cameras, kept until a value changes."""
-        known: Cameras | None = self._memo.result
-        if known is not None and known.are(intrinsics, distortion):
-            return known
-        inputs = intrinsics, distortion
-        options = intrinsics.dtype, intrinsics.device
-        cameras: Cameras = self._memo(inputs, options, lambda: Cameras.of(type(self), *inputs))
+        cameras = kept_cameras(self._memo, type(self), intrinsics, distortion)
         if cameras.usable is not None and not self._warned:
             self._warn_of_unusable(cameras, cameras.usable)
         return cameras
@@ -490,8 +484,14 @@ class Camera(BatchedModule):
             )
 
     @property
-    def _tensors(self) -> tuple[Tensor, Tensor]:
+    def _tensors(self) -> tuple[Tensor, ...]:
+        """All that the camera learns, or could."""
         return self.intrinsics, self.distortion
+
+    @property
+    def _form(self) -> tuple[object, ...]:
+        """What else it is: cameras of one form and equal tensors are the same."""
+        return type(self), self.image_size
 
     # -- the image
 
@@ -831,7 +831,42 @@ def _is_given(values: Tensor) -> bool:
     return is_concrete(values) and not is_predicted(values)
 
 
-def _per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
+def evaluated(
+    direction: type[Project] | type[Unproject],
+    model: type[Camera],
+    inputs: tuple[Tensor, Tensor, Tensor],
+    cameras_of: Callable[[Tensor, Tensor], Cameras],
+) -> tuple[Tensor, Tensor]:
+    """Planes and valid of one model's rows: by blocks, or traced by a compiler or a transform of torch.func.
+
+    Args:
+        direction: the way.
+        model: the class of the cameras.
+        inputs: rows (C, N, size), intrinsics (C, 4) and distortion (C, n) of one dtype.
+        cameras_of: the rows' cameras, of intrinsics and distortion whose values may be looked at.
+    """
+    if _is_plain(inputs):
+        keeps = any(t.requires_grad for t in inputs) and torch.is_grad_enabled()
+        planes, valid = direction.apply(*inputs, cameras_of(*inputs[1:]), model, keeps)  # type: ignore[no-untyped-call]
+        return planes, valid
+    # what is compiled has no derivatives of derivatives
+    order = 1 if torch.compiler.is_compiling() else 2
+    known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
+    return direction.traced(model, *inputs, cameras_of(*inputs[1:]) if known else None, order)
+
+
+def kept_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
+    """The cameras (C,) of one model, kept in a memo until a value changes."""
+    known: Cameras | None = memo.result
+    if known is not None and known.are(intrinsics, distortion):
+        return known
+    inputs = intrinsics, distortion
+    options = intrinsics.dtype, intrinsics.device
+    cameras: Cameras = memo(inputs, options, lambda: Cameras.of(model, *inputs))
+    return cameras
+
+
+def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
     """(*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
     if parameters.dtype != rows.dtype:
         parameters = parameters.to(rows.dtype)

@@ -45,6 +45,7 @@ def test_what_a_loader_collates_can_be_augmented(cameras, workers):
     if len(set(cameras)) == 1:
         assert tuple(batch["camera"].batch_shape) == (3,)
     else:
+        assert isinstance(batch["camera"], ct.Mixed)
         assert [type(camera) for camera in batch["camera"]] == [type(camera) for camera in cameras]
     out = RandomMount(yaw=1, pitch=1, roll=1)(batch)
     assert [valid.tolist() for valid in out["keypoints_valid"]] == [[], [True], [True, True]]
@@ -55,6 +56,8 @@ def test_nests_and_cameras_alone():
     assert batch[0].tolist() == [1.5, 2.5]
     assert batch[1]["name"] == ["a", "b"]
     assert tuple(collate([PINHOLE, PINHOLE]).batch_shape) == (2,)
-    assert collate([PINHOLE, FISHEYE]) == [PINHOLE, FISHEYE]
+    assert isinstance(collate([PINHOLE, FISHEYE]), ct.Mixed)
+    large = FISHEYE.resize(48, 64)
+    assert collate([PINHOLE, large]) == [PINHOLE, large]
     with pytest.raises(TypeError, match="default_collate: batch must contain"):
         collate([object(), object()])

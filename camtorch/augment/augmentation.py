@@ -16,10 +16,11 @@ from torch import Tensor
 from camtorch._arguments import as_whole
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, kind, rows_of, size_of
+from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, rows_of, size_of
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
+from camtorch.mixed import Mixed, kind
 from camtorch.warp.sampling import as_options
 from camtorch.warp.warp import Warp
 
@@ -122,8 +123,8 @@ class Augmentation(SampleTransform):
     * `gaze`, `directions` (B, *N, 3): turned by R, nothing else. `pitch_yaw` (B, *N, 2): a gaze in the angles of
       ETH-XGaze.
     * `head_pose`, `pose` (B, 4, 4) camera from head; or `rvec` (B, 3) and `tvec` (B, 3), as of OpenCV.
-    * `camera`: the camera of the image, one for all, a batch, or a list of single ones of any models. What comes out
-      is the camera of the new image, for which all 3D fields hold.
+    * `camera`: the camera of the image, one for all, a batch, a `ct.Mixed` of any models, or a list of single ones.
+      What comes out is the camera of the new image, for which all 3D fields hold.
 
     `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
     Everything else stays as it is; unknown names that hold real numbers are refused, as they might be geometry.
@@ -271,6 +272,8 @@ class Augmentation(SampleTransform):
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
             )
+        if isinstance(first, Mixed):
+            return self._change_each(first, draw)
         if listed:
             groups: dict[tuple[object, ...], list[int]] = {}
             for i, one in enumerate(cameras):
@@ -286,17 +289,34 @@ class Augmentation(SampleTransform):
         else:
             both = [(applied == value).nonzero()[:, 0] for value in (True, False)]
             members = [(rows, rows_of(first, rows)) for rows in both if len(rows)]
-        parts = []
-        for rows, source in members:
-            if applied[rows[0]]:
-                parts.append(self._part(rows, source, {name: value[rows] for name, value in draw.items()}))
-            else:
-                parts.append(Part(rows, None, source))
+        parts = [self._part_of(rows, source, draw, bool(applied[rows[0]])) for rows, source in members]
         sizes = {size_of(part.warp.target if part.warp else part.camera) for part in parts}
         if len(sizes) > 1 and len(before) == 1:
             text = f"samples of one batch would come out in the sizes {sorted(sizes)}; with p < 1 the size must stay"
             raise ValueError(f"{self._name}: {text}")
         return Change(count, parts, listed=listed)
+
+    def _change_each(self, camera: Mixed, draw: Mapping[str, Tensor]) -> Change:
+        """What a draw does to images of cameras of several models."""
+        applied = draw["apply"]
+        if not may_look(applied):  # traced: all rows move, and a gate chooses
+            parts = [self._part_of(torch.tensor(rows), group, draw, True) for rows, group in camera.groups]
+            mixed = [rows for rows, _ in camera.groups]
+            return Change(len(applied), parts, mixed=mixed, gate=None if self.p == 1 else applied)
+        parts, mixed, chosen = [], [], applied.tolist()
+        for rows, group in camera.groups:
+            for moves in (True, False):
+                here = [n for n, row in enumerate(rows) if chosen[row] == moves]
+                if here:
+                    mixed.append([rows[n] for n in here])
+                    source = group if len(here) == len(rows) else rows_of(group, torch.tensor(here))
+                    parts.append(self._part_of(torch.tensor(mixed[-1]), source, draw, moves))
+        return Change(len(applied), parts, mixed=mixed)
+
+    def _part_of(self, rows: Tensor, source: Camera, draw: Mapping[str, Tensor], moves: bool) -> Part:
+        if not moves:
+            return Part(rows, None, source)
+        return self._part(rows, source, {name: value[rows.to(value.device)] for name, value in draw.items()})
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         missing = [name for name in ("apply", *self.ranges) if name not in draw]
@@ -358,7 +378,7 @@ class Augmentation(SampleTransform):
 
     def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
-        camera = camera if isinstance(camera, Camera) else camera[0]
+        camera = camera if isinstance(camera, Camera) and not camera.is_mixed else camera[0]
         if self.min_filled is not None or self._warned or self.p == 0 or not is_concrete(camera.intrinsics):
             return
         self._warned = True

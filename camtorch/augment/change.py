@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._tracing import in_graph
 from camtorch.camera import Camera
+from camtorch.mixed import Mixed, held, kind, remade
 from camtorch.warp.sampling import Mode, narrow, widen
 from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
 
@@ -58,12 +58,21 @@ class Change:
     Args:
         count: how many samples.
         parts: every sample is in one of them.
-        listed: cameras come as a list, for they may be of several models.
+        listed: cameras come as a list, for they may be of several models and sizes.
+        mixed: the rows of every part, where cameras come as a `Mixed`.
         gate: (count,) bool, where values may not be looked at: which rows of the only part move.
     """
 
-    def __init__(self, count: int, parts: Sequence[Part], *, listed: bool = False, gate: Tensor | None = None):
-        self.count, self.parts, self.listed, self.gate = count, list(parts), listed, gate
+    def __init__(
+        self,
+        count: int,
+        parts: Sequence[Part],
+        *,
+        listed: bool = False,
+        mixed: Sequence[Sequence[int]] | None = None,
+        gate: Tensor | None = None,
+    ):
+        self.count, self.parts, self.listed, self.mixed, self.gate = count, list(parts), listed, mixed, gate
         rows = [part.rows for part in self.parts if part.rows is not None]
         self._inverse: Change | None = None
         self._order = torch.cat(rows).argsort() if rows else None
@@ -78,16 +87,19 @@ class Change:
         """The cameras after."""
         after = [part.camera if part.warp is None else part.warp.target for part in self.parts]
         if self.gate is not None:
-            source, target = (expanded(c, self.count) for c in (self.parts[0].camera, after[0]))
-            moves = self.gate.to(target.intrinsics.device).unsqueeze(-1)
-            intrinsics = torch.where(moves, target.intrinsics, source.intrinsics)
-            distortion = torch.where(moves, target.distortion, source.distortion)
-            return remade(target, intrinsics, distortion, target.image_size)
+            gates = [
+                self.gate if part.rows is None else self.gate[part.rows.to(self.gate.device)] for part in self.parts
+            ]
+            after = [
+                _chosen(gate, camera, part.camera) for gate, camera, part in zip(gates, after, self.parts, strict=True)
+            ]
         return self._cameras(after)
 
     def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
         counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]
         batches = [expanded(camera, n) for camera, n in zip(cameras, counts, strict=True)]
+        if self.mixed is not None:
+            return Mixed.of_groups(list(zip(self.mixed, batches, strict=True)))
         if not self.listed and len({kind(c) for c in batches}) == 1:
             return batches[0] if self._order is None else joined(batches, self._order)
         alone = [single for camera in batches for single in singles(camera)]
@@ -127,7 +139,7 @@ class Change:
             else replace(part, warp=part.warp.inverse(), camera=part.warp.target, shades=None, light=None)
             for part in self.parts
         ]
-        self._inverse = Change(self.count, parts, listed=self.listed, gate=self.gate)
+        self._inverse = Change(self.count, parts, listed=self.listed, mixed=self.mixed, gate=self.gate)
         return self._inverse
 
     def each(
@@ -147,11 +159,12 @@ class Change:
 
         results = [of(part) for part in self.parts]
         gate, order = self.gate, self._order
+        moved = results[0]
+        if order is not None:
+            moved = _both(lambda pieces: torch.cat(pieces)[order.to(pieces[0].device)], *results)
         if gate is not None:
-            return _both(lambda pair: _gated(gate, *pair), results[0], stay(self.parts[0].camera, value))
-        if order is None:
-            return results[0]
-        return _both(lambda pieces: torch.cat(pieces)[order.to(pieces[0].device)], *results)
+            moved = _both(lambda pair: _gated(gate, *pair), moved, stay(self.parts[0].camera, value))
+        return moved
 
     # -- what moves
 
@@ -255,6 +268,15 @@ def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
     return torch.where(gate.to(moved.device).reshape(-1, *[1] * (moved.ndim - 1)), moved, kept.to(moved.dtype))
 
 
+def _chosen(gate: Tensor, target: Camera, source: Camera) -> Camera:
+    """(n,) of two cameras of one kind, the target where the gate (n,) is open."""
+    source, target = (expanded(camera, len(gate)) for camera in (source, target))
+    moves = gate.to(target.intrinsics.device).unsqueeze(-1)
+    intrinsics = torch.where(moves, target.intrinsics, source.intrinsics)
+    distortion = torch.where(moves, target.distortion, source.distortion)
+    return remade(target, intrinsics, distortion, target.image_size)
+
+
 def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Any) -> Any:
     """`function` of the results, or of the first and of the second ones where each is a pair."""
     if isinstance(results[0], tuple):
@@ -267,29 +289,15 @@ def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Any) -> An
 
 def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same model with these numbers; nothing in it learns that is not part of a graph already."""
-    held = _held(intrinsics, distortion)
+    numbers = held(intrinsics, distortion)
     model: type[Camera] = type_before_parametrizations(camera)
-    return model(*(held if distortion.shape[-1] else held[:1]), image_size=image_size)
-
-
-def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
-    """`camera_like` of numbers that need no check: those of another camera, or what was made of them here."""
-    if torch.compiler.is_compiling():  # which follows a constructor, and nothing that does without
-        return camera_like(camera, intrinsics, distortion, image_size)
-    if not distortion.shape[-1]:
-        distortion = intrinsics[..., :0]
-    intrinsics, distortion = _held(intrinsics, distortion)
-    made = camera.with_tensors(intrinsics=intrinsics, distortion=distortion)
-    made.image_size = image_size
-    return made
-
-
-def _held(*numbers: Tensor) -> list[Tensor]:
-    return [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in numbers]
+    return model(*(numbers if distortion.shape[-1] else numbers[:1]), image_size=image_size)
 
 
 def numbers_by(camera: Camera, change: Callable[[Tensor], Tensor]) -> Camera:
     """The camera with its intrinsics and its distortion changed, each by the same function."""
+    if isinstance(camera, Mixed):
+        return camera.by_groups(lambda group: numbers_by(group, change))
     return remade(camera, change(camera.intrinsics), change(camera.distortion), camera.image_size)
 
 
@@ -313,11 +321,6 @@ def size_of(camera: Camera) -> tuple[int, int]:
     return cast("tuple[int, int]", camera.image_size)
 
 
-def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
-    """What cameras must have in common to be rows of one batch."""
-    return type_before_parametrizations(camera), camera.distortion.shape[-1], camera.image_size
-
-
 def alone(camera: Camera) -> Camera:
     """A batch of one as the camera that it holds, which serves any number of samples."""
     return singles(camera)[0] if tuple(camera.batch_shape) == (1,) else camera
@@ -325,6 +328,8 @@ def alone(camera: Camera) -> Camera:
 
 def rows_of(camera: Camera, index: Tensor) -> Camera:
     """The cameras of these rows; one without batch dims serves all of them."""
+    if isinstance(camera, Mixed):
+        return camera[index]
     batch = camera.batch_shape
     return numbers_by(camera, lambda t: t.expand(*batch, t.shape[-1])[index]) if batch else camera
 
@@ -338,6 +343,8 @@ def expanded(camera: Camera, count: int) -> Camera:
 
 def singles(camera: Camera) -> list[Camera]:
     """The cameras of a batch, one by one."""
+    if isinstance(camera, Mixed):
+        return list(camera)
     intrinsics, distortion = (
         t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)
     )

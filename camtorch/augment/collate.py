@@ -10,8 +10,9 @@ from torch import Tensor
 from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from camtorch.augment.change import expanded, joined, kind
+from camtorch.augment.change import expanded, joined
 from camtorch.camera import Camera
+from camtorch.mixed import Mixed, kind
 
 
 def collate(samples: Sequence[object]) -> object:
@@ -19,7 +20,8 @@ def collate(samples: Sequence[object]) -> object:
 
     As torch's own `default_collate`, which stacks tensors, arrays and numbers; but tensors and arrays whose shapes
     differ, such as the keypoints of several faces, come as the list of tensors that the augmentations take. Cameras
-    become a batch, or a list where they are of several models or sizes; so they do by `default_collate`.
+    become a batch, a `ct.Mixed` where they are of several models, or a list where their images are of several sizes; so
+    they do by `default_collate`.
 
     Raises:
         TypeError: what cannot be collated, as by `default_collate`.
@@ -38,9 +40,11 @@ def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map=None) -> Tensor | lis
 
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map=None) -> Camera | list[Camera]:
-    """Single cameras as one batch, or as a list where they are of several models or sizes."""
-    if any(camera.batch_shape for camera in batch) or len({kind(camera) for camera in batch}) > 1:
+    """Single cameras as one batch, of several models if need be, or as a list where they are of several sizes."""
+    if any(camera.batch_shape for camera in batch) or len({camera.image_size for camera in batch}) > 1:
         return list(batch)
+    if len({kind(camera) for camera in batch}) > 1:
+        return Mixed(batch).by_groups(lambda group: group)  # fewer tensors to leave a worker
     return joined([expanded(camera, 1) for camera in batch])
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from camtorch._threads import ALONE, EVEN, is_split
 
+_PAIR = 32  # numbers of two vectors of 64 bytes, or a multiple
 # Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
 # them still has a first derivative good to 1e-13 of the function's own scale.
 _SMALL_ANGLE2 = 1e-2
@@ -71,17 +72,20 @@ def cosc_root(t: Tensor) -> Tensor:
 
 
 def atan2(y: Tensor, x: Tensor) -> Tensor:
-    """torch.atan2 of planes of one shape; outside of compiled code it is rounded alike by any number of threads.
+    """torch.atan2 of planes of one shape; outside of compiled code a number is rounded alike wherever it stands.
 
-    It takes the last elements of each thread's part, fewer than two vectors, one by one, and rounds them otherwise.
+    torch takes the last elements of each thread's part, fewer than two vectors, one by one, and rounds them otherwise.
     """
-    if torch.compiler.is_compiling() or not is_split() or y.numel() <= ALONE:
+    count = y.numel()
+    if torch.compiler.is_compiling() or not y.is_cpu or count % (EVEN if is_split() and count > ALONE else _PAIR) == 0:
         return torch.atan2(y, x)
     y, x, shape = y.reshape(-1), x.reshape(-1), y.shape
-    even = len(y) // EVEN * EVEN
-    if even == len(y):
-        return torch.atan2(y, x).view(shape)
-    return torch.cat((torch.atan2(y[:even], x[:even]), torch.atan2(y[even:], x[even:]))).view(shape)
+    even = count // EVEN * EVEN if count > ALONE else 0
+    more = y.new_ones(-count % _PAIR)
+    if not even:
+        return torch.atan2(torch.cat((y, more)), torch.cat((x, more)))[:count].view(shape)
+    tail = torch.atan2(torch.cat((y[even:], more)), torch.cat((x[even:], more)))[: count - even]
+    return torch.cat((torch.atan2(y[:even], x[:even]), tail)).view(shape)
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:

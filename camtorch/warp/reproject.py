@@ -165,10 +165,10 @@ class Reproject(GeometryModule):
 
     def _rays(self) -> tuple[Tensor, Tensor]:
         """The target's, kept while nothing can learn."""
-        inputs = self.target.intrinsics, self.target.distortion
+        inputs = self.target._tensors
         if (torch.is_grad_enabled() and any(map(in_graph, inputs))) or not all(map(is_concrete, inputs)):
             return self.target.rays()
-        kept: tuple[Tensor, Tensor] = self._memo(inputs, (self.target.image_size,), self.target.rays)
+        kept: tuple[Tensor, Tensor] = self._memo(inputs, self.target._form, self.target.rays)
         return kept
 
     def _shows(

@@ -164,7 +164,7 @@ class Warp(GeometryModule):
         sampled = self._checked(images, mode, padding_mode, fill)
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
-        if self.is_an_operator and torch.compiler.is_compiling() and not learns and compiled.takes(images, inputs):
+        if self._is_operator() and not learns and compiled.takes(images, inputs):
             options = self.tolerance, self.antialias, self._reach(sampled[1]), *sampled
             return compiled.warped(images, self.source, self.target, self.rotation, *options)
         if self._is_long() and not (learns or in_graph(images)):
@@ -311,8 +311,7 @@ class Warp(GeometryModule):
         reach = self._reach(padding)
         if self._pinned is not None and (reach == self.padding_mode or isinstance(self._pinned, Sampling)):
             return self._pinned
-        cameras = [(type(camera), camera.image_size) for camera in (self.source, self.target)]
-        options = (*cameras, self.rotation is None, self.antialias, self.tolerance)
+        options = (self.source._form, self.target._form, self.rotation is None, self.antialias, self.tolerance)
         memo = self._memos[reach if self.tolerance else "zeros"]  # what is exact serves all
         kept: Sampling | Lattice = memo(inputs, options, lambda: self._whole(reach))
         return kept
@@ -336,8 +335,13 @@ class Warp(GeometryModule):
             constant: Sampling = self._constants(inputs, (self._reach(padding), self.antialias, self.tolerance), whole)
             return constant
 
+    def _is_operator(self) -> bool:
+        """Whether code is compiled that calls this warp as one; it knows cameras of one model alone."""
+        mixed = self.source.is_mixed or self.target.is_mixed
+        return torch.compiler.is_compiling() and self.is_an_operator and not mixed
+
     def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
-        may = torch.compiler.is_compiling() and self.tolerance and self.target.intrinsics.is_cpu
+        may = self._is_operator() and self.tolerance and self.target.intrinsics.is_cpu
         if may and not is_exporting():
             where = self.source, self.target, self.rotation
             return self._with_scale(*compiled.positions(*where, self.tolerance, padding))
@@ -363,7 +367,7 @@ class Warp(GeometryModule):
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
         # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the
         # operator of compiled code keeps its own
-        if torch.compiler.is_compiling() and compiled.takes(self.target.intrinsics.detach(), self._inputs()):
+        if self._is_operator() and compiled.takes(self.target.intrinsics.detach(), self._inputs()):
             return self
         if not in_transform() and not torch.is_inference_mode_enabled():
             inputs = self._inputs()
@@ -371,8 +375,8 @@ class Warp(GeometryModule):
         return self
 
     def _inputs(self) -> list[Tensor]:
-        s, t = self.source, self.target
-        return [p for p in (s.intrinsics, s.distortion, t.intrinsics, t.distortion, self.rotation) if p is not None]
+        turned = [] if self.rotation is None else [self.rotation]
+        return [*self.source._tensors, *self.target._tensors, *turned]
 
     # -- labels
 

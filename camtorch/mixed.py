@@ -1,0 +1,350 @@
+"""A batch of cameras of any models, which is evaluated model by model."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import type_before_parametrizations
+
+from camtorch._arguments import working_dtype
+from camtorch._module import Memo
+from camtorch._tracing import in_graph
+from camtorch.camera import Camera, evaluated, kept_cameras, per_row
+from camtorch.projection.project import Project
+from camtorch.projection.unproject import Unproject
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class _Group(NamedTuple):
+    """Cameras of one model and number of coefficients, which are evaluated at once."""
+
+    model: type[Camera]
+    members: tuple[int, ...]
+    """Which modules it is made of."""
+    taken: tuple[int, ...] | None
+    """Which rows of those, one after the other; None for all of them in their order."""
+    rows: tuple[int, ...]
+    """The place of each in the batch, ascending."""
+    memo: Memo
+
+
+class Mixed(Camera):
+    """A batch of cameras of any models, one for each image: it projects, is cropped, and is warped as one camera.
+
+        camera = ct.Mixed([ct.Pinhole(...), ct.KannalaBrandt(...), ct.BrownConrady(...)])
+        pixels, valid = camera.project(points)  # (3, N, 3), a row for each camera
+
+    Results are to the bit those of each camera by itself. Cameras of one model and number of coefficients are
+    evaluated together: 64 cameras of 8 models take 8 calls, however they are ordered.
+
+    Args:
+        cameras: single cameras, and batches of one dim, whose rows follow each other. They are kept as they are, as in
+            an `nn.ModuleList`: what learns in them goes on learning here, and `camera[i]` is the i-th one.
+
+    Its `intrinsics`, `K`, `fx` and so on are those of all; there is no common `distortion`. All that learns computes in
+    the widest dtype among the cameras and the points. `groups` are the batches of one model that it is made of.
+
+    Raises:
+        TypeError: what is no camera. ValueError: no cameras, more than one batch dim, images of different sizes,
+            different devices.
+    """
+
+    is_mixed = True
+    cameras: nn.ModuleList
+    """What it was made of: single cameras and batches."""
+
+    def __init__(self, cameras: Iterable[Camera]):
+        members = _members(cameras)
+        self._arrange(members, [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))])
+
+    def _arrange(self, members: Sequence[Camera], places: Sequence[tuple[int, int]]) -> None:
+        """Be a batch of whose rows each is a row of one of the members."""
+        if not places:
+            raise ValueError("Mixed: cameras without a row")
+        nn.Module.__init__(self)
+        self.cameras = nn.ModuleList(members)
+        self.image_size = members[0].image_size
+        self._places = tuple(places)
+        kinds: dict[tuple[object, ...], list[int]] = {}
+        for row, (i, _) in enumerate(self._places):
+            kinds.setdefault(kind(members[i]), []).append(row)
+        self._groups = tuple(self._group(members, rows) for rows in kinds.values())
+        places_in_groups = {row: n for n, row in enumerate(row for group in self._groups for row in group.rows)}
+        self._order = tuple(places_in_groups[row] for row in range(len(places)))
+
+    def _group(self, members: Sequence[Camera], rows: Sequence[int]) -> _Group:
+        places = [self._places[row] for row in rows]
+        used = tuple(dict.fromkeys(i for i, _ in places))
+        starts = [0, *accumulate(_count(members[i]) for i in used)]
+        index = tuple(starts[used.index(i)] + row for i, row in places)
+        whole = index == tuple(range(starts[-1]))
+        model: type[Camera] = type_before_parametrizations(members[used[0]])
+        return _Group(model, used, None if whole else index, tuple(rows), Memo())
+
+    @classmethod
+    def _of(cls, members: Sequence[Camera], places: Sequence[tuple[int, int]]) -> Self:
+        made = cls.__new__(cls)
+        made._arrange(members, places)
+        return made
+
+    @classmethod
+    def of_groups(cls, groups: Sequence[tuple[Sequence[int], Camera]]) -> Self:
+        """The batch of which each group, (rows, cameras), fills some rows, all of them together.
+
+        Args:
+            groups: the rows of the batch, and as many cameras; as of `groups`.
+        """
+        places: dict[int, tuple[int, int]] = {}
+        for i, (rows, _) in enumerate(groups):
+            places.update({int(row): (i, n) for n, row in enumerate(rows)})
+        if sorted(places) != list(range(sum(len(rows) for rows, _ in groups))):
+            raise ValueError(f"Mixed: groups must fill every row once; got {[list(map(int, r)) for r, _ in groups]}")
+        return cls._of(_checked([camera for _, camera in groups]), [places[row] for row in range(len(places))])
+
+    # -- what it holds
+
+    @property
+    def groups(self) -> list[tuple[list[int], Camera]]:
+        """The rows of each model and number of coefficients, and their cameras as a batch; gradients go to all."""
+        made = []
+        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self._tensors), strict=True):
+            first = self._member(group.members[0])
+            if len(group.members) > 1 or group.taken is not None or not first.batch_shape:
+                first = remade(first, intrinsics, distortion, self.image_size)
+            made.append((list(group.rows), first))
+        return made
+
+    def _member(self, i: int) -> Camera:
+        return cast("Camera", self.cameras[i])
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """(B,), the number of cameras."""
+        return torch.Size((len(self._places),))
+
+    @property
+    def _tensors(self) -> tuple[Tensor, ...]:
+        """Intrinsics and distortion of each group."""
+        tensors: list[Tensor] = []
+        for group in self._groups:
+            members = [self._member(i) for i in group.members]
+            batches = [m.batch_shape for m in members]
+            tensors += [_joined(t, batches, group.taken) for t in zip(*(m._tensors for m in members), strict=True)]
+        wide = working_dtype(tensors[0], *tensors)
+        return tuple(t if t.dtype == wide else t.to(wide) for t in tensors)
+
+    @staticmethod
+    def _pairs(tensors: Sequence[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
+        return zip(tensors[::2], tensors[1::2], strict=True)
+
+    @property
+    def _form(self) -> tuple[object, ...]:
+        return type(self), self.image_size, tuple((group.model, group.rows) for group in self._groups)
+
+    @property
+    def intrinsics(self) -> Tensor:  # type: ignore[override]
+        """(B, 4) fx, fy, cx, cy of all."""
+        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self._tensors[::2], strict=True)]
+        return parts[0] if len(parts) == 1 else self._in_order(torch.cat(parts))
+
+    @property
+    def distortion(self) -> NoReturn:  # type: ignore[override]
+        """There is none in common."""
+        self._refuse("distortion", "camera[i].distortion is that of one, and camera.groups are batches of one model")
+
+    @property
+    def distortion_names(self) -> NoReturn:  # type: ignore[override]
+        """See `distortion`."""
+        self._refuse("distortion", "camera[i] is one of them, and camera.groups are batches of one model")
+
+    @staticmethod
+    def _refuse(what: str, instead: str) -> NoReturn:
+        raise TypeError(f"Mixed: cameras of several models have no {what} in common; {instead}")
+
+    def _in_order(self, tensor: Tensor, dim: int = 0) -> Tensor:
+        """Rows of the groups, one after the other along a dim, as the batch has them."""
+        if self._order == tuple(range(len(self._order))):
+            return tensor
+        return tensor.index_select(dim, torch.tensor(self._order, device=tensor.device))
+
+    # -- both directions
+
+    def _seen_by_rows(
+        self, direction: type[Project] | type[Unproject], rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        results = []
+        for n, (group, pair) in enumerate(zip(self._groups, self._pairs(tensors), strict=True)):
+            here, count = rows, lead
+            if len(self._groups) > 1:
+                start, stop = group.rows[0], group.rows[-1] + 1
+                contiguous = stop - start == len(group.rows)
+                index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
+                here, count = rows[index], torch.Size((len(group.rows),))
+            intrinsics, distortion = (per_row(t, count, here) for t in pair)
+            results.append(evaluated(direction, group.model, (here, intrinsics, distortion), self._watch(n)))
+        if len(results) == 1:
+            return results[0]
+        planes, valid = zip(*results, strict=True)
+        return self._in_order(torch.cat(planes, 1), 1), self._in_order(torch.cat(valid))
+
+    def _watch(self, n: int) -> Callable[[Tensor, Tensor], Any]:
+        """The cameras of a group, kept until a value changes; its members say what is wrong with them."""
+        group = self._groups[n]
+
+        def cameras(intrinsics: Tensor, distortion: Tensor) -> Any:
+            found = kept_cameras(group.memo, group.model, intrinsics, distortion)
+            if found.usable is not None:
+                for member in map(self._member, group.members):
+                    if not member._warned:
+                        lead = member.batch_shape
+                        member._cameras(*(per_row(t.to(intrinsics), lead, t) for t in member._tensors))
+            return found
+
+        return cameras
+
+    def explain(self, points: Tensor) -> list[str]:
+        """Why points (B, *N, 3) have no pixel, in words; see `Camera.explain`."""
+        return [line for camera, mine in zip(self, points, strict=True) for line in camera.explain(mine)]
+
+    # -- other cameras
+
+    def by_groups(self, change: Callable[[Camera], Camera]) -> Self:
+        """The batch of what `change` makes of each group."""
+        return type(self).of_groups([(rows, change(camera)) for rows, camera in self.groups])
+
+    def _edited(self, **edit: Any) -> Self:
+        return self.by_groups(lambda camera: camera._edited(**edit))
+
+    def __getitem__(self, index: Any) -> Camera:  # type: ignore[override]
+        """Of an int, that camera, as it was given where it was given alone; else the `Mixed` of a part of the batch.
+
+        Raises:
+            IndexError: beyond the batch, or of more than one dim.
+        """
+        try:
+            taken = torch.arange(len(self._places))[index]
+        except (IndexError, TypeError) as error:
+            raise IndexError(f"Mixed: {index!r} of a batch ({len(self._places)},): {error}") from None
+        if taken.ndim == 0:
+            i, row = self._places[int(taken)]
+            camera = self._member(i)
+            return camera[row] if camera.batch_shape else camera
+        if taken.ndim > 1:
+            raise IndexError(f"Mixed: it has one batch dim, and {index!r} makes more of it")
+        places = [self._places[row] for row in taken.tolist()]
+        if not places:
+            raise IndexError(f"Mixed: {index!r} leaves no camera of a batch ({len(self._places)},)")
+        used = list(dict.fromkeys(i for i, _ in places))
+        return type(self)._of([self._member(i) for i in used], [(used.index(i), row) for i, row in places])
+
+    def with_tensors(self, **tensors: Tensor) -> NoReturn:
+        """There are none to give."""
+        self._refuse("tensors", "camera.by_groups(change) changes batches of one model each")
+
+    def convert(self, *_: Any, **__: Any) -> NoReturn:
+        """Each group by itself: `camera.by_groups(lambda group: group.convert(model).camera)`."""
+        self._refuse("conversion", "camera.by_groups(lambda group: group.convert(model).camera) converts them all")
+
+    @classmethod
+    def from_matrix(cls, *_: Any, **__: Any) -> NoReturn:
+        """Of a model."""
+        cls._refuse("constructor from numbers", "make each camera by its model, and ct.Mixed([...]) of them")
+
+    @classmethod
+    def from_fov(cls, *_: Any, **__: Any) -> NoReturn:
+        """Of a model."""
+        cls._refuse("constructor from numbers", "make each camera by its model, and ct.Mixed([...]) of them")
+
+    def __repr__(self) -> str:
+        counts = Counter(
+            f"{group.model.__name__}({' '.join(self._member(group.members[0]).distortion_names)})"
+            for group in self._groups
+            for _ in group.rows
+        )
+        named = ", ".join(f"{count} {name}" for name, count in counts.items())
+        return f"Mixed({named}, image_size={self.image_size})"
+
+
+def _count(camera: Camera) -> int:
+    return len(camera) if camera.batch_shape else 1
+
+
+def _members(cameras: Any) -> list[Camera]:
+    """What a batch is made of, as users pass it."""
+    if isinstance(cameras, Camera):
+        cameras = [cameras]
+    if isinstance(cameras, Mapping):
+        raise TypeError("Mixed: cameras must be a list of cameras; of a dict, as rig.cameras, give list(d.values())")
+    try:
+        given = list(cameras)
+    except TypeError:
+        raise TypeError(f"Mixed: cameras must be a list of cameras; got {type(cameras).__name__}") from None
+    for i, camera in enumerate(given):
+        if not isinstance(camera, Camera):
+            raise TypeError(f"Mixed: cameras[{i}] must be a Camera; got {type(camera).__name__}")
+    return _checked([one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))])
+
+
+def _checked(members: list[Camera]) -> list[Camera]:
+    if not members:
+        raise ValueError("Mixed: an empty list of cameras")
+    for i, camera in enumerate(members):
+        if len(camera.batch_shape) > 1:
+            shape = tuple(camera.batch_shape)
+            raise ValueError(f"Mixed: cameras[{i}] has batch dims {shape}; cameras are single, or batches of one dim")
+    sizes = list(dict.fromkeys(camera.image_size for camera in members))
+    if len(sizes) > 1:
+        raise ValueError(
+            f"Mixed: the images of a batch are of one size; got cameras of {', '.join(map(str, sizes))} (height, "
+            "width). camera.resize, .crop and .pad give the camera of an edited image"
+        )
+    devices = list(dict.fromkeys(str(camera.intrinsics.device) for camera in members))
+    if len(devices) > 1:
+        raise ValueError(f"Mixed: the cameras are on {' and '.join(devices)}; camera.to(device) brings them together")
+    return members
+
+
+# -- cameras as rows of a batch
+
+
+def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
+    """What cameras must have in common to be rows of one batch of one model."""
+    return type_before_parametrizations(camera), camera.distortion.shape[-1], camera.image_size
+
+
+def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
+    """A camera of the same model with these numbers, which need no check; nothing in it learns that is in no graph."""
+    intrinsics, distortion = held(intrinsics, distortion if distortion.shape[-1] else intrinsics[..., :0])
+    if torch.compiler.is_compiling():  # which follows a constructor, and nothing that does without
+        model: type[Camera] = type_before_parametrizations(camera)
+        return model(*((intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)), image_size=image_size)
+    made = camera.with_tensors(intrinsics=intrinsics, distortion=distortion)
+    made.image_size = image_size
+    return made
+
+
+def held(*numbers: Tensor) -> list[Tensor]:
+    """Tensors of a graph as they are, and others as Parameters that do not learn."""
+    return [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in numbers]
+
+
+def _joined(tensors: Sequence[Tensor], batches: Sequence[torch.Size], index: Sequence[int] | None) -> Tensor:
+    """(C, n): the numbers of single cameras and of batches one after the other, or those at an index of them."""
+    if len(tensors) == 1 and batches[0]:
+        whole = tensors[0]
+    elif not any(batches):
+        whole = torch.stack(list(tensors))
+    else:
+        whole = torch.cat([t.expand(*(b or (1,)), t.shape[-1]) for t, b in zip(tensors, batches, strict=True)])
+    if index is None:
+        return whole
+    if len(tensors) == 1:
+        whole = whole.expand(*batches[0], whole.shape[-1])
+    return whole.index_select(0, torch.tensor(index, device=whole.device))
