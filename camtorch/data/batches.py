@@ -1,0 +1,172 @@
+"""Batches of rows, dicts of numpy arrays: what Ray Data's `map_batches` calls with, and others likewise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from camtorch.augment.sample import IMAGES, Sample
+from camtorch.camera import Camera
+from camtorch.data.columns import PARTS, to_columns
+from camtorch.data.moving import Mover, Moves
+from camtorch.data.seeded import Key
+
+Array: TypeAlias = "np.ndarray[Any, Any]"
+Batch = dict[str, Any]
+"""Column -> an array or a list, of as many rows as all others."""
+_OWNER = "MapBatches"
+_CHANNELS = 4
+
+
+class MapBatches:
+    """Augments, or warps, batches of rows: the function of Ray Data's `map_batches`, and of whatever calls like it.
+
+        rows = ray.data.read_images("images/", include_paths=True)
+        rows = rows.map_batches(ct.data.MapBatches(augment, key="path", seed=0), batch_size=32)
+
+    Columns are arrays (B, ...), or arrays of objects where rows differ in shape, and named as the fields of an
+    `Augmentation`, without its batch dim:
+
+    * `image` (B, H, W, C) or (B, H, W), channels last, usually uint8; `mask`, `depth`, `distance` likewise.
+    * `keypoints` (B, N, 2), `boxes` or `bboxes` (B, M, 4) x1 y1 x2 y2, `polygons`, in pixels with the centre of the
+      top-left one at (0, 0); `gaze` (B, 3), `head_pose` (B, 4, 4), `rvec`, `tvec`, `points`, and all others.
+    * The camera of every row as numbers, `camera_model`, `camera_intrinsics` (B, 4), `camera_distortion` (B, n) and
+      `camera_image_size` (B, 2), see `to_columns`; without them that of the augmentation, or of the warp.
+
+    They come out with their layout and dtype, coordinates of whole numbers in float32, beside `keypoints_valid` (B, N)
+    and so on, `rotation` (B, 3, 3) and the columns of the new camera, of which `from_columns` makes a batch of cameras.
+    All other columns are passed on; numbers that might be geometry have to be named in `fields`.
+
+    Every row is computed by itself, and drawn by its key: so it comes out the same to the bit, in whatever batch, block
+    or worker, and in a loop in one process.
+
+    Args:
+        transform: an augmentation; a `Warp` or `Dewarp`; or what makes a warp of a camera, such as `ct.Dewarp` itself,
+            for rows that have cameras.
+        key: the column that names a row for ever, of whole numbers or strings, or a list of such columns. Only what
+            draws needs it. Paths should begin at the folder of the data set where they differ between machines.
+        seed, epoch: of what is drawn.
+        fields: column -> kind, for columns of other names; "keep" passes one on as it is. See `Augmentation`.
+
+    Raises:
+        TypeError: nothing that moves samples. ValueError: no key for what draws.
+    """
+
+    def __init__(
+        self,
+        transform: Moves,
+        *,
+        key: str | Sequence[str] | None = None,
+        seed: int = 0,
+        epoch: int = 0,
+        fields: Mapping[str, str] | None = None,
+    ):
+        self._move = Mover(transform, _OWNER, seed, epoch, fields)
+        self._keys = [key] if isinstance(key, str) else list(key or ())
+        if self._move.draws and not self._keys:
+            raise ValueError(
+                f'{_OWNER}: key must name the column whose value names a row, as in key="path" after '
+                "read_images(..., include_paths=True): what a row draws follows from it, and not from its place"
+            )
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw for this epoch from now on; engines that were given the function before do not hear of it."""
+        self._move.set_epoch(epoch)
+
+    def __call__(self, batch: Mapping[str, Any]) -> Batch:
+        """A batch, moved row by row.
+
+        Raises:
+            ValueError: columns of several lengths, no column of the key, and what the augmentation raises. TypeError:
+                no dict of columns.
+        """
+        if not isinstance(batch, Mapping):
+            raise TypeError(
+                f'{_OWNER}: a batch must be a dict of arrays, as of batch_format="numpy"; got {type(batch).__name__}'
+            )
+        counts = {name: len(column) for name, column in batch.items()}
+        if len(set(counts.values())) > 1:
+            raise ValueError(f"{_OWNER}: all columns must have as many rows; got {counts}")
+        missing = [name for name in self._keys if name not in batch]
+        if missing:
+            raise ValueError(f"{_OWNER}: no column {missing[0]!r} to name the rows; there are {', '.join(batch)}")
+        rows = []
+        for i in range(len(next(iter(batch.values()), ()))):
+            row = {name: column[i] for name, column in batch.items()}
+            key = self._key(row)
+            with self._move.naming(key):
+                rows.append(self._row(key, row))
+        if not rows:
+            return dict(batch)
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        result = {**batch, **{name: _column([row.get(name) for row in rows]) for name in names}}
+        for name, column in batch.items():
+            if name in names and _is_objects(column) and not _is_objects(result[name]):
+                result[name] = _objects(list(result[name]))
+        return result
+
+    def _key(self, row: Mapping[str, Any]) -> Key | None:
+        values = [row[name].item() if isinstance(row[name], np.generic) else row[name] for name in self._keys]
+        return None if not values else values[0] if len(values) == 1 else tuple(values)
+
+    def _row(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
+        """What has changed in a row."""
+        camera = {part: row[f"camera_{part}"] for part in PARTS if f"camera_{part}" in row}
+        sample: Sample = {}
+        column_of: dict[str, str] = {}
+        for name, value in row.items():
+            if name in self._keys or name.removeprefix("camera_") in PARTS or value is None:
+                continue
+            value = _dense(value)
+            field = _singular(name, value)
+            if self._move.kind(field, value) is not None or name.endswith("_valid"):
+                column_of[field], sample[field] = name, value
+        if camera:
+            sizes = [v.shape[:2] for f, v in sample.items() if self._move.kind(f, v) in IMAGES and np.ndim(v) in (2, 3)]
+            sample["camera"] = self._move.camera({k: _dense(v) for k, v in camera.items()}, sizes[0] if sizes else None)
+        moved = self._move(key, sample)
+        result: Sample = {}
+        for name, value in moved.items():
+            if isinstance(value, Camera):
+                result.update(to_columns(value, name))
+            elif name in column_of:
+                result[column_of[name]] = value
+            else:
+                field = name.removesuffix("_valid")
+                result[f"{column_of[field]}_valid" if field in column_of and field != name else name] = value
+        return result
+
+
+def _singular(name: str, value: Any) -> str:
+    """The field of a column: a column `images` holds one image in each row, unless it holds several."""
+    single = np.ndim(value) == 2 or (np.ndim(value) == 3 and value.shape[-1] <= _CHANNELS)
+    return name.removesuffix("s") if name in ("images", "masks") and single else name
+
+
+def _dense(value: Any) -> Any:
+    """An array of numbers, where it came as arrays in an array of objects."""
+    if _is_objects(value) and len(value) and all(isinstance(v, (np.ndarray, list, tuple)) for v in value):
+        parts = [_dense(np.asarray(part)) for part in value]
+        if len({part.shape for part in parts}) == 1 and not any(map(_is_objects, parts)):
+            return np.stack(parts)
+    return value
+
+
+def _is_objects(column: Any) -> bool:
+    return isinstance(column, np.ndarray) and column.dtype == object
+
+
+def _column(values: list[Any]) -> Array:
+    """Rows as one array, of objects where their shapes or types differ."""
+    if len({(getattr(v, "shape", None), getattr(v, "dtype", type(v))) for v in values}) == 1 and values[0] is not None:
+        return np.stack(values) if isinstance(values[0], np.ndarray) else np.asarray(values)
+    return _objects(values)
+
+
+def _objects(values: list[Any]) -> Array:
+    column = np.empty(len(values), object)
+    for i, value in enumerate(values):
+        column[i] = value
+    return column

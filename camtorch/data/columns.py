@@ -1,0 +1,81 @@
+"""Cameras as columns of numbers, one row a sample, for tables that hold no objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from camtorch.augment.collate import collate_cameras
+from camtorch.camera import MODELS, Camera
+
+PARTS = ("model", "intrinsics", "distortion", "image_size")
+
+
+def to_columns(camera: Camera, name: str = "camera") -> dict[str, Any]:
+    """A camera as numbers: `camera_model`, the key in `ct.MODELS`; `camera_intrinsics` (4,) fx, fy, cx, cy in pixels;
+    `camera_distortion` (n,); `camera_image_size` (2,), height and width.
+
+    Of a batch of B cameras all have a row each: (B, 4) and so on.
+
+    Args:
+        camera: with an image_size, and one batch dim at most.
+        name: another one for "camera".
+
+    Raises:
+        TypeError: no camera. ValueError: one without image_size, or of several batch dims.
+    """
+    if not isinstance(camera, Camera):
+        raise TypeError(f"to_columns: camera must be a Camera; got {type(camera).__name__}")
+    if camera.image_size is None or len(camera.batch_shape) > 1:
+        raise ValueError(
+            "to_columns: the camera must have an image_size and one batch dim at most; got image_size "
+            f"{camera.image_size} and batch dims {tuple(camera.batch_shape)}"
+        )
+    numbers = [t.detach().cpu().numpy() for t in (camera.intrinsics, camera.distortion)]
+    batch = tuple(camera.batch_shape)
+    rows = [np.broadcast_to(v, (*batch, v.shape[-1])).copy() for v in (*numbers, np.asarray(camera.image_size))]
+    model = np.full(batch, camera.key) if batch else camera.key
+    return {f"{name}_{part}": value for part, value in zip(PARTS, (model, *rows), strict=True)}
+
+
+def from_columns(columns: Mapping[str, Any], name: str = "camera") -> Camera | list[Camera]:
+    """The camera of a row, or those of a batch: a batch of cameras, or a list where models or sizes differ.
+
+    Args:
+        columns: with those of `to_columns`, and any others; `camera_distortion` may lack.
+        name: another one for "camera".
+
+    Returns:
+        Cameras that do not learn, of the dtype of the columns.
+
+    Raises:
+        ValueError: columns that lack, or are not those of a camera.
+    """
+    missing = [f"{name}_{part}" for part in ("model", "intrinsics", "image_size") if f"{name}_{part}" not in columns]
+    if missing:
+        raise ValueError(f"from_columns: {', '.join(missing)} is missing; to_columns makes the columns of a camera")
+    parts = {part: columns[f"{name}_{part}"] for part in PARTS if f"{name}_{part}" in columns}
+    if isinstance(parts["model"], str) or np.ndim(parts["model"]) == 0:
+        return camera_of(parts, "from_columns")
+    rows = [{part: values[i] for part, values in parts.items()} for i in range(len(parts["model"]))]
+    return collate_cameras([camera_of(row, "from_columns") for row in rows])
+
+
+def camera_of(parts: Mapping[str, Any], owner: str) -> Camera:
+    """The frozen camera of model, intrinsics, distortion and image_size."""
+    model = str(parts["model"])
+    if model not in MODELS:
+        raise ValueError(f"{owner}: the model of a camera must be one of {', '.join(MODELS)}; got {model!r}")
+    numbers = [_numbers(parts[part]) for part in ("intrinsics", "distortion") if parts.get(part) is not None]
+    height, width = (int(side) for side in parts["image_size"])
+    camera: Camera = MODELS[model](*(n for n in numbers if n.size), image_size=(height, width))
+    return camera.requires_grad_(False)
+
+
+def _numbers(values: Any) -> np.ndarray[Any, Any]:
+    """An array of its own; lists and arrays of objects are of float64."""
+    array = values.numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+    return np.array(array, array.dtype if array.dtype.kind == "f" else np.float64)

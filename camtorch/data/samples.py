@@ -1,0 +1,164 @@
+"""Samples as WebDataset decodes them: an image by its file name's ending, labels of JSON, and the key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from camtorch.augment.sample import IMAGES, KEEP, KINDS, Sample
+from camtorch.camera import Camera
+from camtorch.data.columns import PARTS, to_columns
+from camtorch.data.moving import Mover, Moves
+
+_OWNER = "MapSamples"
+_ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "npy")
+_VALID = "_valid"
+
+
+class MapSamples:
+    """Augments, or warps, samples of a WebDataset pipeline, one by one: the function of its `.map`.
+
+        samples = wds.WebDataset("train-{00..15}.tar").decode("rgb8")
+        samples = samples.map(ct.data.MapSamples(augment, seed=0))
+
+    A sample is a dict of decoded entries:
+
+    * `jpg`, `png`, `webp` and so on: the image, a uint8 array (H, W, C) or (H, W). `mask.png`, `depth.npy`: what the
+      name says, moved as such.
+    * `json`: an object of labels, named as the fields of an `Augmentation`, of numbers in lists or arrays:
+      `keypoints` [[x, y], ...], `boxes` [[x1, y1, x2, y2], ...], `gaze` [x, y, z], `head_pose` and so on; and `camera`,
+      an object of `model`, `intrinsics`, `distortion` and `image_size`, if the transform has none.
+
+    Lists come out as lists, arrays as arrays, in the same places. `keypoints_valid` and so on, `rotation` and the new
+    `camera` join the labels, so that a `ShardWriter` can write what comes out. Everything else is passed on.
+
+    A sample is drawn by its key: it comes out the same to the bit from whatever shard, node or worker.
+
+    Args:
+        transform: an augmentation; a `Warp` or `Dewarp`; or what makes a warp of a camera, such as `ct.Dewarp`.
+        key: the entry that names a sample for ever. Where several shards hold the same keys, something that tells
+            them apart has to be put in.
+        labels: the entry of labels.
+        seed, epoch: of what is drawn.
+        fields: name -> kind, for entries and labels of other names; "keep" passes one on as it is.
+
+    Raises:
+        TypeError: nothing that moves samples.
+    """
+
+    def __init__(
+        self,
+        transform: Moves,
+        *,
+        key: str = "__key__",
+        labels: str = "json",
+        seed: int = 0,
+        epoch: int = 0,
+        fields: Mapping[str, str] | None = None,
+    ):
+        self._move = Mover(transform, _OWNER, seed, epoch, fields)
+        self._key, self._labels = key, labels
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw for this epoch from now on; workers that run already do not hear of it."""
+        self._move.set_epoch(epoch)
+
+    def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+        """A sample, moved.
+
+        Raises:
+            ValueError: no key, images that are not decoded, and what the augmentation raises. TypeError: no dict.
+        """
+        if not isinstance(sample, Mapping):
+            raise TypeError(
+                f"{_OWNER}: a sample must be a dict of entries, before .to_tuple; got {type(sample).__name__}"
+            )
+        if self._move.draws and self._key not in sample:
+            raise ValueError(f"{_OWNER}: no {self._key!r} to name the sample; it has {', '.join(map(str, sample))}")
+        with self._move.naming(sample.get(self._key)):
+            return self._moved(sample)
+
+    def _moved(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+        labels = sample.get(self._labels, {})
+        if not isinstance(labels, Mapping):
+            raise TypeError(
+                f"{_OWNER}: {self._labels} must be an object of labels; got {type(labels).__name__}"
+                + (". Undecoded ones are decoded by .decode()" if isinstance(labels, bytes) else "")
+            )
+        fields: Sample = {}
+        entry_of: dict[str, str] = {}
+        for name, value in sample.items():
+            field = None if name in (self._key, self._labels) else self._field(name, value)
+            if field is not None:
+                if field in fields or field in labels:
+                    raise ValueError(f"{_OWNER}: {name} and {entry_of.get(field, self._labels)} both hold {field}")
+                fields[field], entry_of[field] = value, name
+        lists = set()
+        for name, value in labels.items():
+            if name == "camera" or value is None:
+                continue
+            if name.endswith(_VALID) or self._move.kind(name, value) is not None:
+                if isinstance(value, list):
+                    lists.add(name)
+                    value = _array(name, value, self._move.kind(name, value))
+                fields[name] = value
+        camera = labels.get("camera")
+        if camera is not None:
+            sizes = [v.shape[:2] for n, v in fields.items() if self._move.kind(n, v) in IMAGES]
+            fields["camera"] = camera if isinstance(camera, Camera) else self._move.camera(camera, *sizes[:1] or [None])
+        result, told = dict(sample), dict(labels)
+        for name, value in self._move(sample.get(self._key), fields).items():
+            if name in entry_of:
+                result[entry_of[name]] = value
+            elif isinstance(value, Camera):
+                numbers = to_columns(value, "")
+                told[name] = {part: _plain(numbers[f"_{part}"]) for part in PARTS}
+            elif name == "image_valid":
+                result[f"{name}.npy"] = value
+            else:
+                told[name] = value if name in labels and name not in lists else _plain(value)
+        result[self._labels] = told
+        return result
+
+    def _field(self, entry: str, value: Any) -> str | None:
+        """The field that an entry holds, or None if it is passed on."""
+        if entry.startswith("__"):
+            return None
+        stem, _, ending = entry.rpartition(".")
+        if entry in self._move.fields:
+            return entry
+        name = stem if ending in _ENDINGS else entry
+        if not stem and ending in _ENDINGS and ending != "npy":
+            name = "image"
+        if ending in _ENDINGS and isinstance(value, (bytes, bytearray)):
+            raise ValueError(f'{_OWNER}: {entry} is not decoded; .decode("rgb8") before .map makes arrays of images')
+        if self._move.kind(name or entry, value) is None:
+            if ending in _ENDINGS and np.ndim(value) >= 2:
+                raise ValueError(
+                    f"{_OWNER}: whether {entry} moves is not known; fields={{{entry!r}: KIND}} says so, where KIND is "
+                    f"{', '.join(IMAGES)} or {KEEP}, among others"
+                )
+            return None
+        if name in KINDS and not isinstance(value, np.ndarray):
+            raise TypeError(
+                f'{_OWNER}: {entry} must be a numpy array, as of .decode("rgb8"); got {type(value).__name__}'
+            )
+        return name
+
+
+def _array(name: str, value: list[Any], kind: str | None) -> np.ndarray[Any, Any]:
+    """A label as an array: of float64, or of bool for validity."""
+    try:
+        array = np.asarray(value, bool if kind is None else np.float64)
+    except (ValueError, TypeError):
+        raise ValueError(f"{_OWNER}: {name} must be numbers in lists of one length; got {value!r:.80}") from None
+    if array.size or kind is None:
+        return array
+    return array.reshape(*[0] * (KINDS[kind].dims - 1), *KINDS[kind].last)
+
+
+def _plain(value: Any) -> Any:
+    """Of Python's own types, as JSON takes them."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

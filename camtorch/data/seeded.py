@@ -1,0 +1,150 @@
+"""Draws that follow from the key of a sample, and from neither its batch, nor its worker, nor what came before it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from camtorch._arguments import as_whole
+from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.numpy import Transform
+from camtorch.augment.sample import Sample
+
+Key = int | str | Sequence["int | str"]
+"""What names a sample: its index, its path, or a tuple of several of these."""
+
+
+def generator(key: Key, *, seed: int = 0, epoch: int = 0) -> torch.Generator:
+    """A generator for one sample, the same on every machine, to draw from by `augmentation(..., generator=...)`.
+
+    Args:
+        key: of the sample, the same whenever it comes; a tuple, as of a path and a number, is one key.
+        seed: of the whole run.
+        epoch: so that a sample is drawn anew in each of them.
+
+    Raises:
+        TypeError: a key that is neither an integer nor a string nor a tuple of them; a seed or an epoch that is no
+            integer. ValueError: a negative one.
+    """
+    numbers = _number(seed, "seed"), _number(epoch, "epoch")
+    digest = hashlib.blake2b(repr((*numbers, _plain(key))).encode(), digest_size=8).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest, "little"))
+
+
+def _number(value: int, name: str) -> int:
+    whole = as_whole(value, name, "generator")
+    if not 0 <= whole < 1 << 63:
+        raise ValueError(f"generator: {name} must be 0 or more, and below 2 to the 63rd; got {value}")
+    return whole
+
+
+def _plain(key: object) -> object:
+    """The key of Python's own types, whatever library it comes from."""
+    if isinstance(key, (np.ndarray, Tensor)) and key.ndim == 0:
+        key = key.item()
+    if isinstance(key, (tuple, list)) and key:
+        return tuple(map(_plain, key))
+    if isinstance(key, (int, np.integer)) and not isinstance(key, bool):
+        return int(key)
+    if isinstance(key, str):
+        return str(key)
+    raise TypeError(
+        "generator: key must be what names a sample on every machine and in every run, an integer, a string or a tuple "
+        f"of them; got {key!r:.60}"
+    )
+
+
+class Seeded:
+    """An augmentation whose draw for a sample follows from the sample's key, a seed and the epoch alone.
+
+    So it does not matter which process, rank or worker takes the sample, in which batch, after which others, or after
+    an interruption: there is no state of a generator to be saved. In a dataset, `augment(image=..., key=index)`; of a
+    batch, with its keys as a list or a tensor, `augment(batch, key=batch["index"])`, drawn as one by one.
+
+        augment = ct.data.Seeded(ct.augment.RandomMount(camera=camera), seed=0)
+        for epoch in range(10):
+            augment.set_epoch(epoch)  # the workers of a DataLoader hear of it, also those that persist
+            for batch in loader: ...
+
+    Args:
+        augmentation: an `Augmentation`, or a `Transform` of `camtorch.augment.numpy`.
+        seed: of the whole run, the same in all ranks.
+        epoch: the first.
+
+    Raises:
+        TypeError: another kind of transform. ValueError: one that draws for whole batches (`same_on_batch`).
+    """
+
+    def __init__(self, augmentation: Augmentation | Transform, *, seed: int = 0, epoch: int = 0):
+        inner = augmentation.augmentation if isinstance(augmentation, Transform) else augmentation
+        if not isinstance(inner, Augmentation):
+            raise TypeError(
+                "Seeded: augmentation must be an Augmentation, or camtorch.augment.numpy's Transform of one; got "
+                f"{type(inner).__name__}"
+            )
+        if inner.same_on_batch:
+            raise ValueError("Seeded: same_on_batch=True draws by the batch, and here no draw depends on the batch")
+        self.augmentation, self._inner = augmentation, inner
+        # in memory that processes share, for those which have begun already
+        self._numbers = torch.tensor([_number(seed, "seed"), _number(epoch, "epoch")]).share_memory_()
+
+    @property
+    def seed(self) -> int:
+        """Of the whole run."""
+        return int(self._numbers[0])
+
+    @property
+    def epoch(self) -> int:
+        """The present one."""
+        return int(self._numbers[1])
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw for this epoch from now on, here and in the workers of a DataLoader; between two of its iterations."""
+        self._numbers[1] = _number(epoch, "epoch")
+
+    def generator(self, key: Key) -> torch.Generator:
+        """The generator of a sample."""
+        return generator(key, seed=self.seed, epoch=self.epoch)
+
+    def draw(self, keys: Sequence[Key] | Tensor | np.ndarray[Any, Any]) -> dict[str, Tensor]:
+        """The draw of a batch of samples, `augmentation.draw` of each one by itself."""
+        draws = [self._inner.draw(1, self.generator(key)) for key in keys]
+        if not draws:
+            return self._inner.draw(0)
+        return {name: torch.cat([draw[name] for draw in draws]) for name in draws[0]}
+
+    def __call__(
+        self,
+        sample: Mapping[str, Any] | None = None,
+        *,
+        key: Key | Sequence[Key] | Tensor | np.ndarray[Any, Any],
+        **fields: Any,
+    ) -> Sample:
+        """Augment a sample, a dict or keyword arguments, by its key; or a batch, by a list or a tensor of its keys."""
+        many = key.ndim > 0 if isinstance(key, (Tensor, np.ndarray)) else isinstance(key, list)
+        if not many:
+            return self.augmentation(sample, generator=self.generator(key), **fields)  # type: ignore[arg-type]
+        if isinstance(self.augmentation, Transform):
+            raise TypeError(f"Seeded: a Transform of arrays takes one sample, and one key; got {key!r:.60}")
+        return self.augmentation(sample, draw=self.draw(key), **fields)  # type: ignore[arg-type]
+
+    def state_dict(self) -> dict[str, int]:
+        """What a checkpoint needs: the seed and the epoch."""
+        return {"seed": self.seed, "epoch": self.epoch}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Go on from a checkpoint, also in the workers of a DataLoader."""
+        numbers = _number(state["seed"], "seed"), _number(state["epoch"], "epoch")
+        self._numbers.copy_(torch.tensor(numbers))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._numbers.share_memory_()
+
+    def __repr__(self) -> str:
+        return f"Seeded({self.augmentation!r}, seed={self.seed}, epoch={self.epoch})"

@@ -1,0 +1,367 @@
+"""Samples by their keys: draws, batches of arrays and WebDataset's samples are the same however they are divided."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+import torch
+import webdataset as wds
+from torch.utils.data import DataLoader, Dataset
+
+import camtorch as ct
+import camtorch.augment.numpy
+
+SIZE = (24, 32)
+
+
+def camera(dtype=torch.float32):
+    intrinsics = torch.tensor([18.0, 18.2, 15.4, 11.6], dtype=dtype)
+    coefficients = torch.tensor([0.02, -0.01, 0.004, -0.001], dtype=dtype)
+    return ct.KannalaBrandt(intrinsics, coefficients, image_size=SIZE).requires_grad_(False)
+
+
+def augmentation(**options):
+    options = {"yaw": 8, "pitch": 8, "roll": 10, "p": 0.8, "min_filled": 0.9, "camera": camera()} | options
+    return ct.augment.RandomCamera(**options)
+
+
+def rows(count=4, ragged=False):
+    """A list of rows."""
+    rng = np.random.default_rng(0)
+    return [
+        {
+            "path": f"day/{i}.jpg",
+            "image": rng.integers(0, 255, (*SIZE, 3), np.uint8),
+            "mask": rng.integers(0, 3, SIZE),
+            "keypoints": rng.uniform(2, 20, (i % 4 if ragged else 3, 2)).astype(np.float32),
+            "boxes": rng.uniform(2, 10, (1, 4)) * [1, 1, 2, 2],
+            "gaze": np.float32([0.1, 0, -1]),
+            "head_pose": np.eye(4, dtype=np.float32),
+            "label": i,
+        }
+        for i in range(count)
+    ]
+
+
+def column(values):
+    if len({(np.shape(value), np.asarray(value).dtype.name) for value in values}) == 1:
+        return np.stack(values)
+    result = np.empty(len(values), object)
+    for i, value in enumerate(values):
+        result[i] = value
+    return result
+
+
+def batch(some):
+    return {name: column([row[name] for row in some]) for name in some[0]}
+
+
+def apart(columns):
+    return [{name: column[i] for name, column in columns.items()} for i in range(len(columns["path"]))]
+
+
+def assert_same(found, expected):
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert np.asarray(found[name]).dtype == np.asarray(value).dtype, name
+        np.testing.assert_array_equal(found[name], value, err_msg=name)
+
+
+# -- draws by keys
+
+
+def test_a_key_says_what_is_drawn_on_every_machine():
+    draw = ct.augment.RandomMount().draw(1, ct.data.generator(("day/3.jpg", 1), seed=7, epoch=2))
+    # pinned: what was drawn for a data set is to be drawn again by the next version
+    assert [round(float(value), 9) for value in draw.values()] == [1.0, -0.135368969, 5.922456888, -0.341305659, 1.0]
+    same = [5, np.int64(5), np.array(5), torch.tensor(5)]
+    assert len({ct.data.generator(key).initial_seed() for key in same}) == 1
+    others = [5, "5", (5,), (5, 0), (0, 5), 6]
+    seeds = [ct.data.generator(key, seed=s, epoch=e).initial_seed() for key in others for s in (0, 1) for e in (0, 1)]
+    assert len(set(seeds)) == len(seeds)
+    for key in (0.5, None, b"5", True, (), ("a", None), np.arange(2)):
+        with pytest.raises(TypeError, match="generator: key must be what names a sample"):
+            ct.data.generator(key)
+    for numbers in ({"seed": -1}, {"epoch": 1 << 63}):
+        with pytest.raises(ValueError, match=r"must be 0 or more, and below 2 to the 63rd; got"):
+            ct.data.generator(0, **numbers)
+
+
+def test_a_batch_is_drawn_as_one_by_one():
+    augment = ct.data.Seeded(augmentation(), seed=3, epoch=1)
+    keys = torch.tensor([4, 2, 9])
+    whole = augment.draw(keys)
+    for i, key in enumerate(keys):
+        for name, value in augment.augmentation.draw(1, augment.generator(key)).items():
+            assert torch.equal(whole[name][i], value[0]), name
+    images = torch.rand(3, 1, *SIZE)
+    moved = augment({"image": images}, key=keys)
+    single = augment(image=images[1], key=2)
+    torch.testing.assert_close(moved["image"][1], single["image"], rtol=0, atol=1e-4)
+    assert augment.draw([])["yaw"].shape == (0,)
+    with pytest.raises(ValueError, match="same_on_batch=True draws by the batch"):
+        ct.data.Seeded(augmentation(same_on_batch=True))
+    with pytest.raises(TypeError, match="Seeded: augmentation must be an Augmentation"):
+        ct.data.Seeded(ct.Dewarp(camera()))
+    with pytest.raises(TypeError, match="takes one sample, and one key"):
+        ct.data.Seeded(camtorch.augment.numpy.Transform(augmentation()))(image=images.numpy(), key=[1, 2, 3])
+
+
+def test_a_state_goes_on_in_another_process():
+    augment = ct.data.Seeded(augmentation(), seed=3)
+    augment.set_epoch(5)
+    other = ct.data.Seeded(augmentation())
+    other.load_state_dict(json.loads(json.dumps(augment.state_dict())))
+    for again in (other, pickle.loads(pickle.dumps(augment))):
+        assert (again.seed, again.epoch) == (3, 5)
+        assert torch.equal(again.draw([1])["yaw"], augment.draw([1])["yaw"])
+    augment.set_epoch(6)
+    assert other.epoch == 5
+
+
+class Images(Dataset):
+    def __init__(self):
+        self.augment = ct.data.Seeded(augmentation(), seed=1)
+
+    def __len__(self):
+        return 6
+
+    def __getitem__(self, index):
+        moved = self.augment(image=torch.linspace(0, 1, 768).reshape(1, *SIZE), key=index)
+        return {"image": moved["image"], "index": index}
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_workers_that_persist_hear_of_the_epoch():
+    if "fork" not in torch.multiprocessing.get_all_start_methods():
+        pytest.skip("this system cannot fork")
+    data = Images()
+    loader = DataLoader(
+        data, batch_size=2, num_workers=2, multiprocessing_context="fork", persistent_workers=True, shuffle=True
+    )
+    epochs = []
+    for epoch in (0, 1, 0):
+        data.augment.set_epoch(epoch)
+        found = {int(i): image for b in loader for i, image in zip(b["index"], b["image"], strict=True)}
+        assert all(torch.equal(found[i], data[i]["image"]) for i in range(len(data)))
+        epochs.append(torch.stack([found[i] for i in range(len(data))]))
+    assert torch.equal(epochs[0], epochs[2])
+    assert not torch.equal(epochs[0], epochs[1])
+
+
+# -- batches of arrays
+
+
+@pytest.mark.parametrize("ragged", [False, True])
+def test_rows_are_the_same_in_every_batch(ragged):
+    some = rows(ragged=ragged)
+    function = ct.data.MapBatches(augmentation(), key="path", seed=4, epoch=1)
+    whole = function(batch(some))
+    assert whole["image"].dtype == np.uint8
+    assert whole["image"].shape == (len(some), *SIZE, 3)
+    assert whole["mask"].dtype == np.int64
+    assert whole["boxes"].dtype == np.float64
+    assert (whole["keypoints"].dtype == object) == ragged
+    assert whole["label"].tolist() == list(range(len(some)))
+    for size in (1, 3):
+        order = np.random.default_rng(size).permutation(len(some))
+        for start in range(0, len(some), size):
+            part = [some[i] for i in order[start : start + size]]
+            for moved, i in zip(apart(function(batch(part))), order[start : start + size], strict=True):
+                assert_same(moved, apart(whole)[i])
+    transform = camtorch.augment.numpy.Transform(augmentation())
+    for moved, row in zip(apart(whole), some, strict=True):
+        fields = {name: row[name] for name in row.keys() - {"path", "label"}}
+        alone = transform(fields, generator=ct.data.generator(row["path"], seed=4, epoch=1))
+        new = alone.pop("camera")
+        assert_same({name: moved[name] for name in alone}, alone)
+        assert ct.data.from_columns(moved).intrinsics.tolist() == new.intrinsics.tolist()
+    function.set_epoch(2)
+    assert not np.array_equal(function(batch(some))["rotation"], whole["rotation"])
+
+
+def test_rows_have_cameras_of_their_own():
+    cameras = [camera(), ct.Pinhole.from_fov(70, image_size=SIZE).double(), camera(torch.float64)]
+    some = [row | ct.data.to_columns(one) for row, one in zip(rows(3), cameras, strict=True)]
+    moved = ct.data.MapBatches(augmentation(camera=None), key=["path", "label"], seed=1)(batch(some))
+    for i, (row, one) in enumerate(zip(some, cameras, strict=True)):
+        assert ct.data.from_columns(row).intrinsics.dtype == one.intrinsics.dtype
+        alone = augmentation(camera=None)(
+            gaze=torch.from_numpy(row["gaze"]),
+            camera=one.requires_grad_(False),
+            generator=ct.data.generator((row["path"], i), seed=1),
+        )
+        now = ct.data.from_columns({name: values[i] for name, values in moved.items()})
+        assert type(now) is type(one)
+        assert torch.equal(now.intrinsics, alone["camera"].intrinsics)
+        assert torch.equal(now.distortion, alone["camera"].distortion)
+        assert moved["gaze"][i].tolist() == alone["gaze"].tolist()
+    listed = ct.data.from_columns(moved)
+    assert [type(one) for one in listed] == [type(one) for one in cameras]
+    columns = ct.data.to_columns(ct.augment.collate([camera(), camera()]))
+    assert tuple(ct.data.from_columns(columns).batch_shape) == (2,)
+    dewarped = ct.data.MapBatches(ct.Dewarp)(batch(some))
+    for i, one in enumerate(cameras):
+        dewarp = ct.Dewarp(one)
+        image = torch.from_numpy(some[i]["image"]).permute(2, 0, 1)[None]
+        assert np.array_equal(dewarped["image"][i], dewarp(image)[0].permute(1, 2, 0))
+        points, valid = dewarp.transform_points(torch.from_numpy(some[i]["keypoints"]))
+        assert np.array_equal(dewarped["keypoints_valid"][i], valid)
+        np.testing.assert_array_equal(dewarped["keypoints"][i], points.numpy().astype(np.float32))
+
+
+def test_a_warp_of_one_camera_for_all_rows():
+    learns = ct.KannalaBrandt(camera().intrinsics, camera().distortion.clone(), image_size=SIZE)
+    dewarp = ct.Dewarp(learns, rotation=ct.augment.mount_rotation(*torch.tensor([10.0, 0, 0])))
+    some = rows()
+    moved = ct.data.MapBatches(dewarp)(batch(some))
+    images = torch.from_numpy(batch(some)["image"]).permute(0, 3, 1, 2)
+    assert np.array_equal(moved["image"], dewarp(images).permute(0, 2, 3, 1).numpy())
+    assert np.array_equal(moved["rotation"][0], dewarp.rotation.numpy())
+    turned = moved["head_pose"][0][:3, :3]
+    np.testing.assert_allclose(turned, dewarp.rotation, atol=1e-6)
+    assert (moved["camera_model"] == "pinhole").all()
+
+
+def test_columns_as_engines_hand_them_over():
+    some = rows(3)
+    whole = batch(some)
+    for array in whole.values():
+        array.setflags(write=False)
+    function = ct.data.MapBatches(augmentation(fields={"score": "keep"}), key="path", fields={"nose": "keypoints"})
+    expected = function(whole)
+    nested = np.empty(3, object)  # lists in lists, as Arrow has them
+    for i, row in enumerate(some):
+        nested[i] = np.empty(3, object)
+        for j, point in enumerate(row["keypoints"]):
+            nested[i][j] = point
+    given = whole | {"keypoints": nested, "path": list(whole["path"]), "images": whole["image"], "none": [None] * 3}
+    del given["image"]
+    given["nose"], given["score"] = whole["keypoints"], np.ones((3, 2))
+    found = function(given)
+    assert np.array_equal(found["images"], expected["image"])
+    assert np.array_equal(found["score"], given["score"])
+    for i in range(3):
+        assert np.array_equal(found["keypoints"][i], expected["keypoints"][i])
+        assert np.array_equal(found["nose"][i], expected["keypoints"][i])
+        assert np.array_equal(found["nose_valid"][i], expected["keypoints_valid"][i])
+    assert "image" not in found
+    empty = function({name: values[:0] for name, values in whole.items()})
+    assert {name: len(values) for name, values in empty.items()} == dict.fromkeys(whole, 0)
+
+
+def test_wrong_batches_are_told():
+    function = ct.data.MapBatches(augmentation(), key="path")
+    some = batch(rows(2))
+    with pytest.raises(ValueError, match='key must name the column whose value names a row, as in key="path"'):
+        ct.data.MapBatches(augmentation())
+    with pytest.raises(TypeError, match=r"an augmentation, a Warp, or what makes a Warp of a camera.*got Linear"):
+        ct.data.MapBatches(torch.nn.Linear(1, 1))
+    with pytest.raises(TypeError, match='as of batch_format="numpy"; got list'):
+        function([1])
+    with pytest.raises(ValueError, match="all columns must have as many rows"):
+        function(some | {"label": [1]})
+    with pytest.raises(ValueError, match="no column 'path' to name the rows; there are image"):
+        function({"image": some["image"]})
+    with pytest.raises(ValueError, match=r"sample 'day/0.jpg': RandomCamera: image is \(12, 32\)"):
+        function({"path": some["path"], "image": some["image"][:, :12]})
+    with pytest.raises(ValueError, match="'score' holds real numbers"):
+        function(some | {"score": np.ones((2, 3))})
+    with pytest.raises(ValueError, match="no camera in the sample, of which a warp is made; it has image"):
+        ct.data.MapBatches(ct.Dewarp)({"image": some["image"]})
+    with pytest.raises(ValueError, match=r"the camera has no model; ct.data.to_columns tells all of it"):
+        function(some | {"camera_intrinsics": np.ones((2, 4))})
+    with pytest.raises(ValueError, match=r"must be one of brown_conrady, .*; got 'opencv'"):
+        function(some | {"camera_intrinsics": np.ones((2, 4)), "camera_model": ["opencv"] * 2})
+    ground = ct.BirdsEye(camera(), ct.Extrinsics([2.0, 0, 0], [0, 0, 2.0]), x=(-1, 1), y=(1, 3), resolution=0.1)
+    with pytest.raises(TypeError, match="BirdsEye moves images alone"):
+        ct.data.MapBatches(ground)
+
+
+# -- samples of WebDataset
+
+
+def write_shards(folder, some, count):
+    """Shards of samples, taken in turns."""
+    paths = [folder / f"{count}-{i}.tar" for i in range(count)]
+    for i, path in enumerate(paths):
+        with wds.TarWriter(str(path)) as tar:
+            for row in some[i::count]:
+                labels = {name: row[name].tolist() for name in ("keypoints", "boxes", "gaze", "head_pose")}
+                labels |= {"name": "somebody", "keypoints_valid": [True, False, True]}
+                entries = {"__key__": row["path"].removesuffix(".jpg"), "png": row["image"], "json": labels}
+                tar.write(entries | {"mask.png": row["mask"].astype(np.uint8), "cls": row["label"]})
+    return [str(path) for path in paths]
+
+
+def moved_shards(paths, **options):
+    handlers = [
+        wds.handle_extension("mask.png", lambda data: np.asarray(wds.autodecode.imagehandler("l8")("png", data)))
+    ]
+    shards = wds.WebDataset(paths, shardshuffle=False, empty_check=False).decode(*handlers, "rgb8")
+    function = ct.data.MapSamples(augmentation(**options), seed=2)
+    return {sample["__key__"]: sample for sample in shards.map(function)}
+
+
+# webdataset leaves that to the collector
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_shards_are_the_same_however_they_are_divided(tmp_path):
+    some = rows()
+    whole, parts = (moved_shards(write_shards(tmp_path, some, count)) for count in (1, 3))
+    assert whole.keys() == parts.keys()
+    transform = camtorch.augment.numpy.Transform(augmentation())
+    for row in some:
+        key = row["path"].removesuffix(".jpg")
+        sample = whole[key]
+        assert {name for name in sample if not name.startswith("__")} == {"png", "mask.png", "json", "cls"}
+        fields = {name: row[name] for name in ("image", "mask", "gaze", "head_pose")}
+        fields["keypoints"] = row["keypoints"].astype(np.float64)
+        alone = transform(fields, generator=ct.data.generator(key, seed=2))
+        assert np.array_equal(sample["png"], alone["image"])
+        assert np.array_equal(sample["mask.png"], alone["mask"])
+        assert sample["mask.png"].ndim == 2
+        assert sample["json"]["keypoints"] == alone["keypoints"].tolist()
+        assert sample["json"]["keypoints_valid"] == (alone["keypoints_valid"] & [True, False, True]).tolist()
+        assert np.array_equal(sample["png"], parts[key]["png"])
+        assert json.dumps(sample["json"]) == json.dumps(parts[key]["json"])
+        assert sample["json"]["name"] == "somebody"
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_what_comes_out_is_written_and_read_again(tmp_path):
+    (path,) = write_shards(tmp_path, rows(2), 1)
+    moved = moved_shards([path], valid_mask=True)
+    with wds.TarWriter(str(tmp_path / "new.tar")) as tar:
+        for sample in moved.values():
+            tar.write(sample)
+    back = {s["__key__"]: s for s in wds.WebDataset(str(tmp_path / "new.tar"), shardshuffle=False).decode("rgb8")}
+    for key, sample in moved.items():
+        assert np.array_equal(back[key]["png"], sample["png"])
+        assert np.array_equal(back[key]["image_valid.npy"], sample["image_valid.npy"])
+        assert back[key]["json"] == sample["json"]
+        again = ct.data.MapSamples(ct.Dewarp)({"png": sample["png"], "json": sample["json"]})
+        assert again["json"]["camera"]["model"] == "pinhole"
+
+
+def test_wrong_samples_are_told():
+    function = ct.data.MapSamples(augmentation())
+    sample = {"__key__": "a", "jpg": rows(1)[0]["image"], "json": {}}
+    for change, message in (
+        ({"jpg": b"JFIF"}, r'jpg is not decoded; .decode\("rgb8"\) before .map'),
+        ({"jpg": torch.zeros(3, *SIZE)}, r'jpg must be a numpy array, as of .decode\("rgb8"\); got Tensor'),
+        ({"json": b"{}"}, "json must be an object of labels; got bytes. Undecoded ones"),
+        ({"left.png": sample["jpg"]}, "whether left.png moves is not known; fields={'left.png': KIND}"),
+        ({"png": sample["jpg"]}, "png and jpg both hold image"),
+        ({"json": {"keypoints": [[1, 2], [3]]}}, "keypoints must be numbers in lists of one length"),
+        ({"json": {"scores": [0.5]}}, "'scores' holds real numbers"),
+        ({"json": {"camera": {"model": "pinhole"}}}, "the camera has no intrinsics"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            function(sample | change)
+    with pytest.raises(ValueError, match="no '__key__' to name the sample; it has jpg"):
+        function({"jpg": sample["jpg"]})
+    with pytest.raises(TypeError, match=r"must be a dict of entries, before .to_tuple; got tuple"):
+        function(("jpg",))
+    empty = function(sample | {"json": {"keypoints": [], "polygons": [], "boxes": None}})
+    assert (empty["json"]["keypoints"], empty["json"]["polygons"], empty["json"]["boxes"]) == ([], [], None)
