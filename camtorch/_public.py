@@ -1,6 +1,6 @@
 """The names that `camtorch` shows: this file imports what `camtorch/__init__.py` hands out at first use."""
 
-from camtorch import augment, data, io
+from camtorch import augment, data, io, lenses
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
 from camtorch.calibration.pnp import solve_pnp
@@ -100,6 +100,7 @@ __all__ = [
     "data",
     "fit",
     "io",
+    "lenses",
     "load",
     "native_available",
     "rectify",

@@ -18,7 +18,8 @@ from camtorch.augment.change import frozen, numbers_by, remade, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera, from_values
-from camtorch.models import MODELS
+from camtorch.lenses.drawing import covering, lenses_for
+from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.domain import Domain, domain_of, keep
 from camtorch.projection.rays import field_of_view, image_lattice
 from camtorch.projection.unproject import shown
@@ -33,6 +34,10 @@ DRAWN = 16
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
 _STEP = 1e-4
 _PARTS = -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step that is too long, in the order in which they are tried
+_REAL = "real"
+_FOCAL, _CENTRE, _DISTORTION, _CROP = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02), (0.9, 1.0)
+_LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05)
+_USUAL = tuple(map(id, (_FOCAL, _CENTRE, _DISTORTION, _CROP, _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION)))
 _SIDE = 9
 _EDGE_SAMPLES = 32
 _AZIMUTHS = 128
@@ -47,8 +52,10 @@ class RandomCamera(Augmentation):
 
     Args:
         like: whose lens the new camera has. None: the sample's own camera. A Camera, whose numbers are copied and do
-            not learn. The name of a preset, see
-            `PRESETS`. A key of `ct.MODELS`, for that model with zero coefficients; it needs `fov`.
+            not learn. The name of a preset, see `PRESETS`. A key of `ct.MODELS`, for that model with zero
+            coefficients; it needs `fov`. "real": for each sample one of 7,000 calibrated lenses (`ct.lenses`), even
+            chances for all whose images, cropped to the new shape, have a field of view in the range of `fov`. Every
+            pixel has a ray. As lenses vary enough, focal, centre, distortion and crop then do nothing unless given.
         camera: of samples that do not bring one.
         yaw: degrees by which the camera turns to its right.
         pitch: degrees by which it then looks up.
@@ -90,10 +97,10 @@ class RandomCamera(Augmentation):
         roll: RangeLike | None = (-10.0, 10.0),
         zoom: RangeLike | None = (1.0, 1.0),
         fov: RangeLike | Literal["source"] | None = None,
-        focal: RangeLike | None = (0.95, 1.05),
-        centre: RangeLike | None = (-0.02, 0.02),
-        distortion: RangeLike | None = (-0.02, 0.02),
-        crop: RangeLike | None = (0.9, 1.0),
+        focal: RangeLike | None = _FOCAL,
+        centre: RangeLike | None = _CENTRE,
+        distortion: RangeLike | None = _DISTORTION,
+        crop: RangeLike | None = _CROP,
         chromatic: RangeLike | None = None,
         vignetting: RangeLike | None = None,
         image_size: tuple[int, int] | None = None,
@@ -103,7 +110,12 @@ class RandomCamera(Augmentation):
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
         self._memo, self._plane = Memo(), Memo()
         self.image_size = as_image_size(image_size, self._name)
-        self.like = _as_like(like, self._name)
+        self._is_real = isinstance(like, str) and like == _REAL
+        self.like = None if self._is_real else _as_like(like, self._name)
+        if self._is_real:
+            focal, centre, distortion, crop = (
+                None if id(given) in _USUAL else given for given in (focal, centre, distortion, crop)
+            )
         if self.like is not None and self.like.image_size is None and fov is None:
             raise ValueError(f"{self._name}: like={like!r} says nothing of the field of view; give fov=(low, high)")
         tiny, huge = 1e-3, 1e3
@@ -112,6 +124,7 @@ class RandomCamera(Augmentation):
             "pitch": (pitch, {"least": -180, "most": 180}),
             "roll": (roll, {"least": -180, "most": 180}),
             "zoom": (zoom, {"least": tiny, "most": huge, "around": 1}),
+            "lens": ((0, 1) if self._is_real else None, {}),
             "fov": (None if self.fov else _pair(fov), {"least": tiny, "most": 360}),
             "focal": (focal, {"least": tiny, "most": huge, "around": 1}),
             "centre": (centre, {"least": -1, "most": 1, "size": 2}),
@@ -122,6 +135,8 @@ class RandomCamera(Augmentation):
             "vignetting": (_pair(vignetting), {"least": 0, "most": 1}),
         }
         self.ranges = {n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None}
+        among = self.ranges.pop("fov", None) if self._is_real else None
+        self._among = None if among is None else (among.low, among.high)
 
     def _without(self, options: Mapping[str, object], *names: str) -> dict[str, Any]:
         """None for the ranges that a class does without.
@@ -149,8 +164,11 @@ class RandomCamera(Augmentation):
         return shades, light
 
     def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
-        base = source if self.like is None else self.like
         size = self.image_size or size_of(source)
+        base = source if self.like is None else self.like
+        if self._is_real:
+            intrinsics, k, reach = lenses_for(size, self._among).at(values["lens"])
+            base = remade(_ANY, intrinsics, k, size)
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if any(t.dtype != dtype or t.device != device for t in (base.intrinsics, base.distortion)):
             base = numbers_by(base, lambda t: t.to(device, dtype))
@@ -166,6 +184,9 @@ class RandomCamera(Augmentation):
                 fx, fy = fx * values[name], fy * values[name]
         if "centre" in values:
             cx, cy = cx + values["centre"][..., 0] * size[1], cy + values["centre"][..., 1] * size[0]
+        if self._is_real:
+            factor = covering(torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1), reach, size)
+            fx, fy = fx * factor, fy * factor
         distortion = base.distortion
         if jitters:
             intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
@@ -268,7 +289,8 @@ class RandomLens(RandomCamera):
     """Another lens before the camera, which stays where it looks.
 
     Args are those of `RandomCamera`: like, fov, focal, centre, distortion, chromatic, vignetting, and all options. From
-    pinhole data, `RandomLens("kannala_brandt", fov=(120, 140))` makes a fisheye's.
+    pinhole data, `RandomLens("kannala_brandt", fov=(120, 140))` makes a fisheye's, `RandomLens("real", fov=(100, 150))`
+    that of lenses that exist.
     """
 
     def __init__(
@@ -276,13 +298,16 @@ class RandomLens(RandomCamera):
         like: Camera | PresetName | str | None = None,
         *,
         fov: RangeLike | Literal["source"] | None = None,
-        focal: RangeLike | None = (0.9, 1.1),
-        centre: RangeLike | None = (-0.03, 0.03),
-        distortion: RangeLike | None = (-0.05, 0.05),
+        focal: RangeLike | None = _LENS_FOCAL,
+        centre: RangeLike | None = _LENS_CENTRE,
+        distortion: RangeLike | None = _LENS_DISTORTION,
         **options: Any,
     ):
         none = self._without(options, "yaw", "pitch", "roll", "zoom", "crop")
         super().__init__(like, fov=fov, focal=focal, centre=centre, distortion=distortion, **none, **options)
+
+
+_ANY = frozen(KannalaBrandt([1.0, 1.0, 0.0, 0.0]), None)
 
 
 def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
@@ -295,9 +320,9 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
     if isinstance(like, str) and like in MODELS:
         ideal = MODELS[like]([1.0, 1.0, 0.0, 0.0])
         return frozen(ideal, None)
-    close = get_close_matches(like, [*PRESETS, *MODELS], 1) if isinstance(like, str) else []
+    close = get_close_matches(like, [_REAL, *PRESETS, *MODELS], 1) if isinstance(like, str) else []
     raise ValueError(
-        f"{owner}: like must be a Camera, a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
+        f"{owner}: like must be a Camera, 'real', a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
         f"got {like!r}" + (f". Did you mean {close[0]!r}?" if close else "")
     )
 

@@ -1,0 +1,116 @@
+"""Real lenses to draw from, brought to the size of an image, of which every pixel has a ray."""
+
+from __future__ import annotations
+
+import math
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.lenses.collection import columns
+from camtorch.models import KannalaBrandt
+from camtorch.projection.domain import Domain
+
+_RMS = 1.0  # pixels
+_ASPECT = 0.05  # by which pixels may differ from squares
+_CENTRE = 0.1  # of the image's sides: how far from its middle the principal point may lie
+_FOLD = 0.98  # of the image's radius at the fold: closer to it a pixel is many degrees wide
+_PART = 256  # lenses whose tables stay in the processor's cache: eight times as fast as all at once
+_EDGE = 1e-3  # degrees: what float32 may make of a field of view
+
+
+class Lenses(NamedTuple):
+    """Lenses before images of one size, in float64."""
+
+    intrinsics: Tensor
+    """(N, 4)."""
+    distortion: Tensor
+    """(N, 4)."""
+    reach: Tensor
+    """(N,): the radius of the image at the lens's fold in focal lengths."""
+
+    def at(self, share: Tensor) -> Lenses:
+        """Those at shares (*B,) of the way through the list, from 0 to 1."""
+        last = len(self.reach) - 1
+        index = (share * len(self.reach)).long().clamp(0, last).to(self.reach.device)
+        return Lenses(*(column[index].to(share) for column in self))
+
+
+@cache
+def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sizes (N, 2) of (height, width), intrinsics and distortion (N, 4), and `Lenses.reach`.
+
+    Of lenses that are neither stretched nor reprojected, with square pixels, a principal point about the image's
+    middle, and a reprojection error of less than a pixel.
+    """
+    texts, numbers = columns()
+    table = torch.from_numpy(numbers)
+    size = torch.tensor([[float(side) for side in texts[name]] for name in ("height", "width")], dtype=torch.float64)
+    plain = [
+        not digital and across in ("", "1", "1.0") and down in ("", "1", "1.0")
+        for digital, across, down in zip(*(texts[n] for n in ("digital_lens", "h_stretch", "v_stretch")), strict=True)
+    ]
+    off = (table[[3, 2]] / size - 0.5).abs().amax(0)
+    is_good = torch.tensor(plain) & (table[8] < _RMS) & (off < _CENTRE) & (table[0] > 0)
+    is_good = is_good & ((table[0] / table[1] - 1).abs() < _ASPECT)
+    intrinsics, distortion = table[:4, is_good].mT, table[4:8, is_good].mT.contiguous()
+    parts = [Domain(KannalaBrandt.optics, part).edge2 for part in distortion.split(_PART)]
+    reach = torch.cat(parts).sqrt()[:, 0]
+    return size[:, is_good].mT, intrinsics, distortion, reach
+
+
+def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
+    """(*B,): the factor, at least 1, on the focal lengths with which every pixel of an image has a ray.
+
+    Args:
+        intrinsics: (*B, 4).
+        reach: (*B,), the radius of the image at the lens's fold in focal lengths.
+        size: (height, width) of the image.
+    """
+    fx, fy, cx, cy = intrinsics.unbind(-1)
+    height, width = size
+    across = torch.maximum(cx + 0.5, width - 0.5 - cx) / fx
+    down = torch.maximum(cy + 0.5, height - 0.5 - cy) / fy
+    return (torch.hypot(across, down) / (_FOLD * reach)).clamp(min=1.0)
+
+
+@lru_cache(maxsize=16)
+def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses:
+    """The lenses whose images of a size have a horizontal field of view in a range, in degrees.
+
+    A calibrated image is scaled until it covers the new one, and cropped evenly. Where pixels then have no ray, the
+    focal lengths grow until they have.
+
+    Args:
+        size: (height, width).
+        fov: (low, high), or None for all lenses.
+
+    Raises:
+        ValueError: there are none.
+    """
+    sizes, intrinsics, distortion, reach = _good()
+    new = torch.tensor(size, dtype=torch.float64)
+    scale = (new / sizes).amax(-1, keepdim=True)
+    # pixels' centres are half a pixel from the edges
+    centre = (intrinsics[:, 2:] - (sizes.flip(-1) - 1) / 2) * scale + (new.flip(-1) - 1) / 2
+    focal = intrinsics[:, :2] * scale
+    focal = focal * covering(torch.cat((focal, centre), -1), reach, size)[:, None]
+    found = torch.cat((focal, centre), -1)
+    if fov is None:
+        return Lenses(found, distortion, reach)
+    ends = torch.stack((torch.full_like(centre, -0.5), torch.full_like(centre, size[1] - 0.5)), 1)
+    ends[..., 1] = centre[:, None, 1]
+    parts = zip(*(column.split(_PART) for column in (found, distortion, ends)), strict=True)
+    rays = torch.cat([KannalaBrandt(f, k).requires_grad_(False).unproject(pixels)[0] for f, k, pixels in parts])
+    wide = torch.rad2deg(torch.atan2(rays[..., 0].abs(), rays[..., 2]).sum(-1))
+    low, high = fov[0] + _EDGE, fov[1] - _EDGE
+    chosen = (wide > low) & (wide < high)
+    if not bool(chosen.any()):
+        widest = math.floor(float(wide.max()))
+        raise ValueError(
+            f"no real lens shows {fov[0]:g} to {fov[1]:g} degrees across images of (height, width) {size}; the widest "
+            f"shows {widest}. fov=(low, high) is a range of degrees"
+        )
+    return Lenses(found[chosen], distortion[chosen], reach[chosen])

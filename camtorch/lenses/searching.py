@@ -1,0 +1,143 @@
+"""Real lenses by words, as people write them."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+import unicodedata
+from functools import cache
+
+from camtorch._arguments import as_image_size
+from camtorch.lenses.collection import Lens, entries
+from camtorch.models import KannalaBrandt
+
+_WORD = re.compile(r"\d+(?:\.\d+)?|[^\W\d_]+")  # "HERO9", "Hero 9" and "hero-9" are the same two
+_NUMBER = re.compile(r"\d+")
+_ASPECT = 0.01  # the part by which aspect ratios may differ, as sizes are rounded
+_SHOWN = 8
+
+
+def search(words: str = "", *, image_size: tuple[int, int] | None = None) -> list[Lens]:
+    """The lenses whose names have all of these words, best first; all lenses if there are none.
+
+    Case, spaces and signs do not count, nor does the order of words. The last letters of a word may be missing, and
+    words that no name has are taken for the most similar one of the same numbers. Best are those with the fewest other
+    words; then those that are neither stretched nor reprojected by the camera; then those of the smallest reprojection
+    error.
+
+    Args:
+        words: of brand, camera, lens and setting, or a size: "GoPro HERO9 wide", "Laowa 7.5mm 3840x2160".
+        image_size: (height, width): only lenses that were calibrated for images of this aspect ratio, those of this
+            size first.
+    """
+    size = as_image_size(image_size, "lenses.search")
+    terms = _terms(words, "search")
+    found = list(entries()) if not terms else _matching(terms) or _matching([_nearest(term) for term in terms])
+    if size is None:
+        return found
+    alike = [lens for lens in found if abs(lens.image_size[1] * size[0] / (lens.image_size[0] * size[1]) - 1) < _ASPECT]
+    return sorted(alike, key=lambda lens: lens.image_size != size)
+
+
+def find(words: str, *, image_size: tuple[int, int] | None = None) -> KannalaBrandt:
+    """The camera of the best match of `search`, in float64, with nothing to learn.
+
+    Args:
+        words: see `search`, which also lists what else they may mean.
+        image_size: (height, width) of the images at hand: the camera is scaled to them. By default that of the
+            calibration.
+
+    Raises:
+        ValueError: nothing has all of these words (the text lists what has most of them), or nothing of that aspect
+            ratio. TypeError: no text.
+    """
+    terms = _terms(words, "find")
+    if not terms:
+        raise ValueError(f"lenses.find: words must name a camera or a lens, as 'GoPro HERO9 wide'; got {words!r}")
+    found = search(words)
+    if not found:
+        near = _most_alike(terms)
+        what = f"; the nearest are {_listed(near)}" if near else ""
+        raise ValueError(f"lenses.find: no lens is called {words!r}{what}")
+    size = as_image_size(image_size, "lenses.find")
+    if size is None:
+        return found[0].camera()
+    fitting = search(words, image_size=size)
+    if not fitting:
+        sizes = sorted({lens.image_size for lens in found})
+        raise ValueError(
+            f"lenses.find: {words!r} was not calibrated for images of the aspect ratio of {size}, but (height, width) "
+            f"{', '.join(map(str, sizes[:_SHOWN]))}; camera.crop takes a part of one"
+        )
+    camera = fitting[0].camera()
+    return camera if camera.image_size == size else camera.resize(*size)
+
+
+def _listed(lenses: list[Lens]) -> str:
+    names = list(dict.fromkeys(repr(lens.name) for lens in lenses))
+    return ", ".join(names[:_SHOWN]) + (" ..." if len(names) > _SHOWN else "")
+
+
+def _words_of(text: str) -> list[str]:
+    return _WORD.findall(unicodedata.normalize("NFKC", text).casefold())
+
+
+def _terms(words: str, function: str) -> list[str]:
+    """What is to be found in a name, each without the spaces and signs within."""
+    if not isinstance(words, str):
+        raise TypeError(f"lenses.{function}: words must be a text; got {type(words).__name__}")
+    return [term for term in ("".join(_words_of(part)) for part in words.split()) if term]
+
+
+@cache
+def _names() -> tuple[list[str], list[int]]:
+    """Of every entry, the words of its name, and of its size, between spaces; and how many the name has."""
+    words = [_words_of(lens.name) for lens in entries()]
+    sizes = (f"{lens.image_size[1]} x {lens.image_size[0]}" for lens in entries())
+    return [f" {' '.join(name)} {size} " for name, size in zip(words, sizes, strict=True)], [len(w) for w in words]
+
+
+@cache
+def _vocabulary() -> list[str]:
+    """What terms may have meant: words, and two that stand together."""
+    names = [line.split() for line in _names()[0]]
+    pairs = (a + b for words in names for a, b in itertools.pairwise(words))
+    return sorted({word for words in names for word in words} | set(pairs))
+
+
+def _pattern(term: str) -> re.Pattern[str]:
+    """A term as names may have it: with spaces in between, up to the end of a word, or of some of its letters."""
+    end = "(?= )" if term[-1].isdigit() else r"(?= |([^\W\d_]))"
+    return re.compile(" " + " ?".join(map(re.escape, term)) + end)
+
+
+def _matching(terms: list[str]) -> list[Lens]:
+    """Lenses with all of the terms, best first."""
+    patterns = [_pattern(term) for term in terms]
+    count, ranked = sum(len(_words_of(term)) for term in terms), []
+    for lens, line, length in zip(entries(), *_names(), strict=True):
+        hits = [pattern.search(line) for pattern in patterns]
+        if all(hits):
+            cut = sum(bool(hit and hit.lastindex) for hit in hits)
+            ranked.append((cut, length - count, not lens.is_optical, lens.rms, lens))
+    ranked.sort(key=lambda entry: entry[:4])
+    return [entry[4] for entry in ranked]
+
+
+def _nearest(term: str) -> str:
+    """The term if a name has it, or else the most similar that one has, of the same numbers: a HERO99 is no HERO9."""
+    if any(map(_pattern(term).search, _names()[0])):
+        return term
+    numbers = _NUMBER.findall(term)
+    alike = [word for word in _vocabulary() if _NUMBER.findall(word) == numbers]
+    return (difflib.get_close_matches(term, alike, 1, 0.75) or [term])[0]
+
+
+def _most_alike(terms: list[str]) -> list[Lens]:
+    """The lenses with the most of the terms, or of what is most like them."""
+    patterns, (names, lengths) = [_pattern(_nearest(term)) for term in terms], _names()
+    counts = [sum(bool(pattern.search(line)) for pattern in patterns) for line in names]
+    most = max(counts)
+    alike = [i for i, count in enumerate(counts) if count == most > 0]
+    return [entries()[i] for i in sorted(alike, key=lambda i: lengths[i])]

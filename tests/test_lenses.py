@@ -1,0 +1,203 @@
+"""Lenses that exist: their numbers are the collection's, names find them, and what is drawn from them is whole."""
+
+import csv
+import hashlib
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.lenses.collection import columns
+from camtorch.lenses.drawing import lenses_for
+from camtorch.warp.warp import along_edges
+
+SAMPLE = Path(__file__).parent / "files" / "lenses.csv"
+"""Some rows of the collection, as they were published, with their numbers."""
+NUMBERS = "ad94623534940b7809d22a2b41f3526d4c7fc6e703053c5101587317b8e97c0e"
+TEXTS = "1c52d1c7241fd41fef74081697c57e0d68169f82c32077cbc7f17324b0c217b0"
+
+
+def rows():
+    with SAMPLE.open(newline="") as lines:
+        return list(csv.DictReader(lines))
+
+
+def test_every_number_of_the_collection_is_there_to_the_bit():
+    texts, numbers = columns()
+    assert hashlib.sha256(numbers.astype("<f8").tobytes()).hexdigest() == NUMBERS
+    by_row = [list(row) for row in zip(*texts.values(), strict=True)]
+    assert hashlib.sha256(repr(by_row).encode()).hexdigest() == TEXTS
+    assert len(ct.lenses.search()) == 9810
+
+
+@pytest.mark.parametrize("row", rows(), ids=lambda row: row["index"])
+def test_an_entry_says_what_the_collection_says(row):
+    lens = ct.lenses.search()[int(row["index"])]
+    assert (lens.brand, lens.body, lens.lens, lens.setting) == tuple(
+        row[n] for n in ("brand", "camera", "lens", "setting")
+    )
+    assert lens.intrinsics == tuple(float(row[n]) for n in ("fx", "fy", "cx", "cy"))
+    assert lens.distortion == tuple(float(row[f"k{i}"]) for i in range(1, 5))
+    assert lens.image_size == (int(row["height"]), int(row["width"]))
+    assert lens.rms == float(row["rms_px"])
+    assert lens.readout_ms == (float(row["readout_ms"]) if row["readout_ms"] else None)
+    assert lens.is_optical == (
+        not row["digital_lens"]
+        and float(row["fx"]) > 0
+        and all(row[n] in ("", "1", "1.0") for n in ("h_stretch", "v_stretch"))
+    )
+    assert lens.name in repr(lens)
+    if float(row["fx"]) < 0:
+        with pytest.raises(ValueError, match="astray"):
+            lens.camera()
+    else:
+        camera = lens.camera()
+        assert camera.intrinsics.tolist() == list(lens.intrinsics)
+        assert camera.distortion.tolist() == list(lens.distortion)
+        assert not camera.intrinsics.requires_grad
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["GoPro HERO9 wide", "gopro hero 9 black wide", "HERO9-black  WIDE", "wide hero9", "GoPro HERO9 wide 3840x2160"],
+)
+def test_words_find_a_lens_as_people_write_them(words):
+    row = next(row for row in rows() if row["camera"] == "HERO9 Black")
+    camera = ct.lenses.find(words)
+    assert camera.intrinsics.tolist() == [float(row[name]) for name in ("fx", "fy", "cx", "cy")]
+    assert camera.image_size == (2160, 3840)
+
+
+def test_the_best_match_has_the_fewest_other_words_then_the_smallest_error():
+    found = ct.lenses.search("GoPro HERO9 wide")
+    names = [len(lens.name.split()) for lens in found[:3]]
+    assert names == sorted(names)
+    assert found[0].rms < found[1].rms
+    assert found[0].name == found[1].name == "GoPro HERO9 Black Wide"
+    assert all("9" in lens.body and "ide" in lens.name for lens in found)
+    # what the camera reprojects comes after what the lens made
+    views = [lens.is_optical for lens in ct.lenses.search("GoPro HERO12 Black Hyperview")]
+    assert not all(views)
+
+
+def test_a_slip_of_the_pen_is_forgiven_and_another_number_is_not():
+    assert ct.lenses.search("GoPro Hreo9 wdie")[0].name == "GoPro HERO9 Black Wide"
+    with pytest.raises(ValueError, match="'GoPro HERO99 wide'; the nearest are 'GoPro"):
+        ct.lenses.find("GoPro HERO99 wide")
+    with pytest.raises(ValueError, match=r"no lens is called 'xqzzk'$"):
+        ct.lenses.find("xqzzk")
+    with pytest.raises(ValueError, match="must name a camera"):
+        ct.lenses.find("  ")
+    with pytest.raises(TypeError, match="words must be a text; got int"):
+        ct.lenses.find(9)
+    assert ct.lenses.search("xqzzk") == []
+
+
+def test_a_lens_for_the_images_at_hand():
+    whole, small = (ct.lenses.find("GoPro HERO9 Black Wide", image_size=size) for size in (None, (1080, 1920)))
+    assert small.image_size == (1080, 1920)
+    assert torch.allclose(small.intrinsics[:2], whole.intrinsics[:2] / 2)
+    assert ct.lenses.find("GoPro HERO9 Black Wide", image_size=(3984, 5312)).intrinsics[0] != whole.intrinsics[0]
+    with pytest.raises(ValueError, match="not calibrated for images of the aspect ratio"):
+        ct.lenses.find("GoPro HERO9 Black Wide", image_size=(1000, 3000))
+
+
+def folds(k):
+    """(N,) NumPy alone: the angle at which theta + k1 theta^3 + ... + k4 theta^9 turns back, pi if it never does."""
+    # the derivative as a polynomial in y = 1 / theta^2, whose first coefficient is 1
+    companion = np.zeros((len(k), 4, 4))
+    companion[:, [1, 2, 3], [0, 1, 2]] = 1
+    companion[:, 0] = -k * [3, 5, 7, 9]
+    roots = np.linalg.eigvals(companion)
+    real = (np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)
+    return np.minimum(np.maximum(np.where(real, roots.real, 0.0).max(1), 1e-9) ** -0.5, np.pi)
+
+
+@pytest.mark.parametrize("step", [16, pytest.param(1, marks=pytest.mark.slow)])
+def test_corners_without_a_ray_are_those_beyond_the_fold(step):
+    lenses = [lens for lens in ct.lenses.search()[::step] if min(lens.intrinsics[:2]) > 0]
+    f, k = (np.array([getattr(lens, name) for lens in lenses]) for name in ("intrinsics", "distortion"))
+    size = np.array([lens.image_size for lens in lenses], dtype=float)
+    zero = np.zeros(len(lenses))
+    right, bottom = size[:, 1] - 1, size[:, 0] - 1
+    corners = np.stack([np.stack(c, -1) for c in ((zero, zero), (right, zero), (right, bottom), (zero, bottom))], 1)
+    radius = np.hypot(*((corners - f[:, None, 2:]) / f[:, None, :2]).transpose(2, 0, 1))
+    theta = folds(k)
+    x = theta**2
+    reach = (theta * (1 + x * (k[:, 0] + x * (k[:, 1] + x * (k[:, 2] + x * k[:, 3])))))[:, None]
+    clear = np.abs(radius / reach - 1) > 1e-9  # of rounding
+    camera = ct.KannalaBrandt(f, k)
+    _, valid = camera.unproject(torch.from_numpy(corners))
+    differ = (valid.numpy() != (radius < reach)) & clear
+    assert not differ.any(), [lenses[i].name for i in differ.any(1).nonzero()[0]]
+    share = 1 - float(valid.all(1).double().mean())
+    assert 0.01 < share < 0.08
+    if step == 1:
+        assert len(lenses) == 9810 - 31
+        assert int((~valid.all(1)).sum()) == int((radius > reach).any(1).sum())
+
+
+def source(size=(480, 640)):
+    return ct.Pinhole([400.0, 400.0, (size[1] - 1) / 2, (size[0] - 1) / 2], image_size=size).requires_grad_(False)
+
+
+def rim(height, width):
+    corners = torch.tensor([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]])
+    return along_edges(corners[None], 16)[0]
+
+
+@pytest.mark.parametrize(
+    ("augmentation", "size", "fov", "count"),
+    [
+        (ct.augment.RandomLens, (480, 640), (100, 150), 1000),
+        pytest.param(ct.augment.RandomCamera, (480, 640), (100, 150), 1000, marks=pytest.mark.slow),
+        pytest.param(ct.augment.RandomLens, (1080, 1920), (150, 190), 1000, marks=pytest.mark.slow),
+        pytest.param(ct.augment.RandomLens, (640, 480), None, 1000, marks=pytest.mark.slow),
+    ],
+)
+def test_a_thousand_draws_of_real_lenses_see_with_every_pixel_in_the_range(augmentation, size, fov, count):
+    augment = augmentation("real", fov=fov, camera=source(size))
+    target = augment.change(None, augment.draw(count, torch.Generator().manual_seed(1))).target
+    edge = rim(*size)
+    assert all(bool(target[i : i + 200].unproject(edge.expand(200, -1, -1))[1].all()) for i in range(0, count, 200))
+    wide = torch.cat([target[i : i + 50].field_of_view[:, 0] for i in range(0, count, 250)])  # some of them: it is slow
+    low, high = fov or (0, 360)
+    assert wide.min() >= math.radians(low)
+    assert wide.max() <= math.radians(high)
+    assert len(target.intrinsics[:, 0].unique()) > (300 if fov == (100, 150) else 10)
+
+
+def test_a_jittered_real_lens_is_whole_too():
+    jitter = {"focal": (0.7, 1.3), "centre": 0.1, "distortion": 0.2}
+    augment = ct.augment.RandomLens("real", fov=(100, 150), camera=source(), **jitter)
+    target = augment.change(None, augment.draw(24, torch.Generator().manual_seed(1))).target
+    assert target.unproject(rim(480, 640).expand(24, -1, -1))[1].all()
+    still = ct.augment.RandomLens("real", fov=(100, 150), camera=source())
+    assert set(still.ranges) == {"lens"}
+
+
+def test_a_calibration_covers_the_new_image_or_is_zoomed():
+    """Of a lens without a fold: the calibrated image is scaled and cropped, and nothing else."""
+    drawn = lenses_for((480, 640), None)
+    lens = ct.lenses.search("GoPro HERO9 Black Wide 3840x2160")[0]
+    (i,) = (drawn.distortion == torch.tensor(lens.distortion, dtype=torch.float64)).all(-1).nonzero()[0].tolist()
+    expected = lens.camera().crop(0, 480, 2160, 2880).resize(480, 640)
+    assert torch.allclose(drawn.intrinsics[i], expected.intrinsics, rtol=1e-12)
+
+
+def test_fields_of_view_that_no_lens_has_are_refused():
+    with pytest.raises(ValueError, match="no real lens shows 300 to 310 degrees"):
+        ct.augment.RandomLens("real", fov=(300, 310), camera=source()).change(None, {"apply": [True], "lens": [0.5]})
+    with pytest.raises(ValueError, match="'real', a preset"):
+        ct.augment.RandomLens("reel")
+
+
+def test_a_sample_comes_with_a_real_lens():
+    augment = ct.augment.RandomCamera("real", fov=(100, 150), camera=source(), image_size=(240, 320), min_filled=0.9)
+    sample = augment(image=torch.rand(4, 3, 480, 640), generator=torch.Generator().manual_seed(0))
+    assert isinstance(sample["camera"], ct.KannalaBrandt)
+    assert sample["camera"].image_size == (240, 320)
+    assert (sample["image"] > 0).double().mean() > 0.85
