@@ -113,7 +113,7 @@ def test_an_exchanged_width_and_height_is_not_scaled(folder, capsys):
         (["dewarp", "none.png", "--camera", "camera.yml", "-o", "o.png"], "none.png: no such file"),
         (["dewarp", "camera.yml", "--camera", "camera.yml", "-o", "o.png"], "camera.yml: not an image"),
         (["dewarp", "cut.png", "--camera", "camera.yml", "-o", "o.png"], "cut.png: "),
-        (["dewarp", ".", "--camera", "camera.yml", "-o", "o.png"], ": Is a directory"),
+        (["dewarp", ".", "--camera", "camera.yml", "-o", "o.png"], "o.png: is the name of one file"),
         (["dewarp", "in.png", "--camera", "none.yml", "-o", "o.png"], "none.yml: No such file"),
         (
             ["dewarp", "in.png", "--camera", "in.png", "-o", "o.png"],

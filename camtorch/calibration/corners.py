@@ -13,7 +13,6 @@ JSON: `{"camtorch_corners": 1, "board": {...}, "points": [[x, y, z], ...], "imag
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -65,19 +64,6 @@ class Corners:
     points: NDArray[np.float64]
     """(N, 3)."""
     images: list[ImageCorners] = field(default_factory=list)
-
-
-def hash_of(path: str | os.PathLike[str]) -> str:
-    """Of what is in a file.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    found = hashlib.blake2b(digest_size=16)
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            found.update(block)
-    return found.hexdigest()
 
 
 def read_corners(path: str | os.PathLike[str]) -> Corners:

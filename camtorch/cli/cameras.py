@@ -111,6 +111,20 @@ def read_camera_of(image: Path, size: tuple[int, int], arguments: argparse.Names
 
 def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
     """As `read_camera_of`, and the camera's pose, None where its file has none."""
+    rig, name, camera = _unfitted(image, arguments)
+    return fitting(camera, arguments.camera, image, size, arguments.rescale), rig.extrinsics.get(name)
+
+
+def read_unfitted(image: Path, arguments: argparse.Namespace) -> Camera:
+    """The camera that took an image, whatever size that has, by the options of `add_photograph`; see `fitting`.
+
+    Raises:
+        ValueError: as `read_camera`; no file is given.
+    """
+    return _unfitted(image, arguments)[2]
+
+
+def _unfitted(image: Path, arguments: argparse.Namespace) -> tuple[Rig, str, Camera]:
     path: Path | None = arguments.camera
     if path is None:
         raise ValueError(
@@ -118,8 +132,7 @@ def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace
         )
     rig = read_rig(path, arguments.name, arguments.from_model)
     name, camera = _only(path, rig)
-    camera = _single(path, name, camera)
-    return _fitting(camera, path, image, size, arguments.rescale), rig.extrinsics.get(name)
+    return rig, name, _single(path, name, camera)
 
 
 def read_pair(
@@ -138,7 +151,7 @@ def read_pair(
     cameras = {}
     for name, image, size in zip(names, images, sizes, strict=True):
         camera = _single(path, name, rig.camera_of(name))
-        cameras[name] = _fitting(camera, path, image, size, arguments.rescale)
+        cameras[name] = fitting(camera, path, image, size, arguments.rescale)
         if name not in rig.extrinsics:
             raise ValueError(f"{path}: {name} has no pose, so how the cameras stand to each other is not known")
     return Rig(cameras, {name: rig.extrinsics[name] for name in names})
@@ -161,8 +174,8 @@ def _two_names(path: Path, rig: Rig, left: str | None, right: str | None) -> tup
     return (second, first) if left == second or right == first else (first, second)
 
 
-def _fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:
-    """The camera of a file for an image of that (height, width).
+def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:
+    """The camera of a file for an image of that (height, width), which the camera gets where it has none.
 
     Raises:
         ValueError: it is for another size and is not to be scaled.

@@ -1,31 +1,40 @@
-"""The command `camtorch dewarp`: a photograph without its lens's distortion."""
+"""The command `camtorch dewarp`: photographs and videos without their lens's distortion."""
 
 from __future__ import annotations
 
 import argparse
+import glob
 import math
-from typing import TYPE_CHECKING
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from camtorch.cli.options import add_output, add_photograph, parse_path, parse_size
+from camtorch.cli.options import add_force, add_jobs, add_photograph, parse_path, parse_size, parse_suffix
+from camtorch.cli.terminal import Bar, note, say
+from camtorch.jobs import pool
 
 if TYPE_CHECKING:
+    from camtorch.cli.dewarping import Dewarping
     from camtorch.cli.options import Commands
+    from camtorch.jobs.items import Item, Shard
 
-
-_TOLERANCE = 0.001
-"""Pixels that nobody sees, for a lattice of positions also where a calibration is in float64."""
+_DEFAULT = "dewarped.png"
+_SLASHES = ("/", os.sep)
 
 
 def add(commands: Commands) -> None:
     """Add the command to a command line."""
     command = commands.add_parser(
         "dewarp",
-        help="undistort an image",
-        description="Undistort an image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png",
+        help="undistort images and videos",
+        description="Undistort an image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png; or all of a "
+        "folder: camtorch dewarp images/ --camera camera.yml -o straight/",
         allow_abbrev=False,
     )
-    command.set_defaults(run=run)
-    command.add_argument("image", type=parse_path, metavar="IMAGE", help="the image")
+    command.set_defaults(run=run, prepare=prepare)
+    command.add_argument(
+        "image", type=_word, nargs="+", metavar="IMAGE", help="the image; or images, videos, folders, quoted patterns"
+    )
     command.add_argument(
         "--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective"
     )
@@ -39,44 +48,264 @@ def add(commands: Commands) -> None:
         "--size", type=parse_size, metavar="WxH", help="size of the new image; by default the old one's"
     )
     add_photograph(command)
-    add_output(command, "dewarped.png")
+    command.add_argument(
+        "-o",
+        "--output",
+        type=_word,
+        metavar="OUT",
+        help=f"the new image, {_DEFAULT} by default; OUT/, a folder, where there are several",
+    )
+    add_force(command)
+    many = add_jobs(command)
+    many.add_argument(
+        "--suffix", type=parse_suffix, metavar=".EXT", help="of new images or videos; by default those of the old ones"
+    )
+    video = command.add_argument_group("videos (pip install 'camtorch[video]')")
+    video.add_argument(
+        "--codec", metavar="NAME", help="an encoder of ffmpeg's; libx264 by default, in .webm libvpx-vp9"
+    )
+    video.add_argument("--crf", type=int, metavar="N", help="the encoder's quality, lower is better; 18 in libx264")
 
 
-def run(arguments: argparse.Namespace) -> None:
+def _word(text: str) -> str:
+    """A path as it was written: a slash at its end says that it is a folder."""
+    parse_path(text)
+    return text
+
+
+def prepare(arguments: argparse.Namespace) -> None:
+    """Before torch is imported: let processes begin to do so as well."""
+    words: list[str] = arguments.image
+    several = len(words) > 1 or os.path.isdir(words[0]) or glob.has_magic(words[0])
+    if several and arguments.jobs != 1 and not arguments.dry_run:
+        pool.prepare(["camtorch.cli.dewarping"])
+
+
+def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
-    import torch
-
-    from camtorch.cli import cameras, images
-    from camtorch.cli.warping import warped
-    from camtorch.warp.dewarp import Dewarp
+    from camtorch.cli import videos
 
     fov = arguments.fov
     if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
         wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
         allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
         raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
-    images.check_target(arguments.output, force=arguments.force, inputs=(arguments.image, arguments.camera))
-    image, orientation = images.read(arguments.image)
+    words: list[str] = arguments.image
+    output: str | None = arguments.output
+    into_folder = output is not None and output.endswith(_SLASHES)
+    is_pattern = glob.has_magic(words[0]) and not os.path.lexists(words[0])
+    if len(words) > 1 or os.path.isdir(words[0]) or is_pattern or into_folder:
+        return _many(arguments)
+    for name in ("resume", "suffix"):
+        if getattr(arguments, name):
+            raise ValueError(f"--{name} is for folders: -o OUT/, with a slash, puts the new one into one")
+    source = Path(words[0])
+    if videos.is_video(source):
+        _video(arguments, source)
+    else:
+        _image(arguments, source)
+    return 0
+
+
+# -- one file
+
+
+def _image(arguments: argparse.Namespace, source: Path) -> None:
+    import torch
+
+    from camtorch.cli import cameras, images
+    from camtorch.cli.dewarping import TOLERANCE
+    from camtorch.cli.warping import warped
+    from camtorch.warp.dewarp import Dewarp
+
+    output = Path(arguments.output or _DEFAULT)
+    images.check_target(output, force=arguments.force, inputs=(source, arguments.camera))
+    image, orientation = images.read(source)
     rows, columns = image.shape[-2:]
-    camera = cameras.read_camera_of(arguments.image, (rows, columns), arguments)
+    camera = cameras.read_camera_of(source, (rows, columns), arguments)
+    if arguments.dry_run:
+        print(f"{source} -> {output}")
+        return
     with torch.no_grad():
         warp = Dewarp(
             camera,
             projection=arguments.projection,
-            fov=None if fov is None else math.radians(fov),
+            fov=_radians(arguments.fov),
             image_size=arguments.size,
-            tolerance=_TOLERANCE,
+            tolerance=TOLERANCE,
         )
         result, filled = warped(warp, image, "dewarping")
         del image
         lattice = (camera.resize(64, 64).pixel_grid() + 0.5) * torch.tensor([columns / 64, rows / 64]) - 0.5
         shown = float(warp.transform_points(lattice)[1].double().mean())
-    images.write(arguments.output, images.from_tensor(result), orientation=orientation)
+    images.write(output, images.from_tensor(result), orientation=orientation)
     height, width = result.shape[-2:]
     fx, fy, cx, cy = warp.target.intrinsics.tolist()
     degrees = math.degrees(float(warp.target.field_of_view[0]))
     print(
-        f"{arguments.output}: {camera.key} dewarped to {arguments.projection}, {degrees:.1f} degrees "
+        f"{output}: {camera.key} dewarped to {arguments.projection}, {degrees:.1f} degrees "
         f"wide, {width}x{height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; {100 * filled:.1f} % of it is "
         f"filled and shows {100 * shown:.0f} % of the photograph"
+    )
+
+
+def _radians(degrees: float | None) -> float | None:
+    return None if degrees is None else math.radians(degrees)
+
+
+def _video(arguments: argparse.Namespace, source: Path) -> None:
+    from camtorch.cli import targets, videos
+    from camtorch.jobs.items import Item
+
+    output = Path(arguments.output or Path(_DEFAULT).with_suffix(source.suffix))
+    targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
+    videos.check_kind(output)
+    work = _dewarping(arguments, [source])
+    item = videos.sized(Item((source,), (output,)))
+    if arguments.dry_run:
+        print(f"{source} -> {output}")
+        return
+    bar = Bar("dewarping", "frames")
+    try:
+        told = work(item, _Shown(bar, item))
+    finally:
+        bar.close()
+    print(f"{output}: dewarped, {_told(arguments, told)}, {told['frames']} frames")
+
+
+class _Shown:
+    """Shows how far one item is; a `camtorch.jobs.items.Listener`."""
+
+    def __init__(self, bar: Bar, item: Item):
+        self._bar, self._item = bar, item
+
+    def note(self, text: str) -> None:
+        note(text)
+
+    def done(self, size: float) -> None:
+        self._bar.show(size, max(size, self._item.size))
+
+
+# -- many files
+
+
+def _many(arguments: argparse.Namespace) -> int:
+    from camtorch.cli import images, videos
+    from camtorch.jobs import inputs, items, run
+    from camtorch.jobs.manifest import Manifest
+
+    if arguments.output is None:
+        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder of them")
+    output, shard = Path(arguments.output), items.Shard.of_environment()
+    if os.path.lexists(output) and not output.is_dir():
+        raise ValueError(f"{output}: is no folder, which -o names for several images or a folder of them")
+    known = inputs.IMAGES | set(videos.FORMATS)
+    if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
+        raise ValueError(
+            f"{output}: is the name of one file, but there are several to be written; -o OUT/ names a folder"
+        )
+    found = inputs.find(arguments.image, known, output)
+    everything = [_item(one, output, arguments.suffix) for one in found.files]
+    for item in everything:
+        (videos if videos.is_video(item.inputs[0]) else images).check_kind(item.outputs[0])
+    items.check(everything, [arguments.camera] if arguments.camera else [])
+    work = _dewarping(arguments, [one.path for one in found.files])
+    mine = [videos.sized(item) for item in shard.of(everything)]
+    faults = found.faults if shard.rank == 0 else []
+    manifest = Manifest(output, "dewarp", work.settings(), shard)
+    if arguments.dry_run:
+        return _dry_run(mine, faults, manifest, arguments.resume)
+    moving = any(item.size != 1 for item in mine)
+    title = "dewarping" if shard.count == 1 else f"dewarping, shard {shard.rank + 1} of {shard.count}"
+    bar = Bar(title, "frames" if moving else "images")
+    try:
+        with manifest:
+            report = run.run(
+                mine,
+                work,
+                manifest,
+                processes=min(arguments.jobs or _cores(shard), max(len(mine), 1)),
+                resume=arguments.resume,
+                force=arguments.force,
+                watch=lambda progress: bar.show(progress.done, progress.total, progress.kept),
+            )
+    except FileExistsError as error:
+        raise ValueError(f"{error}; --resume goes on where it was broken off, --force overwrites") from None
+    finally:
+        bar.close()
+    for text, names in report.notes.items():
+        note(f"{names[0]} {text}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {text}")
+    failed = [*((str(path), why) for path, why in faults), *report.failed]
+    for name, why in failed:
+        say(f"error: {name}: {why}")
+    told = list({str(result): result for result in report.results.values()}.values())
+    how = f", {_told(arguments, told[0])}" if len(told) == 1 else ""
+    parts = [f"{report.made} of {len(mine) + len(faults)} dewarped{how}"]
+    if report.kept:
+        parts.append(f"{report.kept} were done already")
+    if failed:
+        parts.append(f"{len(failed)} failed")
+    print(f"{output}: {'; '.join(parts)}")
+    return 1 if failed else 0
+
+
+def _item(found: Any, output: Path, suffix: str | None) -> Item:
+    from camtorch.cli import videos
+    from camtorch.jobs.items import Item
+
+    place = found.place
+    if suffix is not None and videos.is_video(place) == videos.is_video(Path(suffix)):
+        place = place.with_suffix(suffix)
+    return Item((found.path,), (output / place,))
+
+
+def _dry_run(mine: list[Item], faults: list[tuple[Path, str]], manifest: Any, resume: bool) -> int:
+    from camtorch.jobs import run
+
+    count = 0
+    for item in run.pending(mine, manifest, resume=resume):
+        print(f"{item.name} -> {item.outputs[0]}")
+        count += 1
+    for path, why in faults:
+        say(f"error: {path}: {why}")
+    print(f"{count} to do, {len(mine) - count} done already")
+    return 1 if faults else 0
+
+
+def _cores(shard: Shard) -> int:
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(own // shard.local, 1)
+
+
+def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
+    """What is done to each; the camera is of the size of the first image where its file states none."""
+    from camtorch.cli import cameras, images, videos
+    from camtorch.cli.dewarping import Dewarping
+
+    camera = cameras.read_unfitted(sources[0] if sources else Path(arguments.image[0]), arguments)
+    if camera.image_size is None:
+        for source in sources:
+            size = (videos if videos.is_video(source) else images).size_of(source)
+            if size is not None:
+                camera = cameras.fitting(camera, arguments.camera, source, size, rescale=False)
+                break
+    encoder = videos.Encoder(arguments.codec, arguments.crf)
+    if any(map(videos.is_video, sources)):
+        encoder.check()
+    return Dewarping(
+        camera,
+        arguments.camera,
+        arguments.rescale,
+        arguments.projection,
+        _radians(arguments.fov),
+        arguments.size,
+        encoder,
+    )
+
+
+def _told(arguments: argparse.Namespace, told: dict[str, Any]) -> str:
+    fx, fy, cx, cy = told["intrinsics"]
+    return (
+        f"{told['model']} to {arguments.projection}, {told['degrees']:.1f} degrees wide, "
+        f"{told['width']}x{told['height']}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; {100 * told['filled']:.1f} % of it is filled"
     )

@@ -8,14 +8,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-_SUFFIXES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
-"""What is taken of a folder."""
-
-
-def natural(path: Path) -> list[tuple[int, int, str]]:
-    """A key to sort by that has 2 before 10."""
-    parts = re.split(r"(\d+)", str(path))
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in parts]
+from camtorch.jobs.inputs import IMAGES, natural
 
 
 def gather(words: Iterable[str]) -> list[Path]:
@@ -31,7 +24,7 @@ def gather(words: Iterable[str]) -> list[Path]:
     for word in words:
         path = Path(word)
         if path.is_dir():
-            paths = [p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES and p.is_file()]
+            paths = [p for p in path.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
             if not paths:
                 raise ValueError(f"{word}: a folder without images")
         elif os.path.lexists(word) or not glob.has_magic(word):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,11 @@ class ImageFileError(ValueError):
     """An image file that cannot be read or written. The text names the file and the reason."""
 
 
-def read(path: Path) -> tuple[Tensor, int | None]:
+def read(path: Path, tell: Callable[[str], None] = note) -> tuple[Tensor, int | None]:
     """An image as stored, and its Exif orientation: it is not turned, for calibrations know stored pixels.
 
-    Notes say what is left out: the lower bits of deep colours, which Pillow does not read, and all but the first image
-    of several.
+    Notes, which `tell` gets, say what is left out: the lower bits of deep colours, which Pillow does not read, and all
+    but the first image of several.
 
     Returns:
         (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey images.
@@ -47,9 +48,9 @@ def read(path: Path) -> tuple[Tensor, int | None]:
             count, cut = getattr(image, "n_frames", 1), _is_cut(image)
             image.load()
             if count > 1:
-                note(f"{path} holds {count} images; only the first is taken")
+                tell(f"{path} holds {count} images; only the first is taken")
             if cut:
-                note(f"{path} has 16 bits a colour; only the upper 8 are read")
+                tell(f"{path} has 16 bits a colour; only the upper 8 are read")
             return _pixels(path, image), image.getexif().get(_ORIENTATION)
     except FileNotFoundError:
         raise ImageFileError(f"{path}: no such file") from None
@@ -62,6 +63,17 @@ def read(path: Path) -> tuple[Tensor, int | None]:
         raise
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def size_of(path: Path) -> tuple[int, int] | None:
+    """(height, width) of what its first bytes say is an image; None of anything else."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                return image.height, image.width
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
+        return None
 
 
 def _is_cut(image: Image.Image) -> bool:
@@ -105,6 +117,15 @@ def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = (
         ValueError: see `targets.check`; an unknown file type, or one that stores other sizes.
     """
     targets.check(path, force=force, inputs=inputs)
+    check_kind(path)
+
+
+def check_kind(path: Path) -> None:
+    """Refuse a name that says of no file type that images can be written as.
+
+    Raises:
+        ImageFileError: an unknown file type, or one that stores other sizes.
+    """
     kind = Image.registered_extensions().get(path.suffix.lower())
     if kind not in Image.SAVE or kind in _OTHER_SIZES:
         why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"
@@ -117,8 +138,8 @@ def from_tensor(image: Tensor) -> Image.Image:
     return Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
 
 
-def write(path: Path, image: Image.Image, *, orientation: int | None = None) -> None:
-    """Write a Pillow image, whole or not at all; folders that lack are made.
+def write(path: Path, image: Image.Image, *, orientation: int | None = None, synced: bool = True) -> None:
+    """Write a Pillow image, whole or not at all; folders that lack are made; `synced` as of `replacing`.
 
     Raises:
         ImageFileError: the file type does not take such pixels, or the disk does not take the file.
@@ -129,7 +150,7 @@ def write(path: Path, image: Image.Image, *, orientation: int | None = None) -> 
         options["exif"][_ORIENTATION] = orientation
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as (file,):
+        with replacing(path, synced=synced) as (file,):
             image.save(file, Image.registered_extensions()[path.suffix.lower()], **options)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

@@ -45,16 +45,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`, by default the process's own.
 
     Returns:
-        The exit status: 0; 2 after an error, which is one line on stderr; 130 after an interrupt; 141 where nobody
-        reads what is printed.
+        The exit status: 0; 1 where some of many files failed; 2 after an error, which is one line on stderr; 130 after
+        an interrupt; 141 where nobody reads what is printed.
     """
     try:
         arguments = _parser().parse_args(argv)
+        arguments.prepare(arguments)
         with _interrupts_end_the_process():
             import torch  # noqa: F401 (not before, see above)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            arguments.run(arguments)
+            status: int = arguments.run(arguments) or 0
         for warning in caught:
             note(warning.message)
         if sys.stdout is not None:  # closed by whoever called
@@ -70,12 +71,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         say(f"error: {_reason(error)}")
         return 2
-    return 0
+    return status
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.", allow_abbrev=False)
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
+    parser.set_defaults(prepare=lambda arguments: None)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (dewarp, rectify, birdseye, augment, convert, show, calibrate, board, demo):
         command.add(commands)

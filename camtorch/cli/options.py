@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 LARGEST_SIDE = 32768
 """Pixels."""
+_MOST_JOBS = 1024
 
 
 def parse_path(text: str) -> Path:
@@ -93,6 +94,30 @@ def add_output(command: argparse.ArgumentParser, default: str | None, text: str 
         "-o", "--output", type=parse_path, default=default and Path(default), metavar="OUT", help=text + usual
     )
     add_force(command)
+
+
+def add_jobs(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """How many files are worked on."""
+    group = command.add_argument_group("many files")
+    group.add_argument("--jobs", type=_parse_jobs, metavar="N", help="processes; by default as many as there are cores")
+    group.add_argument(
+        "--resume", action="store_true", help="go on where a run was broken off; what is done and unchanged is kept"
+    )
+    group.add_argument("--dry-run", action="store_true", help="print what would be done")
+    return group
+
+
+def _parse_jobs(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 0 < int(text) <= _MOST_JOBS):
+        raise argparse.ArgumentTypeError(f"{text!r} is not 1 to {_MOST_JOBS} processes")
+    return int(text)
+
+
+def parse_suffix(text: str) -> str:
+    """A suffix, as ".png"."""
+    if not (text.startswith(".") and text[1:].isalnum()):
+        raise argparse.ArgumentTypeError(f"{text!r} is no suffix, as .png is")
+    return text
 
 
 def add_force(command: argparse.ArgumentParser) -> None:

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camtorch.calibration.boards import Board, Chessboard
-from camtorch.calibration.corners import Corners, ImageCorners, hash_of, read_corners, write_corners
+from camtorch.calibration.corners import Corners, ImageCorners, read_corners, write_corners
 from camtorch.calibration.detection import NOT_FOUND, detect
 from camtorch.cli import images
 from camtorch.cli.gathering import together
 from camtorch.cli.terminal import note, progress
+from camtorch.io.hashing import hash_of
 
 _LEAST_VIEWS = 3
 _TRIED_ANEW = 5  # images in which a board of another size is looked for

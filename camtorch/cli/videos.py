@@ -1,0 +1,578 @@
+"""Video files through warps, by PyAV: time stamps, sound, subtitles and colours stay as they are."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import importlib
+import os
+import queue
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+
+from camtorch.camera import Camera
+from camtorch.io.writing import replacing
+from camtorch.jobs.items import Item, Listener
+from camtorch.warp.warp import Warp
+
+FORMATS = {
+    ".avi": "avi",
+    ".m4v": "mp4",
+    ".mkv": "matroska",
+    ".mov": "mov",
+    ".mp4": "mp4",
+    ".mts": "mpegts",
+    ".ts": "mpegts",
+    ".webm": "webm",
+}
+"""What ffmpeg calls the formats of files with these suffixes, in lower case."""
+_READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which would have other files read
+_QUALITIES = {"libx264": 18, "libx265": 20, "libvpx-vp9": 24, "libsvtav1": 24, "libaom-av1": 24}
+_QUANTISER = 3  # of encoders without a crf: near the best
+_LAMBDA = 118  # FF_QP2LAMBDA
+_THREADS = 4  # of an encoder: what it makes depends on their number, and shall not depend on the machine's
+_AHEAD = 8  # frames
+_OFTEN = 0.1  # seconds between two reports
+_EVEN = ("libx264", "libx265")
+_BY_QUANTISER = ("mpeg4", "mpeg2video", "mjpeg")
+_CUT = 0.5  # seconds that may be missing at the end
+
+T = TypeVar("T")
+
+
+class VideoFileError(ValueError):
+    """A video that cannot be read or written. The text names the file and the reason."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether its name says so."""
+    return path.suffix.lower() in FORMATS
+
+
+def check_kind(path: Path) -> None:
+    """Refuse a name that says of no format that videos can be written as.
+
+    Raises:
+        VideoFileError: an unknown suffix.
+    """
+    if not is_video(path):
+        known = ", ".join(FORMATS)
+        raise VideoFileError(f"{path}: {path.suffix or 'no suffix'}: no video can be written as that; try {known}")
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """What videos are written with."""
+
+    codec: str | None = None
+    """An encoder of ffmpeg's; by default what suits the format."""
+    crf: int | None = None
+    """Its quality; by default one at which hardly anything is lost."""
+
+    def check(self) -> None:
+        """Refuse what no video can be written with.
+
+        Raises:
+            ImportError: PyAV is not installed. ValueError: no such encoder, or it knows no crf.
+        """
+        av = _av()
+        if self.codec is None:
+            return
+        try:
+            codec = av.Codec(self.codec, "w")
+        except av.codec.codec.UnknownCodecError:
+            raise ValueError(
+                f"--codec {self.codec}: there is no such encoder; there are {', '.join(_QUALITIES)}, ffv1 ..."
+            ) from None
+        if codec.type != "video":
+            raise ValueError(f"--codec {self.codec}: an encoder of {codec.type}, not of video")
+        if self.crf is not None and not _has_crf(self.codec):
+            raise ValueError(f"--crf: {self.codec} has no such option")
+
+    def of(self, format: str) -> str:
+        """The encoder for files of a format."""
+        return self.codec or ("libvpx-vp9" if format == "webm" else "libx264")
+
+
+def _av() -> Any:
+    try:
+        return importlib.import_module("av")
+    except ImportError:
+        raise ImportError(
+            "videos are read and written by PyAV, which is not installed: pip install 'camtorch[video]'"
+        ) from None
+
+
+def _has_crf(codec: str) -> bool:
+    return any(option.name == "crf" for option in _av().CodecContext.create(codec, "w").supported_options.private)
+
+
+# -- what a file says of itself
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """A file and its first video stream; what goes wrong with it in the block is a VideoFileError."""
+    av = _av()
+    try:
+        with av.open(os.fspath(path), options={"format_whitelist": _READ}) as container:
+            if not container.streams.video:
+                raise VideoFileError(f"{path}: no video is in it")
+            yield container, container.streams.video[0]
+    except av.error.FFmpegError as error:
+        raise VideoFileError(f"{path}: {error.strerror}") from None
+
+
+def size_of(path: Path) -> tuple[int, int] | None:
+    """(height, width) of a video; None of anything else."""
+    try:
+        with _opened(path) as (_, stream):
+            return stream.codec_context.height, stream.codec_context.width
+    except VideoFileError:
+        return None
+
+
+def sized(item: Item) -> Item:
+    """The item with the number of its frames, about, if it is a video that says how long it is."""
+    if not is_video(item.inputs[0]):
+        return item
+    try:
+        with _opened(item.inputs[0]) as (container, stream):
+            return replace(item, size=float(max(stream.frames or _length(container, stream) * _rate(stream), 1)))
+    except VideoFileError:
+        return item
+
+
+def _rate(stream: Any) -> Fraction:
+    return stream.guessed_rate or stream.average_rate or Fraction(25)
+
+
+def _length(container: Any, stream: Any) -> Fraction:
+    """Seconds; 0 where that is not said."""
+    if stream.duration is not None and stream.time_base is not None:
+        return stream.duration * stream.time_base
+    return Fraction(container.duration or 0, 1_000_000)
+
+
+# -- planes
+#
+# A video is stored in planes of brightness and colour, the latter often of half the resolution. Each goes through a
+# warp of its own, so nothing is converted: it is half the work of RGB, and the colours that do not move stay exactly
+# as they are.
+
+_PLANAR = re.compile(r"(yuv[aj]?4\d\dp|gray|gbra?p)(9|10|12|14|16)?(le)?|nv12|nv16|nv24")
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """Where a plane of a format lies in a frame."""
+
+    index: int
+    channels: int
+    height: int
+    width: int
+    dtype: type[np.uint8 | np.uint16]
+    fill: int
+    """Of what shows nothing: black."""
+
+    def of(self, frame: Any) -> np.ndarray[Any, Any]:
+        """(H, W, C), the memory of the frame."""
+        plane = frame.planes[self.index]
+        values = np.frombuffer(plane, self.dtype)
+        row = plane.line_size // values.itemsize
+        lines = values[: self.height * row].reshape(self.height, row)
+        return lines[:, : self.width * self.channels].reshape(self.height, self.width, self.channels)
+
+
+def _planes(frame: Any) -> list[_Plane]:
+    components, is_full = frame.format.components, _is_full(frame)
+    is_yuv = frame.format.name.startswith(("yuv", "nv"))
+    planes = []
+    for index in range(len(frame.planes)):
+        own = [component for component in components if component.plane == index]
+        first = own[0]
+        black = 0 if is_full or first.is_alpha or not is_yuv else 16 << (first.bits - 8)
+        fill = 1 << (first.bits - 1) if first.is_chroma else black
+        dtype = np.uint8 if first.bits <= 8 else np.uint16
+        planes.append(_Plane(index, len(own), first.height, first.width, dtype, fill))
+    return planes
+
+
+def _is_full(frame: Any) -> bool:
+    """Whether its values go from 0 to the greatest, as those of images do."""
+    return bool(frame.color_range == 2 or frame.format.name.startswith("yuvj"))
+
+
+def _of_plane(warp: Warp, source: tuple[int, int], target: tuple[int, int], fill: int, *, left: bool) -> Warp:
+    """A warp between planes of these (height, width), which are those of its images or rounded up from half of them.
+
+    Args:
+        warp: of images.
+        source: of the plane.
+        target: of the new one.
+        fill: of what shows nothing.
+        left: whether planes of half the width have their pixels where the left ones of the image's pairs are, as in
+            MPEG-2 and what came after, rather than between.
+    """
+    old, new = _camera_of_plane(warp.source, source, left), _camera_of_plane(warp.target, target, left)
+    return Warp(old, new, warp.rotation, fill=float(fill), tolerance=warp.tolerance)
+
+
+def _camera_of_plane(camera: Camera, size: tuple[int, int], left: bool) -> Camera:
+    height, width = size
+    down, across = (-(-whole // part) for whole, part in zip((camera.height, camera.width), size, strict=True))
+    if (down, across) == (1, 1):
+        return camera
+    bottom, right = down * height - camera.height, across * width - camera.width
+    camera = copy.deepcopy(camera.pad(0, right, 0, bottom).resize(height, width))
+    if left and across == 2:
+        with torch.no_grad():
+            camera.intrinsics[..., 2] += 0.25
+    return camera
+
+
+class _Frames:
+    """Warps frames of one size."""
+
+    def __init__(self, warp: Warp, frame: Any):
+        """By a warp of images, for frames like this one."""
+        new = _av().VideoFrame(warp.target.width, warp.target.height, frame.format.name)
+        left = not frame.format.name.startswith("yuvj")
+        self.size, self._format = (new.height, new.width), frame.format.name
+        self._pairs = []
+        for old, made in zip(_planes(frame), _planes(new), strict=True):
+            sizes = (old.height, old.width), (made.height, made.width)
+            self._pairs.append((old, made, _of_plane(warp, *sizes, old.fill, left=left).requires_grad_(False)))
+
+    def __call__(self, frame: Any) -> Any:
+        """The new frame, at the same time."""
+        new = _av().VideoFrame(self.size[1], self.size[0], self._format)
+        for old, made, warp in self._pairs:
+            values = torch.from_numpy(old.of(frame)).permute(2, 0, 1)[None]
+            with torch.no_grad():
+                made.of(new)[:] = warp(values)[0].permute(1, 2, 0).numpy()
+        new.pts, new.time_base, new.duration = frame.pts, frame.time_base, frame.duration
+        new.color_range, new.colorspace = frame.color_range, frame.colorspace
+        new.color_primaries, new.color_trc = frame.color_primaries, frame.color_trc
+        return new
+
+
+# -- from file to file: one thread reads, one warps, one writes
+
+
+def remake(
+    source: Path,
+    target: Path,
+    warp_of: Callable[[tuple[int, int]], tuple[Warp, dict[str, Any]]],
+    encoder: Encoder,
+    listener: Listener,
+) -> dict[str, Any]:
+    """Write a video whose frames are those of another one through a warp.
+
+    Time stamps, sound, subtitles, chapters, titles, the rotation with which it is shown, and what colours mean are
+    those of the source. Pixels are square then. What the format of the target cannot hold is an error.
+
+    Args:
+        source: a video.
+        target: a new one, whose suffix says the format. It is written whole or not at all; folders that lack are made.
+        warp_of: the warp for frames of a (height, width), and what is to be known of it.
+        encoder: of the new video.
+        listener: is told how many frames are done.
+
+    Returns:
+        What is to be known of the warp, and "frames", how many there are.
+
+    Raises:
+        VideoFileError: what is not a video, ends too early, changes its size, or cannot be written so.
+    """
+    av = _av()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target, synced=False) as (file,), _opened(source) as (container, stream):
+        read = _Read(source, container, stream, encoder.of(FORMATS[target.suffix.lower()]), listener)
+        # exact: no random identifiers
+        output = av.open(file, "w", format=FORMATS[target.suffix.lower()], options={"fflags": "+bitexact"})
+        try:
+            facts = _remade(read, _Written(target, output), warp_of, encoder.crf)
+        except BaseException:
+            with contextlib.suppress(av.error.FFmpegError):
+                output.close()
+            raise
+        output.close()
+    return facts
+
+
+def _remade(
+    read: _Read,
+    written: _Written,
+    warp_of: Callable[[tuple[int, int]], tuple[Warp, dict[str, Any]]],
+    crf: int | None,
+) -> dict[str, Any]:
+    frames: _Frames | None = None
+    waiting: list[Any] = []
+    shown = time.monotonic()
+    with _behind() as later, _ahead(read) as things:
+        for thing in things:
+            if not hasattr(thing, "planes"):  # a packet of sound or words
+                if frames is None:
+                    waiting.append(thing)
+                else:
+                    later(written.copy, thing)
+                continue
+            if frames is None:
+                warp, facts = warp_of((thing.height, thing.width))
+                frames = _Frames(warp, thing)
+                written.begin(read, thing, frames.size, crf)
+                for packet in waiting:
+                    later(written.copy, packet)
+            later(written.encode, frames(thing))
+            if time.monotonic() > shown + _OFTEN:
+                shown = time.monotonic()
+                read.listener.done(read.count)
+        if frames is None:
+            raise VideoFileError(f"{read.path}: no frame of it can be read")
+        later(written.encode, None)
+    read.check_end()
+    return facts | {"frames": read.count}
+
+
+class _Read:
+    """The frames of a video, in a format that an encoder takes, and the packets of sound and subtitles between them."""
+
+    def __init__(self, path: Path, container: Any, stream: Any, codec: str, listener: Listener):
+        self.path, self.container, self.stream, self.codec, self.listener = path, container, stream, codec, listener
+        self.others = [other for other in container.streams if other.type in ("audio", "subtitle")]
+        kept = [stream, *self.others]
+        lost = sorted({other.type for other in container.streams if other not in kept})
+        if lost:
+            listener.note(f"{path}: its other streams, {', '.join(lost)}, are left out")
+        stream.thread_type = "AUTO"
+        self.rate = _rate(stream)
+        self.count = 0
+        """Frames so far."""
+        self._end = self._last = 0.0
+        """Of its frames, and of all, in seconds from the begin."""
+
+    def __iter__(self) -> Iterator[Any]:
+        av = _av()
+        size = pixels = None
+        begin = float((self.container.start_time or 0) / 1e6)
+        after: Fraction | None = None
+        for packet in self.container.demux(self.stream, *self.others):
+            if packet.stream is not self.stream:
+                if packet.dts is not None:
+                    self._last = max(self._last, float((packet.pts or packet.dts) * packet.time_base) - begin)
+                    yield packet
+                continue
+            try:
+                frames = packet.decode()
+            except av.error.InvalidDataError:
+                if self.count:
+                    raise
+                continue  # a recording that begins between whole frames
+            for frame in frames:
+                if size is None:
+                    size, pixels = (frame.height, frame.width), self._pixels(frame.format.name)
+                    if frame.interlaced_frame:
+                        self.listener.note(f"{self.path}: is interlaced; two moments get mixed within its frames")
+                if size != (frame.height, frame.width):
+                    raise VideoFileError(
+                        f"{self.path}: its frames are {size[1]}x{size[0]}, then {frame.width}x{frame.height}"
+                    )
+                step = 1 / self.rate
+                if frame.pts is None:
+                    frame.time_base = frame.time_base or step
+                    frame.pts = round((after or Fraction(0)) / frame.time_base)
+                after = frame.pts * frame.time_base + step
+                self._end = float(after) - begin
+                self.count += 1
+                yield self._converted(frame, pixels)
+
+    def _pixels(self, format: str) -> str:
+        """The format to work in: that of the video, if that can be done and written."""
+        codec = _av().Codec(self.codec, "w")
+        known = [one.name for one in codec.video_formats or ()]
+        if _PLANAR.fullmatch(format) and (format in known or not known):
+            return format
+        return "yuv420p" if "yuv420p" in known or not known else next(filter(_PLANAR.fullmatch, known), known[0])
+
+    def _converted(self, frame: Any, format: str | None) -> Any:
+        if frame.format.name == format:
+            return frame
+        if not frame.format.is_rgb:
+            return frame.reformat(format=format)
+        new = frame.reformat(format=format, dst_colorspace="ITU709", dst_color_range="MPEG")
+        new.colorspace, new.color_range = 1, 1  # as just said
+        return new
+
+    def check_end(self) -> None:
+        """Refuse a video that ended before it should.
+
+        Raises:
+            VideoFileError: it is cut off.
+        """
+        length = float(_length(self.container, self.stream))
+        end = self._end if self.stream.duration is not None else max(self._end, self._last)
+        if length - end > max(_CUT, 0.02 * length):
+            raise VideoFileError(f"{self.path}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged")
+
+
+class _Written:
+    """The new file."""
+
+    def __init__(self, path: Path, output: Any):
+        self.path, self.output = path, output
+        self._stream: Any = None
+        self._copies: dict[int, Any] = {}
+        self._tick: Fraction | None = None
+
+    def begin(self, read: _Read, frame: Any, size: tuple[int, int], crf: int | None) -> None:
+        """Say what will be in it: new frames of a (height, width), all else as `read` has it; `frame` is its first."""
+        format, codec = self.output.format.name, read.codec
+        # formats and encoders that know no time stamps but multiples of one step
+        self._tick = 1 / read.rate if format == "avi" or codec == "mpeg4" else frame.time_base
+        try:
+            stream = self.output.add_stream(codec, rate=read.rate, time_base=self._tick)
+        except ValueError as error:
+            raise VideoFileError(f"{self.path}: {error}; --codec names another encoder") from None
+        height, width = size
+        halved = {(c.width < frame.width, c.height < frame.height) for c in frame.format.components if c.is_chroma}
+        if codec in _EVEN and any((across and width % 2) or (down and height % 2) for across, down in halved):
+            raise VideoFileError(f"{self.path}: {width}x{height}, but {codec} wants even numbers; --size names them")
+        stream.width, stream.height, stream.pix_fmt = width, height, frame.format.name
+        context = stream.codec_context
+        context.color_range, context.colorspace = frame.color_range, frame.colorspace
+        context.color_primaries, context.color_trc = frame.color_primaries, frame.color_trc
+        context.thread_count = _THREADS
+        if _has_crf(codec):
+            stream.options = {"crf": str(_QUALITIES.get(codec, 20) if crf is None else crf)}
+        elif codec in _BY_QUANTISER:
+            context.qscale, context.global_quality = True, _QUANTISER * _LAMBDA
+        if format == "avi":
+            stream.options |= {"bf": "0"}  # its frames come in the order in which they are shown
+        matrix = frame.side_data.get("DISPLAYMATRIX")
+        if matrix is not None:
+            stream.set_display_matrix(np.frombuffer(matrix, np.int32).tolist())
+            if format not in ("mp4", "mov", "matroska"):
+                read.listener.note(f"{read.path}: is shown turned, which {self.path.suffix} files do not say")
+        self._stream = stream
+        stream.metadata.update(_kept(read.stream.metadata))
+        self.output.metadata.update(_kept(read.container.metadata))
+        self.output.set_chapters(read.container.chapters())
+        for other in read.others:
+            try:
+                copy = self.output.add_stream_from_template(other)
+            except ValueError:
+                raise VideoFileError(
+                    f"{read.path}: its {other.type}, {other.codec_context.name}, cannot be kept in {self.path.suffix}; "
+                    ".mkv takes nearly all"
+                ) from None
+            copy.metadata.update(_kept(other.metadata))
+            copy.disposition = other.disposition
+            self._copies[other.index] = copy
+
+    def copy(self, packet: Any) -> None:
+        """Write a packet as it is."""
+        packet.stream = self._copies[packet.stream.index]
+        self.output.mux(packet)
+
+    def encode(self, frame: Any) -> None:
+        """Write a frame; None in the end."""
+        if frame is not None and frame.time_base != self._tick:
+            frame.pts, frame.time_base = round(frame.pts * frame.time_base / self._tick), self._tick
+            frame.duration = 1
+        self.output.mux(self._stream.encode(frame))
+
+
+def _kept(metadata: dict[str, str]) -> dict[str, str]:
+    """What the new file does not say of itself."""
+    own = ("brand", "encoder", "DURATION", "BPS", "NUMBER_OF", "_STATISTICS")
+    return {name: text for name, text in metadata.items() if not any(word in name for word in own)}
+
+
+# -- threads
+
+
+@contextlib.contextmanager
+def _ahead(things: Iterable[T]) -> Iterator[Iterator[T]]:
+    """The same things, which another thread gets somewhat before they are wanted."""
+    waiting: queue.Queue[tuple[str, Any]] = queue.Queue(_AHEAD)
+    ended = threading.Event()
+
+    def put(kind: str, what: Any) -> None:
+        while not ended.is_set():
+            with contextlib.suppress(queue.Full):
+                waiting.put((kind, what), timeout=0.1)
+                return
+
+    def work() -> None:
+        try:
+            for thing in things:
+                put("thing", thing)
+                if ended.is_set():
+                    return
+            put("end", None)
+        except BaseException as error:  # the other thread's to deal with
+            put("error", error)
+
+    def got() -> Iterator[T]:
+        while True:
+            kind, what = waiting.get()
+            if kind == "end":
+                return
+            if kind == "error":
+                raise what
+            yield what
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        yield got()
+    finally:
+        ended.set()
+        thread.join()
+
+
+@contextlib.contextmanager
+def _behind() -> Iterator[Callable[[Callable[[T], object], T], None]]:
+    """A function that has another thread call one with an argument, in the order of calls, and soon.
+
+    What these raise, a later call does, or the end of the block, before which all is done.
+    """
+    waiting: queue.Queue[tuple[Callable[[Any], object], Any] | None] = queue.Queue(_AHEAD)
+    errors: list[BaseException] = []
+
+    def work() -> None:
+        while (call := waiting.get()) is not None:
+            if not errors:
+                try:
+                    call[0](call[1])
+                except BaseException as error:  # the other thread's to deal with
+                    errors.append(error)
+
+    def later(function: Callable[[T], object], argument: T) -> None:
+        if errors:
+            raise errors[0]
+        waiting.put((function, argument))
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        yield later
+    except BaseException as error:
+        errors.insert(0, error)  # so what waits is left
+        raise
+    finally:
+        waiting.put(None)
+        thread.join()
+        if errors and sys.exc_info()[1] is None:
+            raise errors[0]

@@ -1,0 +1,107 @@
+"""What a job consists of: items, each of some files read and some files made of them; and which of them a shard has."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias, TypeVar
+
+Json: TypeAlias = Any
+"""What JSON holds."""
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Item:
+    """Some files, and what is made of them."""
+
+    inputs: tuple[Path, ...]
+    """All that is read; reports call the item by the first one."""
+    outputs: tuple[Path, ...]
+    """All that is written, of no other item."""
+    variant: str = ""
+    """What the outputs depend on beside what is in the inputs and the settings of the job: a seed, for example."""
+    size: float = 1.0
+    """How much work it is: the frames of a video."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return str(self.inputs[0])
+
+
+class Listener(Protocol):
+    """Who hears of the work on an item while it goes on."""
+
+    def note(self, text: str) -> None:
+        """What the user should know though the work goes on; where it begins with the item's name, that is left out."""
+
+    def done(self, size: float) -> None:
+        """How much of `Item.size` is done."""
+
+
+Work: TypeAlias = Callable[[Item, Listener], Json]
+"""Makes all outputs of an item, each whole or not at all, and returns what the manifest is to keep of it.
+
+It is pickled, once for each process. Whatever it raises is why the item failed; of a ValueError or OSError the text is
+shown as it is.
+"""
+
+
+def check(items: Sequence[Item], others: Iterable[Path] = ()) -> None:
+    """Refuse items that would write over each other, or over what is read, by them or in `others`.
+
+    Raises:
+        ValueError: two items have the same output; an output is an input.
+    """
+    of_output: dict[str, Item] = {}
+    read = {os.path.realpath(path): path for item in items for path in item.inputs}
+    read |= {os.path.realpath(path): path for path in others}
+    for item in items:
+        for path in item.outputs:
+            place = os.path.realpath(path)
+            other = of_output.setdefault(place, item)
+            if other is not item:
+                raise ValueError(f"{other.name} and {item.name} would both be written to {path}")
+            if place in read:
+                raise ValueError(f"{path}: would overwrite {read[place]}, which is read; name another folder")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Every `count`-th item from the `rank`-th on, for one of `count` processes that share a job."""
+
+    rank: int = 0
+    count: int = 1
+    local: int = 1
+    """How many of them are on this machine."""
+
+    @classmethod
+    def of_environment(cls, environment: Mapping[str, str] | None = None) -> Shard:
+        """By RANK, WORLD_SIZE and LOCAL_WORLD_SIZE as torchrun sets them, else by what srun sets for a step.
+
+        Raises:
+            ValueError: one without the other, or no numbers that fit.
+        """
+        known = os.environ if environment is None else environment
+        for rank, count, local in (
+            ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"),
+            ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NTASKS_PER_NODE"),
+        ):
+            # outside of a step SLURM_NTASKS is what was asked for, and nobody else works
+            if known.get(rank, "") == "":
+                if rank == "RANK" and known.get(count, "") not in ("", "1"):
+                    raise ValueError(f"{count} is {known[count]!r}, but {rank} is not set: which shard is this?")
+                continue
+            values = [known.get(name, "") for name in (rank, count)]
+            if not all(value.isascii() and value.isdigit() for value in values) or int(values[0]) >= int(values[1]):
+                raise ValueError(f"{rank}={values[0]!r} and {count}={values[1]!r} do not say which shard of how many")
+            here = known.get(local, "")
+            return cls(int(values[0]), int(values[1]), max(1, int(here)) if here.isdigit() else 1)
+        return cls()
+
+    def of(self, items: Sequence[T]) -> Sequence[T]:
+        """Its part of all items."""
+        return items[self.rank :: self.count]
