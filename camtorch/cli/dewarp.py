@@ -307,5 +307,6 @@ def _told(arguments: argparse.Namespace, told: dict[str, Any]) -> str:
     fx, fy, cx, cy = told["intrinsics"]
     return (
         f"{told['model']} to {arguments.projection}, {told['degrees']:.1f} degrees wide, "
-        f"{told['width']}x{told['height']}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; {100 * told['filled']:.1f} % of it is filled"
+        f"{told['width']}x{told['height']}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; "
+        f"{100 * told['filled']:.1f} % of it is filled"
     )

@@ -359,6 +359,9 @@ class _Read:
         self.rate = _rate(stream)
         self.count = 0
         """Frames so far."""
+        self._first: int | None = None
+        self._stamp: int | None = None
+        """Of the last frame."""
         self._end = self._last = 0.0
         """Of its frames, and of all, in seconds from the begin."""
 
@@ -366,7 +369,6 @@ class _Read:
         av = _av()
         size = pixels = None
         begin = float((self.container.start_time or 0) / 1e6)
-        after: Fraction | None = None
         for packet in self.container.demux(self.stream, *self.others):
             if packet.stream is not self.stream:
                 if packet.dts is not None:
@@ -388,14 +390,23 @@ class _Read:
                     raise VideoFileError(
                         f"{self.path}: its frames are {size[1]}x{size[0]}, then {frame.width}x{frame.height}"
                     )
-                step = 1 / self.rate
-                if frame.pts is None:
-                    frame.time_base = frame.time_base or step
-                    frame.pts = round((after or Fraction(0)) / frame.time_base)
-                after = frame.pts * frame.time_base + step
-                self._end = float(after) - begin
+                self._date(frame)
+                self._end = float(frame.pts * frame.time_base + 1 / self.rate) - begin
                 self.count += 1
                 yield self._converted(frame, pixels)
+
+    def _date(self, frame: Any) -> None:
+        """Have a frame's time stamp, where there is none, or a wrong one, follow the last one's."""
+        frame.time_base = frame.time_base or 1 / self.rate
+        stamp = frame.pts
+        if self.container.format.name == "avi":  # whose stamps are those of the order in which frames are stored
+            self._first = frame.dts if self._first is None else self._first
+            stamp = None if frame.dts is None or self._first is None else frame.dts - self._first
+        if stamp is None:
+            stamp = 0 if self._stamp is None else self._stamp + round(1 / self.rate / frame.time_base)
+        if self._stamp is not None:
+            stamp = max(stamp, self._stamp + 1)
+        frame.pts = self._stamp = stamp
 
     def _pixels(self, format: str) -> str:
         """The format to work in: that of the video, if that can be done and written."""
@@ -455,6 +466,8 @@ class _Written:
         context.thread_count = _THREADS
         if _has_crf(codec):
             stream.options = {"crf": str(_QUALITIES.get(codec, 20) if crf is None else crf)}
+            if codec == "libx265":
+                stream.options |= {"x265-params": "log-level=error"}
         elif codec in _BY_QUANTISER:
             context.qscale, context.global_quality = True, _QUANTISER * _LAMBDA
         if format == "avi":
@@ -495,7 +508,7 @@ class _Written:
 
 def _kept(metadata: dict[str, str]) -> dict[str, str]:
     """What the new file does not say of itself."""
-    own = ("brand", "encoder", "DURATION", "BPS", "NUMBER_OF", "_STATISTICS")
+    own = ("brand", "minor_version", "encoder", "DURATION", "BPS", "NUMBER_OF", "_STATISTICS")
     return {name: text for name, text in metadata.items() if not any(word in name for word in own)}
 
 
