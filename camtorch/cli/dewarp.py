@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from camtorch.cli.options import add_force, add_jobs, add_photograph, parse_path, parse_size, parse_suffix
-from camtorch.cli.terminal import Bar, note, say
+from camtorch.cli.terminal import Bar, note
 from camtorch.jobs import pool
 
 if TYPE_CHECKING:
     from camtorch.cli.dewarping import Dewarping
     from camtorch.cli.options import Commands
-    from camtorch.jobs.items import Item, Shard
+    from camtorch.jobs.items import Item
+    from camtorch.jobs.run import Report
 
 _DEFAULT = "dewarped.png"
 _SLASHES = ("/", os.sep)
@@ -190,20 +191,14 @@ class _Shown:
 
 
 def _many(arguments: argparse.Namespace) -> int:
-    from camtorch.cli import images, videos
-    from camtorch.jobs import inputs, items, run
+    from camtorch.cli import images, many, videos
+    from camtorch.jobs import inputs, items
     from camtorch.jobs.manifest import Manifest
 
-    if arguments.output is None:
-        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder of them")
-    output, shard = Path(arguments.output), items.Shard.of_environment()
-    if os.path.lexists(output) and not output.is_dir():
-        raise ValueError(f"{output}: is no folder, which -o names for several images or a folder of them")
+    output, shard = many.output_folder(arguments.output), items.Shard.of_environment()
     known = inputs.IMAGES | set(videos.FORMATS)
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
-        raise ValueError(
-            f"{output}: is the name of one file, but there are several to be written; -o OUT/ names a folder"
-        )
+        raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
     found = inputs.find(arguments.image, known, output)
     everything = [_item(one, output, arguments.suffix) for one in found.files]
     for item in everything:
@@ -211,42 +206,21 @@ def _many(arguments: argparse.Namespace) -> int:
     items.check(everything, [arguments.camera] if arguments.camera else [])
     work = _dewarping(arguments, [one.path for one in found.files])
     mine = [videos.sized(item) for item in shard.of(everything)]
-    faults = found.faults if shard.rank == 0 else []
-    manifest = Manifest(output, "dewarp", work.settings(), shard)
-    if arguments.dry_run:
-        return _dry_run(mine, faults, manifest, arguments.resume)
-    moving = any(item.size != 1 for item in mine)
-    title = "dewarping" if shard.count == 1 else f"dewarping, shard {shard.rank + 1} of {shard.count}"
-    bar = Bar(title, "frames" if moving else "images")
-    try:
-        with manifest:
-            report = run.run(
-                mine,
-                work,
-                manifest,
-                processes=min(arguments.jobs or _cores(shard), max(len(mine), 1)),
-                resume=arguments.resume,
-                force=arguments.force,
-                watch=lambda progress: bar.show(progress.done, progress.total, progress.kept),
-            )
-    except FileExistsError as error:
-        raise ValueError(f"{error}; --resume goes on where it was broken off, --force overwrites") from None
-    finally:
-        bar.close()
-    for text, names in report.notes.items():
-        note(f"{names[0]} {text}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {text}")
-    failed = [*((str(path), why) for path, why in faults), *report.failed]
-    for name, why in failed:
-        say(f"error: {name}: {why}")
-    told = list({str(result): result for result in report.results.values()}.values())
-    how = f", {_told(arguments, told[0])}" if len(told) == 1 else ""
-    parts = [f"{report.made} of {len(mine) + len(faults)} dewarped{how}"]
-    if report.kept:
-        parts.append(f"{report.kept} were done already")
-    if failed:
-        parts.append(f"{len(failed)} failed")
-    print(f"{output}: {'; '.join(parts)}")
-    return 1 if failed else 0
+
+    def told(report: Report) -> str:
+        facts = many.same([{**result, "frames": None} for result in report.results.values()])
+        return f", {_told(arguments, facts)}" if facts else ""
+
+    return many.carry_out(
+        mine,
+        found.faults if shard.rank == 0 else [],
+        work,
+        Manifest(output, "dewarp", work.settings(), shard),
+        arguments,
+        doing="dewarping",
+        units="frames" if any(item.size != 1 for item in mine) else "images",
+        told=told,
+    )[0]
 
 
 def _item(found: Any, output: Path, suffix: str | None) -> Item:
@@ -257,24 +231,6 @@ def _item(found: Any, output: Path, suffix: str | None) -> Item:
     if suffix is not None and videos.is_video(place) == videos.is_video(Path(suffix)):
         place = place.with_suffix(suffix)
     return Item((found.path,), (output / place,))
-
-
-def _dry_run(mine: list[Item], faults: list[tuple[Path, str]], manifest: Any, resume: bool) -> int:
-    from camtorch.jobs import run
-
-    count = 0
-    for item in run.pending(mine, manifest, resume=resume):
-        print(f"{item.name} -> {item.outputs[0]}")
-        count += 1
-    for path, why in faults:
-        say(f"error: {path}: {why}")
-    print(f"{count} to do, {len(mine) - count} done already")
-    return 1 if faults else 0
-
-
-def _cores(shard: Shard) -> int:
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(own // shard.local, 1)
 
 
 def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:

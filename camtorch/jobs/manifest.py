@@ -90,7 +90,7 @@ class Manifest:
     def __init__(self, folder: Path, job: str, settings: Json, shard: Shard | None = None):
         shard = shard or Shard()
         of = "" if shard.count == 1 else f"-{shard.rank}-of-{shard.count}"
-        self.folder, self.job, self.settings = folder, job, settings
+        self.folder, self.job, self.settings, self.shard = folder, job, settings, shard
         self.path = folder / f".camtorch-{job}{of}.jsonl"
         text = json.dumps(settings, sort_keys=True, allow_nan=False)
         self.terms = Terms(folder, hashlib.blake2b(text.encode(), digest_size=16).hexdigest())

@@ -88,7 +88,7 @@ def run(
     def receive(task: _Task, kind: str, what: Json) -> None:
         item = task.item
         if kind == "failed":
-            fail(item, what.removeprefix(f"{item.name}: "))
+            fail(item, what.removeprefix(item.name).lstrip(": "))
         elif kind == "done":
             record, is_new = what
             report.results[item] = record["result"]
