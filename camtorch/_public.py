@@ -12,6 +12,9 @@ from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save
 from camtorch.mixed import Mixed
+from camtorch.maps.formats import load_map
+from camtorch.maps.lookup import LookupMap
+from camtorch.maps.report import MapReport
 from camtorch.models import (
     EUCM,
     FOV,
@@ -75,6 +78,8 @@ __all__ = [
     "FisheyeRadTanThinPrism",
     "KannalaBrandt",
     "LatLon",
+    "LookupMap",
+    "MapReport",
     "Mei",
     "Mixed",
     "OCamCalib",
@@ -102,6 +107,7 @@ __all__ = [
     "io",
     "lenses",
     "load",
+    "load_map",
     "native_available",
     "rectify",
     "save",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -14,6 +15,9 @@ from camtorch._arguments import as_values, broadcast_shapes
 from camtorch._module import GeometryModule, Memo, is_constant, with_values
 from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, set_aside
 from camtorch.camera import Camera
+from camtorch.maps.formats import save_map
+from camtorch.maps.protocol import Options as MapOptions
+from camtorch.maps.report import MapReport
 from camtorch.native.sampler import empty
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import compiled
@@ -445,6 +449,45 @@ class Warp(GeometryModule):
             "antialias": self.antialias,
             "tolerance": self._tolerance,
         }
+
+    # -- for other runtimes
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        format: str | None = None,
+        *,
+        step: int | None = None,
+        v: Literal["up", "down"] | None = None,
+        order: Literal["yx", "xy"] | None = None,
+        block: tuple[int, int] | None = None,
+        dtype: Literal["float32", "uint8"] | None = None,
+        clip: bool | None = None,
+    ) -> MapReport:
+        """Write where each pixel of the target is taken from, for another runtime, and measure what was written.
+
+        What the file holds is read back, interpolated as its runtime does, and compared with the exact positions, at
+        every pixel that shows the source's image. A map holds positions alone: mode, padding, fill and antialias are
+        the runtime's, but for "onnx", which holds all but the last.
+
+        Args:
+            path: of the file, replaced as a whole or not at all. Bare tables get a description beside them, PATH.json.
+            format: "opencv" (.yml, .xml, .npz), "opencv_fixed" (the same), "stmap" (.exr, .tif), "dw100", "ti_ldc",
+                "depthai", "obj", "gltf" (.glb, .gltf) or "onnx"; by default what the suffix says.
+            step: pixels of the target between the nodes of a mesh: 16 by default for "depthai", "obj" and "gltf", 8 for
+                "ti_ldc", where it is a power of two up to 128.
+            v: "stmap": "up", as Nuke has it and by default, or "down".
+            order: "depthai": "yx" for loadMeshFiles, the default, or "xy" for setWarpMesh.
+            block: "ti_ldc": (height, width) of the blocks of the target; by default the largest that can be had.
+            dtype: "onnx": of the images, "float32" by default.
+            clip: "dw100", "ti_ldc": draw in positions that the format cannot hold, rather than refuse them.
+
+        Raises:
+            CameraFileError: a format that cannot hold this warp; it says why. ValueError: a batch of warps, an unknown
+                format, an option that it does not have. ImportError: a library that it needs is missing; the error
+                names the extra. OSError: the file cannot be written.
+        """
+        return save_map(self, path, format, MapOptions(step, v, order, block, dtype, clip))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_pinned": None}

@@ -1,0 +1,170 @@
+"""Arrays in map files: archives of NumPy and matrices of `cv2.FileStorage`, never trusted."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import re
+import warnings
+import zipfile
+import zlib
+from typing import Any
+
+import numpy as np
+
+from camtorch.io._errors import CameraFileError
+from camtorch.maps.protocol import MOST_PIXELS
+
+Arrays = dict[str, np.ndarray]
+
+_TYPES = {"f": "<f4", "d": "<f8", "s": "<i2", "w": "<u2", "i": "<i4", "u": "u1"}
+_LETTERS = {np.dtype(code): letter for letter, code in _TYPES.items()}
+_HEADER = 24  # bytes before the data in base64, which say the type once more
+_LINE = 76  # characters of base64 in a line
+_MOST_ARRAYS = 100
+_FAILURES = (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError)
+
+
+def as_archive(arrays: dict[str, Any]) -> bytes:
+    """What `numpy.savez` writes."""
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def from_archive(path: str, content: bytes) -> Arrays:
+    """The arrays of an archive; pickled objects are not read.
+
+    Raises:
+        CameraFileError: another archive, a damaged one, arrays of other than numbers, or too large ones.
+    """
+    arrays: Arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = archive.infolist()
+            if len(entries) > _MOST_ARRAYS:
+                raise ValueError(f"{len(entries)} arrays")
+            for entry in entries:
+                with archive.open(entry) as file:
+                    version = np.lib.format.read_magic(file)
+                    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else _later_header
+                    shape, fortran, dtype = header(file)
+                    count = int(np.prod([1, *shape], dtype=object))
+                    if dtype.kind not in "fiu" or not 0 <= count <= 2 * MOST_PIXELS:
+                        raise ValueError(f"{entry.filename}: {dtype} of shape {shape} is no part of a map")
+                    data = file.read(count * dtype.itemsize)
+                array = np.frombuffer(data, dtype, count)
+                arrays[entry.filename.removesuffix(".npy")] = array.reshape(shape, order="F" if fortran else "C")
+    except _FAILURES as error:
+        raise CameraFileError(path, "content", f"no archive of NumPy's that holds a map: {error}") from None
+    return arrays
+
+
+def _later_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    return np.lib.format.read_array_header_2_0(file)
+
+
+def as_storage(arrays: dict[str, Any], *, xml: bool) -> bytes:
+    """What `cv2.FileStorage` reads: matrices in base64, as it writes them with WRITE_BASE64; and whole numbers."""
+    parts = [b'<?xml version="1.0"?>\n<opencv_storage>\n' if xml else b"%YAML:1.0\n---\n"]
+    for key, value in arrays.items():
+        if isinstance(value, int):
+            parts.append((f"<{key}>{value}</{key}>\n" if xml else f"{key}: {value}\n").encode())
+            continue
+        rows, columns, channels = value.shape if value.ndim == 3 else (*value.shape, 1)
+        letter = _LETTERS[value.dtype]
+        dt = letter if channels == 1 else f'"{channels}{letter}"'
+        text = base64.b64encode(f"{channels}{letter}".ljust(_HEADER).encode() + np.ascontiguousarray(value).tobytes())
+        lines = b"\n    ".join(text[i : i + _LINE] for i in range(0, len(text), _LINE))
+        if xml:
+            parts.append(
+                f'<{key} type_id="opencv-matrix">\n  <rows>{rows}</rows>\n  <cols>{columns}</cols>\n  <dt>{dt}</dt>\n'
+                '  <data type_id="binary">\n    '.encode()
+                + lines
+                + f"\n    </data></{key}>\n".encode()
+            )
+        else:
+            parts.append(
+                f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: {dt}\n   data: !!binary |\n"
+                "    ".encode()
+                + lines
+                + b"\n"
+            )
+    return b"".join([*parts, b"</opencv_storage>\n" if xml else b""])
+
+
+_YAML_MATRIX = re.compile(
+    rb'^([\w.-]{1,99}): !!opencv-matrix\s{1,9}rows: (\d{1,9})\s{1,9}cols: (\d{1,9})\s{1,9}dt: "?(\d{0,3})([a-z])"?'
+    rb"\s{1,9}data: (\[|!!binary \|)",
+    re.MULTILINE,
+)
+_XML_MATRIX = re.compile(
+    rb'<([\w.-]{1,99}) type_id="opencv-matrix">\s{0,9}<rows>(\d{1,9})</rows>\s{0,9}<cols>(\d{1,9})</cols>\s{0,9}'
+    rb'<dt>"?(\d{0,3})([a-z])"?</dt>\s{0,9}<data( type_id="binary")?>'
+)
+_YAML_NUMBER = re.compile(rb"^([\w.-]{1,99}): (\d{1,9})\s*$", re.MULTILINE)
+_XML_NUMBER = re.compile(rb"^<([\w.-]{1,99})>(\d{1,9})</[\w.-]{1,99}>\s*$", re.MULTILINE)
+_YAML_END = re.compile(rb"^\S", re.MULTILINE)
+
+
+def from_storage(path: str, content: bytes) -> Arrays:
+    """The matrices of a YAML or XML file that `cv2.FileStorage` wrote, (rows, columns[, channels]), and whole numbers.
+
+    Raises:
+        CameraFileError: a matrix that is damaged, too large or of another type.
+    """
+    xml = content.lstrip()[:1] == b"<"
+    arrays: Arrays = {}
+    for found in (_XML_NUMBER if xml else _YAML_NUMBER).finditer(content):
+        arrays[found[1].decode()] = np.array(int(found[2]))
+    for count, found in enumerate((_XML_MATRIX if xml else _YAML_MATRIX).finditer(content)):
+        name = found[1].decode()
+        if count >= _MOST_ARRAYS:
+            raise CameraFileError(path, "content", f"more than {_MOST_ARRAYS} matrices")
+        rows, columns, channels = int(found[2]), int(found[3]), int(found[4] or 1)
+        coded = found[6] is not None and found[6] != b"["
+        if xml:
+            end = content.find(b"</data>", found.end())
+        elif coded:
+            following = _YAML_END.search(content, found.end())
+            end = following.start() if following else len(content)
+        else:
+            end = content.find(b"]", found.end())
+        letter = found[5].decode()
+        if end < 0 or letter not in _TYPES or rows * columns * channels > 2 * MOST_PIXELS:
+            raise CameraFileError(
+                path, name, f"{rows}x{columns} of type {channels}{letter} without an end, or too large"
+            )
+        dtype = np.dtype(_TYPES[letter])
+        data = content[found.end() : end]
+        try:
+            values = _from_base64(data, dtype) if coded else _from_words(data, dtype)
+            shape = (rows, columns, channels) if channels > 1 else (rows, columns)
+            arrays[name] = values.reshape(shape)
+        except ValueError as error:
+            raise CameraFileError(
+                path, name, f"no {rows}x{columns} matrix of type {channels}{letter}: {error}"
+            ) from None
+    return arrays
+
+
+def _from_base64(data: bytes, dtype: np.dtype) -> np.ndarray:
+    try:
+        raw = base64.b64decode(b"".join(data.split()), validate=True)
+    except binascii.Error as error:
+        raise ValueError(str(error)) from None
+    return np.frombuffer(raw, dtype, offset=_HEADER)
+
+
+def _from_words(data: bytes, dtype: np.dtype) -> np.ndarray:
+    text = data.decode("ascii", "replace").replace(",", " ").lower().replace(".nan", "nan").replace(".inf", "inf")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            values = np.fromstring(text, np.float64, sep=" ")
+        except DeprecationWarning as error:
+            raise ValueError(str(error)) from None
+    if dtype.kind != "f" and not np.isfinite(values).all():
+        raise ValueError("not whole numbers")
+    return values.astype(dtype)

@@ -1,0 +1,58 @@
+"""Meshes of DepthAI (Luxonis): float32 positions at every 16th pixel of the target, in raster order, little-endian.
+
+(ceil(W / step) + 1) x (ceil(H / step) + 1) nodes. order="yx" is what `StereoDepth.loadMeshFiles` and `loadMeshData`
+take; order="xy" the points of `setWarpMesh`, for which `numpy.fromfile(path, "<f4").reshape(-1, 2)` reads them.
+Integers are pixel centres.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from camtorch.io._errors import CameraFileError
+from camtorch.maps.exact import Exact
+from camtorch.maps.lookup import LookupMap
+from camtorch.maps.mesh import mesh_of, nodes_every
+from camtorch.maps.protocol import Encoded, Given, Options
+from camtorch.maps.tables import lookup, sizes, table
+
+_STEP = 16
+_ORDERS = ("yx", "xy")
+_LONGEST_STEP = 256
+
+
+class DepthAI:
+    """The format: see the module."""
+
+    name = "depthai"
+    suffixes = ()
+    options = ("step", "order")
+    described = True
+
+    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
+        """Raises ValueError: an option that is none."""
+        step, order = _STEP if options.step is None else options.step, options.order or "yx"
+        if order not in _ORDERS:
+            raise ValueError(f"Warp.save: order must be 'yx' (loadMeshFiles) or 'xy' (setWarpMesh); got {order!r}")
+        if not 1 <= step <= _LONGEST_STEP:
+            raise ValueError(f"Warp.save: step must be 1 to {_LONGEST_STEP} pixels; got {step}")
+        height, width = exact.target_size
+        mesh = mesh_of(exact, nodes_every(step, width), nodes_every(step, height))
+        nodes = mesh.nodes if order == "xy" else mesh.nodes[..., ::-1]
+        facts = {"step": step, "nodes": (len(mesh.rows), len(mesh.columns)), "order": order}
+        return Encoded(np.ascontiguousarray(nodes, "<f4").tobytes(), facts)
+
+    def matches(self, path: str, content: bytes) -> bool:
+        return False
+
+    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
+        """Raises CameraFileError: another length, no such order, nobody says the sizes."""
+        source, target = sizes(path, given)
+        step, order = _STEP if given.step is None else given.step, given.order or "yx"
+        if order not in _ORDERS or not 1 <= step <= _LONGEST_STEP:
+            raise CameraFileError(path, "order", f"{order!r} every {step} pixels; known are {_ORDERS}")
+        shape = len(nodes_every(step, target[0])), len(nodes_every(step, target[1])), 2
+        nodes = table(path, content, "<f4", shape).astype(np.float64)
+        return lookup(
+            path, self.name, nodes if order == "xy" else nodes[..., ::-1], step, source, target, {"order": order}
+        )

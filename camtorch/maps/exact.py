@@ -1,0 +1,83 @@
+"""What a map is measured against: where a warp takes the pixels of its target from, in float64."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+if TYPE_CHECKING:
+    from camtorch.warp.warp import Warp
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+_STRIP = 1 << 19  # pixels computed at a time
+
+
+class Exact:
+    """Positions on the source's image by pixels of the target, as the cameras say: no lattice, nothing rounded.
+
+    Args:
+        warp: a single one; what of it learns is taken as it is.
+
+    Raises:
+        ValueError: a batch of warps.
+    """
+
+    def __init__(self, warp: Warp):
+        count = warp.batch_shape.numel()
+        if count != 1:
+            raise ValueError(
+                f"Warp.save: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
+                "cameras, so save each of ct.Warp(source[i], target[i], rotation[i])"
+            )
+        self.warp = warp
+        self.source_size: tuple[int, int] = warp.source._size("Warp.save")
+        self.target_size: tuple[int, int] = warp.target._size("Warp.save")
+        self._batch, self._device = warp.batch_shape, warp.target.intrinsics.device
+        with torch.no_grad():
+            self._back = warp.inverse()
+
+    def at(self, columns: Floats, rows: Floats) -> tuple[Floats, Bools]:
+        """Positions of the pixels where columns (m,) and rows (n,) of the target cross; they may lie off its image.
+
+        Returns:
+            (n, m, 2), x and y in pixels of the source, finite; and (n, m): there is a ray, and the source maps it.
+        """
+        positions, mapped = np.empty((len(rows), len(columns), 2)), np.empty((len(rows), len(columns)), np.bool_)
+        step = max(_STRIP // max(len(columns), 1), 1)
+        for top in range(0, len(rows), step):
+            here = slice(top, top + step)
+            grid = np.stack(np.meshgrid(columns, rows[here]), -1)
+            pixels = torch.from_numpy(grid).to(self._device).expand(*self._batch, *grid.shape)
+            with torch.no_grad():
+                moved, valid = self._back._move(pixels)
+            positions[here] = moved.double().cpu().numpy().reshape(grid.shape)
+            mapped[here] = valid.cpu().numpy().reshape(grid.shape[:-1])
+        return positions, mapped
+
+    @cached_property
+    def _pixels(self) -> tuple[Floats, Bools]:
+        height, width = self.target_size
+        return self.at(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+
+    @property
+    def positions(self) -> Floats:
+        """(H', W', 2), of every pixel of the target."""
+        return self._pixels[0]
+
+    @property
+    def mapped(self) -> Bools:
+        """(H', W'): the pixel has a ray, and the source maps it, on its image or off."""
+        return self._pixels[1]
+
+    @cached_property
+    def shown(self) -> Bools:
+        """(H', W'): the pixel shows something of the source's image, as `Warp.valid_mask`."""
+        height, width = self.source_size
+        x, y = self.positions[..., 0], self.positions[..., 1]
+        return self.mapped & (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)

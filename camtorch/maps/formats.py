@@ -1,0 +1,211 @@
+"""`Warp.save` and `load_map`: the formats of maps, none of which is known here but by its object.
+
+To add a format, write one file beside this one, as `protocol.py` says, and name its object below.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+from camtorch.io._errors import CameraFileError
+from camtorch.io.parsing import check_ordinary
+from camtorch.io.writing import as_json, replacing
+from camtorch.maps.depthai import DepthAI
+from camtorch.maps.dw100 import DW100
+from camtorch.maps.exact import Exact
+from camtorch.maps.lookup import LookupMap
+from camtorch.maps.onnx import ONNX
+from camtorch.maps.opencv import OpenCV
+from camtorch.maps.protocol import Given, MapFormat, Options
+from camtorch.maps.report import MapReport, measure
+from camtorch.maps.stmap import STMap
+from camtorch.maps.texture_mesh import TextureMesh
+from camtorch.maps.ti_ldc import TILDC
+
+if TYPE_CHECKING:
+    from camtorch.warp.warp import Warp
+
+# in the order in which they are asked
+_FORMATS: tuple[MapFormat, ...] = (
+    OpenCV("opencv", fixed=False),
+    OpenCV("opencv_fixed", fixed=True),
+    STMap(),
+    DW100(),
+    TILDC(),
+    DepthAI(),
+    TextureMesh("obj", (".obj",)),
+    TextureMesh("gltf", (".glb", ".gltf")),
+    ONNX(),
+)
+FORMATS = tuple(format.name for format in _FORMATS)
+
+_LARGEST_FILE = 1 << 31
+_LARGEST_DESCRIPTION = 1 << 16
+
+
+def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, options: Options) -> MapReport:
+    """See `Warp.save`."""
+    name = _path(path, "Warp.save")
+    chosen = _chosen(name, format)
+    for option in fields(options):
+        if getattr(options, option.name) is not None and option.name not in chosen.options:
+            takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
+            raise ValueError(f"Warp.save: {chosen.name} has no {option.name}{takes}")
+    exact = Exact(warp)
+    encoded = chosen.encode(name, exact, options)
+    said = {key: encoded.facts.get(key) for key in ("step", "v", "order")}
+    read = chosen.decode(name, encoded.content, Given(exact.source_size, exact.target_size, **said))
+    files = (name, _description(name)) if chosen.described else (name,)
+    report = measure(name, read, exact, files, encoded.facts)
+    with replacing(*files) as opened:
+        opened[0].write(encoded.content)
+        if chosen.described:
+            opened[1].write(as_json(_described(report)).encode())
+    return report
+
+
+def load_map(
+    path: str | os.PathLike[str],
+    format: str | None = None,
+    *,
+    source_size: tuple[int, int] | None = None,
+    target_size: tuple[int, int] | None = None,
+    step: int | None = None,
+    v: str | None = None,
+    order: str | None = None,
+) -> LookupMap:
+    """Read a map that `Warp.save` wrote, or another program: to see what it holds, and to compare it with a warp.
+
+    Args:
+        path: the file.
+        format: one of those of `Warp.save`; found from the content, the name and the description beside it if left
+            out.
+        source_size: (height, width) of the images that it takes, where the file does not say.
+        target_size: (height, width) of those that it makes, where the file does not say.
+        step: pixels of the target between the nodes of a bare table, where nothing beside it says.
+        v: "up" or "down", which way v runs in an STMap that does not say; up if left out.
+        order: "yx" or "xy", of a DepthAI mesh without its description.
+
+    Returns:
+        A `LookupMap`: `.positions`, `.map_x`, `.map_y`, `.grid()`, `.error(warp)`; called with images it warps them.
+
+    Raises:
+        CameraFileError: the file cannot be used; it says why. OSError: it cannot be opened. ValueError: an unknown
+            format. ImportError: a library that the format needs is missing; the error names the extra.
+    """
+    name = _path(path, "load_map")
+    given: dict[str, Any] = {"step": step, "v": v, "order": order}
+    given |= {"source_size": source_size, "target_size": target_size}
+    content = _content(name)
+    if format is not None:
+        chosen = _named(format)
+    else:
+        chosen = next((known for known in _FORMATS if known.matches(name, content)), None) or _from_description(name)
+    described = _read_description(name) if chosen.described else {}
+    facts = {key: _as_fact(value) for key, value in described.items() if key not in _SIZES_AND_ERRORS}
+    stated: dict[str, Any] = {key: facts[key] for key in ("step", "order") if key in facts}
+    if all(key in described for key in _SIZES):
+        stated["source_size"] = described["source_height"], described["source_width"]
+        stated["target_size"] = described["target_height"], described["target_width"]
+    for key, value in stated.items():
+        given[key] = value if given[key] is None else given[key]
+    if given["step"] is not None and not isinstance(given["step"], int):
+        raise CameraFileError(name, "step", f"{given['step']!r:.60} is no number of pixels")
+    try:
+        read = chosen.decode(name, content, Given(**given))
+    except MemoryError as error:
+        raise CameraFileError(name, "content", f"cannot be read: {error or 'out of memory'}") from None
+    read.facts = {**facts, **read.facts}
+    return read
+
+
+_SIZES = ("source_height", "source_width", "target_height", "target_width")
+_SIZES_AND_ERRORS = ("format", *_SIZES, "max_error", "rms_error")
+
+
+def _description(path: str) -> str:
+    """The file that says what a bare table does not."""
+    return path + ".json"
+
+
+def _described(report: MapReport) -> dict[str, Any]:
+    sizes = dict(zip(_SIZES, (*report.source_size, *report.target_size), strict=True))
+    errors = {"max_error": round(report.max_error, 6), "rms_error": round(report.rms_error, 6)}
+    return {"format": report.format, **sizes, **report.facts, **errors}
+
+
+def _read_description(path: str) -> dict[str, Any]:
+    """What stands beside a bare table, or nothing."""
+    beside = _description(path)
+    if not os.path.isfile(beside):
+        return {}
+    with open(beside, "rb") as file:
+        content = file.read(_LARGEST_DESCRIPTION + 1)
+    try:
+        described = json.loads(content[:_LARGEST_DESCRIPTION])
+    except (ValueError, RecursionError) as error:
+        raise CameraFileError(beside, "content", f"no description of a map: {error}") from None
+    if not isinstance(described, dict) or len(content) > _LARGEST_DESCRIPTION:
+        raise CameraFileError(beside, "content", "no description of a map")
+    return described
+
+
+def _as_fact(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _from_description(path: str) -> MapFormat:
+    name = _read_description(path).get("format")
+    found = next((known for known in _FORMATS if known.name == name), None)
+    if found is None:
+        raise CameraFileError(
+            path, "content", f"no format that is known by its content; say format, one of {', '.join(FORMATS)}"
+        )
+    return found
+
+
+def _content(path: str) -> bytes:
+    check_ordinary(path)
+    with open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > _LARGEST_FILE:
+            raise CameraFileError(path, "size", f"{size} bytes; at most {_LARGEST_FILE} are read")
+        content = file.read(_LARGEST_FILE)
+    if not content:
+        raise CameraFileError(path, "content", "the file is empty")
+    return content
+
+
+def _path(path: Any, owner: str) -> str:
+    try:
+        name = os.fsdecode(path)
+    except TypeError:
+        raise TypeError(f"{owner} takes the path of a file; got {type(path).__name__}") from None
+    if "\0" in name:
+        raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
+    return name
+
+
+def _chosen(path: str, format: str | None) -> MapFormat:
+    """The format to write."""
+    if format is not None:
+        return _named(format)
+    suffix = os.path.splitext(path)[1].lower()
+    for known in _FORMATS:
+        if suffix and suffix in known.suffixes:
+            return known
+    suffixes = dict.fromkeys(suffix for known in _FORMATS for suffix in known.suffixes)
+    raise ValueError(
+        f"{path}: the name does not say the format; names on {', '.join(suffixes)} do, for the others say which, as in "
+        f"format='dw100' or --format dw100; known are {', '.join(FORMATS)}"
+    )
+
+
+def _named(format: str) -> MapFormat:
+    found = next((known for known in _FORMATS if known.name == str(format).lower()), None)
+    if found is None:
+        raise ValueError(f"unknown format {format!r} of a map; known are {', '.join(FORMATS)}")
+    return found

@@ -1,0 +1,117 @@
+"""A map as it was read: a position on the source's image for every pixel of the target."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from torch import Tensor
+
+from camtorch.maps.exact import Exact
+
+if TYPE_CHECKING:
+    from camtorch.warp.warp import Warp
+
+_OUTSIDE = -9.0  # a position of `grid_sample` that no image reaches
+
+
+class LookupMap:
+    """A map that was read from a file: where every pixel of the target is taken from.
+
+    Meshes are interpolated as the hardware does. It is there to check a file, and to see what a runtime will make of
+    an image; `Warp` is faster and more exact.
+
+    Args:
+        positions: (H', W', 2) float64, x and y in pixels of the source; NaN where the map draws nothing.
+        source_size: (height, width) of the images that it takes.
+        format: what it was read as.
+        facts: what the file or its description says beside, such as `step`, `nodes` or `block_size`.
+    """
+
+    def __init__(self, positions: Tensor, source_size: tuple[int, int], format: str, facts: dict[str, Any]):
+        self.positions, self.source_size, self.format, self.facts = positions, source_size, format, facts
+
+    @property
+    def target_size(self) -> tuple[int, int]:
+        """(height, width) of the images that it makes."""
+        height, width = self.positions.shape[:2]
+        return height, width
+
+    @property
+    def map_x(self) -> Tensor:
+        """(H', W') float32: the columns, as `cv2.remap` takes them."""
+        return self.positions[..., 0].float()
+
+    @property
+    def map_y(self) -> Tensor:
+        """(H', W') float32: the rows."""
+        return self.positions[..., 1].float()
+
+    def grid(self) -> Tensor:
+        """(1, H', W', 2) float32, as of `Warp.grid`: for `grid_sample(..., align_corners=False)`, -9 for nothing."""
+        height, width = self.source_size
+        size = self.positions.new_tensor([width, height])
+        return ((2 * self.positions + 1) / size - 1).nan_to_num(_OUTSIDE, _OUTSIDE, _OUTSIDE).float()[None]
+
+    def valid_mask(self) -> Tensor:
+        """(1, 1, H', W') bool: the pixel shows something of the source's image."""
+        height, width = self.source_size
+        x, y = self.positions.unbind(-1)  # NaN is nowhere
+        return ((x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5))[None, None]
+
+    def __call__(self, images: Tensor, mode: str = "bilinear", padding_mode: str = "zeros") -> Tensor:
+        """Apply it to images (B, C, H, W) of the source's size, floating point or integer; the dtype stays.
+
+        Args:
+            images: of the source.
+            mode: of `torch.nn.functional.grid_sample`.
+            padding_mode: likewise.
+
+        Raises:
+            ValueError: another shape or size.
+        """
+        shape = tuple(getattr(images, "shape", ()))
+        if not isinstance(images, Tensor) or len(shape) != 4 or shape[-2:] != self.source_size:
+            raise ValueError(
+                f"LookupMap: images must be a tensor (B, C, {self.source_size[0]}, {self.source_size[1]}); got "
+                f"{type(images).__name__} {shape}"
+            )
+        values = images if images.is_floating_point() else images.float()
+        grid = self.grid().to(values).expand(shape[0], -1, -1, -1)
+        result = F.grid_sample(values, grid, mode, padding_mode, align_corners=False)
+        if images.is_floating_point():
+            return result
+        low, high = torch.iinfo(images.dtype).min, torch.iinfo(images.dtype).max
+        return result.round().clamp(low, high).to(images.dtype)
+
+    def error(self, warp: Warp) -> Tensor:
+        """(H', W') float64: how far it is from a warp, in pixels of the source; NaN where the warp shows nothing.
+
+        Positions beyond the outermost pixel centres count as on them, as edges are repeated; where the map draws
+        nothing and the warp does, it is infinite.
+
+        Raises:
+            ValueError: the warp is between images of other sizes.
+        """
+        return self._off(Exact(warp))
+
+    def _off(self, exact: Exact) -> Tensor:
+        mine, wanted = (self.source_size, self.target_size), (exact.source_size, exact.target_size)
+        if mine != wanted:
+            raise ValueError(
+                f"LookupMap.error: the map is from images of (height, width) {mine[0]} to {mine[1]}, the warp from "
+                f"{wanted[0]} to {wanted[1]}"
+            )
+        limit = self.positions.new_tensor([side - 1 for side in reversed(self.source_size)])
+        limit, zero = limit.to(self.positions), self.positions.new_zeros(2)
+        drawn = [
+            torch.minimum(torch.maximum(p, zero), limit) for p in (self.positions, torch.from_numpy(exact.positions))
+        ]
+        distance = torch.linalg.vector_norm(drawn[0] - drawn[1], dim=-1).nan_to_num(math.inf)
+        return torch.where(torch.from_numpy(exact.shown), distance, math.nan)
+
+    def __repr__(self) -> str:
+        facts = "".join(f", {name}={value}" for name, value in self.facts.items())
+        return f"LookupMap({self.format}, source_size={self.source_size}, target_size={self.target_size}{facts})"

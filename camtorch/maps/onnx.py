@@ -1,0 +1,146 @@
+"""A warp as an ONNX model: one GridSample with a constant grid, of opset 16, that any runtime since 2022 takes.
+
+The input "images" (batch, channels, H, W) of float32 or uint8, of any batch and any number of channels; the output
+"warped" (batch, channels, H', W') of the same type. Mode, padding and fill are the warp's; align_corners is 0. By the
+extra `onnx`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+
+from camtorch.io._errors import CameraFileError
+from camtorch.maps.exact import Exact
+from camtorch.maps.lookup import LookupMap
+from camtorch.maps.protocol import MOST_PIXELS, Encoded, Given, Options, checked
+
+_OPSET, _IR = 16, 8
+_DTYPES = ("float32", "uint8")
+_OUTSIDE, _FAR = -9.0, 100.0  # as of `Warp.grid`: nowhere, and where positions are drawn in to
+
+
+class ONNX:
+    """The format: see the module."""
+
+    name = "onnx"
+    suffixes = (".onnx",)
+    options = ("dtype",)
+    described = False
+
+    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
+        """Raises ValueError: an antialiased warp, a bicubic one with an edge that runtimes make in different ways."""
+        warp, dtype = exact.warp, options.dtype or "float32"
+        if dtype not in _DTYPES:
+            raise ValueError(f"Warp.save: dtype must be one of {_DTYPES}; got {dtype!r}")
+        if warp.antialias:
+            raise ValueError("Warp.save: GridSample has no antialiasing; save a warp with antialias=False")
+        if warp.mode == "bicubic" and warp.padding_mode != "zeros":
+            raise ValueError(
+                f"Warp.save: mode='bicubic' with padding_mode={warp.padding_mode!r} is not the same in every ONNX "
+                "runtime; 'bilinear' is, or padding_mode='zeros'"
+            )
+        model = _model(exact, dtype)
+        return Encoded(model.SerializeToString(), {"dtype": dtype, "opset": _OPSET})
+
+    def matches(self, path: str, content: bytes) -> bool:
+        return path.lower().endswith(".onnx")
+
+    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
+        """Raises CameraFileError: no model of one GridSample with a constant grid."""
+        onnx = _needed()
+        try:
+            model = onnx.load_model_from_string(content)
+            samples = [node for node in model.graph.node if node.op_type == "GridSample"]
+            if len(samples) != 1:
+                raise ValueError(f"{len(samples)} GridSample nodes; one is read")
+            grids = [t for t in model.graph.initializer if t.name == samples[0].input[1]]
+            if not grids or grids[0].data_location == onnx.TensorProto.EXTERNAL:
+                raise ValueError("a grid that is no constant in this file")
+            attributes = {a.name: onnx.helper.get_attribute_value(a) for a in samples[0].attribute}
+            if attributes.get("align_corners", 0):
+                raise ValueError("align_corners=1")
+            grid = onnx.numpy_helper.to_array(grids[0]).astype(np.float64)
+            if grid.ndim != 4 or grid.shape[0] != 1 or grid.shape[3] != 2 or not 0 < grid.size <= 2 * MOST_PIXELS:
+                raise ValueError(f"a grid of shape {grid.shape}")
+            images = model.graph.input[0].type.tensor_type
+            sides = [int(dim.dim_value) for dim in images.shape.dim[2:4]]
+            kind = onnx.helper.tensor_dtype_to_np_dtype(images.elem_type).name
+        except Exception as error:  # whatever protobuf raises
+            raise CameraFileError(path, "content", f"no ONNX model of a warp: {error}") from None
+        size = checked(path, "source_size", sides)
+        positions = ((grid[0] + 1) * (size[1], size[0]) - 1) / 2
+        positions[(grid[0] == _OUTSIDE).all(-1) | ~np.isfinite(positions).all(-1)] = np.nan
+        return LookupMap(torch.from_numpy(positions), size, self.name, {"dtype": kind})
+
+
+def _needed() -> ModuleType:
+    try:
+        import onnx
+        import onnx.helper
+        import onnx.numpy_helper
+    except ImportError:
+        raise ImportError('models of ONNX need onnx: pip install "camtorch[onnx]"') from None
+    return onnx
+
+
+def _model(exact: Exact, dtype: str) -> Any:
+    onnx = _needed()
+    helper, kinds = onnx.helper, onnx.TensorProto
+    warp, (height, width) = exact.warp, exact.source_size
+    grid = ((2 * exact.positions + 1) / (width, height) - 1).clip(-_FAR, _FAR)
+    grid = np.where(exact.mapped[..., None], grid, _OUTSIDE).astype(np.float32)[None]
+    fill = np.array(warp.fill, np.float32).reshape(1, -1, 1, 1)
+    constants = {
+        "grid": grid,
+        "planes": np.array([1, -1, height, width], np.int64),
+        "target_size": np.array(exact.target_size, np.int64),
+        "first": np.array([0], np.int64),
+        "third": np.array([2], np.int64),
+    }
+    nodes: list[Any] = []
+    names = (f"step{i}" for i in itertools.count())
+
+    def add(kind: str, *inputs: str, **attributes: Any) -> str:
+        """A node, and the name of what it makes."""
+        output = next(names)
+        nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
+        return output
+
+    images = add("Cast", "images", to=kinds.FLOAT) if dtype == "uint8" else "images"
+    blended = warp.padding_mode == "zeros" and bool(fill.any())  # the rim fades to the fill, not to zero
+    if blended or not exact.mapped.all():
+        constants["fill"] = fill
+    if blended:
+        images = add("Sub", images, "fill")
+    # all channels of all images as those of one: the grid is read once
+    flat = add("Reshape", images, "planes")
+    options = {"mode": warp.mode, "padding_mode": warp.padding_mode, "align_corners": 0}
+    sampled = add("GridSample", flat, "grid", **options)
+    leading = add("Slice", add("Shape", "images"), "first", "third")
+    result = add("Reshape", sampled, add("Concat", leading, "target_size", axis=0))
+    if blended:
+        result = add("Add", result, "fill")
+    elif warp.padding_mode != "zeros" and not exact.mapped.all():
+        constants["mapped"] = exact.mapped[None, None]
+        result = add("Where", "mapped", result, "fill")
+    if dtype == "uint8":
+        constants["least"], constants["most"] = np.array(0, np.float32), np.array(255, np.float32)
+        result = add("Cast", add("Clip", add("Round", result), "least", "most"), to=kinds.UINT8)
+    nodes[-1].output[0] = "warped"
+    kind = kinds.UINT8 if dtype == "uint8" else kinds.FLOAT
+    channels: int | str = fill.shape[1] if fill.shape[1] > 1 else "channels"
+    graph = helper.make_graph(
+        nodes,
+        "warp",
+        [helper.make_tensor_value_info("images", kind, ["batch", channels, height, width])],
+        [helper.make_tensor_value_info("warped", kind, ["batch", channels, *exact.target_size])],
+        [onnx.numpy_helper.from_array(array, name) for name, array in constants.items()],
+    )
+    model = helper.make_model(graph, producer_name="camtorch", opset_imports=[helper.make_opsetid("", _OPSET)])
+    model.ir_version = _IR
+    return model

@@ -1,0 +1,131 @@
+"""Meshes of TI's lens distortion correction, the LDC of the VPAC in TDA4 and AM6xA.
+
+At every 2^m-th pixel of the target, ceil(W / 2^m) + 1 in each of ceil(H / 2^m) + 1 lines, source minus target: x and y
+as signed 16-bit eighths of a pixel, interleaved, little-endian, lines filled up to 16 bytes. The hardware interpolates
+bilinearly and draws positions in to the image.
+
+It makes the target block by block, and fetches for each the part of the source around what the block's corners say,
+with a padding that software has to state so that all pixels of the block find what they need. Both are reported: the
+largest of the usual block sizes whose padding the register holds, or that asked for, and the padding, for the bicubic
+filter. Widths of blocks are multiples of 8, heights even.
+
+Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" and "LDC Input Block Fetch".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from camtorch.io._errors import CameraFileError
+from camtorch.maps.exact import Exact, Floats
+from camtorch.maps.lookup import LookupMap
+from camtorch.maps.mesh import held, mesh_of, nodes_every, rounded
+from camtorch.maps.protocol import Encoded, Given, Options
+from camtorch.maps.tables import lookup, sizes, table
+
+_PARTS = 8
+_LOW, _HIGH = -(1 << 15), (1 << 15) - 1
+_STEPS = tuple(1 << m for m in range(8))
+_STEP = 8
+_ALIGNED = 16  # bytes
+_LARGEST = 8192  # pixels along a side
+_BLOCKS = ((64, 64), (32, 64), (32, 32), (16, 32), (16, 16), (8, 16), (8, 8), (4, 8), (2, 8))  # height, width
+_MOST_PADDING = 15  # four bits
+_BEFORE, _AFTER = 1, 2  # pixels beside the whole part of a position that a bicubic filter reads
+_LONGEST_BLOCK = 255  # eight bits
+
+
+class TILDC:
+    """The format: see the module."""
+
+    name = "ti_ldc"
+    suffixes = ()
+    options = ("step", "block", "clip")
+    described = True
+
+    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
+        """Raises CameraFileError: sizes, offsets or padding that the LDC does not take. ValueError: a bad option."""
+        step = _STEP if options.step is None else options.step
+        if step not in _STEPS:
+            raise ValueError(f"Warp.save: step must be one of {_STEPS} for ti_ldc; got {step!r}")
+        block = options.block
+        if block is not None and (block[1] % 8 or block[0] % 2 or not all(0 < s <= _LONGEST_BLOCK for s in block)):
+            raise ValueError(
+                "Warp.save: block=(height, width) must be of an even height and a width that is a multiple of 8, each "
+                f"at most {_LONGEST_BLOCK}; got {block}"
+            )
+        if max(*exact.source_size, *exact.target_size) > _LARGEST:
+            raise CameraFileError(path, "size", f"a side above {_LARGEST} px, which the LDC does not take")
+        height, width = exact.target_size
+        mesh = mesh_of(exact, nodes_every(step, width), nodes_every(step, height))
+        places = np.stack(np.meshgrid(mesh.columns, mesh.rows), -1)
+        limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
+        mesh = held(path, "ti_ldc", mesh, *limits, clip=bool(options.clip))
+        offsets = (rounded(mesh, exact, _PARTS, *limits) - places * _PARTS).astype("<i2")
+        pitch = _pitch(len(mesh.columns))
+        lines = np.zeros((len(mesh.rows), pitch // 2), "<i2")
+        lines[:, : 2 * len(mesh.columns)] = offsets.reshape(len(mesh.rows), -1)
+        content = lines.tobytes()
+        given = Given(exact.source_size, exact.target_size, step)
+        positions = self.decode(path, content, given).positions.numpy()
+        size, padding, largest = _fetched(path, positions, exact.source_size, block)
+        facts = {"step": step, "nodes": (len(mesh.rows), len(mesh.columns)), "line_offset": pitch}
+        return Encoded(content, {**facts, "block_size": size, "pixel_padding": padding, "source_block": largest})
+
+    def matches(self, path: str, content: bytes) -> bool:
+        return False
+
+    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
+        """Raises CameraFileError: another length, no such step, nobody says the sizes."""
+        source, target = sizes(path, given)
+        step = _STEP if given.step is None else given.step
+        if step not in _STEPS:
+            raise CameraFileError(path, "step", f"{step!r} is none of {_STEPS}")
+        columns, rows = nodes_every(step, target[1]), nodes_every(step, target[0])
+        lines = table(path, content, "<i2", (len(rows), _pitch(len(columns)) // 2))
+        offsets = lines[:, : 2 * len(columns)].reshape(len(rows), len(columns), 2) / _PARTS
+        places = np.stack(np.meshgrid(columns, rows), -1)
+        return lookup(path, self.name, places + offsets, step, source, target, {})
+
+
+def _pitch(columns: int) -> int:
+    """Bytes from line to line."""
+    return -(-4 * columns // _ALIGNED) * _ALIGNED
+
+
+def _fetched(
+    path: str, positions: Floats, source: tuple[int, int], block: tuple[int, int] | None
+) -> tuple[tuple[int, int], int, tuple[int, int]]:
+    """The size of a block of the target, the padding that it needs, and the largest part of the source fetched.
+
+    Raises:
+        CameraFileError: more padding than the hardware has.
+    """
+    drawn = positions.clip(0, np.array(source[::-1], np.float64) - 1)
+    padding = -1
+    for size in _BLOCKS if block is None else (block,):
+        padding, largest = _padding(drawn, size)
+        if padding <= _MOST_PADDING:
+            return size, padding, largest
+    size = _BLOCKS[-1] if block is None else block
+    raise CameraFileError(
+        path,
+        "pixel padding",
+        f"blocks of {size[1]}x{size[0]} need {padding} pixels of the source around what their corners say; the LDC has "
+        f"at most {_MOST_PADDING}{'' if block is None else '; smaller blocks need less'}",
+    )
+
+
+def _padding(drawn: Floats, size: tuple[int, int]) -> tuple[int, tuple[int, int]]:
+    """The padding of blocks (height, width), and the largest part of the source fetched with it, (height, width)."""
+    height, width = drawn.shape[:2]
+    rows, columns = -(-height // size[0]), -(-width // size[1])
+    whole = np.pad(drawn, ((0, rows * size[0] - height), (0, columns * size[1] - width), (0, 0)), "edge")
+    blocks = whole.reshape(rows, size[0], columns, size[1], 2).transpose(0, 2, 1, 3, 4)
+    corners = blocks[:, :, [0, 0, -1, -1], [0, -1, 0, -1]]  # (rows, columns, 4, 2)
+    first, last = np.floor(corners.min(2)), np.ceil(corners.max(2))
+    flat = blocks.reshape(rows, columns, -1, 2)
+    low, high = np.floor(flat.min(2)) - _BEFORE, np.floor(flat.max(2)) + _AFTER
+    padding = int(max((first - low).max(), (high - last).max(), 0))
+    across, down = (last - first).reshape(-1, 2).max(0) + 1 + 2 * padding
+    return padding, (int(down), int(across))
