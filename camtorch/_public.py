@@ -11,10 +11,10 @@ from camtorch.camera import MODELS, Camera
 from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save
-from camtorch.mixed import Mixed
 from camtorch.maps.formats import load_map
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.report import MapReport
+from camtorch.mixed import Mixed
 from camtorch.models import (
     EUCM,
     FOV,

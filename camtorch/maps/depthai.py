@@ -37,7 +37,7 @@ class DepthAI:
         if not 1 <= step <= _LONGEST_STEP:
             raise ValueError(f"Warp.save: step must be 1 to {_LONGEST_STEP} pixels; got {step}")
         height, width = exact.target_size
-        mesh = mesh_of(exact, nodes_every(step, width), nodes_every(step, height))
+        mesh = mesh_of(path, exact, nodes_every(step, width), nodes_every(step, height))
         nodes = mesh.nodes if order == "xy" else mesh.nodes[..., ::-1]
         facts = {"step": step, "nodes": (len(mesh.rows), len(mesh.columns)), "order": order}
         return Encoded(np.ascontiguousarray(nodes, "<f4").tobytes(), facts)

@@ -41,7 +41,7 @@ class DW100:
                     path, f"{what} size", f"{size[1]}x{size[0]}; the DW100 takes 176x144 to 4096x3072 pixels"
                 )
         height, width = exact.target_size
-        mesh = mesh_of(exact, nodes_every(_STEP, width), nodes_every(_STEP, height))
+        mesh = mesh_of(path, exact, nodes_every(_STEP, width), nodes_every(_STEP, height))
         low, high = np.zeros(2), np.full(2, _MOST / _PARTS)
         mesh = held(path, "dw100", mesh, low, high, clip=bool(options.clip))
         parts = rounded(mesh, exact, _PARTS, low, high)

@@ -55,6 +55,8 @@ def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, optio
             takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
             raise ValueError(f"Warp.save: {chosen.name} has no {option.name}{takes}")
     exact = Exact(warp)
+    if not exact.shown.any():
+        raise ValueError(f"Warp.save: {name}: no pixel of the target shows anything of the source's image")
     encoded = chosen.encode(name, exact, options)
     said = {key: encoded.facts.get(key) for key in ("step", "v", "order")}
     read = chosen.decode(name, encoded.content, Given(exact.source_size, exact.target_size, **said))

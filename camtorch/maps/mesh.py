@@ -14,6 +14,7 @@ _SLACK = 0.5  # pixels: as far as a pixel that shows the image may lie beyond th
 _OUTWARDS = 1 / 32  # of the second differences by which nodes round outwards
 _MOST_STEPS = 200
 _GAIN = 1e-9  # pixels
+_NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 _REACH = 1  # sizes of the source by which nodes that no shown pixel needs may lie off it
 
 
@@ -69,15 +70,27 @@ def nodes_every(step: int, size: int) -> Floats:
     return np.arange(-(-size // step) + 1, dtype=np.float64) * step
 
 
-def mesh_of(exact: Exact, columns: Floats, rows: Floats, *, triangles: bool = False) -> Mesh:
+def mesh_of(path: str, exact: Exact, columns: Floats, rows: Floats, *, triangles: bool = False) -> Mesh:
     """The mesh of a warp: exact at its nodes, and smoothly continued to those that have no position.
 
+    Args:
+        path: of the map, for errors.
+        exact: of the warp.
+        columns: (m,) of the nodes in pixels of the target.
+        rows: (n,) likewise.
+        triangles: whether cells are two triangles, of which those that show nothing are left out.
+
     Raises:
-        ValueError: the warp shows nothing.
+        CameraFileError: positions leap across the source from one pixel to the next.
     """
     shown = exact.shown
-    if not shown.any():
-        raise ValueError("Warp.save: no pixel of the target shows anything of the source's image; a mesh needs some")
+    if leaps := _leaps(exact):
+        raise CameraFileError(
+            path,
+            "mesh",
+            f"positions leap across the source beside {leaps} pixels, as at the seam of a panorama, and no mesh does. "
+            "A target that does not show the seam has one; opencv, stmap and onnx hold positions pixel by pixel",
+        )
     (i, s), (j, t) = _cells(rows, shown.shape[0]), _cells(columns, shown.shape[1])
     down, across = np.nonzero(shown)
     below = (t[across] < s[down]).astype(np.intp)
@@ -96,11 +109,25 @@ def mesh_of(exact: Exact, columns: Floats, rows: Floats, *, triangles: bool = Fa
     return Mesh(columns, rows, nodes, needed, drawn if triangles else None)
 
 
+def _leaps(exact: Exact) -> int:
+    """How many shown pixels are half the source away from a shown neighbour."""
+    half = np.array(exact.source_size[::-1], np.float64) / 2
+    p, shown = exact.positions, exact.shown
+    count = 0
+    for one, two in (
+        ((slice(1, None),), (slice(None, -1),)),
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+    ):
+        far = (np.abs(p[one] - p[two]) > half).any(-1)
+        count += int((far & shown[one] & shown[two]).sum())
+    return count
+
+
 def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats:
     """Nodes (n, m, 2) with those that are not known laid out from their neighbours, ring by ring.
 
-    The first ring is where a parabola through three nodes goes on, as it has a part in what is shown; those behind it
-    go on along lines, and stay between `low` and `high`.
+    The first ring is where parabolas through three nodes go on, as it has a part in what is shown. Those behind it go
+    on along lines, each by half the step before, so that hardware is not sent across the image.
     """
     nodes, known = nodes.copy(), known.copy()
     n, m = known.shape
@@ -108,23 +135,22 @@ def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats
     while not known.all():
         padded, there = np.pad(nodes, ((3, 3), (3, 3), (0, 0))), np.pad(known, 3)
         total, weight = np.zeros_like(nodes), np.zeros((n, m))
-        for down, across in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+        for down, across in _NEIGHBOURS:
             near, middle, far = (
                 (slice(3 + k * down, 3 + k * down + n), slice(3 + k * across, 3 + k * across + m)) for k in (1, 2, 3)
             )
-            one, two = there[near], there[near] & there[middle]
+            two = there[near] & there[middle]
             three = two & there[far] & first
             a, b, c = padded[near], padded[middle], padded[far]
-            guess = np.where(three[..., None], 3 * a - 3 * b + c, np.where(two[..., None], 2 * a - b, a))
-            trust = np.where(three, 1.0, np.where(two, 1e-3, np.where(one, 1e-6, 0.0)))
+            line = 2 * a - b if first else a + (a - b) / 2
+            guess = np.where(three[..., None], 3 * a - 3 * b + c, np.where(two[..., None], line, a))
+            trust = np.where(three, 1.0, np.where(two, 1e-3, np.where(there[near], 1e-6, 0.0)))
             total += trust[..., None] * guess
             weight += trust
         new = ~known & (weight > 0)
-        if not new.any():
-            return np.where(known[..., None], nodes, low)
-        nodes[new] = total[new] / weight[new][:, None]
-        if not first:
-            nodes[new] = nodes[new].clip(low, high)
+        nodes[new] = (total[new] / weight[new][:, None]).clip(low, high)
+        if not new.any():  # not one is known
+            break
         known, first = known | new, False
     return nodes
 

@@ -57,7 +57,8 @@ class MapReport:
 
 
 def _shown(value: Any) -> str:
-    return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    # sizes are (height, width), and printed as everywhere
+    return "x".join(map(str, reversed(value))) if isinstance(value, tuple) else str(value)
 
 
 def measure(path: str, read: LookupMap, exact: Exact, files: tuple[str, ...], facts: dict[str, Any]) -> MapReport:

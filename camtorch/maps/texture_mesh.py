@@ -59,7 +59,7 @@ class TextureMesh:
         if not 1 <= step <= _LONGEST_STEP:
             raise ValueError(f"Warp.save: step must be 1 to {_LONGEST_STEP} pixels; got {step}")
         height, width = exact.target_size
-        mesh = mesh_of(exact, _edges(step, width), _edges(step, height), triangles=True)
+        mesh = mesh_of(path, exact, _edges(step, width), _edges(step, height), triangles=True)
         columns, rows = mesh.columns + 0.5, height - (mesh.rows + 0.5)
         places = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
         parts = ((mesh.nodes + 0.5) / exact.source_size[::-1]).reshape(-1, 2)

@@ -57,7 +57,7 @@ class TILDC:
         if max(*exact.source_size, *exact.target_size) > _LARGEST:
             raise CameraFileError(path, "size", f"a side above {_LARGEST} px, which the LDC does not take")
         height, width = exact.target_size
-        mesh = mesh_of(exact, nodes_every(step, width), nodes_every(step, height))
+        mesh = mesh_of(path, exact, nodes_every(step, width), nodes_every(step, height))
         places = np.stack(np.meshgrid(mesh.columns, mesh.rows), -1)
         limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
         mesh = held(path, "ti_ldc", mesh, *limits, clip=bool(options.clip))
