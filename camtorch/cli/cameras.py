@@ -77,13 +77,15 @@ def _of_model(path: Path, model: str) -> Rig:
     return opencv.read_rig(path, model)
 
 
-def read_camera(path: Path, name: str | None = None, model: str | None = None) -> Camera:
+def read_camera(
+    path: Path, name: str | None = None, model: str | None = None, size: tuple[int, int] | None = None
+) -> Camera:
     """The one camera of a file, or the one of that name; see `read_rig`.
 
     Raises:
         ValueError: there are several, or a batch.
     """
-    return _single(path, *_only(path, read_rig(path, name, model)))
+    return _single(path, *_only(path, read_rig(path, name, model, size)))
 
 
 def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:

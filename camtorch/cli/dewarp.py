@@ -9,7 +9,15 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from camtorch.cli.options import add_force, add_jobs, add_photograph, parse_path, parse_size, parse_suffix
+from camtorch.cli.options import (
+    add_force,
+    add_jobs,
+    add_photograph,
+    add_projection,
+    checked_fov,
+    parse_path,
+    parse_suffix,
+)
 from camtorch.cli.terminal import Bar, note
 from camtorch.jobs import pool
 
@@ -36,18 +44,7 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "image", type=_word, nargs="+", metavar="IMAGE", help="the image; or images, videos, folders, quoted patterns"
     )
-    command.add_argument(
-        "--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective"
-    )
-    command.add_argument(
-        "--fov",
-        type=float,
-        metavar="DEGREES",
-        help="horizontal field of view of the new image; by default that of the old one, up to 120 in perspective",
-    )
-    command.add_argument(
-        "--size", type=parse_size, metavar="WxH", help="size of the new image; by default the old one's"
-    )
+    add_projection(command)
     add_photograph(command)
     command.add_argument(
         "-o",
@@ -86,11 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
     from camtorch.cli import videos
 
-    fov = arguments.fov
-    if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
-        wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
-        allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
-        raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
+    checked_fov(arguments)
     words: list[str] = arguments.image
     output: str | None = arguments.output
     into_folder = output is not None and output.endswith(_SLASHES)
@@ -131,7 +124,7 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
         warp = Dewarp(
             camera,
             projection=arguments.projection,
-            fov=_radians(arguments.fov),
+            fov=checked_fov(arguments),
             image_size=arguments.size,
             tolerance=TOLERANCE,
         )
@@ -148,10 +141,6 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
         f"wide, {width}x{height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; {100 * filled:.1f} % of it is "
         f"filled and shows {100 * shown:.0f} % of the photograph"
     )
-
-
-def _radians(degrees: float | None) -> float | None:
-    return None if degrees is None else math.radians(degrees)
 
 
 def _video(arguments: argparse.Namespace, source: Path) -> None:
@@ -253,7 +242,7 @@ def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
         arguments.camera,
         arguments.rescale,
         arguments.projection,
-        _radians(arguments.fov),
+        checked_fov(arguments),
         arguments.size,
         encoder,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,11 +66,43 @@ def add_pair(command: argparse.ArgumentParser) -> None:
     _add_rescale(command)
 
 
-def add_calibration(command: argparse.ArgumentParser, of_name: str = "which camera, in a file with several") -> None:
-    """How to read a calibration that is the command's subject."""
+def add_projection(command: argparse._ActionsContainer) -> None:
+    """What a dewarped image shows."""
+    command.add_argument(
+        "--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective"
+    )
+    command.add_argument(
+        "--fov",
+        type=float,
+        metavar="DEGREES",
+        help="horizontal field of view of the new image; by default that of the old one, up to 120 in perspective",
+    )
+    command.add_argument(
+        "--size", type=parse_size, metavar="WxH", help="size of the new image; by default the old one's"
+    )
+
+
+def checked_fov(arguments: argparse.Namespace) -> float | None:
+    """--fov of `add_projection` in radians.
+
+    Raises:
+        ValueError: one that the projection does not have.
+    """
+    fov: float | None = arguments.fov
+    if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
+        wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
+        allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
+        raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
+    return None if fov is None else math.radians(fov)
+
+
+def add_calibration(
+    command: argparse.ArgumentParser, of_name: str = "which camera, in a file with several", size: str = "--size"
+) -> None:
+    """How to read a calibration that is the command's subject; `size` is the option that says for which images."""
     command.add_argument("--name", help=of_name)
     _add_from_model(command)
-    command.add_argument("--size", type=parse_size, metavar="WxH", help="of images, where the file does not say")
+    command.add_argument(size, type=parse_size, metavar="WxH", help="of images, where the file does not say")
 
 
 def _add_from_model(command: argparse.ArgumentParser, *others: str) -> None:

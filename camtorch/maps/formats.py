@@ -60,7 +60,7 @@ def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, optio
     encoded = chosen.encode(name, exact, options)
     said = {key: encoded.facts.get(key) for key in ("step", "v", "order")}
     read = chosen.decode(name, encoded.content, Given(exact.source_size, exact.target_size, **said))
-    files = (name, _description(name)) if chosen.described else (name,)
+    files = _files(name, chosen)
     report = measure(name, read, exact, files, encoded.facts)
     with replacing(*files) as opened:
         opened[0].write(encoded.content)
@@ -113,7 +113,7 @@ def load_map(
         stated["source_size"] = described["source_height"], described["source_width"]
         stated["target_size"] = described["target_height"], described["target_width"]
     for key, value in stated.items():
-        given[key] = value if given[key] is None else given[key]
+        given[key] = value
     if given["step"] is not None and not isinstance(given["step"], int):
         raise CameraFileError(name, "step", f"{given['step']!r:.60} is no number of pixels")
     try:
@@ -122,6 +122,40 @@ def load_map(
         raise CameraFileError(name, "content", f"cannot be read: {error or 'out of memory'}") from None
     read.facts = {**facts, **read.facts}
     return read
+
+
+def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[str, ...]:
+    """The files that `Warp.save` writes: that of the path, and beside a bare table its description.
+
+    Raises:
+        ValueError: as `Warp.save`, of the path and the format.
+    """
+    name = _path(path, "Warp.save")
+    return _files(name, _chosen(name, format))
+
+
+def _files(path: str, format: MapFormat) -> tuple[str, ...]:
+    return (path, _description(path)) if format.described else (path,)
+
+
+def check_map(
+    warp: Warp,
+    path: str | os.PathLike[str],
+    format: str | None = None,
+    *,
+    step: int | None = None,
+    v: str | None = None,
+    order: str | None = None,
+) -> MapReport:
+    """How far a map that is there is from a warp; see `load_map`.
+
+    Raises:
+        ValueError: it is between images of other sizes, and as `load_map`.
+    """
+    exact = Exact(warp)
+    sizes: dict[str, Any] = {"source_size": exact.source_size, "target_size": exact.target_size}
+    read = load_map(path, format, step=step, v=v, order=order, **sizes)
+    return measure(_path(path, "check_map"), read, exact, (), read.facts)
 
 
 _SIZES = ("source_height", "source_width", "target_height", "target_width")
