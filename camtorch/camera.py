@@ -21,17 +21,19 @@ from camtorch._arguments import (
     as_points,
     as_real,
     as_values,
+    as_vectors,
     as_whole,
     broadcast_shapes,
     is_predicted,
 )
 from camtorch._module import BatchedModule, Memo
-from camtorch._tracing import FAKE_MODE, has_tangent, is_concrete
+from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, is_concrete
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.projection.explanation import explain, unusable
+from camtorch.projection.fields import local_pinhole, patch_centres, perspective_field, plucker
 from camtorch.projection.ops import CLASSES, register_camera
 from camtorch.projection.project import Project
 from camtorch.projection.rays import AXES, field_of_view, focal_for
@@ -41,8 +43,12 @@ from camtorch.projection.unproject import Unproject
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from camtorch.extrinsics import Extrinsics
+
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
+
+_MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 
 _ELSEWHERE = {
     "opencv": "brown_conrady",
@@ -177,7 +183,8 @@ class Camera(BatchedModule):
             raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
         self.distortion_names = names
         self.image_size = as_image_size(image_size, owner)
-        self._memo, self._warned = Memo(), is_predicted(intrinsics) or is_predicted(distortion)
+        self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
+        self._warned = is_predicted(intrinsics) or is_predicted(distortion)
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, len(names)))
 
@@ -504,23 +511,115 @@ class Camera(BatchedModule):
         u, v = pixels.unbind(-1)
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
-    def pixel_grid(self) -> Tensor:
-        """(H, W, 2): the centre of every pixel."""
-        height, width = self._size("pixel_grid")
+    def pixel_grid(self, stride: int = 1) -> Tensor:
+        """(H, W, 2): the centre of every pixel; or (H / stride, W / stride, 2): that of every patch.
+
+        Args:
+            stride: of a feature map: pixels along each side of a patch. Patch i has its middle at
+                `stride * i + (stride - 1) / 2`, half a pixel off its corner pixel's centre even at stride 2.
+
+        Raises:
+            ValueError: no image size, or one that is not a multiple of the stride: crop, pad or resize the camera as
+                the image is.
+        """
         like = self.intrinsics.new_empty(0, dtype=torch.promote_types(self.intrinsics.dtype, torch.float32))
-        rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (height, width))
-        v, u = torch.meshgrid(rows, columns, indexing="ij")
-        return torch.stack((u, v), -1)
+        return patch_centres(self._size("pixel_grid"), stride, like, type(self).__name__)
 
     def _size(self, what: str) -> tuple[int, int]:
         if self.image_size is None:
             raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
         return self.image_size
 
-    def rays(self) -> tuple[Tensor, Tensor]:
-        """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W)."""
-        grid = self.pixel_grid()
-        return self.unproject(grid.expand(*self.batch_shape, *grid.shape))
+    def rays(self, stride: int = 1) -> tuple[Tensor, Tensor]:
+        """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W); or of all patches, see `pixel_grid`.
+
+        Those of up to half a million pixels or patches are kept while nothing that they depend on can learn or has
+        changed.
+        """
+        rays, valid = self._kept(self._rays, self._tensors, stride, lambda: self.unproject(self._all_pixels(stride)))
+        return rays, valid
+
+    def _all_pixels(self, stride: int) -> Tensor:
+        """(*B, H, W, 2): the pixel grid for every camera."""
+        grid = self.pixel_grid(stride)
+        return grid.expand(*self.batch_shape, *grid.shape)
+
+    def _kept(
+        self, memo: Memo, inputs: Sequence[Tensor], stride: int, compute: Callable[[], tuple[Tensor, ...]]
+    ) -> tuple[Tensor, ...]:
+        """A copy of results over the image, kept where nothing learns and they are not too long; or new ones."""
+        learns = torch.is_grad_enabled() and any(map(in_graph, inputs))
+        count = (
+            math.prod((*self.batch_shape, *self._size("pixel_grid")))
+            // max(as_whole(stride, "stride", "pixel_grid"), 1) ** 2
+        )
+        if learns or count > _MOST_KEPT:
+            return compute()
+        options = (self._form, stride)
+        return tuple(t.clone() for t in memo(inputs, options, compute))
+
+    def plucker(self, extrinsics: Extrinsics | None = None, stride: int = 1) -> tuple[Tensor, Tensor]:
+        """The line in the world that every pixel or patch sees, in Pluecker coordinates.
+
+        Args:
+            extrinsics: camera from world, of batch dims that broadcast with the camera's. None: the world is the
+                camera's frame, in which all lines meet in the origin.
+            stride: see `pixel_grid`.
+
+        Returns:
+            (*B, H, W, 6): the unit direction d and the moment m = position x d of the line, in the world's frame and
+            unit of length; and valid (*B, H, W) bool. Of two lines that meet d1 . m2 + d2 . m1 is zero. What is not
+            valid is zeros, without a gradient.
+        """
+        return plucker(*self.rays(stride), extrinsics, f"{type(self).__name__}.plucker")
+
+    def local_pinhole(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """The pinhole camera that agrees with this one to first order around each pixel.
+
+        A ray near that of the pixel is seen at K (R ray) / z, up to the square of its distance. So a patch can be taken
+        as an ordinary image, by a network that knows no other.
+
+        Args:
+            pixels: (*B, *N, 2).
+
+        Returns:
+            R (*B, *N, 3, 3), `ray_local = R ray_camera`: its z axis is the ray of the pixel, its x axis the way of the
+            ray as the pixel goes right. And K (*B, *N, 3, 3), upper triangular, with the pixel as its principal point
+            and a skew where the image has one there. Both are exact, and identities where `unproject` is not valid.
+        """
+        pixels, _ = as_points(
+            pixels, "pixels", 2, self.batch_shape, self._tensors, f"{type(self).__name__}.local_pinhole"
+        )
+        return local_pinhole(self, pixels)
+
+    def perspective_field(self, gravity: Numbers, stride: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+        """How every pixel or patch stands to the horizon: what networks on single images read a camera's pose from.
+
+        As in Jin et al., Perspective Fields for Single Image Camera Calibration, 2023, for any lens.
+
+        Args:
+            gravity: (3,) or (*B, 3), the direction in which things fall, in the camera's frame, of any length:
+                (0, 1, 0) for a level camera. `R @ down`, where R is camera from world.
+            stride: see `pixel_grid`.
+
+        Returns:
+            latitude (*B, H, W) in radians, of the ray above the horizon; up (*B, H, W, 2), the unit direction (u, v) in
+            the image in which things rise, (0, 0) straight above and below; and valid (*B, H, W) bool, elsewhere both
+            are zeros. Kept as `rays` are.
+
+        Raises:
+            ValueError: another shape, a gravity of length zero.
+        """
+        owner = f"{type(self).__name__}.perspective_field"
+        down = as_vectors(gravity, "gravity", owner)
+        if is_concrete(down) and not bool((down != 0).any(-1).all()):
+            raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
+        down = down.to(self.intrinsics.device)
+        inputs = (*self._tensors, down)
+        latitude, up, valid = self._kept(
+            self._fields, inputs, stride, lambda: perspective_field(self, down, self._all_pixels(stride))
+        )
+        return latitude, up, valid
 
     def backproject(self, depth: Numbers, kind: Literal["z", "distance"] = "z") -> tuple[Tensor, Tensor]:
         """The points of the camera frame that the pixels of a depth map show.

@@ -28,6 +28,8 @@ class _Group(NamedTuple):
     model: type[Camera]
     members: tuple[int, ...]
     """Which modules it is made of."""
+    counts: tuple[int | None, ...]
+    """How many cameras each of them is; None for a single one."""
     taken: tuple[int, ...] | None
     """Which rows of those, one after the other; None for all of them in their order."""
     rows: tuple[int, ...]
@@ -71,7 +73,7 @@ class Mixed(Camera):
         nn.Module.__init__(self)
         self.cameras = nn.ModuleList(members)
         self.image_size = members[0].image_size
-        self._places = tuple(places)
+        self._places, self._rays, self._fields = tuple(places), Memo(), Memo()
         kinds: dict[tuple[object, ...], list[int]] = {}
         for row, (i, _) in enumerate(self._places):
             kinds.setdefault(kind(members[i]), []).append(row)
@@ -86,7 +88,8 @@ class Mixed(Camera):
         index = tuple(starts[used.index(i)] + row for i, row in places)
         whole = index == tuple(range(starts[-1]))
         model: type[Camera] = type_before_parametrizations(members[used[0]])
-        return _Group(model, used, None if whole else index, tuple(rows), Memo())
+        counts = tuple(len(members[i]) if members[i].batch_shape else None for i in used)
+        return _Group(model, used, counts, None if whole else index, tuple(rows), Memo())
 
     @classmethod
     def _of(cls, members: Sequence[Camera], places: Sequence[tuple[int, int]]) -> Self:
@@ -116,7 +119,7 @@ class Mixed(Camera):
         made = []
         for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self._tensors), strict=True):
             first = self._member(group.members[0])
-            if len(group.members) > 1 or group.taken is not None or not first.batch_shape:
+            if group.counts[1:] or group.counts[0] is None or group.taken is not None:
                 first = remade(first, intrinsics, distortion, self.image_size)
             made.append((list(group.rows), first))
         return made
@@ -133,10 +136,10 @@ class Mixed(Camera):
     def _tensors(self) -> tuple[Tensor, ...]:
         """Intrinsics and distortion of each group."""
         tensors: list[Tensor] = []
+        members = cast("list[Camera]", list(self.cameras._modules.values()))
         for group in self._groups:
-            members = [self._member(i) for i in group.members]
-            batches = [m.batch_shape for m in members]
-            tensors += [_joined(t, batches, group.taken) for t in zip(*(m._tensors for m in members), strict=True)]
+            pairs = [members[i]._tensors for i in group.members]
+            tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
         wide = working_dtype(tensors[0], *tensors)
         return tuple(t if t.dtype == wide else t.to(wide) for t in tensors)
 
@@ -219,8 +222,8 @@ class Mixed(Camera):
         """The batch of what `change` makes of each group."""
         return type(self).of_groups([(rows, change(camera)) for rows, camera in self.groups])
 
-    def _edited(self, **edit: Any) -> Self:
-        return self.by_groups(lambda camera: camera._edited(**edit))
+    def _edited(self, matrix: Sequence[Sequence[float]], size: tuple[int, int]) -> Self:
+        return self.by_groups(lambda camera: camera._edited(matrix, size))
 
     def __getitem__(self, index: Any) -> Camera:  # type: ignore[override]
         """Of an int, that camera, as it was given where it was given alone; else the `Mixed` of a part of the batch.
@@ -335,16 +338,14 @@ def held(*numbers: Tensor) -> list[Tensor]:
     return [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in numbers]
 
 
-def _joined(tensors: Sequence[Tensor], batches: Sequence[torch.Size], index: Sequence[int] | None) -> Tensor:
-    """(C, n): the numbers of single cameras and of batches one after the other, or those at an index of them."""
-    if len(tensors) == 1 and batches[0]:
-        whole = tensors[0]
-    elif not any(batches):
-        whole = torch.stack(list(tensors))
-    else:
-        whole = torch.cat([t.expand(*(b or (1,)), t.shape[-1]) for t, b in zip(tensors, batches, strict=True)])
-    if index is None:
-        return whole
-    if len(tensors) == 1:
-        whole = whole.expand(*batches[0], whole.shape[-1])
-    return whole.index_select(0, torch.tensor(index, device=whole.device))
+def _joined(tensors: Sequence[Tensor], group: _Group) -> Tensor:
+    """(C, n): the same numbers of all cameras of a group; or what they share, if it is a batch that shares them."""
+    if group.counts[1:] or group.taken is not None:
+        if not any(group.counts):
+            whole = torch.stack(list(tensors))
+        else:
+            pairs = zip(tensors, group.counts, strict=True)
+            whole = torch.cat([t.expand(1 if count is None else count, t.shape[-1]) for t, count in pairs])
+        taken = group.taken
+        return whole if taken is None else whole.index_select(0, torch.tensor(taken, device=whole.device))
+    return tensors[0] if group.counts[0] else tensors[0].unsqueeze(0)

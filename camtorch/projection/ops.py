@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from camtorch._arguments import columns
-from camtorch._tracing import register
+from camtorch._tracing import in_transform, register
 from camtorch.optics.radial_inverse import table_width
 from camtorch.projection.domain import Optics, domain_of
 from camtorch.projection.fold import AZIMUTHS
@@ -146,6 +146,7 @@ _to_rows.register_autograd(lambda ctx, cotangent: _to_planes(cotangent))
 def to_planes(rows: Tensor) -> tuple[Tensor, ...]:
     """(C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
     interleaved = torch.compiler.is_compiling() and rows.device.type == "cpu" and rows.stride(-2) != 1
+    interleaved = interleaved and not in_transform()  # the operator has no forward mode
     return (_to_planes(rows) if interleaved else rows.movedim(-1, 0)).unbind(0)
 
 

@@ -11,6 +11,7 @@ from torch.autograd import Function
 
 from camtorch._arguments import columns
 from camtorch._threads import as_cores_are_free
+from camtorch._tracing import in_transform
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, BriefTable, short, solve
 from camtorch.projection.ops import positive, search_in_place, search_open, to_planes, without_keeping
@@ -311,7 +312,8 @@ class Unproject(Function):
             rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
             return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
-        if torch.compiler.is_compiling() and not any(t.requires_grad for t in (pixels, intrinsics, distortion)):
+        learns = any(t.requires_grad for t in (pixels, intrinsics, distortion))
+        if torch.compiler.is_compiling() and not learns and not in_transform():
             order = 0
         rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
         return rays, positive(torch.ones_like(a) if mask is None else mask.expand_as(a))

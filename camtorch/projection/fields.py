@@ -1,0 +1,162 @@
+"""What networks are told of a camera, pixel by pixel: lines in the world, local pinholes, latitude and up."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import as_whole, broadcast_shapes, working_dtype
+from camtorch._tracing import in_transform, is_concrete
+from camtorch.extrinsics import Extrinsics
+from camtorch.rotations import rotate_planes, rotation_matrix
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+_STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray goes straight up or down
+
+
+def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) -> Tensor:
+    """(H / stride, W / stride, 2): the middle of every patch of stride x stride pixels.
+
+    Raises:
+        ValueError: a stride below 1, or one that does not divide the size.
+    """
+    step = as_whole(stride, "stride", owner)
+    if step < 1:
+        raise ValueError(f"{owner}: stride must be at least 1; got {step}")
+    if any(side % step for side in size):
+        height, width = size
+        fewer, more = (
+            [side // step * step for side in sides] for sides in (size, (height + step - 1, width + step - 1))
+        )
+        pads = more[1] - width, more[0] - height
+        raise ValueError(
+            f"{owner}: patches of stride {step} do not fill images of {size} (height, width). What is done to the "
+            f"image first is done to the camera: .crop(0, 0, {fewer[0]}, {fewer[1]}) where a convolution drops the "
+            f"rest, .pad(0, {pads[0]}, 0, {pads[1]}) where it is padded at the right and at the bottom, or "
+            f".resize({fewer[0]}, {fewer[1]})"
+        )
+    middle = (step - 1) / 2
+    rows, columns = (torch.arange(side // step, dtype=like.dtype, device=like.device) * step + middle for side in size)
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack((u, v), -1)
+
+
+def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: str) -> tuple[Tensor, Tensor]:
+    """Lines (*B, H, W, 6) in the world along rays (*B, H, W, 3), see `Camera.plucker`; and valid (*B, H, W)."""
+    if extrinsics is None:
+        return torch.cat((torch.where(valid[..., None], rays, 0.0), torch.zeros_like(rays)), -1), valid
+    if not isinstance(extrinsics, Extrinsics):
+        hint = (
+            ". A matrix, camera from world, goes in as ct.Extrinsics.from_matrix(T); one of a camera's pose, world "
+            "from camera, as ct.Extrinsics.from_matrix(T).inverse()"
+        )
+        hint = hint if hasattr(extrinsics, "shape") else ""
+        got = type(extrinsics).__name__
+        raise TypeError(f"{owner}: extrinsics must be ct.Extrinsics, camera from world; got {got}{hint}")
+    dtype, (height, width) = working_dtype(rays, extrinsics.rotation, extrinsics.translation), rays.shape[-3:-1]
+    batch = _broadcast(rays.shape[:-3], extrinsics.batch_shape, "extrinsics", owner)
+    planes = [plane.to(dtype).expand(*batch, height, width).flatten(-2) for plane in rays.unbind(-1)]
+    direction = torch.stack(rotate_planes(rotation_matrix(-extrinsics.rotation).to(dtype), (*planes,)), -1)
+    moment = torch.linalg.cross(extrinsics.position.to(dtype).unsqueeze(-2).expand_as(direction), direction)
+    lines, valid = (
+        torch.cat((direction, moment), -1).unflatten(-2, (height, width)),
+        valid.expand(*batch, height, width),
+    )
+    return torch.where(valid[..., None], lines, 0.0), valid
+
+
+def _broadcast(batch: torch.Size, other: torch.Size, name: str, owner: str) -> torch.Size:
+    try:
+        return broadcast_shapes(batch, other)
+    except ValueError:
+        raise ValueError(
+            f"{owner}: batch dims {tuple(other)} of {name} do not fit those of the camera, {tuple(batch)}"
+        ) from None
+
+
+class Tangents(NamedTuple):
+    """Unit rays (..., 3), how they turn as the pixel goes right and down (..., 3), and valid (...) bool."""
+
+    rays: Tensor
+    across: Tensor
+    down: Tensor
+    valid: Tensor
+
+
+def tangents(camera: Camera, pixels: Tensor) -> Tangents:
+    """Rays of pixels (*B, *N, 2) with their exact derivatives, in a graph where the camera or the pixels are in one."""
+    if in_transform() or not is_concrete(pixels):
+        right, below = (pixels.new_tensor(unit).expand_as(pixels) for unit in ((1.0, 0.0), (0.0, 1.0)))
+        by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
+        by_v: Any = torch.func.jvp(camera.unproject, (pixels,), (below,), has_aux=True)
+        return Tangents(by_u[0], by_u[1], by_v[1], by_u[2])
+    learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera._tensors))
+    with torch.inference_mode(False), torch.enable_grad():
+        given = pixels if learns and pixels.requires_grad else pixels.detach().clone().requires_grad_()
+        rays, valid = camera.unproject(given)
+        by_pixel = [
+            torch.autograd.grad(plane, given, torch.ones_like(plane), retain_graph=True, create_graph=learns)[0]
+            for plane in rays.unbind(-1)
+        ]
+    across, down = torch.stack(by_pixel, -1).unbind(-2)
+    return Tangents(rays if learns else rays.detach(), across, down, valid)
+
+
+def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotations (..., 3, 3) to local frames, pixels per unit of their planes (..., 2, 2), and valid (...) bool.
+
+    The local z axis is the ray, and x goes where the ray does as the pixel goes right. So the derivative of the plane
+    by the pixel is upper triangular, and its inverse as well. Both are identities where they are not valid.
+    """
+    turned = (torch.linalg.cross(at.across, at.down) * at.rays).sum(-1)
+    valid = at.valid & torch.isfinite(turned) & (turned > torch.finfo(turned.dtype).tiny)
+    given = zip(
+        (at.rays, at.across, at.down), torch.eye(3, dtype=turned.dtype, device=turned.device).roll(1, 0), strict=True
+    )
+    z, across, down = (torch.where(valid[..., None], vector, axis) for vector, axis in given)
+    wide = across.square().sum(-1).sqrt()
+    x = across / wide[..., None]
+    y = torch.linalg.cross(z, x)
+    skew, tall = (down * x).sum(-1), (down * y).sum(-1)
+    per_unit = torch.stack((1 / wide, -skew / (wide * tall), torch.zeros_like(wide), 1 / tall), -1).unflatten(
+        -1, (2, 2)
+    )
+    return torch.stack((x, y, z), -2), per_unit, valid
+
+
+def local_pinhole(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
+    rotation, per_unit, valid = local_frames(tangents(camera, pixels))
+    centre = torch.where(valid[..., None], pixels.to(per_unit.dtype), 0.0)
+    top = torch.cat((per_unit, centre[..., None]), -1)
+    bottom = top.new_tensor([0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 3)
+    return rotation, torch.cat((top, bottom), -2)
+
+
+def perspective_field(camera: Camera, gravity: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Latitude (*B, H, W), up (*B, H, W, 2) and valid (*B, H, W); see `Camera.perspective_field`.
+
+    Args:
+        camera: it knows all of the pixels.
+        gravity: (*B, 3), of any length but zero.
+        pixels: (*B, H, W, 2).
+    """
+    _broadcast(camera.batch_shape, gravity.shape[:-1], "gravity", f"{type(camera).__name__}.perspective_field")
+    frame, per_unit, valid = local_frames(tangents(camera, pixels))
+    upward = -gravity / gravity.square().sum(-1, keepdim=True).sqrt()
+    seen = (frame * upward[..., None, None, None, :].to(frame.dtype)).sum(-1)  # x, y, z of the local frame
+    across, along = seen[..., :2], seen[..., 2]
+    length = across.square().sum(-1)
+    tilted = valid & (length > _STRAIGHT)
+    across = torch.where(tilted[..., None], across, across.new_tensor([0.0, -1.0]))
+    up = (per_unit * across[..., None, :]).sum(-1)
+    up = torch.where(tilted[..., None], up / up.square().sum(-1, keepdim=True).sqrt(), 0.0)
+    latitude = torch.atan2(along, across.square().sum(-1).sqrt())
+    straight = along.detach().sign() * (math.pi / 2)
+    latitude = torch.where(valid, torch.where(tilted, latitude, straight), 0.0)
+    return latitude, up, valid.expand(latitude.shape)
