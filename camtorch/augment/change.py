@@ -207,7 +207,7 @@ class Change:
         listed = self.listed or second.listed
         if all(part.rows is None for part in (*self.parts, *second.parts)):
             return Change(self.count, [_joined(self.parts[0], second.parts[0])], listed=listed)
-        parts = []
+        parts, mixed = [], []
         for a in self.parts:
             for b in second.parts:
                 own, its = (torch.arange(self.count) if part.rows is None else part.rows.cpu() for part in (a, b))
@@ -220,8 +220,9 @@ class Change:
                         for part, index, mine in ((a, of_a, own), (b, of_b, its))
                     )
                     parts.append(replace(_joined(one, other), rows=rows))
-        mixed = None if self.mixed is None and second.mixed is None else [part.rows.tolist() for part in parts]
-        return Change(self.count, parts, listed=listed, mixed=mixed)
+                    mixed.append(rows.tolist())
+        some = self.mixed is not None or second.mixed is not None
+        return Change(self.count, parts, listed=listed, mixed=mixed if some else None)
 
     def with_options(self, options: Options) -> Change:
         """The change with its warps made anew by other options."""

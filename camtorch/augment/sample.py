@@ -315,7 +315,7 @@ class SampleTransform(nn.Module):
 
     def _batch(self, sample: Sample) -> tuple[Named, bool, int, Camera | list[Camera]]:
         """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras."""
-        camera = sample.get("camera")
+        camera: Any = sample.get("camera")
         camera = self.camera if camera is None else camera
         named = self._sorted(sample)
         if not named:
