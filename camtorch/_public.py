@@ -43,6 +43,8 @@ from camtorch.models import (
     WoodScape,
 )
 from camtorch.native.library import native_available
+from camtorch.networks import losses
+from camtorch.networks.head import CameraHead
 from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
@@ -63,6 +65,7 @@ __all__ = [
     "Calibration",
     "Camera",
     "CameraFileError",
+    "CameraHead",
     "Conversion",
     "Cylindrical",
     "Dewarp",
@@ -108,6 +111,7 @@ __all__ = [
     "lenses",
     "load",
     "load_map",
+    "losses",
     "native_available",
     "rectify",
     "save",

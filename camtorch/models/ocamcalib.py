@@ -41,6 +41,11 @@ class Shear(Stage):
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> ShearAt:
         return ShearAt(self, a, b)
 
+    def lower_bound(self, radius: Tensor) -> tuple[Tensor, Tensor]:
+        d, e = self.parameters
+        # of the symmetric part the eigenvalues are 1 + (d + e) / 2 and 1 - (d + e) / 2
+        return (1 - (d + e).abs() / 2).expand_as(radius), radius * (1 + torch.maximum(d.abs(), e.abs()))
+
     def start(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         d, e = self.parameters
         return (u - e * v) / (1 - d * e), (v - d * u) / (1 - d * e)

@@ -1,0 +1,216 @@
+"""The layer that turns features into valid cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from camtorch._arguments import as_image_size, as_values, as_whole
+from camtorch._module import GeometryModule
+from camtorch._tracing import in_graph
+from camtorch.calibration.calibrate import as_model
+from camtorch.camera import Camera
+from camtorch.networks.limits import Limits
+from camtorch.networks.prior import prior_of
+from camtorch.optics.radial_inverse import precise
+
+_ASPECT = 0.1
+_LARGEST = 1e6  # whose square is a number, and whose gradient is nothing
+_NODES = 33
+
+
+class CameraHead(GeometryModule):
+    """A layer from features (*B, features) to cameras (*B), each of which has a ray for every point of its image.
+
+    A linear layer makes numbers of the features, `names` says of what, and whatever they are the camera is valid:
+
+    * Focal length, on a scale of logarithms, and principal point go through q(x) = x / sqrt(1 + x^2) to their ranges.
+    * The coefficients are k = given + d / sqrt(1 + g^2). Here d is made of the numbers so that each 1 moves the rim of
+      the image by a tenth of its distance from the axis, and lopsided terms by a hundredth; d / g is as far as their
+      direction leads before the lens would fold on the image or bend beyond reason, see `Limits`.
+
+    Both are nearly linear well within their limits and come as close to them as is asked. Their gradients fade with the
+    third power of the numbers, not exponentially. Whatever the coefficients, the lens shows at the corners of the image
+    what the given one shows there at the focal length predicted: so `fov` holds for all. Of charts that have
+    coefficients themselves (`UCM`, `DoubleSphere`, `Division`, ...) it is the focal length near the axis that stays.
+
+    The layer starts with weights of zero: every camera is then `prior`.
+
+    Args:
+        features: how many.
+        model: a class of cameras or its key in `ct.MODELS`; or a camera, which then is the prior.
+        image_size: (height, width) of the images in pixels; that of a given camera if left out.
+        fov: the least and the greatest horizontal field of view in DEGREES, of the lens as given; the prior has the
+            geometric mean of both focal lengths. (40, 120) if left out; around a given camera up to 1.5 times its focal
+            length, and down to as many times less if its lens shows the corners of such images.
+        count: of coefficients, for models that leave a choice.
+        centre: how far the principal point may lie from the middle, or from that of the given camera, as a part of the
+            image's width and height.
+        fixed: names of numbers that stay as in the prior: "cx", "cy", "k3", ...
+        shared_focal: fx and fy are one number, in the ratio that they have in the prior; else that may change by ten
+            percent.
+
+    Raises:
+        ValueError: fields of view that the lens does not reach, or not with the corners of the image, or that seem to
+            be radians; panoramas; unknown names, counts that the model does not take.
+        TypeError: no model, no pair of numbers.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        model: type[Camera] | str | Camera,
+        *,
+        image_size: tuple[int, int] | None = None,
+        fov: Sequence[float] | None = None,
+        count: int | None = None,
+        centre: float = 0.1,
+        fixed: Collection[str] | str = (),
+        shared_focal: bool = True,
+    ):
+        super().__init__()
+        owner = type(self).__name__
+        features = as_whole(features, "features", owner)
+        if isinstance(fixed, Collection) and {"fx", "fy", "all"} & set((fixed,) if isinstance(fixed, str) else fixed):
+            raise ValueError(f"{owner}: a focal length is held by its field of view, fov=(90, 90); got fixed={fixed!r}")
+        asked = as_model(model, count, None, fixed, owner)
+        known = None if asked.start is None else asked.start.image_size
+        size = as_image_size(image_size, owner) or known
+        if size is None:
+            raise ValueError(f"{owner}: a camera is valid for an image; give its image_size=(height, width)")
+        if known not in (None, size):
+            raise ValueError(f"{owner}: the camera is of images of {known}; got image_size={size}")
+        if not 0 <= centre < 0.5:
+            raise ValueError(f"{owner}: centre must be a part of the image, from 0 to below 0.5; got {centre!r}")
+        self.model, self.image_size, self.centre, self.shared_focal = asked.kind, size, float(centre), shared_focal
+        prior = prior_of(asked, size, self.centre, 0.0 if shared_focal else _ASPECT, fov, owner)
+        least, given, most = (math.log(disc) for disc in prior.discs)
+        discs = torch.linspace(least, most, _NODES, dtype=torch.float64)
+        scales = prior.scales(discs.exp())
+        free = asked.free.tolist()
+        # what changes nothing, as the angles of a table, is nothing to learn
+        self._coefficients = [i for i, moves in enumerate((scales > 0).all(0).tolist()) if moves and free[4 + i]]
+        self._centres = [i for i in range(2) if free[2 + i] and centre > 0]
+        self.names = (
+            "focal",
+            *(() if shared_focal else ("aspect",)),
+            *(("cx", "cy")[i] for i in self._centres),
+            *(prior.names[i] for i in self._coefficients),
+        )
+        """Of the numbers, in their order: "focal", "aspect" if it is free, "cx", "cy", and of the coefficients."""
+        share = (2 * given - least - most) / (most - least) if most > least else 0.0
+        share = min(max(share, -1 + 1e-6), 1 - 1e-6)
+        filled = Limits(asked.kind, prior.lens).filled(prior.lens[None], discs.new_full((1, 1), prior.discs[1]))
+        constants = {
+            "_discs": discs,
+            "_scales": scales[:, self._coefficients].log(),
+            "_start": discs.new_tensor(share / math.sqrt(1 - share * share)),
+            "_far": prior.focal * filled[0, 0],
+            "_ratio": discs.new_tensor(prior.aspect),
+            "_middle": discs.new_tensor(prior.middle),
+            "_lens": prior.lens,
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
+        self.linear = nn.Linear(features, len(self.names))
+        nn.init.zeros_(self.linear.weight)
+        nn.init.zeros_(self.linear.bias)
+
+    if TYPE_CHECKING:
+        _discs: Tensor
+        _scales: Tensor
+        _start: Tensor
+        _far: Tensor
+        _ratio: Tensor
+        _middle: Tensor
+        _lens: Tensor
+
+    @property
+    def prior(self) -> Camera:
+        """The camera of numbers that are all zero."""
+        return self.camera(self._discs.new_zeros(len(self.names), dtype=self.linear.weight.dtype))
+
+    def forward(self, features: Tensor) -> Camera:
+        """The cameras (*B) of features (*B, features)."""
+        owner = type(self).__name__
+        features = as_values(features, "features", owner)
+        if features.ndim == 0 or features.shape[-1] != self.linear.in_features:
+            raise ValueError(
+                f"{owner}: features must be (*B, {self.linear.in_features}); got shape {tuple(features.shape)}"
+            )
+        with torch.autocast(features.device.type, enabled=False):
+            return self.camera(self.linear(features.to(self.linear.weight.dtype)))
+
+    if TYPE_CHECKING:
+        __call__ = forward  # whose types nn.Module does not tell
+
+    def camera(self, numbers: Tensor) -> Camera:
+        """The cameras (*B) of numbers (*B, n), in the order of `names`: for a layer of one's own in the place of
+        the linear one. Beyond a million numbers are a million; what is NaN makes a camera without valid points.
+        """
+        owner = f"{type(self).__name__}.camera"
+        numbers = as_values(numbers, "numbers", owner)
+        if numbers.ndim == 0 or numbers.shape[-1] != len(self.names):
+            raise ValueError(
+                f"{owner}: numbers must be (*B, {len(self.names)}), {', '.join(self.names)}; got shape "
+                f"{tuple(numbers.shape)}"
+            )
+        dtype = torch.promote_types(numbers.dtype, torch.float32)
+        rows = precise(numbers.to(dtype).reshape(-1, len(self.names)).clamp(-_LARGEST, _LARGEST))
+        first = len(self.names) - len(self._coefficients)
+        given, free = rows[:, :first], rows[:, first:]
+        least, most = self._discs[0].to(rows), self._discs[-1].to(rows)
+        disc = least + (most - least) * (1 + _bounded(given[:, :1] + self._start.to(rows))) / 2
+        lens = self._lens.to(rows)
+        limits = Limits(self.model, lens)
+        k = lens + self._moves(limits, free, disc)
+        disc = disc.exp()
+        focal = self._far.to(rows) / limits.filled(k, limits.disc(k, disc))
+        half = self._ratio.to(rows) / 2
+        half = half if self.shared_focal else half + _ASPECT / 2 * _bounded(given[:, 1:2])
+        height, width = self.image_size
+        centre = self._middle.to(rows).expand(len(rows), 2)
+        if self._centres:
+            reach = rows.new_tensor([width, height])[self._centres] * self.centre
+            moved = reach * _bounded(given[:, first - len(self._centres) :])
+            centre = centre + (moved if len(self._centres) == 2 else _placed(moved, self._centres[0]))
+        intrinsics = torch.cat((focal * (-half).exp(), focal * half.exp(), centre), -1).to(dtype)
+        lead = numbers.shape[:-1]
+        parts = [intrinsics.reshape(*lead, 4), k.to(dtype).reshape(*lead, -1)][: 2 if len(lens) else 1]
+        camera = self.model(*parts, image_size=self.image_size)
+        return camera if in_graph(parts[0]) else camera.requires_grad_(False)
+
+    def _moves(self, limits: Limits, numbers: Tensor, disc: Tensor) -> Tensor:
+        """(R, n): what is added to the coefficients given, for numbers (R, free) and logarithms (R, 1) of discs."""
+        none = numbers.new_zeros(len(numbers), len(limits.given))
+        if not self._coefficients:
+            return none
+        step = (self._discs[-1] - self._discs[0]).to(numbers) / (_NODES - 1)
+        place = ((disc - self._discs[0].to(numbers)) / step.clamp(min=1e-12)).clamp(0, _NODES - 1)
+        before = place.detach().nan_to_num().long().clamp(max=_NODES - 2)
+        table = self._scales.to(numbers)
+        scale = torch.lerp(table[before[:, 0]], table[before[:, 0] + 1], place - before).exp()
+        size = torch.linalg.vector_norm(numbers, dim=-1, keepdim=True)
+        index = torch.tensor(self._coefficients, device=numbers.device)
+        moves = none.index_copy(1, index, numbers * scale)
+        gauge = size / limits.along(moves / size.clamp(min=1e-12), disc.exp())
+        return moves * torch.rsqrt(1 + gauge * gauge)
+
+    def extra_repr(self) -> str:
+        """The model, the images and the names of the numbers."""
+        return f"{self.model.__name__}, image_size={self.image_size}, numbers=({' '.join(self.names)})"
+
+
+def _bounded(x: Tensor) -> Tensor:
+    """From -1 to 1: like x near zero, with gradients that fade with the third power."""
+    return x * torch.rsqrt(1 + x * x)
+
+
+def _placed(values: Tensor, index: int) -> Tensor:
+    """(R, 1) as the x or the y of (R, 2)."""
+    zero = torch.zeros_like(values)
+    return torch.cat((values, zero) if index == 0 else (zero, values), -1)

@@ -1,0 +1,168 @@
+"""How far the coefficients of a lens may go before it would fold, or bend beyond reason, on what an image shows."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import columns
+from camtorch.optics.backprojection import FURTHEST, Inverted
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+    from camtorch.optics.charts import Chart, Planes2
+
+BEYOND = 1.02
+"""How much further out than the image is asked, where its rim is safe from rounding."""
+_NODES = 48  # of Chebyshev: what a polynomial of t = radius^2 is between them is hardly more than on them
+_LEAST, _MOST = 0.05, 4.0  # the slope of a lens, and how far out it sends points, compared with the lens given
+_FLATTEST, _STEEPEST = 0.25, 20.0  # the same of charts: angle by radius
+_KEPT = 0.02  # of the way from the lens given to where a formula ends
+_AZIMUTHS = 32
+_AT_AXIS = 0.02
+_FIRST, _LAST, _GRID = 1e-3, 1e3, 32
+_ROUNDS, _PARTS = 5, 8
+_STEP = 1e-6
+
+
+class Profile(NamedTuple):
+    """A lens from the axis outwards, at the nodes of a disc, (*C, nodes) each; what a model does not have is None."""
+
+    turns: Tensor
+    """The angles from node to node."""
+    room: Tensor
+    """Positive where the chart has rays."""
+    slope: Tensor | None
+    """A lower bound of the slope of the lens in all directions."""
+    reach: Tensor | None
+    """An upper bound of how many times further out points come to lie."""
+    defined: Tensor | None
+    """Positive where the formula exists."""
+
+
+class Limits:
+    """The coefficients with which a model is one-to-one on a disc around the axis: a set, seen from one lens in it.
+
+    It holds the lenses that, on the whole disc, have more than a twentieth of the slope of the lens given, in every
+    direction, and send no point four times as far out; charts that have coefficients are at least a quarter, and at
+    most twenty times as steep as the one given. It is convex where all terms of a lens are of one stage and linear in
+    the coefficients: polynomials, decentering, thin prisms. Elsewhere only lines from the lens given are looked at.
+
+    Coefficients are (*C, n) and radii of discs, on the plane of the chart, (*C, 1).
+    """
+
+    def __init__(self, model: type[Camera], given: Tensor):
+        """given: (n,), the coefficients of the lens from which others are seen."""
+        self.model, self.given = model, given
+        chart, lens = model.optics(columns(given))
+        self.bends = len(chart.parameters) > 0
+        self.is_radial = len(lens.stages) == 0 or lens.is_radial
+
+    def disc(self, k: Tensor, radius: Tensor) -> Tensor:
+        """The disc of another lens that shows, near the axis, what that of the lens given shows.
+
+        Coefficients that scale the whole image, as the xi of `DoubleSphere`, so leave the field of view nearly alone.
+        """
+        if not self.bends:
+            return radius
+        near = _AT_AXIS * radius
+        return radius * _angles(self._chart(self.given), near) / _angles(self._chart(k), near)
+
+    def filled(self, k: Tensor, radius: Tensor) -> Tensor:
+        """(*C, 1): the radius of the largest circle of the sensor, in focal lengths, that the disc fills."""
+        _, lens = self.model.optics(columns(k))
+        if not lens.stages:
+            return radius
+        count = 1 if self.is_radial else _AZIMUTHS
+        turn = torch.arange(count, dtype=k.dtype, device=k.device) * (2 * math.pi / count)
+        return torch.hypot(*lens(radius * turn.cos(), radius * turn.sin())).amin(-1, keepdim=True)
+
+    def _chart(self, k: Tensor) -> Chart:
+        return self.model.optics(columns(k))[0]
+
+    def _profile(self, k: Tensor, radius: Tensor) -> Profile:
+        share = torch.arange(1, _NODES + 1, dtype=k.dtype, device=k.device) * (math.pi / (2 * _NODES))
+        radii = BEYOND * self.disc(k, radius) * share.sin()
+        chart, lens = self.model.optics(columns(k))
+        angles = _angles(chart, radii)
+        # what turns back needs no table to tell
+        room = FURTHEST - radii if isinstance(chart, Inverted) else chart.on_plane(radii, torch.zeros_like(radii))
+        room = torch.minimum(room, math.pi - angles)
+        slope = reach = None
+        if lens.stages:
+            slope, furthest = lens.lower_bound(radii)
+            reach = furthest / radii
+        defined = self.model.defined(k.unbind(-1))
+        turns = angles.diff(dim=-1, prepend=torch.zeros_like(angles[..., :1]))
+        return Profile(turns, room, slope, reach, None if defined is None else defined.unsqueeze(-1))
+
+    def _margin(self, k: Tensor, radius: Tensor, given: Profile) -> Tensor:
+        """(*C): positive for coefficients in the set; given: the profile of the lens given."""
+        here = self._profile(k, radius)
+        ratios = [here.room / given.room - _KEPT]
+        if self.bends:
+            turns = here.turns / given.turns
+            ratios += [turns / _FLATTEST - 1, 1 - turns / _STEEPEST]
+        if here.slope is not None and given.slope is not None:
+            ratios.append(here.slope / given.slope - _LEAST)
+        if here.reach is not None and given.reach is not None:
+            ratios.append(1 - here.reach / given.reach / _MOST)
+        if here.defined is not None and given.defined is not None:
+            ratios.append(here.defined / given.defined - _KEPT)
+        least = [r.nan_to_num(nan=-1.0).amin(-1) for r in ratios]
+        return torch.stack(torch.broadcast_tensors(*least)).amin(0)
+
+    def along(self, direction: Tensor, radius: Tensor) -> Tensor:
+        """(C, 1): how many times a direction (C, n) may be added to the coefficients given before the set ends.
+
+        A thousand times if not before, and the first end if there are several. Its derivatives are exact, but for those
+        of higher order.
+        """
+        with torch.no_grad():
+            plain = direction.detach(), radius.detach()
+            given = self._profile(self._start(direction), plain[1].unsqueeze(-2))
+            times, ends = self._end(*plain, given)
+            step = _STEP * times
+            ahead, behind = (self._at(times + change, *plain, given) for change in (step, -step))
+            slope = (ahead - behind) / (2 * step)
+            ends &= slope < 0
+        # the implicit function: where the margin would change, the end moves until it does not
+        margin = self._at(times, direction, radius, self._profile(self._start(direction), radius.unsqueeze(-2)))
+        moved = (margin - margin.detach()) / torch.where(ends, slope, 1.0)
+        return times - torch.where(ends, moved, 0.0)
+
+    def _at(self, times: Tensor, direction: Tensor, radius: Tensor, given: Profile) -> Tensor:
+        """(C, S): the margin with the direction added so many times, (C, S)."""
+        k = self._start(direction) + times.unsqueeze(-1) * direction.unsqueeze(-2)
+        return self._margin(k, radius.unsqueeze(-2), given)
+
+    def _start(self, like: Tensor) -> Tensor:
+        # where both terms of a hypotenuse are zero it has no gradient
+        nearly_zero: float = torch.finfo(like.dtype).tiny ** 0.5
+        return self.given.to(like) + nearly_zero
+
+    def _end(self, direction: Tensor, radius: Tensor, given: Profile) -> Planes2:
+        """(C, 1): where the margin is lost first, and bool: whether it is."""
+        share = torch.linspace(0, 1, _GRID, dtype=direction.dtype, device=direction.device)
+        times = (_FIRST * (_LAST / _FIRST) ** share).expand(len(direction), -1)
+        low, ends = torch.zeros_like(times[:, :1]), None
+        parts = torch.arange(1, _PARTS + 1, dtype=direction.dtype, device=direction.device) / _PARTS
+        for _ in range(_ROUNDS):
+            kept = (self._at(times, direction, radius, given) > 0).long().cumprod(-1).sum(-1, keepdim=True)
+            ends = kept < times.shape[-1] if ends is None else ends
+            low = torch.where(kept > 0, times.gather(-1, (kept - 1).clamp(min=0)), low)
+            high = times.gather(-1, kept.clamp(max=times.shape[-1] - 1))
+            times = low + (high - low) * parts
+        assert ends is not None
+        before, after = (self._at(end, direction, radius, given) for end in (low, high))
+        fraction = (before / (before - after)).nan_to_num(nan=0.0).clamp(0, 1)
+        return low + (high - low) * torch.where(ends, fraction, 0.0), ends
+
+
+def _angles(chart: Chart, radii: Tensor) -> Tensor:
+    """The angles from the axis of points that far from it."""
+    x, _, z = chart.to_ray(radii, torch.zeros_like(radii), 1)
+    return torch.atan2(x, z)

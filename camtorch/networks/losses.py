@@ -1,0 +1,225 @@
+"""Losses between cameras, for networks that predict them: on rays, and on pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, overload
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, as_values, as_whole, broadcast_shapes
+from camtorch.camera import Camera
+
+
+def angles(first: Tensor, second: Tensor) -> Tensor:
+    """(...) radians between directions (..., 3), from 0 to pi; exact to rounding for the smallest and the largest.
+
+    Its gradient has length 1, and is zero where it has none: between equal directions and between opposite ones. acos
+    of the dot product is off by 3e-4 in float32, and its gradient is infinite there. Source: Kahan, "How futile are
+    mindless assessments of roundoff in floating-point computation?", 2006, section 12.
+
+    Args:
+        first: of any length but zero.
+        second: likewise; both broadcast.
+    """
+    a, b = (w / torch.linalg.vector_norm(w, dim=-1, keepdim=True) for w in (first, second))
+    # the norm has a gradient of zero at zero
+    return 2 * torch.atan2(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
+
+
+@overload
+def rays(
+    predicted: Camera,
+    target: Camera,
+    *,
+    samples: int | tuple[int, int] = 16,
+    pixels: Numbers | None = None,
+    weights: Numbers | None = None,
+    reduction: Literal["mean"] = "mean",
+) -> Tensor: ...
+
+
+@overload
+def rays(
+    predicted: Camera,
+    target: Camera,
+    *,
+    samples: int | tuple[int, int] = 16,
+    pixels: Numbers | None = None,
+    weights: Numbers | None = None,
+    reduction: Literal["none"],
+) -> tuple[Tensor, Tensor]: ...
+
+
+def rays(
+    predicted: Camera,
+    target: Camera,
+    *,
+    samples: int | tuple[int, int] = 16,
+    pixels: Numbers | None = None,
+    weights: Numbers | None = None,
+    reduction: Literal["mean", "none"] = "mean",
+) -> Tensor | tuple[Tensor, Tensor]:
+    """The angles between the rays that two cameras have for the same pixels of their images.
+
+    It compares cameras of any models, whatever their numbers mean, and weighs focal length, principal point and
+    distortion by what they do: in radians.
+
+    Args:
+        predicted: of any batch dims *B.
+        target: likewise; both broadcast.
+        samples: rows and columns of the pixels that are looked at, evenly over the image: the middles of as many equal
+            parts of it; a number for both.
+        pixels: (*B, *N, 2), those to be looked at instead.
+        weights: of the angles, broadcast against them.
+        reduction: "mean": over the angles that are valid in both, by weight. "none": all of them.
+
+    Returns:
+        The mean, radians; 0 if nothing is valid. Or angles (*B, rows, columns), or (*B, *N) for pixels, that are 0
+        without a gradient where they are not valid, times the weights; and valid in the same shape.
+
+    Raises:
+        ValueError: images of different sizes, or none, and no pixels; another reduction.
+        TypeError: no cameras.
+    """
+    owner = "losses.rays"
+    batch = _check(predicted, target, owner)
+    if pixels is None:
+        places = _places(predicted, target, samples, batch, owner)
+    else:
+        places = as_values(pixels, "pixels", owner, predicted.intrinsics.device)
+    (a, ours), (b, theirs) = predicted.unproject(places), target.unproject(places)
+    return _reduced(angles(a, b), ours & theirs, weights, reduction, owner)
+
+
+@overload
+def reprojection(
+    predicted: Camera,
+    target: Camera | Tensor,
+    points: Tensor | None = None,
+    *,
+    samples: int | tuple[int, int] = 16,
+    weights: Numbers | None = None,
+    reduction: Literal["mean"] = "mean",
+) -> Tensor: ...
+
+
+@overload
+def reprojection(
+    predicted: Camera,
+    target: Camera | Tensor,
+    points: Tensor | None = None,
+    *,
+    samples: int | tuple[int, int] = 16,
+    weights: Numbers | None = None,
+    reduction: Literal["none"],
+) -> tuple[Tensor, Tensor]: ...
+
+
+def reprojection(
+    predicted: Camera,
+    target: Camera | Tensor,
+    points: Tensor | None = None,
+    *,
+    samples: int | tuple[int, int] = 16,
+    weights: Numbers | None = None,
+    reduction: Literal["mean", "none"] = "mean",
+) -> Tensor | tuple[Tensor, Tensor]:
+    """How far from where they are a camera sees points, in pixels.
+
+    Points that the predicted camera does not see at all do not count, and so do not pull it: `rays` does, over the
+    whole image.
+
+    Args:
+        predicted: of batch dims *B.
+        target: the camera that sees the points where they are, or those pixels (*B, *N, 2) themselves, NaN where not
+            seen.
+        points: (*B, *N, 3) of the camera frame; the rays of the target's own image if left out, see `samples`.
+        samples: see `rays`.
+        weights: see `rays`.
+        reduction: see `rays`.
+
+    Returns:
+        The mean distance over points that both see, or distances (*B, *N) and valid; see `rays`.
+
+    Raises:
+        ValueError: pixels without points; and as `rays`. TypeError: no cameras.
+    """
+    owner = "losses.reprojection"
+    if isinstance(target, Camera):
+        batch = _check(predicted, target, owner)
+        if points is None:
+            pixels = _places(predicted, target, samples, batch, owner)
+            points, seen = target.unproject(pixels)
+        else:
+            pixels, seen = target.project(points)
+    else:
+        _check(predicted, predicted, owner)
+        if points is None:
+            raise ValueError(f"{owner}: pixels say nothing without the points (*B, *N, 3) that are seen there")
+        pixels = as_values(target, "target", owner, predicted.intrinsics.device)
+        seen = torch.isfinite(pixels).all(-1)
+        pixels = torch.where(seen.unsqueeze(-1), pixels, 0.0)
+    found, valid = predicted.project(points)
+    valid = valid & seen
+    # of a point without a pixel the distance has no gradient
+    distance = torch.linalg.vector_norm(found - pixels, dim=-1)
+    return _reduced(distance, valid, weights, reduction, owner)
+
+
+def _check(predicted: object, target: object, owner: str) -> torch.Size:
+    """The batch dims of two cameras."""
+    for camera, name in ((predicted, "predicted"), (target, "target")):
+        if not isinstance(camera, Camera):
+            raise TypeError(f"{owner}: {name} must be a Camera; got {type(camera).__name__}")
+    assert isinstance(predicted, Camera)
+    assert isinstance(target, Camera)
+    shapes = predicted.batch_shape, target.batch_shape
+    try:
+        return broadcast_shapes(*shapes)
+    except ValueError:
+        raise ValueError(
+            f"{owner}: the batch dims {tuple(shapes[0])} of predicted and {tuple(shapes[1])} of target do not fit "
+            "together"
+        ) from None
+
+
+def _places(
+    predicted: Camera, target: Camera, samples: int | tuple[int, int], batch: Sequence[int], owner: str
+) -> Tensor:
+    """(*B, rows, columns, 2): the middles of equal parts of the image."""
+    sizes = {camera.image_size for camera in (predicted, target) if camera.image_size is not None}
+    if len(sizes) != 1:
+        what = f"of {' and '.join(map(str, sorted(sizes)))}" if sizes else "without an image_size"
+        raise ValueError(f"{owner}: the cameras must be of images of one size; got those {what}")
+    height, width = sizes.pop()
+    pair = samples if isinstance(samples, (tuple, list)) else (samples, samples)
+    if len(pair) != 2 or any(as_whole(count, "samples", owner) < 1 for count in pair):
+        raise ValueError(f"{owner}: samples must be rows and columns, or a number for both; got {samples!r}")
+    dtype = torch.promote_types(predicted.intrinsics.dtype, torch.float32)
+    v, u = (
+        (torch.arange(count, dtype=dtype, device=predicted.intrinsics.device) + 0.5) * (side / count) - 0.5
+        for count, side in zip(pair, (height, width), strict=True)
+    )
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).expand(*batch, *pair, 2)
+
+
+def _reduced(
+    values: Tensor, valid: Tensor, weights: Numbers | None, reduction: str, owner: str
+) -> Tensor | tuple[Tensor, Tensor]:
+    values = torch.where(valid, values, 0.0)
+    weighing = valid.to(values.dtype)
+    if weights is not None:
+        given = as_values(weights, "weights", owner, values.device).to(values.dtype)
+        try:
+            values, weighing = values * given, weighing * given
+        except RuntimeError:
+            raise ValueError(
+                f"{owner}: weights must broadcast against {tuple(valid.shape)}; got {tuple(given.shape)}"
+            ) from None
+    if reduction == "none":
+        return values, valid
+    if reduction != "mean":
+        raise ValueError(f'{owner}: reduction must be "mean" or "none"; got {reduction!r}')
+    return values.sum() / weighing.sum().clamp(min=torch.finfo(values.dtype).tiny)

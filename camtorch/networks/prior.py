@@ -1,0 +1,189 @@
+"""What a `CameraHead` starts from, and the discs of the lens that its images show at the most."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import columns
+from camtorch.networks.limits import BEYOND
+from camtorch.projection.rays import focal_for
+
+if TYPE_CHECKING:
+    from camtorch.calibration.calibrate import Model
+    from camtorch.camera import Camera
+
+_FOV = 40.0, 120.0
+_LONGER, _SHORTER = 1.5, (1.5, 1.25, 1.1, 1.05)  # than a given camera's; the first that leaves its corners rays
+_RIM, _LOPSIDED = 0.1, 0.1  # real lenses have a tenth as much of what is lopsided
+_TURNS = 0.0, math.pi / 4, math.pi / 2  # where what is lopsided moves most
+_AZIMUTHS = 16
+
+
+@dataclass
+class Prior:
+    """A lens, and from where to where its focal length goes.
+
+    Attributes:
+        model: its class.
+        lens: (n,) coefficients, float64.
+        focal: the geometric mean of fx and fy.
+        aspect: log(fy / fx).
+        middle: cx, cy.
+        discs: radii on the plane of the chart that reach as far as the farthest corner: at the greatest focal length,
+            at `focal`, and at the least.
+    """
+
+    model: type[Camera]
+    lens: Tensor
+    focal: float
+    aspect: float
+    middle: tuple[float, float]
+    discs: tuple[float, float, float]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the coefficients."""
+        return self.model.names_of(len(self.lens)) or ()
+
+    def scales(self, discs: Tensor) -> Tensor:
+        """(K, n): by how much a coefficient changes for 1, with discs of radii (K,); 0 for what changes nothing.
+
+        That moves the rim by a tenth of its distance from the axis, by a hundredth in what is lopsided.
+        """
+        turn = discs.new_tensor(_TURNS)
+        a, b = ((discs[:, None] * c).reshape(-1, 1) for c in (turn.cos(), turn.sin()))
+        with torch.enable_grad():
+            k = self.lens.expand(len(a), -1).clone().requires_grad_()
+            rays = self.model.optics(columns(k.detach()))[0].to_ray(a, b, 1)
+            chart, lens = self.model.optics(columns(k))
+            p, q = lens(*chart.to_plane(*rays, 1)) if lens.stages else chart.to_plane(*rays, 1)
+            moved = [
+                torch.autograd.grad(w.sum(), k, retain_graph=True, allow_unused=True)[0] if w.requires_grad else None
+                for w in (p, q)
+            ]
+        by_k = [torch.zeros_like(k) if m is None else m for m in moved]
+        moved_by = torch.hypot(*by_k) / torch.hypot(p, q).detach()
+        most = moved_by.unflatten(0, (len(discs), len(_TURNS))).amax(1)
+        odd = self.model.odd_in_x | self.model.odd_in_y
+        share = _RIM * torch.tensor([_LOPSIDED if name in odd else 1.0 for name in self.names], dtype=discs.dtype)
+        return torch.where(most > 0, share / most.clamp(min=1e-300), 0.0)
+
+
+def prior_of(
+    asked: Model, image_size: tuple[int, int], centre: float, aspect: float, fov: Sequence[float] | None, owner: str
+) -> Prior:
+    """The prior of a model, or of a camera to start from, and the discs that a range of fields of view takes.
+
+    Args:
+        asked: the model, its number of coefficients, and the camera.
+        image_size: (height, width).
+        centre: see `CameraHead`.
+        aspect: by how much the logarithm of fy / fx may change.
+        fov: degrees; see `CameraHead`.
+        owner: of errors.
+
+    Raises:
+        ValueError: no such range, one that the lens does not reach, a camera that is not within it; panoramas.
+    """
+    degrees, start, (height, width) = _as_fov(fov, owner), asked.start, image_size
+    given, middle, ratio = None, ((width - 1) / 2, (height - 1) / 2), 0.0
+    if start is not None:
+        fx, fy, cx, cy = start.intrinsics.detach().double().flatten().tolist()
+        given, middle, ratio = math.sqrt(fx * fy), (cx, cy), math.log(fy / fx)
+    sides = [max(c + 0.5, side - 0.5 - c) + centre * side for c, side in zip(middle, (width, height), strict=True)]
+    stretches = [math.exp((ratio + sign * aspect) / 2) for sign in (-1, 1)]
+    far = max(math.hypot(sides[0] * stretch, sides[1] / stretch) for stretch in stretches)
+    found = []
+    for lens in _lenses(asked):
+        plane = _plane(asked.kind, lens)
+        if not asked.kind.optics(columns(lens))[0].has_scale:
+            raise ValueError(f"{owner}: {asked.kind.__name__} is a panorama, and has no lens to predict")
+        if given is not None and degrees is None:
+            ranges = [(given * _LONGER, given, given / times) for times in _SHORTER]
+        else:
+            pair = torch.tensor(degrees or _FOV, dtype=lens.dtype).deg2rad()
+            focal, reached = focal_for(plane, pair, image_size, "horizontal")
+            longest, shortest = (focal * math.exp(ratio / 2)).tolist()
+            ranges = [(longest, given or math.sqrt(longest * shortest), shortest)] if bool(reached.all()) else []
+        for longest, focal_length, shortest in ranges:
+            if not shortest * (1 - 1e-6) <= focal_length <= longest * (1 + 1e-6):
+                raise ValueError(
+                    f"{owner}: the given camera has a field of view that is not within fov={tuple(fov or ())}"
+                )
+            discs = [_disc(plane, far / f) for f in (longest, focal_length, shortest)]
+            if all(discs):
+                found.append(Prior(asked.kind, lens, focal_length, ratio, middle, (discs[0], discs[1], discs[2])))
+                break
+    if found:
+        return _liveliest(found)
+    if start is not None:
+        raise ValueError(
+            f"{owner}: the camera has no rays for the corners of images of {image_size}, with its principal point "
+            f"moved by up to centre={centre} of them" + ("" if degrees is None else f", and fov={degrees}") + ". A "
+            "smaller centre, a narrower fov, or the camera of a crop"
+        )
+    raise ValueError(
+        f"{owner}: {asked.kind.__name__} has no rays for the corners of images of {image_size} with "
+        f"fov={degrees or _FOV} and centre={centre}. A narrower fov, a smaller centre, or a model that sees further"
+    )
+
+
+def _liveliest(priors: list[Prior]) -> Prior:
+    """The first one, unless coefficients do nothing there that do something elsewhere, as the omega of `FOV` at 0.
+
+    Then that of most coefficients of which the one that does least does most.
+    """
+    scales = [prior.scales(torch.tensor(prior.discs, dtype=torch.float64)) for prior in priors]
+    counts = [int((scale > 0).all(0).sum()) for scale in scales]
+    if counts[0] == max(counts):
+        return priors[0]
+    some = [i for i, count in enumerate(counts) if count == max(counts)]
+    return priors[min(some, key=lambda i: float(scales[i].amax()))]
+
+
+def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | None:
+    if fov is None:
+        return None
+    try:
+        low, high = (float(angle) for angle in fov)
+    except TypeError:
+        raise TypeError(f"{owner}: fov must be the least and the greatest, as (40, 120); got {fov!r}") from None
+    if not 0 < low <= high <= 360:
+        raise ValueError(f"{owner}: fov must be degrees, from the least to the greatest; got {fov!r}")
+    if high <= 2 * math.pi:
+        raise ValueError(f"{owner}: fov is in degrees; {fov!r} seems to be radians, which math.degrees() converts")
+    return low, high
+
+
+def _lenses(asked: Model) -> Iterator[Tensor]:
+    """The coefficients of the camera; or those of an ideal one, and those that fits of the model start from."""
+    if asked.start is not None:
+        yield asked.start.distortion.detach().double().reshape(-1).cpu()
+        return
+    names = asked.names[4:]
+    ideal = dict(zip(names, asked.kind.ideal(asked.count), strict=True))
+    for values in ({}, *asked.kind.fit_starts):
+        yield torch.tensor([{**ideal, **values}[name] for name in names], dtype=torch.float64)
+
+
+def _plane(model: type[Camera], lens: Tensor) -> Camera:
+    """The camera of focal length 1 with its principal point at 0."""
+    intrinsics = lens.new_tensor([1.0, 1.0, 0.0, 0.0])
+    return (model(intrinsics, lens) if len(lens) else model(intrinsics)).requires_grad_(False)
+
+
+def _disc(plane: Camera, reach: float) -> float:
+    """The radius of the disc of the chart's plane that is seen up to a distance from the centre; 0 where none is."""
+    turn = torch.arange(_AZIMUTHS, dtype=torch.float64) * (2 * math.pi / _AZIMUTHS)
+    rim = BEYOND * reach * torch.stack((turn.cos(), turn.sin()), -1)
+    if not bool(plane.unproject(rim)[1].all()):
+        return 0.0
+    x, y, z = plane.unproject(rim / BEYOND)[0].unbind(-1)
+    chart, _ = plane.optics(columns(plane.distortion))
+    return float(torch.hypot(*chart.to_plane(x, y, z, 1)).amax())

@@ -1,0 +1,298 @@
+"""`CameraHead`: whatever its numbers are, every point of the image has a ray; and they learn."""
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from cameras import DISTINCT
+
+import camtorch as ct
+from camtorch.networks.limits import Limits
+from camtorch.projection.rays import image_lattice
+
+SIZE = (480, 640)
+PANORAMAS = {"cylindrical", "equirectangular", "latlon", "transverse_cylindrical"}
+FOV = {"orthographic_fisheye": (40, 80)}  # degrees; further out is nothing
+KEYS = sorted(set(ct.MODELS) - PANORAMAS)
+QUICK = [key if key in DISTINCT else pytest.param(key, marks=pytest.mark.slow) for key in KEYS]
+
+
+def head(key, features=16, **options):
+    options = {"image_size": SIZE, "fov": FOV.get(key), **options}
+    return ct.CameraHead(features, key, **options)
+
+
+def random(layer, scale, generator):
+    """With random weights, whose numbers have that size."""
+    for parameter in layer.linear.parameters():
+        torch.nn.init.normal_(parameter, std=scale / math.sqrt(layer.linear.in_features + 1), generator=generator)
+    return layer
+
+
+def all_have_rays(camera, rows=9, columns=11) -> torch.Tensor:
+    """Bool (*B): pixels over the whole image, its outer corners and edges included, have rays."""
+    pixels = image_lattice(camera, rows, columns).flatten(0, 1)
+    rays, valid = camera.unproject(pixels.expand(*camera.batch_shape, *pixels.shape))
+    back, again = camera.project(rays)
+    near = (back - pixels).norm(dim=-1) < 0.05
+    return (valid & again & near).all(-1)
+
+
+def valid_cameras(key, number, **options):
+    generator = torch.Generator().manual_seed(1)
+    layer = head(key, **options)
+    with torch.no_grad():
+        for scale in (0.3, 1.0, 5.0, 1e9):
+            random(layer, scale, generator)
+            for features in torch.randn(number // 4, 16, generator=generator).split(500):
+                yield layer(features)
+
+
+@pytest.mark.parametrize(
+    "key", [pytest.param(k, marks=pytest.mark.slow) if k == "f_theta_backward" else k for k in QUICK]
+)
+def test_random_weights_give_cameras_with_a_ray_for_every_point_of_the_image(key):
+    for camera in valid_cameras(key, 80):
+        assert bool(all_have_rays(camera).all())
+        assert bool((camera.intrinsics[..., :2] > 0).all())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", ["brown_conrady", "kannala_brandt", "fisheye624", "double_sphere", "division"])
+def test_ten_thousand_random_features(key):
+    count = 0
+    for camera in valid_cameras(key, 10_000):
+        assert bool(all_have_rays(camera, 5, 7).all())
+        count += len(camera)
+    assert count == 10_000
+
+
+@pytest.mark.parametrize("count", [5, 8, 14])
+def test_all_counts_of_brown_conrady(count):
+    for camera in valid_cameras("brown_conrady", 40, count=count, shared_focal=False, centre=0.3):
+        assert camera.distortion.shape == (10, count)
+        assert bool(all_have_rays(camera).all())
+
+
+def test_the_limits_are_near():
+    # a lens bent ten times as far in the direction that a head ends in has lost corners: limits are no walls far away
+    layer = head("kannala_brandt", count=1, fov=(120, 120), centre=0.0)
+    number = torch.zeros(2, 2)
+    number[:, 1] = torch.tensor([-1e6, 1e6])
+    camera = layer.camera(number)
+    assert bool(all_have_rays(camera).all())
+    barrel, pincushion = camera.distortion[:, 0].tolist()
+    corner = camera[0].unproject(torch.tensor([[-0.5, -0.5]]))[0]
+    angle = float(torch.acos(corner[0, 2]))
+    assert -1 / 3 < barrel * angle**2 < -0.9 / 3  # the fold is at -1/3
+    assert pincushion * angle**2 > 1
+
+
+@pytest.mark.parametrize("key", QUICK)
+def test_it_starts_as_its_prior(key):
+    layer = head(key)
+    prior = layer.prior
+    camera = layer(torch.randn(3, 16))
+    assert torch.equal(camera.intrinsics, prior.intrinsics.expand(3, 4))
+    assert torch.equal(camera.distortion, prior.distortion.expand_as(camera.distortion))
+    least, most = (math.radians(angle) for angle in FOV.get(key, (40, 120)))
+    assert least < prior.field_of_view[0] < most
+    torch.testing.assert_close(prior.intrinsics[2:], torch.tensor([319.5, 239.5]))
+
+
+def test_the_prior_of_a_model_has_the_geometric_mean_of_its_focal_lengths():
+    layer = head("pinhole", fov=(40, 120))
+    ends = [320 / math.tan(math.radians(angle / 2)) for angle in (40, 120)]
+    assert layer.prior.fx.item() == pytest.approx(math.sqrt(math.prod(ends)), rel=1e-6)
+    found = [layer.camera(torch.tensor([sign * 1e6, 0.0, 0.0])).fx.item() for sign in (-1, 1)]
+    assert sorted(found) == pytest.approx(sorted(ends), rel=1e-5)
+
+
+CAMERAS = [
+    ct.BrownConrady([520.0, 524.0, 317.0, 244.0], [-0.28, 0.07, 0.001, -0.0002, 0.01], image_size=SIZE),
+    ct.KannalaBrandt([280.0, 280.0, 318.0, 236.0], [-0.012, 0.03, -0.02, 0.004], image_size=SIZE),
+    ct.EUCM([300.0, 301.0, 321.0, 240.0], [0.6, 1.1], image_size=SIZE),
+]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.key)
+def test_a_given_camera_is_the_prior(camera):
+    layer = ct.CameraHead(4, camera)
+    assert layer.image_size == SIZE
+    torch.testing.assert_close(layer.prior.intrinsics, camera.intrinsics.detach(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(layer.prior.distortion, camera.distortion.detach(), rtol=1e-6, atol=0)
+    generator = torch.Generator().manual_seed(0)
+    near = random(layer, 0.1, generator)(torch.randn(20, 4, generator=generator))
+    assert bool(all_have_rays(near).all())
+    assert (near.fy / near.fx - camera.fy / camera.fx).abs().max() < 1e-5
+    assert (near.fx / camera.fx).log().abs().max() < 0.2
+
+
+def test_one_moves_the_rim_by_a_tenth():
+    for key in ("brown_conrady", "fisheye624", "ucm"):
+        layer = head(key).double()
+        edge = layer.prior.unproject(torch.tensor([[-64.5, -48.5]], dtype=torch.float64))[0]  # the farthest corner
+        for i, name in enumerate(layer.names[3:], 3):
+            number = torch.zeros(2, len(layer.names), dtype=torch.float64)
+            number[:, i] = torch.tensor([-1e-3, 1e-3])
+            lens = layer.camera(number)
+            plane = type(lens)(lens.intrinsics.new_tensor([1.0, 1, 0, 0]).expand(2, 4), lens.distortion)
+            before, after = plane.project(edge.expand(2, 1, 3))[0]
+            moved = ((after - before) / 2e-3).norm() / after.norm()
+            most = 0.01 if name[0] in "ps" else 0.1
+            assert 0.3 * most < moved < 1.05 * most, name
+
+
+@pytest.mark.parametrize("key", [k for k in QUICK if k != "pinhole"])
+def test_gradients_are_those_of_what_it_computes(key):
+    layer = head(key, shared_focal=False).double()
+    generator = torch.Generator().manual_seed(2)
+    numbers = torch.randn(2, len(layer.names), generator=generator, dtype=torch.float64)
+    step = 1e-5 * torch.randn(numbers.shape, generator=generator, dtype=torch.float64)
+
+    def outputs(x):
+        camera = layer.camera(x)
+        return torch.cat((camera.intrinsics / 300, (camera.distortion - layer.prior.distortion) / size), -1)
+
+    size = 1.0
+    with torch.no_grad():
+        size = (layer.camera(numbers).distortion - layer.prior.distortion).abs().clamp(min=1e-12)
+        numeric = (outputs(numbers + step) - outputs(numbers - step)) / 2
+    learns = numbers.clone().requires_grad_()
+    for i, change in enumerate(numeric.unbind(-1)):
+        (gradient,) = torch.autograd.grad(outputs(learns)[:, i].sum(), learns)
+        torch.testing.assert_close((gradient * step).sum(-1), change, rtol=1e-4, atol=1e-9)
+
+
+def test_gradients_do_not_vanish_far_out():
+    layer = head("brown_conrady", fixed=("cx", "cy", "k2", "k3", "p1", "p2"))
+    numbers = torch.tensor([[4.0, 4.0], [-4.0, -4.0]], requires_grad=True)
+    camera = layer.camera(numbers)
+    (camera.fx.log().sum() + camera.distortion[:, 0].sum()).backward()
+    assert (numbers.grad.abs() > 1e-3).all()
+
+
+@pytest.mark.slow
+def test_it_learns_a_camera_from_its_rays():
+    truth = ct.KannalaBrandt([300.0, 300.0, 330.0, 230.0], [-0.05, 0.02, -0.01, 0.002], image_size=SIZE)
+    layer = head("kannala_brandt", 2, fov=(60, 150))
+    optimizer = torch.optim.Adam(layer.parameters(), lr=0.1)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.1, total_steps=200)
+    for _ in range(200):
+        optimizer.zero_grad()
+        loss = ct.losses.rays(layer(torch.ones(1, 2)), truth)
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    assert loss < 1e-3
+    found = layer(torch.ones(2))
+    assert abs(found.fx / 300 - 1) < 0.01
+    assert (found.intrinsics[2:] - truth.intrinsics[2:]).abs().max() < 2
+
+
+def test_fixed_names_and_counts():
+    layer = head("fisheye624", fixed=("cx", "cy", "p0", "p1", "s0", "s1", "s2", "s3"), shared_focal=False)
+    assert layer.names == ("focal", "aspect", "k0", "k1", "k2", "k3", "k4", "k5")
+    camera = random(layer, 1.0, torch.Generator().manual_seed(0))(torch.randn(5, 16))
+    assert bool((camera.distortion[:, 6:] == 0).all())
+    assert bool((camera.cx == 319.5).all())
+    assert (camera.fy / camera.fx - 1).abs().max() > 0.01
+    assert head("kannala_brandt", count=2, fixed="cy").names == ("focal", "cx", "k1", "k2")
+    assert head("division", count=3).camera(torch.zeros(6)).distortion.shape == (3,)
+    assert "omega" in head("fov").names  # which at 0 would change nothing
+    assert set(head("eucm").names) > {"alpha", "beta"}
+    assert not [name for name in head("tabulated").names if name.startswith("theta")]
+
+
+def test_it_is_a_module_like_others(tmp_path):
+    layer = random(head("brown_conrady", 8), 0.5, torch.Generator().manual_seed(0))
+    features = torch.randn(2, 3, 8)
+    camera = layer(features)
+    assert tuple(camera.batch_shape) == (2, 3)
+    assert camera.image_size == SIZE
+    single = layer(features[0, 0])
+    torch.testing.assert_close(single.intrinsics, camera.intrinsics[0, 0])
+    other = head("brown_conrady", 8)
+    assert set(layer.state_dict()) == {"linear.weight", "linear.bias"}
+    other.load_state_dict(layer.state_dict())
+    for again in (other, copy.deepcopy(layer), pickle.loads(pickle.dumps(layer))):
+        assert torch.equal(again(features).distortion, camera.distortion)
+    with torch.no_grad():
+        assert not layer(features).intrinsics.requires_grad
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(layer(features).intrinsics, camera.intrinsics)
+    half = copy.deepcopy(layer).half()
+    assert half(features).intrinsics.dtype == torch.float32
+    assert "numbers=(focal cx cy k1 k2 p1 p2 k3)" in repr(layer)
+
+
+def test_rows_are_independent_and_a_bad_one_is_alone():
+    layer = random(head("kannala_brandt", 8), 1.0, torch.Generator().manual_seed(0))
+    features = torch.randn(4, 8)
+    whole = layer(features)
+    torch.testing.assert_close(layer(features[2:3]).distortion, whole.distortion[2:3], rtol=1e-6, atol=1e-9)
+    features[1, 0] = torch.nan
+    assert all_have_rays(layer(features)).tolist() == [True, False, True, True]
+    assert bool(all_have_rays(layer(1e30 * torch.randn(4, 8))).all())
+
+
+@pytest.mark.slow
+def test_it_compiles_whole():
+    layer = random(head("kannala_brandt", 4), 1.0, torch.Generator().manual_seed(0))
+
+    def numbers(features):
+        camera = layer(features)
+        return camera.intrinsics, camera.distortion
+
+    features = torch.randn(3, 4)
+    compiled = torch.compile(numbers, backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(features), numbers(features))
+
+
+def test_the_set_seen_from_a_lens_is_convex_for_polynomials():
+    limits = Limits(ct.ThinPrismFisheye, torch.zeros(8, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.randn(64, 8, generator=generator, dtype=torch.float64)
+    radius = torch.full((64, 1), 1.2, dtype=torch.float64)
+    ends = 0.999 * limits.along(direction, radius) * direction
+    middle = (ends[:32] + ends[32:]) / 2
+    assert (limits.along(middle, radius[:32]) > 1).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "said"),
+    [
+        ("pinhole", {"image_size": None}, "image_size=(height, width)"),
+        ("equirectangular", {}, "panorama"),
+        ("pinhole", {"fov": (0.7, 2.0)}, "radians"),
+        ("pinhole", {"fov": (120, 40)}, "from the least to the greatest"),
+        ("pinhole", {"fov": (90, 190)}, "no rays for the corners"),
+        ("orthographic_fisheye", {"fov": None}, "A narrower fov"),
+        ("pinhole", {"fixed": "fx"}, "fov=(90, 90)"),
+        ("pinhole", {"fixed": ("k1",)}, "Pinhole has fx, fy, cx, cy"),
+        ("brown_conrady", {"count": 6}, "4, 5, 8, 12 or 14"),
+        ("kannala_brant", {}, "did you mean"),
+        ("pinhole", {"centre": 0.7}, "below 0.5"),
+        (CAMERAS[0], {"image_size": (48, 64)}, "images of (480, 640)"),
+        (CAMERAS[0], {"fov": (20, 30)}, "not within"),
+        (ct.KannalaBrandt([200.0, 200, 320, 240], [-0.2, 0, 0, 0], image_size=SIZE), {}, "the camera of a crop"),
+    ],
+)
+def test_what_is_refused(model, options, said):
+    with pytest.raises(ValueError, match="CameraHead") as error:
+        ct.CameraHead(16, model, **{"image_size": None if isinstance(model, ct.Camera) else SIZE, **options})
+    assert said in str(error.value)
+
+
+def test_features_of_another_size_are_refused():
+    layer = head("pinhole")
+    with pytest.raises(ValueError, match=r"features must be \(\*B, 16\); got shape \(2, 8\)"):
+        layer(torch.zeros(2, 8))
+    with pytest.raises(ValueError, match=r"numbers must be \(\*B, 3\), focal, cx, cy"):
+        layer.camera(torch.zeros(2, 8))
+    with pytest.raises(TypeError, match=r"as \(40, 120\); got 90"):
+        ct.CameraHead(16, "pinhole", image_size=SIZE, fov=90)
+    with pytest.raises(TypeError, match="camera model"):
+        ct.CameraHead(16, torch.nn.Linear, image_size=SIZE)
