@@ -1,6 +1,7 @@
 """README and documentation: every Python block runs on its own, every command runs, every public name has a page."""
 
 import functools
+import importlib.util
 import re
 import shlex
 import shutil
@@ -80,8 +81,14 @@ def folder(tmp_path, monkeypatch, request):
     ct.MODELS.update(known)
 
 
+# Python 3.12 and later warn of forks beside threads, ray of itself; webdataset leaves its files to the collector
+@pytest.mark.filterwarnings(
+    "ignore:.*fork.*:DeprecationWarning", "ignore::DeprecationWarning:ray", "ignore:unclosed file:ResourceWarning"
+)
 @pytest.mark.parametrize(("page", "line", "code"), [*blocks("python")])
 def test_a_block_runs_by_itself(page, line, code, folder):
+    if "import ray\n" in code and importlib.util.find_spec("ray") is None:
+        pytest.skip("ray is not installed; .ci/run installs it")
     exec(compile("\n" * (line - 1) + code, str(page), "exec"), {"__name__": "__main__"})
 
 
