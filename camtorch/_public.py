@@ -52,6 +52,7 @@ from camtorch.warp import views
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.plane import BirdsEye, PlaneWarp
 from camtorch.warp.reproject import Reproject
+from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.surround import Surround, surround
 from camtorch.warp.warp import Warp
 
@@ -94,6 +95,7 @@ __all__ = [
     "Reproject",
     "Rig",
     "RigCalibration",
+    "RollingShutter",
     "Stereographic",
     "Surround",
     "Tabulated",

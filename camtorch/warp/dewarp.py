@@ -14,6 +14,7 @@ from camtorch.models import Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import image_lattice
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp.sampling import Fill, Mode, PaddingMode
+from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp, as_sized
 
 Projection = Literal["perspective", "cylindrical", "equirectangular"]
@@ -39,7 +40,7 @@ class Dewarp(Warp):
             what the image's middle row and column show, and never more than 120 degrees in perspective.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
-        mode, padding_mode, fill, antialias, tolerance: as `Warp` takes them.
+        mode, padding_mode, fill, antialias, tolerance, shutter: as `Warp` takes them.
 
     The target has square pixels, is chosen once, and does not learn. It is finite for every camera, also where the
     lens folds inside the image or sees past 90 degrees.
@@ -61,6 +62,7 @@ class Dewarp(Warp):
         fill: Fill = 0.0,
         antialias: bool = False,
         tolerance: float | None = None,
+        shutter: RollingShutter | None = None,
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
@@ -86,6 +88,7 @@ class Dewarp(Warp):
             fill=fill,
             antialias=antialias,
             tolerance=tolerance,
+            shutter=shutter,
         )
 
 

@@ -35,6 +35,7 @@ from camtorch.warp.sampling import (
     one_of,
     render,
 )
+from camtorch.warp.shutter import RollingShutter, averaged, in_motion
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
@@ -74,6 +75,9 @@ class Warp(GeometryModule):
             lattice of every eighth pixel, several times as fast where cameras are new, and what it does not reach is
             computed. By default 0.001 between cameras in float32, whose rounding costs as much, and zero in
             float64. Zero is exact; so are points, boxes and rays always, warps with a graph, and those on a GPU.
+        shutter: the `RollingShutter` by which the given images were taken: undone along with the lens. Both cameras and
+            the rotation are then those of the middle of the readout.
+        target_shutter: the one by which the images to make are taken: put on.
 
     The sampling grid is kept while nothing that it depends on can learn or has changed.
 
@@ -101,6 +105,8 @@ class Warp(GeometryModule):
         fill: Fill = 0.0,
         antialias: bool = False,
         tolerance: float | None = None,
+        shutter: RollingShutter | None = None,
+        target_shutter: RollingShutter | None = None,
     ):
         super().__init__()
         self.source, self.target = as_sized(source, "source", "Warp"), as_sized(target, "target", "Warp")
@@ -109,7 +115,9 @@ class Warp(GeometryModule):
         self.antialias, self._tolerance = options["antialias"], options["tolerance"]
         self._set_rotation(as_rotation(rotation, "Warp"))
         turned = () if self.rotation is None else self.rotation.shape[:-2]
+        self.shutter, self.target_shutter = as_shutter(shutter, "shutter"), as_shutter(target_shutter, "target_shutter")
         shapes = [tuple(shape) for shape in (source.batch_shape, target.batch_shape, turned)]
+        shapes += [tuple(each.batch_shape) for each in (shutter, target_shutter) if each is not None]
         batch: tuple[int, ...] | None
         try:
             batch = broadcast_shapes(*shapes)
@@ -117,7 +125,7 @@ class Warp(GeometryModule):
             batch = None
         if batch is None or len(batch) > 1:
             raise ValueError(
-                "Warp: source, target and rotation may each have one batch dim, of one size; "
+                "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
                 f"got {', '.join(map(str, shapes))}"
             )
         self.batch_shape = torch.Size(batch)
@@ -166,6 +174,10 @@ class Warp(GeometryModule):
             ValueError: another shape or size. TypeError: no tensor, or a complex one.
         """
         sampled = self._checked(images, mode, padding_mode, fill)
+        if self.target_shutter is not None and sampled[0] != "nearest":
+            moments = self.target_shutter.moments(self.target)
+            if moments:
+                return averaged(images, [self._at(moment) for moment in moments], self.target_shutter.gamma, *sampled)
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
         if self._is_operator() and not learns and compiled.takes(images, inputs):
@@ -299,7 +311,7 @@ class Warp(GeometryModule):
 
     def _learned(self) -> Sampling:
         """With a graph."""
-        return self._with_scale(*tabulate(self.source, self.target, self.rotation))
+        return self._with_scale(*tabulate(*self._seen_by, self.rotation))
 
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
         return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
@@ -315,7 +327,8 @@ class Warp(GeometryModule):
         reach = self._reach(padding)
         if self._pinned is not None and (reach == self.padding_mode or isinstance(self._pinned, Sampling)):
             return self._pinned
-        options = (self.source._form, self.target._form, self.rotation is None, self.antialias, self.tolerance)
+        forms = [None if each is None else each.form for each in (self.shutter, self.target_shutter)]
+        options = (self.source._form, self.target._form, self.rotation is None, self.antialias, self.tolerance, *forms)
         memo = self._memos[reach if self.tolerance else "zeros"]  # what is exact serves all
         kept: Sampling | Lattice = memo(inputs, options, lambda: self._whole(reach))
         return kept
@@ -340,9 +353,10 @@ class Warp(GeometryModule):
             return constant
 
     def _is_operator(self) -> bool:
-        """Whether code is compiled that calls this warp as one; it knows cameras of one model alone."""
-        mixed = self.source.is_mixed or self.target.is_mixed
-        return torch.compiler.is_compiling() and self.is_an_operator and not mixed
+        """Whether code is compiled that calls this warp as one; it knows cameras of one model, and no shutters."""
+        plain = self.shutter is None and self.target_shutter is None
+        plain = plain and not (self.source.is_mixed or self.target.is_mixed)
+        return torch.compiler.is_compiling() and self.is_an_operator and plain
 
     def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
         may = self._is_operator() and self.tolerance and self.target.intrinsics.is_cpu
@@ -354,7 +368,18 @@ class Warp(GeometryModule):
     def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
         """Of some rows of the target."""
         reach = self._reach(padding)
-        return locate(self.source, self.target, self.rotation, self.tolerance, self.antialias, rows, reach)
+        return locate(*self._seen_by, self.rotation, self.tolerance, self.antialias, rows, reach)
+
+    @property
+    def _seen_by(self) -> tuple[Camera, Camera]:
+        """Source and target, each behind its shutter."""
+        return in_motion(self.source, self.shutter), in_motion(self.target, self.target_shutter)
+
+    def _at(self, shutter: RollingShutter) -> Warp:
+        """This warp at a moment of the exposure."""
+        return Warp(
+            self.source, self.target, self.rotation, shutter=self.shutter, target_shutter=shutter, **self.options
+        )
 
     def _rows(self, count: int | None) -> Iterator[range]:
         height, width = self.target._size("Warp")
@@ -380,7 +405,8 @@ class Warp(GeometryModule):
 
     def _inputs(self) -> list[Tensor]:
         turned = [] if self.rotation is None else [self.rotation]
-        return [*self.source._tensors, *self.target._tensors, *turned]
+        shutters = [t for each in (self.shutter, self.target_shutter) if each is not None for t in each.tensors]
+        return [*self.source._tensors, *self.target._tensors, *turned, *shutters]
 
     # -- labels
 
@@ -395,8 +421,9 @@ class Warp(GeometryModule):
         return moved, mapped & self.target.contains(moved)
 
     def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        rays, has_ray = self.source.unproject(pixels)
-        moved, mapped = self.target.project(turn(self.rotation, rays, "pixels"))
+        source, target = self._seen_by
+        rays, has_ray = source.unproject(pixels)
+        moved, mapped = target.project(turn(self.rotation, rays, "pixels"))
         valid = mapped & has_ray
         return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
 
@@ -428,7 +455,10 @@ class Warp(GeometryModule):
         return enclosing, (mapped & self.target.contains(moved)).any(-1)
 
     def transform_rays(self, rays: Tensor) -> Tensor:
-        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
+        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay.
+
+        With shutters both frames are those of the middle of the readout.
+        """
         rays = as_values(rays, "rays", "Warp", self.source.intrinsics.device)
         if rays.ndim == 0 or rays.shape[-1] != 3:
             raise ValueError(f"Warp: rays must be (B, *N, 3); got shape {tuple(rays.shape)}")
@@ -437,7 +467,8 @@ class Warp(GeometryModule):
     def inverse(self) -> Warp:
         """The warp from target to source. What lay outside the image, or between its pixels, stays lost."""
         rotation = None if self.rotation is None else self.rotation.mT
-        return Warp(self.target, self.source, rotation, **self.options)
+        shutters = {"shutter": self.target_shutter, "target_shutter": self.shutter}
+        return Warp(self.target, self.source, rotation, **self.options, **shutters)
 
     @property
     def options(self) -> Options:
@@ -498,6 +529,16 @@ class Warp(GeometryModule):
             f"{name}={value!r}" for name, value in {**self.options, "tolerance": self.tolerance}.items()
         )
         return f"{options}, rotation={self.rotation is not None}"
+
+
+def as_shutter(shutter: RollingShutter | None, name: str) -> RollingShutter | None:
+    """A shutter of a warp, if it is one."""
+    if shutter is not None and not isinstance(shutter, RollingShutter):
+        raise TypeError(
+            f"Warp: {name} must be a RollingShutter; got {type(shutter).__name__}. ct.RollingShutter(readout, rates) "
+            "makes one, of seconds and radians per second"
+        )
+    return shutter
 
 
 _WAYS = {

@@ -1,0 +1,326 @@
+"""Rolling shutters: undone and put on as rows are rendered one by one, there and back, with gradients."""
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from cameras import KEYS, one, slow_unless
+
+import camtorch as ct
+from camtorch.demo import room
+from camtorch.demo.exposure import expose
+from camtorch.warp.shutter import DIRECTIONS
+
+RATES, READOUT = (0.8, 2.5, 1.6), 0.03
+
+
+def fisheye(size=(240, 320), fov=120.0, dtype=torch.float64):
+    lens = [0.02, -0.01, 0.003, -0.001]
+    return ct.KannalaBrandt.from_fov(fov, image_size=size, distortion=lens).to(dtype).requires_grad_(False)
+
+
+def shutter(dtype=torch.float64, rates=RATES, readout=READOUT, **options):
+    return ct.RollingShutter(torch.tensor(readout, dtype=dtype), torch.tensor(rates, dtype=dtype), **options)
+
+
+def turns(times, rates):
+    """(N, 3, 3) NumPy alone: frame at time 0 from the camera's at each time, which turns at constant rates."""
+    result = []
+    for t in times:
+        x, y, z = np.array(rates) * t
+        angle = math.sqrt(x * x + y * y + z * z)
+        k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) / max(angle, 1e-300)
+        result.append(np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k)
+    return np.stack(result)
+
+
+def moments(size, direction):
+    """Times at which the lines of an image are read, in order of their coordinate."""
+    count = size[0] if direction in ("down", "up") else size[1]
+    times = READOUT * ((np.arange(count) + 0.5) / count - 0.5)
+    return times if direction in ("down", "right") else -times
+
+
+def psnr(a, b, where):
+    return float(-10 * torch.log10(((a - b)[where.expand_as(a)] ** 2).mean()))
+
+
+@pytest.mark.parametrize(
+    "direction", [d if d == "down" else pytest.param(d, marks=pytest.mark.slow) for d in DIRECTIONS]
+)
+def test_a_room_rendered_row_by_row(direction):
+    camera, rates = fisheye(fov=40), (0.4, 1.5, 0.8)
+    matrix = torch.from_numpy(turns(moments(camera.image_size, direction), rates)).float()
+    matrix = matrix[:, None] if direction in ("down", "up") else matrix[None]
+    rolled = expose(camera, lambda rays: room.radiance((matrix @ rays[..., None])[..., 0]), samples=6)
+    still = room.render(camera, samples=6)
+    undo = ct.Warp(camera, camera, shutter=shutter(rates=rates, direction=direction), mode="bicubic")
+    put_on = undo.inverse()
+    for warp, before, after in ((undo, rolled, still), (put_on, still, rolled)):
+        # of half the resolution: what resampling costs at edges one pixel wide is not asked here
+        made, wanted, first = (F.avg_pool2d(image[None], 2) for image in (warp(before[None])[0], after, before))
+        where = F.avg_pool2d(warp.valid_mask().float(), 2) == 1
+        assert where.float().mean() > 0.9
+        assert psnr(made, wanted, where) > 40
+        assert psnr(first, wanted, where) < 25
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_points_are_where_their_own_row_sees_them(direction):
+    """By NumPy: each line of the image sees every point somewhere; where that is on the line itself, the point is."""
+    camera = fisheye(fov=90)
+    points = room.keypoints().numpy()
+    points = points[points[:, 2] > 1.5]
+    times = moments(camera.image_size, direction)
+    axis = 1 if direction in ("down", "up") else 0
+    found = []
+    for point in points:
+        track = camera.project(torch.from_numpy(np.einsum("nji,j->ni", turns(times, RATES), point)))[0].numpy()
+        ahead = track[:, axis] - np.arange(len(times))
+        i = int(np.argmax(np.diff(np.sign(ahead)) != 0))
+        share = ahead[i] / (ahead[i] - ahead[i + 1])
+        crosses = ahead[i] * ahead[i + 1] <= 0
+        found.append(track[i] + share * (track[i + 1] - track[i]) if crosses else [np.nan, np.nan])
+    expected = torch.from_numpy(np.array(found))
+    still, seen = camera.project(torch.from_numpy(points))
+    warp = ct.Warp(camera, camera, target_shutter=shutter(direction=direction))
+    moved, valid = warp.transform_points(still)
+    use = valid & seen & camera.contains(expected)
+    assert use.sum() > 15
+    assert (moved - expected)[use].abs().max() < 1e-3  # of lines between which the track is taken for straight
+    assert (moved - still)[use].abs().max() > 3
+    back, valid = warp.inverse().transform_points(expected)
+    assert (back - still)[use & valid].abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "key", slow_unless({"pinhole", "kannala_brandt", "fisheye624", "cylindrical"}.__contains__, KEYS)
+)
+def test_there_and_back_through_any_lens(key):
+    camera = one(key).requires_grad_(False)
+    camera.image_size = camera.image_size or (480, 640)
+    height, width = camera.image_size
+    warp = ct.Warp(camera, camera, target_shutter=shutter(camera.intrinsics.dtype))
+    pixels = torch.rand(200, 2, dtype=camera.intrinsics.dtype, generator=torch.Generator().manual_seed(0))
+    pixels = pixels * torch.tensor([width, height])
+    moved, there = warp.transform_points(pixels)
+    back, valid = warp.inverse().transform_points(moved)
+    assert there.sum() > 20
+    assert (valid | ~there)[camera.contains(moved)].double().mean() > 0.99
+    assert (back - pixels)[there & valid].abs().max() < 1e-3
+    assert (moved - pixels)[there].abs().max() > 0.1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["shutter", "target_shutter"])
+def test_without_a_readout_it_is_the_plain_warp_to_the_bit(name, dtype):
+    camera, straight = fisheye(dtype=dtype), ct.Pinhole.from_fov(80, image_size=(200, 300)).to(dtype)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.2, 0.1], [0.2, 0, -0.3], [-0.1, 0.3, 0]], dtype=dtype))
+    image = torch.rand(2, 3, 240, 320, dtype=dtype)
+    plain, warp = (
+        ct.Warp(camera, straight.requires_grad_(False), turn, **options)
+        for options in ({}, {name: shutter(dtype, readout=0.0)})
+    )
+    assert torch.equal(plain(image), warp(image))
+    assert torch.equal(plain.grid(), warp.grid())
+    assert torch.equal(plain.valid_mask(), warp.valid_mask())
+    pixels = torch.rand(50, 2, dtype=dtype) * 240
+    assert torch.equal(plain.transform_points(pixels)[0], warp.transform_points(pixels)[0])
+
+
+@pytest.mark.parametrize("name", ["shutter", "target_shutter"])
+def test_the_lattice_keeps_its_tolerance(name):
+    camera, straight = fisheye(), ct.Pinhole.from_fov(80, image_size=(240, 320)).double().requires_grad_(False)
+    options = {name: shutter()}
+    warp, exact = (ct.Warp(camera, straight, tolerance=tolerance, **options) for tolerance in (0.001, 0))
+    seen = exact.valid_mask()[0, 0]
+    assert seen.double().mean() > 0.9
+    half = torch.tensor([160.0, 120.0], dtype=torch.float64)
+    assert ((warp.grid() - exact.grid()) * half)[0][seen].norm(dim=-1).max() < 1e-3
+    # and positions are those of points
+    back = exact.inverse().transform_points(straight.pixel_grid().double())[0]
+    assert (((exact.grid()[0] + 1) * half - 0.5) - back)[seen].abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("name", ["shutter", "target_shutter"])
+def test_gradients_go_to_rates_readout_and_camera(name):
+    camera, straight = fisheye(), ct.Pinhole.from_fov(80, image_size=(240, 320)).double()
+    pixels = torch.tensor([[100.0, 60.0], [160.0, 200.0], [220.0, 130.0]], dtype=torch.float64)
+
+    def moved(rates, readout, intrinsics, points):
+        lens = ct.KannalaBrandt(intrinsics, camera.distortion, image_size=camera.image_size)
+        options = {name: ct.RollingShutter(readout, rates)}
+        points, valid = ct.Warp(lens, straight.requires_grad_(False), **options).transform_points(points)
+        assert valid.all()
+        return points
+
+    rates = torch.tensor(RATES, dtype=torch.float64, requires_grad=True)
+    readout = torch.tensor(READOUT, dtype=torch.float64, requires_grad=True)
+    intrinsics = camera.intrinsics.clone().requires_grad_()
+    assert torch.autograd.gradcheck(moved, (rates, readout, intrinsics, pixels.requires_grad_()))
+
+
+def test_rates_are_learned_from_images():
+    camera = fisheye((60, 80), dtype=torch.float32)
+    v, u = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
+    image = torch.stack([torch.sin(u / 7) + torch.cos(v / 5), torch.sin((u + v) / 9)])[None]
+    truth = torch.tensor([0.5, -2.0, 1.0])
+    rolled = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.05, truth))(image)
+    rates = torch.zeros(3, requires_grad=True)
+    optimizer = torch.optim.LBFGS([rates], max_iter=12, line_search_fn="strong_wolfe")
+
+    def loss():
+        optimizer.zero_grad()
+        made = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.05, rates))(image)
+        error = (made - rolled)[..., 6:-6, 6:-6].square().mean()
+        error.backward()
+        return error
+
+    optimizer.step(loss)
+    assert (rates - truth).abs().max() < 0.01
+
+
+def test_a_batch_of_shutters_is_each_of_them():
+    camera = fisheye((120, 160), dtype=torch.float32)
+    rates = torch.tensor([RATES, (0.0, 0.0, 0.0), (-2.0, 1.0, 3.0)])
+    readout = torch.tensor([0.03, 0.02, 0.01])
+    images = torch.rand(3, 2, 120, 160)
+    pixels = torch.rand(3, 7, 2) * 100
+    for name in ("shutter", "target_shutter"):
+        together = ct.Warp(camera, camera, **{name: ct.RollingShutter(readout, rates)})
+        result, (moved, valid) = together(images), together.transform_points(pixels)
+        assert together.valid_mask().shape == (3, 1, 120, 160)
+        for i in range(3):
+            alone = ct.Warp(camera, camera, **{name: ct.RollingShutter(readout[i], rates[i])})
+            assert torch.equal(result[i : i + 1], alone(images[i : i + 1]))
+            assert torch.equal(moved[i], alone.transform_points(pixels[i])[0])
+            assert torch.equal(valid[i], alone.transform_points(pixels[i])[1])
+
+
+def test_both_shutters_one_lens_for_another():
+    camera, other = fisheye(), ct.Pinhole.from_fov(80, image_size=(240, 320)).double().requires_grad_(False)
+    down, up = shutter(), shutter(direction="up", rates=(1.0, -2.0, 0.5))
+    warp = ct.Warp(camera, other, shutter=down, target_shutter=up)
+    pixels = torch.tensor([[150.0, 60.0], [200.0, 140.0]], dtype=torch.float64)
+    between = ct.Warp(camera, other, shutter=down).transform_points(pixels)[0]
+    expected = ct.Warp(other, other, target_shutter=up).transform_points(between)[0]
+    moved, valid = warp.transform_points(pixels)
+    assert valid.all()
+    assert torch.allclose(moved, expected, atol=1e-9)
+    assert torch.allclose(warp.inverse().transform_points(moved)[0], pixels, atol=1e-9)
+    _, valid = warp.transform_boxes(torch.tensor([[100.0, 50.0, 180.0, 160.0]], dtype=torch.float64))
+    assert valid.all()
+    assert torch.equal(warp.transform_rays(torch.eye(3, dtype=torch.float64)), torch.eye(3, dtype=torch.float64))
+
+
+def test_a_scene_that_overtakes_the_rows_is_invalid_and_finite():
+    camera = fisheye((60, 80))
+    warp = ct.Warp(camera, camera, target_shutter=shutter(rates=(60.0, 0.0, 0.0), readout=0.1))
+    rates = torch.tensor([60.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    learned = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.1, rates))
+    for each in (warp, learned):
+        moved, valid = each.transform_points(camera.pixel_grid())
+        assert not valid.all()
+        assert torch.isfinite(moved).all()
+        assert torch.isfinite(each.grid()).all()
+    moved.sum().backward()
+    assert torch.isfinite(rates.grad).all()
+
+
+def test_an_exposure_blurs_by_the_turn_meanwhile():
+    camera = fisheye((120, 160), dtype=torch.float32)
+    image = torch.zeros(1, 1, 120, 160)
+    image[..., 40, 60] = 1.0
+    options = {"exposure": 0.02, "samples": 64}
+    warp = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.0, (0.0, 3.0, 0.0), **options))
+    blurred = warp(image)
+    # turned to the right, the scene passes to the left: by f w t, about, along the row
+    lit = (blurred[0, 0] > 1e-3).nonzero()
+    length = float(lit[:, 1].max() - lit[:, 1].min())
+    assert abs(length - float(camera.intrinsics[0]) * 3.0 * 0.02) < 2.5
+    assert abs(float((blurred[0, 0] * torch.arange(160)).sum() / blurred.sum()) - 60) < 0.2
+    assert abs(float(blurred.sum()) - 1) < 0.1
+    # labels, masks and an exposure of nothing stay
+    assert torch.equal(warp(image, mode="nearest"), image)
+    assert torch.equal(warp.transform_points(torch.tensor([[60.0, 40.0]]))[0].round(), torch.tensor([[60.0, 40.0]]))
+    none = ct.RollingShutter(0.0, (0.0, 3.0, 0.0), exposure=0.0)
+    assert torch.equal(ct.Warp(camera, camera, target_shutter=none)(image), ct.Warp(camera, camera)(image))
+    # a blur of an image that is one colour is that colour, in linear light as well; a light in the dark is brighter
+    flat = torch.full((1, 3, 120, 160), 100, dtype=torch.uint8)
+    bright = ct.RollingShutter(0.01, (1.0, 3.0, 0.0), gamma=2.2, **options)
+    inner = ct.Warp(camera, camera, target_shutter=bright)(flat)[..., 20:-20, 20:-20]
+    assert inner.dtype == torch.uint8
+    assert (inner.int() - 100).abs().max() <= 1
+    assert ct.Warp(camera, camera, target_shutter=bright)(image).sum() > 1.5 * blurred.sum()
+
+
+def test_the_mean_of_an_exposure_is_that_of_its_moments():
+    camera = fisheye((120, 160), dtype=torch.float64)
+    image = torch.rand(1, 1, 120, 160, dtype=torch.float64)
+    made = ct.Warp(camera, camera, target_shutter=shutter(readout=0.0, exposure=0.01, samples=2))(image)
+    parts = []
+    for t in (-0.0025, 0.0025):
+        back = torch.from_numpy(turns([t], RATES)[0].T)
+        parts.append(ct.Warp(camera, camera, back)(image))
+    inside = (slice(None), slice(None), slice(8, -8), slice(8, -8))
+    assert torch.allclose(made[inside], ((parts[0] + parts[1]) / 2)[inside], atol=1e-9)
+
+
+def test_it_is_copied_pickled_and_moved():
+    camera = fisheye((60, 80), dtype=torch.float32)
+    warp = ct.Warp(camera, camera, shutter=ct.RollingShutter(0.03, torch.nn.Parameter(torch.tensor(RATES))))
+    assert "shutter.rates" in warp.state_dict()
+    image = torch.rand(1, 1, 60, 80)
+    for other in (copy.deepcopy(warp), pickle.loads(pickle.dumps(warp))):
+        assert torch.equal(other(image), warp(image))
+    assert warp.double().shutter.rates.dtype == torch.float64
+    assert "direction='down'" in repr(warp)
+    before = warp.grid()
+    with torch.no_grad():
+        warp.shutter.rates *= 2
+    assert not torch.equal(warp.grid(), before)
+    dewarp = ct.Dewarp(fisheye((60, 80)), shutter=shutter())
+    assert dewarp.shutter is not None
+
+
+@pytest.mark.slow
+def test_it_compiles_as_one_graph():
+    camera = fisheye((120, 160), dtype=torch.float32)
+    image = torch.rand(2, 3, 120, 160)
+
+    def rolled(image, rates):
+        return ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.03, rates))(image)
+
+    rates = torch.tensor(RATES)
+    assert torch.allclose(torch.compile(rolled, fullgraph=True)(image, rates), rolled(image, rates), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((33.0, RATES), "readout is in seconds; got 33.0"),
+        ((0.03, (1.0, 2.0)), r"rates must be \(\*B, 3\); got shape \(2,\)"),
+        ((0.03, (1.0, math.nan, 2.0)), "rates must be finite"),
+        (([[0.03]], RATES), r"readout must be a number or \(B,\)"),
+        (([0.03, 0.02], [RATES] * 3), "do not fit together"),
+    ],
+)
+def test_what_is_no_shutter_is_refused(arguments, text):
+    with pytest.raises(ValueError, match=text):
+        ct.RollingShutter(*arguments)
+
+
+def test_options_of_a_shutter_are_checked():
+    with pytest.raises(ValueError, match="direction must be one of"):
+        ct.RollingShutter(0.03, RATES, direction="top")
+    with pytest.raises(ValueError, match="exposure must not be negative"):
+        ct.RollingShutter(0.03, RATES, exposure=-0.01)
+    with pytest.raises(TypeError, match="shutter must be a RollingShutter; got float"):
+        ct.Warp(fisheye(), fisheye(), shutter=0.03)
+    lens, two = ct.Pinhole(torch.ones(3, 4), image_size=(4, 4)), ct.RollingShutter(0.03, torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="shutters may each have one batch dim"):
+        ct.Warp(lens, lens, shutter=two)
