@@ -1,4 +1,4 @@
-"""Augmentations that move image, masks, landmarks, boxes, gaze and head pose together, by changing the camera.
+"""Augmentations that move image, masks, landmarks, boxes, gaze and head pose together, with the camera.
 
 `camtorch.augment.kornia`, `.torchvision`, `.albumentations` and `.numpy` are the same for those libraries' pipelines.
 """
@@ -6,7 +6,20 @@
 from camtorch.augment.augmentation import Augmentation, Range
 from camtorch.augment.change import Change, camera_like
 from camtorch.augment.collate import collate
+from camtorch.augment.compose import Compose
+from camtorch.augment.edits import (
+    CenterCrop,
+    Edit,
+    HorizontalFlip,
+    Pad,
+    RandomCrop,
+    RandomResizedCrop,
+    Resize,
+    Rotate90,
+    VerticalFlip,
+)
 from camtorch.augment.face import FaceNormalizer
+from camtorch.augment.landmarks import LANDMARKS
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
 from camtorch.augment.sample import from_pitch_yaw, to_pitch_yaw
@@ -14,15 +27,26 @@ from camtorch.rotations import mount_rotation
 from camtorch.warp.warp import outlines
 
 __all__ = [
+    "LANDMARKS",
     "PRESETS",
     "Augmentation",
+    "CenterCrop",
     "Change",
+    "Compose",
+    "Edit",
     "FaceNormalizer",
+    "HorizontalFlip",
+    "Pad",
     "Preset",
     "RandomCamera",
+    "RandomCrop",
     "RandomLens",
     "RandomMount",
+    "RandomResizedCrop",
     "Range",
+    "Resize",
+    "Rotate90",
+    "VerticalFlip",
     "camera_like",
     "collate",
     "from_pitch_yaw",

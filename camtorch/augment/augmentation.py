@@ -252,7 +252,17 @@ class Augmentation(SampleTransform):
         """
         if as_whole(count, "count", self._name) < 0:
             raise ValueError(f"{self._name}: count must not be negative; got {count}")
-        return draw(self.ranges, count, self.p, self.same_on_batch, generator)
+        return self.drawn(count, self.p, self.same_on_batch, generator)
+
+    def drawn(
+        self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """`draw` with another p and same_on_batch."""
+        return draw(self.ranges, count, p, same_on_batch, generator)
+
+    def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
+        """(height, width) of what comes out of images of a size."""
+        return self.image_size or size
 
     def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
         """What a draw does to images of `camera` (the augmentation's own if None): a pure function of both."""

@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch._tracing import may_look
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, held, kind, remade
-from camtorch.warp.sampling import Mode, narrow, widen
+from camtorch.warp.affine import AffineWarp, MirrorWarp, after
+from camtorch.warp.sampling import Mode, Options, narrow, widen
 from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
 
 
@@ -40,16 +42,75 @@ class Part:
         camera = rows_of(self.camera, index)
         if self.warp is None:
             return Part(None, None, camera)
-        rotation = self.warp.rotation
-        if rotation is not None and rotation.ndim == 3:
-            rotation = rotation[index]
 
         def of(warp: Warp) -> Warp:
-            return Warp(camera, rows_of(warp.target, index), rotation, **warp.options)
+            return _rows_of_warp(warp, camera, index)
 
         light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
         shades = None if self.shades is None else (of(self.shades[0]), of(self.shades[1]))
         return Part(None, of(self.warp), camera, shades, light)
+
+
+def _rows_of_warp(warp: Warp, camera: Camera, index: Tensor) -> Warp:
+    """The warp of these rows, whose cameras before it are given."""
+    rotation, target = warp.rotation, rows_of(warp.target, index)
+    if rotation is not None and rotation.ndim == 3:
+        rotation = rotation[index]
+    if isinstance(warp, AffineWarp):
+        matrix = warp.matrix if warp.matrix.ndim == 2 else warp.matrix[index]
+        return AffineWarp(camera, target, matrix, rotation, **warp.options)
+    return (MirrorWarp if isinstance(warp, MirrorWarp) else Warp)(camera, target, rotation, **warp.options)
+
+
+def _joined(a: Part, b: Part) -> Part:
+    """One part that does with one warp what two do one after the other.
+
+    Raises:
+        ValueError: the colours or the light of a lens seen through another one.
+    """
+    if b.warp is None:
+        return a
+    first = a.warp
+    if first is None:
+        return replace(b, rows=a.rows, camera=a.camera)
+    rotation = _both_turns(first.rotation, b.warp.rotation)
+    if not isinstance(b.warp, AffineWarp):
+        if a.shades is not None or a.light is not None:
+            raise ValueError(
+                "Compose: the colours or the light of one lens would be seen through another; chromatic and vignetting "
+                "go to the last lens of a chain"
+            )
+
+        def of(warp: Warp) -> Warp:
+            return MirrorWarp(a.camera, warp.target, rotation)
+
+        shades = None if b.shades is None else (of(b.shades[0]), of(b.shades[1]))
+        return Part(a.rows, of(b.warp), a.camera, shades, b.light)
+    edit, size = b.warp.matrix, size_of(b.warp.target)
+    if isinstance(first, AffineWarp):
+        matrix = after(edit, first.matrix)
+        return Part(a.rows, AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation), a.camera)
+
+    def moved(warp: Warp) -> Warp:
+        return MirrorWarp(a.camera, edited(warp.target, edit, size), rotation)
+
+    shades = None if a.shades is None else (moved(a.shades[0]), moved(a.shades[1]))
+    light = None if a.light is None else b.warp(a.light, padding_mode="border")
+    return Part(a.rows, moved(first), a.camera, shades, light)
+
+
+def _optioned(warp: Warp, options: Options) -> Warp:
+    if isinstance(warp, AffineWarp):
+        return AffineWarp(warp.source, warp.target, warp.matrix, warp.rotation, **options)
+    return MirrorWarp(warp.source, warp.target, warp.rotation, **options)
+
+
+def _both_turns(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """(3, 3) or (B, 3, 3): the first, then the second."""
+    if first is None or second is None:
+        return first if second is None else second
+    dtype = torch.promote_types(first.dtype, second.dtype)
+    return (second.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
 
 
 class Change:
@@ -120,6 +181,63 @@ class Change:
             eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
             rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, eye)
         return rotation
+
+    @property
+    def mirrored(self) -> Tensor | None:
+        """(count,) bool: which samples are seen in a mirror; None if none is."""
+        turns = [part.warp.rotation if isinstance(part.warp, MirrorWarp) else None for part in self.parts]
+        if all(turn is None for turn in turns):
+            return None
+        device = self.parts[0].camera.intrinsics.device
+        counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]
+        flags = [
+            torch.zeros(n, dtype=torch.bool, device=device) if t is None else (_handedness(t) < 0).expand(n)
+            for t, n in zip(turns, counts, strict=True)
+        ]
+        rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
+        return None if may_look(rows) and not bool(rows.any()) else rows
+
+    def then(self, second: Change) -> Change:
+        """This change, and then another one of the cameras that this one ends with, by single warps.
+
+        What the cameras in between did not see is seen, if the first one and the last one do.
+        """
+        if self.gate is not None or second.gate is not None:
+            raise ValueError("Compose: what is compiled needs p=1 of all but edits, as it may not look at draws")
+        listed = self.listed or second.listed
+        if all(part.rows is None for part in (*self.parts, *second.parts)):
+            return Change(self.count, [_joined(self.parts[0], second.parts[0])], listed=listed)
+        parts, mixed = [], []
+        for a in self.parts:
+            for b in second.parts:
+                own, its = (torch.arange(self.count) if part.rows is None else part.rows.cpu() for part in (a, b))
+                (of_a,) = torch.isin(own, its).nonzero(as_tuple=True)
+                if len(of_a):
+                    rows = own[of_a]
+                    of_b = (rows[:, None] == its).nonzero()[:, 1]
+                    one, other = (
+                        part if torch.equal(index, torch.arange(len(mine))) else part.take(index)
+                        for part, index, mine in ((a, of_a, own), (b, of_b, its))
+                    )
+                    parts.append(replace(_joined(one, other), rows=rows))
+                    mixed.append(rows.tolist())
+        some = self.mixed is not None or second.mixed is not None
+        return Change(self.count, parts, listed=listed, mixed=mixed if some else None)
+
+    def with_options(self, options: Options) -> Change:
+        """The change with its warps made anew by other options."""
+
+        def of(part: Part) -> Part:
+            if part.warp is None:
+                return part
+            shades = part.shades
+            if shades is not None:
+                shades = _optioned(shades[0], options), _optioned(shades[1], options)
+            return replace(part, warp=_optioned(part.warp, options), shades=shades)
+
+        return Change(
+            self.count, [of(part) for part in self.parts], listed=self.listed, mixed=self.mixed, gate=self.gate
+        )
 
     def row(self, i: int) -> Change:
         """The change of one sample."""
@@ -236,14 +354,27 @@ class Change:
         """
 
         def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
-            return rows.clone() if warp.rotation is None else write(warp.transform_rays(read(rows)))
+            if warp.rotation is None:
+                return rows.clone()
+            moved = write(warp.transform_rays(read(rows)))
+            if read is _same or warp.rotation.ndim == 2:
+                return moved
+            # reading and writing rounds
+            eye = torch.eye(3, dtype=warp.rotation.dtype, device=warp.rotation.device)
+            still = (warp.rotation == eye).all(-1).all(-1)
+            return torch.where(still.reshape(-1, *[1] * (rows.ndim - 1)), rows.to(moved), moved)
 
         return self.each(rays, move, lambda camera, rows: rows)
 
     def depth(self, depth: Tensor) -> Tensor:
-        """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known."""
+        """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known.
+
+        Edits leave values as they are; another lens or mount sees the same distance at another depth.
+        """
 
         def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+            if isinstance(warp, AffineWarp):
+                return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
             wide = widen(rows)
             before, after = (_forward(camera, wide) for camera in (warp.source, warp.target))
             distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
@@ -251,6 +382,12 @@ class Change:
             return narrow(moved, rows.dtype)
 
         return self.each(depth, move, lambda camera, rows: rows)
+
+
+def _handedness(rotation: Tensor) -> Tensor:
+    """(*B,): the determinant of orthogonal matrices, 1 or -1."""
+    x, y, z = rotation.unbind(-2)
+    return (torch.linalg.cross(x, y) * z).sum(-1)
 
 
 def _forward(camera: Camera, like: Tensor) -> Tensor:
@@ -304,6 +441,11 @@ def numbers_by(camera: Camera, change: Callable[[Tensor], Tensor]) -> Camera:
 def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
     """A camera of the same numbers that does not learn."""
     return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
+
+
+def edited(camera: Camera, matrix: Tensor, image_size: tuple[int, int]) -> Camera:
+    """The camera of an image whose pixels move by (2, 3) or (B, 2, 3)."""
+    return remade(camera, *camera._edited_numbers(matrix), image_size)
 
 
 def copied(camera: Camera) -> Camera:

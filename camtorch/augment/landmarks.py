@@ -193,8 +193,8 @@ def _lifted(rows: Tensor, like: Tensor) -> Tensor:
     return rows.to(like.device).reshape(-1, *[1] * (like.ndim - 1))
 
 
-def exchanged(one: Tensor | list[Tensor], other: Tensor | list[Tensor], rows: Tensor) -> tuple[object, object]:
-    """Two fields of a batch, with the chosen rows, (B,) bool, changed for each other's."""
+def exchanged(one: Any, other: Any, rows: Tensor) -> tuple[Any, Any]:
+    """Two fields of a batch, tensors or lists, with the chosen rows, (B,) bool, changed for each other's."""
     if isinstance(one, Tensor) and isinstance(other, Tensor) and one.shape == other.shape:
         chosen = _lifted(rows, one)
         return torch.where(chosen, other, one), torch.where(chosen, one, other)

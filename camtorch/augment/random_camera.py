@@ -488,7 +488,14 @@ def _rim(camera: Camera) -> tuple[Tensor, Tensor]:
     intrinsics = camera.intrinsics.reshape(-1, 1, 4)
     focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
     edges = (along_edges(corners, _EDGE_SAMPLES) - centre) / focal
-    ends = _kept(_ends, camera, camera.distortion).to(edges).reshape(-1, _AZIMUTHS, 2)
+    # edited images have different intrinsics, and few kinds of coefficients
+    lenses, which = (
+        camera.distortion.detach().reshape(-1, camera.distortion.shape[-1]).unique(dim=0, return_inverse=True)
+    )
+    if len(lenses) > _KEPT // 2:
+        ends = _ends(camera, camera.distortion).to(edges).reshape(-1, _AZIMUTHS, 2)
+    else:
+        ends = torch.stack([_kept(_ends, camera, lens) for lens in lenses])[which].to(edges)
     inside = camera.contains(ends * focal + centre)
     ends = torch.where(inside.unsqueeze(-1), ends, edges[:, :1])
     count = max(len(ends), len(edges))

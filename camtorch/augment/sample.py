@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 import torch
@@ -13,7 +13,9 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from camtorch.augment.change import Change, alone, copied, on_device, singles
+from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
+from camtorch.models import Pinhole
 from camtorch.rotations import rotation_matrix, rotation_vector
 
 P = ParamSpec("P")
@@ -89,8 +91,17 @@ def _pitch_yaw(change: Change, angles: Tensor, options: Mapping[str, float]) -> 
 
 
 def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
-    top = change.rays(pose[..., :3, :], _columns, _columns)
+    top = _mirrored_head(change, change.rays(pose[..., :3, :], _columns, _columns), options)
     return torch.cat((top, pose[..., 3:, :].to(top)), -2)
+
+
+def _mirrored_head(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
+    """Columns (B, 3, n) of turned heads: in a mirror a head's left side is its right one, and its turn no mirror."""
+    mirrored = change.mirrored
+    if mirrored is None:
+        return matrix
+    lateral = torch.arange(matrix.shape[-1], device=matrix.device) == options.get("lateral", 0)
+    return torch.where(mirrored.to(matrix.device)[:, None, None] & lateral, -matrix, matrix)
 
 
 def _columns(matrix: Tensor) -> Tensor:
@@ -98,7 +109,12 @@ def _columns(matrix: Tensor) -> Tensor:
 
 
 def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(rvec, lambda r: rotation_matrix(r).mT, lambda columns: rotation_vector(columns.mT))
+    if change.mirrored is None:
+        return change.rays(rvec, lambda r: rotation_matrix(r).mT, lambda columns: rotation_vector(columns.mT))
+    turned = _mirrored_head(change, change.rays(rotation_matrix(rvec), _columns, _columns), options)
+    eye = torch.eye(3, dtype=change.rotation.dtype, device=change.rotation.device)
+    still = (change.rotation == eye).all(-1).all(-1).to(rvec.device)
+    return torch.where(still.unsqueeze(-1), rvec.to(turned), rotation_vector(turned))
 
 
 def _rotation(change: Change, rotation: Tensor, options: Mapping[str, float]) -> Tensor:
@@ -229,6 +245,17 @@ def is_batch(named: Named, camera: object) -> bool:
 # -- moving a sample
 
 
+class Unknown(Pinhole):
+    """The camera of images of which only the size is known, while they are edited; no sample comes out with it."""
+
+    @classmethod
+    def of(cls, like: Tensor) -> Unknown:
+        """For images (..., H, W)."""
+        dtype = like.dtype if like.dtype == torch.float64 else torch.float32
+        numbers = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=dtype, device=like.device)
+        return cls(numbers, image_size=(like.shape[-2], like.shape[-1])).requires_grad_(False)
+
+
 def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
     """A method that records no graph in a worker of a DataLoader, which tensors of a graph cannot leave."""
 
@@ -257,6 +284,13 @@ class SampleTransform(nn.Module):
             raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
         self.mask_fill, self.valid_mask = float(mask_fill), bool(valid_mask)
 
+    mirroring: Mirroring | None = None
+    """What changes places where an augmentation mirrors; None: it never does."""
+
+    def _camera_of(self, named: Named) -> Camera | list[Camera]:
+        """The camera of a sample that has none, nor the augmentation."""
+        raise ValueError(f"{self._name}: no camera; give one as sample['camera'] or {self._name}(camera=...)")
+
     # -- moving
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
@@ -281,13 +315,12 @@ class SampleTransform(nn.Module):
 
     def _batch(self, sample: Sample) -> tuple[Named, bool, int, Camera | list[Camera]]:
         """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras."""
-        camera = sample.get("camera")
+        camera: Any = sample.get("camera")
         camera = self.camera if camera is None else camera
-        if camera is None:
-            raise ValueError(f"{self._name}: no camera; give one as sample['camera'] or {self._name}(camera=...)")
         named = self._sorted(sample)
         if not named:
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
+        camera = self._camera_of(named) if camera is None else camera
         batched = is_batch(named, camera)
         counts: dict[str, int] = {}
         for name, (found, value) in named.items():
@@ -348,7 +381,9 @@ class SampleTransform(nn.Module):
     def _moved(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
         """The sample after a change; `named` holds its fields as a batch."""
         moved = dict(sample)
-        options = {"mask_fill": self.mask_fill}
+        options: dict[str, float] = {"mask_fill": self.mask_fill}
+        if self.mirroring is not None:
+            options["lateral"] = self.mirroring.lateral
 
         def put(name: str, value: Tensor | list[Tensor]) -> None:
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
@@ -381,9 +416,38 @@ class SampleTransform(nn.Module):
         target = change.target
         if isinstance(target, Camera) and not batched:
             target = singles(target)[0]
-        # the change keeps cameras of its own, to go back by
-        moved["camera"] = copied(target) if isinstance(target, Camera) else [copied(one) for one in target]
+        if self.mirroring is not None:
+            self._mirror(moved, named, change.mirrored, batched)
+        if not isinstance(target if isinstance(target, Camera) else next(iter(target), None), Unknown):
+            # the change keeps cameras of its own, to go back by
+            moved["camera"] = copied(target) if isinstance(target, Camera) else [copied(one) for one in target]
         return moved
+
+    def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
+        """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
+        mirroring = cast("Mirroring", self.mirroring)
+        mirroring.sides(named)  # that none lacks the other, whatever was drawn
+        for name, (found, value) in named.items():
+            for key, flags in ((name, False), (f"{name}_valid", True)):
+                if isinstance(value, list):
+                    rows = torch.zeros(len(value), dtype=torch.bool) if mirrored is None else mirrored
+                    pairs = zip(moved.get(key, ()), rows, strict=False)
+                    new = [mirroring.swapped(name, found, v[None], row[None], flags)[0] for v, row in pairs]
+                    moved.update({key: new} if key in moved else {})
+                elif key in moved:
+                    now = moved[key] if batched else moved[key][None]
+                    rows = torch.zeros(len(now), dtype=torch.bool) if mirrored is None else mirrored
+                    swapped = mirroring.swapped(name, found, now, rows, flags)
+                    moved[key] = swapped if batched else swapped[0]
+        for left, right in mirroring.sides(named) if mirrored is not None else ():
+            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
+                if one not in moved or other not in moved:
+                    continue
+                single = not (batched or isinstance(moved[one], list))
+                rows = cast("Tensor", mirrored)
+                pair = [moved[key].unsqueeze(0) if single else moved[key] for key in (one, other)]
+                for key, new in zip((one, other), exchanged(pair[0], pair[1], rows), strict=True):
+                    moved[key] = new.squeeze(0) if single else new
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:

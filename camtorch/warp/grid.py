@@ -46,7 +46,7 @@ class Sampling(NamedTuple):
     scale: Tensor | None
     """(B or 1, h, W'): see `local_scale`; None where nobody asks for it."""
 
-    def cameras(self, rows: slice) -> Sampling:
+    def cameras(self, rows: slice | Tensor) -> Sampling:
         """Of these cameras of the batch."""
         return Sampling(self.grid[rows], self.mapped[rows], None if self.scale is None else self.scale[rows])
 
@@ -71,6 +71,10 @@ class Lattice:
 
     def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]):
         self.nodes, self.cells, self.exact, self.size = nodes, cells, exact, size
+
+    def cameras(self, rows: slice | Tensor) -> Lattice:
+        """Of these cameras of the batch."""
+        return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size)
 
     @property
     def single(self) -> Lattice:
@@ -305,6 +309,23 @@ def on_lattice(
         cells[camera, i, j] = torch.arange(first, first + len(camera), dtype=cells.dtype, device=cells.device)
         known = torch.cat((known, _quintic(lattice, camera, i, j)), 1)
     return Lattice(lattice, cells, known, (height, width))
+
+
+def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:
+    """The lattice of positions that are an affine function of the target's pixels.
+
+    Args:
+        matrix: (B, 2, 3), from pixels (u, v, 1) to positions.
+        rows: of the target.
+        width: of the target.
+        dtype: of the lattice.
+    """
+    count, n, m = len(matrix), math.ceil(len(rows) / _STEP), math.ceil(width / _STEP)
+    v, u = ((torch.arange(k + 5, dtype=matrix.dtype, device=matrix.device) - 2) * _STEP for k in (n, m))
+    across, down, shift = (column[..., None, None] for column in matrix.unbind(-1))
+    nodes = (across * u + (down * (v + rows.start)[:, None] + shift)).to(dtype)
+    cells = torch.full((count, n, m), CUBIC, dtype=torch.int32, device=matrix.device)
+    return Lattice(nodes, cells, nodes.new_empty(2, 0, _STEP, _STEP), (len(rows), width))
 
 
 def _looks(rows: range, width: int, like: Tensor) -> Tensor:

@@ -1,0 +1,182 @@
+"""Augmentations one after the other, which move images once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from camtorch.augment.augmentation import Augmentation, Range, draw
+from camtorch.augment.change import Change
+from camtorch.augment.edits import Edit
+from camtorch.augment.landmarks import Mirroring
+from camtorch.augment.sample import Named
+from camtorch.camera import Camera
+
+_OF_IMAGES = ("mode", "padding_mode", "fill", "tolerance")
+
+
+class Compose(Augmentation):
+    """Augmentations one after the other, each for the camera that the one before leaves, applied all at once.
+
+    Images are sampled once, by the warp from the first camera to the last, and labels move exactly. `nn.Sequential`
+    of the same augmentations, with the same seed, moves labels alike, but samples images at every step, and
+    leaves black what a later step might see again: here, what is cut off on the way and seen by the last camera is
+    shown. Where all are edits no camera is needed.
+
+        augment = ct.augment.Compose(
+            [
+                ct.augment.RandomResizedCrop((480, 640), scale=(0.5, 1.0)),
+                ct.augment.HorizontalFlip(landmarks="ibug68"),
+                ct.augment.RandomLens("dms130", fov="source"),
+            ],
+            camera=camera,
+        )
+
+    Args:
+        augmentations: in the order in which they apply; a `Compose` among them, too.
+        camera: of samples that do not bring one; by default that of the first augmentation.
+        antialias: as of `Edit`: by itself where more than one and a half pixels come to one, if None.
+        options: p, same_on_batch, fields, mode, padding_mode, fill, mask_fill, valid_mask, tolerance, of all of them
+            together; see `Augmentation`. Those of the parts are p, same_on_batch, fields and what they draw.
+
+    Raises:
+        TypeError: something that is no augmentation. ValueError: none; two tables of landmarks that differ; a part that
+            wants other images than the whole; chromatic aberration or vignetting before another lens.
+    """
+
+    def __init__(
+        self,
+        augmentations: Iterable[Augmentation],
+        *,
+        camera: Camera | None = None,
+        fields: Mapping[str, str] | None = None,
+        antialias: bool | None = None,
+        **options: Any,
+    ):
+        name = type(self).__name__
+        parts = list(augmentations) if isinstance(augmentations, Iterable) else [augmentations]
+        for part in parts:
+            if not isinstance(part, Augmentation):
+                raise TypeError(
+                    f"{name}: augmentations must be a list of augmentations of camtorch; got {type(part).__name__}. "
+                    "Those of other libraries go before or after, in nn.Sequential or their own containers"
+                )
+        if not parts:
+            raise ValueError(f"{name}: no augmentations")
+        if options.get("min_filled") is not None:
+            raise TypeError(f"{name}: there is no min_filled here; the lenses in it have it")
+        camera = next((part.camera for part in parts if part.camera is not None), None) if camera is None else camera
+        fields = {key: value for part in parts for key, value in part.fields.items()} | dict(fields or {})
+        if any(part.valid_mask for part in parts):
+            options.setdefault("valid_mask", True)
+        ranges: dict[str, Range] = {}
+        for i, part in enumerate(parts):
+            ranges[f"{i}.apply"] = Range(0, 1)
+            ranges |= {f"{i}.{key}": interval for key, interval in part.ranges.items()}
+        super().__init__(ranges, camera=camera, fields=fields, antialias=bool(antialias), **options)
+        self.antialias = antialias
+        self.augmentations = nn.ModuleList(parts)
+        self._check_options(parts)
+        mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
+        if len(mirrorings) > 1:
+            raise ValueError(f"{name}: flips of one chain need the same landmarks, lateral_axis and swap_sides")
+        self.mirroring: Mirroring | None = next(iter(mirrorings.values()), None)
+
+    def _check_options(self, parts: Sequence[Augmentation]) -> None:
+        usual = Augmentation().options
+        for i, part in enumerate(parts):
+            given = {**part.options, "mask_fill": part.mask_fill}
+            wanted = {**self.options, "mask_fill": self.mask_fill}
+            for key in (*_OF_IMAGES, "mask_fill"):
+                if given[key] not in ({**usual, "mask_fill": 0.0}[key], wanted[key]):
+                    raise ValueError(
+                        f"{self._name}: images are sampled once, so {key}={given[key]!r} of {type(part).__name__} goes "
+                        f"to {self._name} itself"
+                    )
+            coloured = {"chromatic", "vignetting"} & {key.rpartition(".")[2] for key in part.ranges}
+            if coloured and any(not _is_edit(later) for later in parts[i + 1 :]):
+                raise ValueError(
+                    f"{self._name}: the {' and '.join(sorted(coloured))} of {type(part).__name__} would be seen "
+                    "through another lens; only edits may follow it"
+                )
+
+    @property
+    def parts(self) -> list[Augmentation]:
+        """The augmentations, in their order."""
+        return cast("list[Augmentation]", list(self.augmentations))
+
+    # -- drawing
+
+    def drawn(
+        self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """See `Augmentation.drawn`."""
+        values = draw({}, count, p, same_on_batch, generator)
+        for i, part in enumerate(self.parts):
+            own = part.drawn(count, part.p, same_on_batch or part.same_on_batch, generator)
+            values |= {f"{i}.{key}": value.double() for key, value in own.items()}
+        return values
+
+    def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
+        """The size of what comes out of images of a size."""
+        for part in self.parts:
+            size = part.size_after(size)
+        return size
+
+    # -- applying
+
+    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+        """The last camera, and what the rays have become; see `Augmentation.new_camera`."""
+        count = max((len(value) for value in values.values() if value.ndim), default=1)
+        draw = {key: value.expand(count, *value.shape) if not value.ndim else value for key, value in values.items()}
+        change = self._change(source, {"apply": torch.ones(count, dtype=torch.bool), **draw})
+        target = change.target
+        if not isinstance(target, Camera):
+            raise ValueError(f"{self._name}: samples would come out with cameras of several models")
+        return target, change.rotation
+
+    def _camera_of(self, named: Named) -> Camera | list[Camera]:
+        first = self.parts[0]
+        return first._camera_of(named) if _is_edit(self) else super()._camera_of(named)
+
+    def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
+        """What the augmentations tell of images of such a camera."""
+        for part in self.parts:
+            part.tell_of_empty_images(camera)
+
+    def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
+        applied, total = draw["apply"], None
+        for i, part in enumerate(self.parts):
+            prefix = f"{i}."
+            own = {key.removeprefix(prefix): value for key, value in draw.items() if key.startswith(prefix)}
+            own["apply"] = (own["apply"] > 0.5) & applied
+            step = part._change(camera, own)
+            total = step if total is None else total.then(step)
+            camera = _alone(step)
+        assert total is not None
+        sizes = {one.image_size for one in ([camera] if isinstance(camera, Camera) else camera)}
+        if len(sizes) > 1 and not total.listed:
+            raise ValueError(
+                f"{self._name}: samples of one batch would come out in the sizes {sorted(map(str, sizes))}"
+            )
+        return total.with_options({**self.options, "antialias": self.antialias})  # type: ignore[typeddict-item]
+
+    def extra_repr(self) -> str:
+        """The options."""
+        options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
+        return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _is_edit(part: nn.Module) -> bool:
+    return isinstance(part, Edit) or (isinstance(part, Compose) and all(map(_is_edit, part.parts)))
+
+
+def _alone(step: Change) -> Camera | list[Camera]:
+    """The cameras after a change, one for all where it is one."""
+    (first, *others) = step.parts
+    if others or first.rows is not None:
+        return step.target
+    return first.camera if first.warp is None else first.warp.target

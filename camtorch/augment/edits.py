@@ -1,0 +1,407 @@
+"""Edits that everybody makes to images, with all that a sample holds: crops, sizes, flips and quarter turns."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import as_image_size, as_whole
+from camtorch._tracing import is_concrete, may_look
+from camtorch.augment.augmentation import Augmentation, Range, as_range
+from camtorch.augment.change import Change, Part, alone, edited, expanded, joined, size_of
+from camtorch.augment.landmarks import Mirroring, TableLike
+from camtorch.augment.sample import IMAGES, Named, Unknown
+from camtorch.camera import Camera
+from camtorch.mixed import Mixed, kind
+from camtorch.warp.affine import AffineWarp, on_rays
+
+Size = int | Sequence[int]
+
+
+class Edit(Augmentation):
+    """An edit of the image, `sample -> sample`: its camera and all labels follow, or, without a camera, all labels.
+
+    Fields are those of `Augmentation`. Pixels move by an affine map, whether they have a ray or not; pixel edges
+    scale. Depth and distance keep their values. In a mirror directions, points and poses are mirrored, and
+    landmarks and fields `..._left` and `..._right` change places: `rotation` is Q of `ray_after = Q ray_before`, whose
+    determinant is then -1. Whole steps, flips and quarter turns copy pixels bit by bit.
+
+    One's own edit is a subclass that writes `edit`.
+
+    Args:
+        ranges: see `Augmentation`.
+        antialias: whether a pixel takes the mean of all that it covers; None: where more than one and a half pixels
+            along a side come to one.
+        options: camera, p, same_on_batch, fields, mode, padding_mode, fill, mask_fill, valid_mask, tolerance; see
+            `Augmentation`.
+    """
+
+    def __init__(self, ranges: Mapping[str, Range] | None = None, *, antialias: bool | None = None, **options: Any):
+        if options.get("min_filled") is not None:
+            raise TypeError(f"{type(self).__name__}: there is no min_filled here; RandomCamera has it")
+        super().__init__(ranges, antialias=bool(antialias), **options)
+        self.antialias = antialias
+
+    # -- what a subclass writes
+
+    @abstractmethod
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """The map of pixels, and the new size.
+
+        Args:
+            size: (height, width) of the image.
+            values: what was drawn, (*B,) or (*B, n) in float64, as of `Augmentation.new_camera`.
+
+        Returns:
+            (*B, 2, 3) or (2, 3) in float64, from pixels (u, v, 1) to those of the new image, along its axes, and
+            (height, width).
+        """
+
+    def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
+        """The size of what comes out of images of a size."""
+        nothing = {n: torch.full(() if r.size is None else (r.size,), r.low).double() for n, r in self.ranges.items()}
+        return self.edit(size, nothing)[1]
+
+    # -- what follows from it
+
+    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+        """The camera of the edited image, and the mirror or the turn; see `Augmentation.new_camera`."""
+        matrix, size = self.edit(size_of(source), {name: value.double() for name, value in values.items()})
+        return edited(source, matrix, size), _turn(matrix, source)
+
+    def _camera_of(self, named: Named) -> Camera | list[Camera]:
+        for found, value in named.values():
+            if found in IMAGES and isinstance(value, list):
+                return [Unknown.of(one) for one in map(torch.as_tensor, value)]
+            if found in IMAGES:
+                return Unknown.of(value)
+        raise ValueError(
+            f"{self._name}: the sample holds neither an image nor a camera, and how large the image is decides where "
+            f"labels go; give one as sample['camera'] or {self._name}(camera=...)"
+        )
+
+    def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
+        """Nothing is empty that is not asked for."""
+
+    def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
+        count = len(draw["apply"])
+        camera = alone(camera) if isinstance(camera, Camera) else camera
+        if isinstance(camera, Camera) and not isinstance(camera, Mixed):
+            return Change(count, [self._edited_part(None, camera, draw)])
+        if isinstance(camera, Mixed):
+            groups = camera.groups
+        else:
+            kinds: dict[object, list[int]] = {}
+            for i, one in enumerate(camera):
+                kinds.setdefault(kind(one), []).append(i)
+            groups = [(rows, joined([expanded(camera[i], 1) for i in rows])) for rows in kinds.values()]
+        parts = []
+        for rows, source in groups:
+            index = torch.tensor(rows)
+            here = {name: value[index.to(value.device)] for name, value in draw.items()}
+            parts.append(self._edited_part(index, source, here))
+        if isinstance(camera, Mixed):
+            return Change(count, parts, mixed=[rows for rows, _ in groups])
+        return Change(count, parts, listed=True)
+
+    def _edited_part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+        applied, size = draw["apply"], size_of(source)
+        if may_look(applied) and not bool(applied.any()):
+            return Part(rows, None, source)
+        device = source.intrinsics.device
+        values = {name: value.double() for name, value in draw.items() if name != "apply"}
+        matrix, after = self.edit(size, values)
+        some = self.p < 1 if not may_look(applied) else not bool(applied.all())
+        if some or (0 < self.p < 1 and after != size):
+            if after != size:
+                raise ValueError(
+                    f"{self._name}: with p < 1 images must keep their size, so that all come out alike; here they "
+                    f"become {after}, and were {size}"
+                )
+            still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+            matrix = torch.where(applied[:, None, None].to(matrix.device), matrix, still)
+        if matrix.ndim == 3 and may_look(matrix) and not source.batch_shape and bool((matrix == matrix[:1]).all()):
+            matrix = matrix[0]
+        matrix = matrix.to(device)
+        target = edited(source, matrix, after)
+        options = {**self.options, "antialias": self.antialias}
+        return Part(rows, AffineWarp(source, target, matrix, _turn(matrix, source), **options), source)
+
+    def extra_repr(self) -> str:
+        """What is drawn from, and the options."""
+        return super().extra_repr().replace(f"antialias={bool(self.antialias)}", f"antialias={self.antialias}")
+
+
+def _turn(matrix: Tensor, source: Camera) -> Tensor | None:
+    """(*B, 3, 3): what an edit does to rays; None: nothing."""
+    if is_concrete(matrix) and bool((matrix[..., :2].diagonal(dim1=-2, dim2=-1) > 0).all()):
+        return None
+    return on_rays(matrix).to(torch.promote_types(source.intrinsics.dtype, torch.float32))
+
+
+def _map(across: Tensor | float, left: Tensor | float, down: Tensor | float, top: Tensor | float) -> Tensor:
+    """(*B, 2, 3): (across u + left, down v + top)."""
+    numbers = [torch.as_tensor(n, dtype=torch.float64) for n in (across, 0.0, left, 0.0, down, top)]
+    return torch.stack(torch.broadcast_tensors(*numbers), -1).unflatten(-1, (2, 3))
+
+
+def _box_to(size: tuple[int, int], left: Any, top: Any, width: Any, height: Any) -> Tensor:
+    """The map that brings a box, from its outer edges on, to an image of a size."""
+    across, down = size[1] / width, size[0] / height
+    return _map(across, (0.5 - left) * across - 0.5, down, (0.5 - top) * down - 0.5)
+
+
+class RandomResizedCrop(Edit):
+    """A box of the image at random, of another size: as of torchvision, one for every sample.
+
+    Args:
+        size: (height, width) to come out, or one number for a square.
+        scale: of the box, the part of the image's area.
+        ratio: of the box, width to height; drawn evenly in its logarithm. Where a box of that area would be wider or
+            higher than the image, it is smaller.
+        options: see `Edit`.
+    """
+
+    def __init__(
+        self,
+        size: Size,
+        *,
+        scale: Sequence[float] = (0.08, 1.0),
+        ratio: Sequence[float] = (3 / 4, 4 / 3),
+        **options: Any,
+    ):
+        name = type(self).__name__
+        ratios = as_range(ratio, "ratio", name, least=1e-3, most=1e3)
+        ranges = {
+            "scale": as_range(scale, "scale", name, least=1e-6, most=1.0),
+            "ratio": Range(math.log(ratios.low), math.log(ratios.high)),
+            "place": Range(0, 1, 2),
+        }
+        super().__init__(ranges, **options)
+        self.image_size = _as_size(size, name)
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """The box, of whole pixels, to the size."""
+        (rows, cols), new = size, self.image_size
+        assert new is not None
+        ratio = values["ratio"].exp()
+        width = (values["scale"] * rows * cols * ratio).sqrt()
+        width = torch.minimum(width.clamp(max=cols), rows * ratio)
+        height = (width / ratio).round().clamp(1, rows)
+        width = width.round().clamp(1, cols)
+        left, top = ((values["place"] * torch.stack((cols - width, rows - height), -1)).round()).unbind(-1)
+        return _box_to(new, left, top, width, height), new
+
+
+class RandomCrop(Edit):
+    """A box of a size at a random place of the image.
+
+    Args:
+        size: (height, width), or one number for a square; no larger than the image. `Pad` before it makes room.
+        options: see `Edit`.
+    """
+
+    def __init__(self, size: Size, **options: Any):
+        super().__init__({"place": Range(0, 1, 2)}, **options)
+        self.image_size = _as_size(size, self._name)
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """The box at its place."""
+        new = self.image_size
+        assert new is not None
+        if new[0] > size[0] or new[1] > size[1]:
+            raise ValueError(f"{self._name}: the box {new} must lie within the image, which is {size}; Pad enlarges it")
+        room = values["place"].new_tensor([size[1] - new[1], size[0] - new[0]])
+        left, top = (values["place"] * room).round().unbind(-1)
+        return _map(1.0, -left, 1.0, -top), new
+
+
+class CenterCrop(Edit):
+    """The middle of the image, with `fill` around where it is smaller than that.
+
+    Args:
+        size: (height, width), or one number for a square.
+        options: see `Edit`.
+    """
+
+    def __init__(self, size: Size, **options: Any):
+        super().__init__(**options)
+        self.image_size = _as_size(size, self._name)
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """The middle, to the whole pixel."""
+        new = self.image_size
+        assert new is not None
+        top, left = ((before - now) // 2 for before, now in zip(size, new, strict=True))
+        return _map(1.0, -left, 1.0, -top), new
+
+
+class Resize(Edit):
+    """The image in another size.
+
+    Args:
+        size: (height, width); or one number, which the shorter side becomes, as of torchvision.
+        options: see `Edit`.
+    """
+
+    def __init__(self, size: Size, **options: Any):
+        super().__init__(**options)
+        self.shorter = None if isinstance(size, Sequence) else as_whole(size, "size", self._name)
+        self.image_size = _as_size(size, self._name) if self.shorter is None else None
+        if self.shorter is not None and self.shorter < 1:
+            raise ValueError(f"{self._name}: size must be positive; got {size!r}")
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """All of the image to the size."""
+        new = self.image_size
+        if new is None:
+            assert self.shorter is not None
+            height, width = (max(int(self.shorter * side / min(size)), 1) for side in size)
+            new = height, width
+        return _box_to(new, 0, 0, size[1], size[0]), new
+
+
+class Pad(Edit):
+    """The image with a rim of `fill`.
+
+    Args:
+        padding: pixels on every side; or (across, down); or (left, top, right, bottom), as of torchvision.
+        size: instead of it (height, width) that the image is padded to, evenly on both sides.
+        options: see `Edit`.
+    """
+
+    def __init__(self, padding: Size | None = None, *, size: Size | None = None, **options: Any):
+        super().__init__(**options)
+        if (padding is None) == (size is None):
+            raise TypeError(f"{self._name}: give either padding or size; got {padding!r} and {size!r}")
+        self.least = None if size is None else _as_size(size, self._name)
+        self.padding: tuple[int, ...] = ()
+        if padding is not None:
+            given = tuple(padding) if isinstance(padding, Sequence) else (padding,)
+            sides = tuple(as_whole(side, "padding", self._name) for side in given)
+            if len(sides) not in (1, 2, 4) or min(sides) < 0:
+                raise ValueError(
+                    f"{self._name}: padding must be one number, (across, down) or (left, top, right, bottom), and none "
+                    f"negative; got {padding!r}. CenterCrop cuts off"
+                )
+            self.padding = sides * (4 // len(sides))
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """All of the image, moved."""
+        if self.least is not None:
+            new = max(self.least[0], size[0]), max(self.least[1], size[1])
+            top, left = ((now - before) // 2 for before, now in zip(size, new, strict=True))
+        else:
+            left, top, right, bottom = self.padding
+            new = size[0] + top + bottom, size[1] + left + right
+        return _map(1.0, left, 1.0, top), new
+
+
+class Rotate90(Edit):
+    """The image turned by quarters, counterclockwise as by torch.rot90, and the camera with it, which leans.
+
+    Another lens follows a quarter turn where its model is the same on its side; those of cylinders and spheres are not.
+
+    Args:
+        times: how often; or (least, most), of which all are as likely. Of an image that is not square, samples of one
+            batch take either odd or even numbers: draw one for all, `same_on_batch=True`, or (0, 2) by `step=2`.
+        step: between the numbers.
+        options: see `Edit`.
+    """
+
+    def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Any):
+        name = type(self).__name__
+        ends = tuple(times) if isinstance(times, Sequence) else (times, times)
+        low, high = (as_whole(end, "times", name) for end in (ends if len(ends) == 2 else (None, None)))
+        if low > high or as_whole(step, "step", name) < 1:
+            raise ValueError(f"{name}: times must be (least, most), and step positive; got {times!r} and {step!r}")
+        self.times = low, high, step
+        super().__init__({"times": Range(0, 1)}, **options)
+
+    def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
+        """The size after the least number of turns."""
+        return size[::-1] if self.times[0] % 2 else size
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """The turn; see `Camera.rot90`."""
+        (low, high, step), (height, width) = self.times, size
+        count = (high - low) // step + 1
+        turns = (low + step * (values["times"] * count).floor().clamp(max=count - 1)).long() % 4
+        maps = turns.new_tensor(
+            [
+                [[1, 0, 0], [0, 1, 0]],
+                [[0, 1, 0], [-1, 0, width - 1]],
+                [[-1, 0, width - 1], [0, -1, height - 1]],
+                [[0, -1, height - 1], [1, 0, 0]],
+            ],
+            dtype=torch.float64,
+        )
+        on_side = turns % 2
+        if height != width and is_concrete(on_side) and on_side.numel() and int(on_side.min()) != int(on_side.max()):
+            raise ValueError(
+                f"{self._name}: samples of one batch would come out in the sizes {size} and {size[::-1]}; "
+                "same_on_batch=True turns all alike, step=2 leaves images as they lie"
+            )
+        turned = bool(on_side.any()) if is_concrete(on_side) else bool(low % 2)
+        return maps[turns], size[::-1] if turned else size
+
+
+class _Flip(Edit):
+    """Args are those of `HorizontalFlip`."""
+
+    def __init__(
+        self,
+        *,
+        p: float = 0.5,
+        landmarks: TableLike | Mapping[str, TableLike | None] | None = None,
+        lateral_axis: str = "x",
+        swap_sides: bool = True,
+        **options: Any,
+    ):
+        super().__init__(p=p, **options)
+        self.mirroring = Mirroring(landmarks, lateral_axis, swap_sides, self._name)
+
+
+class HorizontalFlip(_Flip):
+    """The image mirrored left to right, and all else as the mirror shows it.
+
+    Gaze, directions, points and rotations of `rays` have x negated. A head pose becomes Q R M: the mirrored head, whose
+    own axis from side to side is mirrored back by M, so that R stays a rotation and landmark i is point i of the
+    same, symmetric, model.
+
+    Args:
+        p: how likely.
+        landmarks: which landmarks change places: one of `LANDMARKS` ("ibug68", "wflw98", "lapa106", "coco17"), or for
+            each landmark the other one's index, or pairs (left, right); for all of keypoints, landmarks and points, or
+            a dict by field. None: all keep their order.
+        lateral_axis: "x", "y" or "z", of the head's own frame, from one side of the head to the other.
+        swap_sides: whether fields named `..._left` and `..._right` change places.
+        options: see `Edit`.
+    """
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """The columns from right to left."""
+        return _map(-1.0, size[1] - 1, 1.0, 0.0), size
+
+
+class VerticalFlip(_Flip):
+    """The image mirrored top to bottom. Left and right change places as well: a left hand in a mirror is a right one.
+
+    Args are those of `HorizontalFlip`.
+    """
+
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+        """The rows from bottom to top."""
+        return _map(1.0, 0.0, -1.0, size[0] - 1), size
+
+
+def _as_size(size: Size, owner: str) -> tuple[int, int]:
+    """(height, width), of which one number makes a square."""
+    made = as_image_size(tuple(size) if isinstance(size, Sequence) else (size, size), owner)
+    assert made is not None
+    return made

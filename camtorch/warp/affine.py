@@ -1,0 +1,321 @@
+"""Warps of edited images: mirrored ones, and those whose pixels move by crops, scales, flips and quarter turns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from torch import Tensor
+
+from camtorch._arguments import as_values, broadcast_shapes
+from camtorch._tracing import in_transform, is_concrete, may_look
+from camtorch.camera import Camera
+from camtorch.native import sampler
+from camtorch.warp.grid import Lattice, Sampling, straight_lattice
+from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, narrow, render, widen
+from camtorch.warp.warp import Warp
+
+SHRINKS = 1.5
+"""From this many pixels of the image to one of the result on, edits antialias by themselves."""
+_MOST = 8  # times that an image is halved
+_PLAIN = (torch.uint8, torch.float32, torch.float64)  # that torch interpolates as they are
+_WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
+
+
+class MirrorWarp(Warp):
+    """A `Warp` whose rotation may be a mirror as well: `ray_target = Q ray_source`, Q orthogonal, of either sign.
+
+    Args:
+        source, target: as of `Warp`.
+        rotation: (3, 3) or (B, 3, 3), which is not checked; or None.
+        antialias: as of `Warp`; None: images that shrink by more than one and a half are halved before, by torch's
+            antialiased interpolation, which takes less time.
+        options: mode and so on, as of `Warp`.
+    """
+
+    def __init__(
+        self,
+        source: Camera,
+        target: Camera,
+        rotation: Tensor | None,
+        *,
+        antialias: bool | None = False,
+        **options: Any,
+    ):
+        super().__init__(source, target, None, antialias=bool(antialias), **options)
+        self._set_rotation(rotation)
+        self._decides = antialias is None
+        self._halvings: list[int] | None = None
+        if rotation is not None:
+            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
+
+    def forward(
+        self,
+        images: Tensor,
+        *,
+        mode: Mode | None = None,
+        padding_mode: PaddingMode | None = None,
+        fill: Fill | None = None,
+    ) -> Tensor:
+        """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
+        if self._decides and not torch.compiler.is_compiling() and not in_transform():
+            sampled = self._checked(images, mode, padding_mode, fill)
+            inputs = self._inputs()
+            smooth = sampled[0] != "nearest" and images.dtype != torch.bool
+            if smooth and not self._is_long() and not self._learns(inputs) and is_concrete(self.target.intrinsics):
+                where = self._kept(inputs, sampled[1])
+                if self._halvings is None:
+                    self._halvings = _halvings(where, self.source._size("Warp"))
+                if any(self._halvings):
+                    return self._smoothed(images, where, self._halvings, *sampled)
+        return super().forward(images, mode=mode, padding_mode=padding_mode, fill=fill)
+
+    def _smoothed(
+        self,
+        images: Tensor,
+        where: Sampling | Lattice,
+        halvings: list[int],
+        mode: Mode,
+        padding_mode: PaddingMode,
+        fill: tuple[float, ...],
+    ) -> Tensor:
+        """Sampled from images that torch's antialiased interpolation halved so many times, for each camera."""
+        result = self._empty(images, self._count(images))
+        images = images.expand(len(result), -1, -1, -1)
+        halvings = halvings * (len(result) // len(halvings))
+        for k in sorted(set(halvings)):
+            every = len(set(halvings)) == 1
+            rows = torch.tensor([i for i, n in enumerate(halvings) if n == k], device=images.device)
+            here = images if every else images[rows]
+            if k:
+                size = [max(-(-side >> k), 1) for side in images.shape[-2:]]
+                plain = images.dtype in _PLAIN
+                small = F.interpolate(here if plain else widen(here), size, mode="bilinear", antialias=True)
+                here = small if plain else narrow(small, images.dtype)
+            part = where if every else where.cameras(rows)
+            made = render(here, part, mode, padding_mode, fill)
+            if every:
+                return made
+            result[rows] = made
+        return result
+
+    def _empty(self, images: Tensor, count: int) -> Tensor:
+        size = self.target._size("Warp")
+        if images.requires_grad or not images.is_cpu:
+            return images.new_empty(count, images.shape[1], *size)
+        return sampler.empty(images, count, size)
+
+    @property
+    def options(self) -> Options:
+        """What another warp takes to sample in the same way."""
+        options = super().options
+        return {**options, "antialias": None} if self._decides else options  # type: ignore[typeddict-item]
+
+    def inverse(self) -> Warp:
+        """The warp from target to source."""
+        rotation = None if self.rotation is None else self.rotation.mT
+        return MirrorWarp(self.target, self.source, rotation, **self.options)
+
+
+class AffineWarp(MirrorWarp):
+    """The image of `source` edited: its pixels move by an affine map, also those that see nothing.
+
+    Whole steps, flips and quarter turns copy pixels, bit by bit. What shrinks by antialiasing is made by torch's
+    interpolate, of a box of whole pixels, and else as by `Warp`.
+
+    Args:
+        source: the camera of the given images.
+        target: that of the edited ones.
+        matrix: (2, 3) or (B, 2, 3) in float64, from pixels (u, v, 1) of the source to those of the target; along the
+            axes, in any order.
+        rotation: what the edit does to rays: a mirror, or a quarter turn, about the axis.
+        options: mode and so on, as of `Warp`.
+    """
+
+    is_an_operator = False
+    matrix: Tensor
+
+    def __init__(self, source: Camera, target: Camera, matrix: Tensor, rotation: Tensor | None, **options: Any):
+        super().__init__(source, target, rotation, **options)
+        self.register_buffer("matrix", matrix, persistent=False)
+        self.batch_shape = broadcast_shapes(self.batch_shape, matrix.shape[:-2])
+
+    def inverse(self) -> Warp:
+        """The edit back. What it cut off stays lost."""
+        rotation = None if self.rotation is None else self.rotation.mT
+        return AffineWarp(self.target, self.source, inverted(self.matrix), rotation, **self.options)
+
+    # -- images
+
+    def forward(
+        self,
+        images: Tensor,
+        *,
+        mode: Mode | None = None,
+        padding_mode: PaddingMode | None = None,
+        fill: Fill | None = None,
+    ) -> Tensor:
+        """Edited images, as of `Warp.forward`."""
+        mode, padding_mode, values = self._checked(images, mode, padding_mode, fill)
+        if images.ndim == 4 and may_look(self.matrix) and not in_transform():
+            made = self._copied(images, values) if padding_mode == "zeros" else None
+            made = self._shrunk(images, mode) if made is None else made
+            if made is not None:
+                return made
+        return super().forward(images, mode=mode, padding_mode=padding_mode, fill=values)
+
+    def _copied(self, images: Tensor, fill: tuple[float, ...]) -> Tensor | None:
+        """By pixels copied, if the map brings whole pixels to whole pixels."""
+        matrices = self._maps
+        linear = matrices[:, :, :2]
+        if not bool((linear.abs().sum(-1) == 1).all() & ((matrices - matrices.round()).abs() < _WHOLE).all()):
+            return None
+        height, width = self.target._size("Warp")
+        moves = [[tuple(map(round, row)) for row in matrix] for matrix in matrices.tolist()]
+        if all(move == moves[0] for move in moves):
+            result, rows = self._empty(images, len(images)), [(slice(None), moves[0])]
+        else:
+            result = self._empty(images, self._count(images))
+            rows = [(slice(i, i + 1), move) for i, move in enumerate(moves)]
+        images = images.expand(len(result), -1, -1, -1)
+        for row, ((a, b, left), (c, d, top)) in rows:
+            view = images[row]
+            if b:
+                view = view.mT
+            dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
+            view = view.flip(dims) if dims else view
+            # of the first pixel of the view
+            left -= (view.shape[-1] - 1) * (a + b < 0)
+            top -= (view.shape[-2] - 1) * (c + d < 0)
+            x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
+            right, bottom = max(min(right, width), x), max(min(bottom, height), y)
+            if (x, y, right, bottom) != (0, 0, width, height):
+                result[row] = result.new_tensor(fill).view(-1, 1, 1) if len(fill) > 1 else fill[0]
+            result[row, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
+        return result
+
+    def _shrunk(self, images: Tensor, mode: Mode) -> Tensor | None:
+        """By torch's antialiased interpolation, if something shrinks and boxes of whole pixels become the results.
+
+        Bit by bit what torchvision's resize makes of the box.
+        """
+        if not (self.antialias or self._decides) or mode == "nearest" or images.dtype == torch.bool:
+            return None
+        height, width = self.target._size("Warp")
+        rows, cols = self.source._size("Warp")
+        back = inverted(self._maps)
+        scale = back[:, :, :2].abs().sum(-1)
+        if not bool((back[:, 0, 1] == 0).all() & (scale > (1 if self.antialias else SHRINKS)).any()):
+            return None
+        # the outer edges of the result, on the source
+        ends = back.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
+        edges = ends * back[:, None, [0, 1], [0, 1]] + back[:, None, :, 2] + 0.5
+        low, high = edges.amin(1), edges.amax(1)
+        inside = bool((low > -_WHOLE).all() & (high < back.new_tensor([cols, rows]) + _WHOLE).all())
+        if not (inside and bool((edges - edges.round()).abs().max() < 1e-6)):
+            return None
+        boxes = torch.cat((low, high), 1).round().long().tolist()
+        flips = [[dim for dim, sign in ((-1, a), (-2, d)) if sign < 0] for ((a, *_), (_, d, _)) in back.tolist()]
+        together = boxes[1:] == boxes[:-1] and flips[1:] == flips[:-1]
+        parts = [slice(None)] if together else [slice(i, i + 1) for i in range(len(boxes))]
+        images = images.expand(len(boxes), -1, -1, -1) if len(boxes) > len(images) else images
+        plain = images.dtype in _PLAIN
+
+        def made(part: slice, box: list[int], flip: list[int]) -> Tensor:
+            left, top, right, bottom = box
+            view = images[part, :, top:bottom, left:right]
+            view = F.interpolate(
+                view if plain else widen(view), (height, width), mode=mode, align_corners=False, antialias=True
+            )
+            return (view if plain else narrow(view, images.dtype)).flip(flip) if flip else narrow(view, images.dtype)
+
+        results = [made(part, box, flip) for part, box, flip in zip(parts, boxes, flips, strict=False)]
+        return results[0] if together else torch.cat(results)
+
+    @property
+    def _maps(self) -> Tensor:
+        """(B or 1, 2, 3)."""
+        return self.matrix.reshape(-1, 2, 3)
+
+    # -- positions
+
+    def _inputs(self) -> list[Tensor]:
+        return [self.matrix]
+
+    def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
+        return self._strip(range(self.target._size("Warp")[0]), padding)
+
+    def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
+        width = self.target._size("Warp")[1]
+        back = inverted(self._maps)
+        side = back.new_tensor(self.source._size("Warp")[::-1])[:, None]
+        # pixels to positions: (2 u + 1) / W - 1
+        back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)
+        dtype = torch.promote_types(self.source.intrinsics.dtype, torch.float32)
+        if self.tolerance and not self.antialias and back.is_cpu and is_concrete(back) and not in_transform():
+            return straight_lattice(back, rows, width, dtype)
+        v, u = (torch.arange(n, dtype=back.dtype, device=back.device) for n in (len(rows), width))
+        v = v + rows.start
+        a, b, c = (w.unsqueeze(-1).unsqueeze(-1) for w in back.unbind(-1))
+        grid = (a * u + b * v[:, None] + c).movedim(1, -1).to(dtype)
+        mapped = torch.ones_like(grid[..., 0], dtype=torch.bool)
+        if not self.antialias:
+            return Sampling(grid, mapped, None)
+        scale = (back[:, :, :2] * side / 2).abs().sum(-1).amax(-1)
+        return Sampling(grid, mapped, scale.to(dtype)[:, None, None].expand(mapped.shape).contiguous())
+
+    # -- labels
+
+    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
+        pixels = pixels if pixels.is_floating_point() else pixels.to(self.source.intrinsics.dtype)
+        valid = torch.isfinite(pixels).all(-1)
+        wide = torch.where(valid.unsqueeze(-1), pixels, 0.0).to(self.matrix.dtype)
+        matrix = self.matrix
+        if matrix.ndim == 3:
+            matrix = matrix.reshape(-1, *[1] * (pixels.ndim - 2), 2, 3)
+        moved = (matrix[..., :2] * wide.unsqueeze(-2)).sum(-1) + matrix[..., 2]
+        dtype = torch.promote_types(pixels.dtype, torch.float32)
+        return torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype), valid
+
+
+def _halvings(where: Sampling | Lattice, size: tuple[int, int]) -> list[int]:
+    """For every camera, how often to halve its image so that at most one and a half pixels of it come to one."""
+    apart, every = (8, 4) if isinstance(where, Lattice) else (1, 32)
+    planes = where.nodes if isinstance(where, Lattice) else where.grid.detach().movedim(-1, 1)
+    planes = planes[:, :, ::every, ::every]
+    seen = (planes.abs() <= 1).all(1)
+    planes = planes * planes.new_tensor([size[1] / 2, size[0] / 2])[:, None, None]
+    total, count = planes.new_zeros(len(planes)), planes.new_zeros(len(planes))
+    for dim in (-1, -2):
+        n = planes.shape[dim] - 1
+        steps = torch.linalg.vector_norm(planes.diff(dim=dim), dim=1)
+        both = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n)
+        total, count = total + (steps * both).sum((1, 2)), count + both.sum((1, 2))
+    scale = total / (count.clamp(min=1) * apart * every)
+    return (scale / SHRINKS).clamp(min=0.5).log2().ceil().long().clamp(min=0, max=_MOST).tolist()
+
+
+def inverted(matrix: Tensor) -> Tensor:
+    """(*B, 2, 3): the maps back."""
+    (a, b, left), (c, d, top) = (row.unbind(-1) for row in matrix.unbind(-2))
+    scale = 1 / (a * d - b * c)
+    a, b, c, d = d * scale, -b * scale, -c * scale, a * scale
+    rows = a, b, -(a * left + b * top), c, d, -(c * left + d * top)
+    return torch.stack(rows, -1).unflatten(-1, (2, 3))
+
+
+def after(second: Tensor, first: Tensor) -> Tensor:
+    """(*B, 2, 3): the first map, then the second."""
+    linear = (second[..., :2].unsqueeze(-1) * first[..., :2].unsqueeze(-3)).sum(-2)
+    shift = (second[..., :2] * first[..., 2].unsqueeze(-2)).sum(-1) + second[..., 2]
+    return torch.cat((linear, shift.unsqueeze(-1)), -1)
+
+
+def on_rays(matrix: Tensor) -> Tensor:
+    """(*B, 3, 3): what maps of pixels do to rays, a mirror or a turn about the axis: their signs."""
+    signs = matrix[..., :2].sign()
+    zero = torch.zeros_like(signs[..., 0])
+    ahead = torch.stack((zero[..., 0], zero[..., 0], zero[..., 0] + 1), -1)
+    return torch.cat((torch.cat((signs, zero.unsqueeze(-1)), -1), ahead.unsqueeze(-2)), -2)
