@@ -1,8 +1,8 @@
 """A warp as an ONNX model: one GridSample with a constant grid, of opset 16, that any runtime since 2022 takes.
 
 The input "images" (batch, channels, H, W) of float32 or uint8, of any batch and any number of channels; the output
-"warped" (batch, channels, H', W') of the same type. Mode, padding and fill are the warp's; align_corners is 0. By the
-extra `onnx`.
+"warped" (batch, channels, H', W') of the same type. Positions, mode, padding and fill are the warp's own, so images are
+too; align_corners is 0. By the extra `onnx`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from camtorch.maps.protocol import MOST_PIXELS, Encoded, Given, Options, checked
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")
-_OUTSIDE, _FAR = -9.0, 100.0  # as of `Warp.grid`: nowhere, and where positions are drawn in to
+_OUTSIDE = -9.0  # as of `Warp.grid`
 
 
 class ONNX:
@@ -92,8 +92,9 @@ def _model(exact: Exact, dtype: str) -> Any:
     onnx = _needed()
     helper, kinds = onnx.helper, onnx.TensorProto
     warp, (height, width) = exact.warp, exact.source_size
-    grid = ((2 * exact.positions + 1) / (width, height) - 1).clip(-_FAR, _FAR)
-    grid = np.where(exact.mapped[..., None], grid, _OUTSIDE).astype(np.float32)[None]
+    with torch.no_grad():
+        grid = warp.grid().float().cpu().numpy()  # what the warp itself samples by
+    mapped = ~(grid == _OUTSIDE).all(-1)
     fill = np.array(warp.fill, np.float32).reshape(1, -1, 1, 1)
     constants = {
         "grid": grid,
@@ -113,7 +114,8 @@ def _model(exact: Exact, dtype: str) -> Any:
 
     images = add("Cast", "images", to=kinds.FLOAT) if dtype == "uint8" else "images"
     blended = warp.padding_mode == "zeros" and bool(fill.any())  # the rim fades to the fill, not to zero
-    if blended or not exact.mapped.all():
+    filled = warp.padding_mode != "zeros" and not mapped.all()
+    if blended or filled:
         constants["fill"] = fill
     if blended:
         images = add("Sub", images, "fill")
@@ -125,8 +127,8 @@ def _model(exact: Exact, dtype: str) -> Any:
     result = add("Reshape", sampled, add("Concat", leading, "target_size", axis=0))
     if blended:
         result = add("Add", result, "fill")
-    elif warp.padding_mode != "zeros" and not exact.mapped.all():
-        constants["mapped"] = exact.mapped[None, None]
+    elif filled:
+        constants["mapped"] = mapped[:, None]
         result = add("Where", "mapped", result, "fill")
     if dtype == "uint8":
         constants["least"], constants["most"] = np.array(0, np.float32), np.array(255, np.float32)

@@ -113,11 +113,12 @@ def _from_exr(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
             with openexr.File(file, separate_channels=True) as image:
                 channels = image.parts[0].channels
                 planes = [np.array(channels[name].pixels) for name in "RG"]
+            found = {key: header[_PREFIX + key] for key in _KEYS if _PREFIX + key in header}
+            stated = {key: value for key, value in found.items() if isinstance(value, (str, int))}
         except Exception as error:  # whatever its C++ raises
             raise CameraFileError(path, "content", f"no EXR with red and green: {error}") from None
-    if any(plane.ndim != 2 or plane.dtype.kind != "f" for plane in planes):
-        raise CameraFileError(path, "content", "red and green are not float")
-    stated = {key: header[_PREFIX + key] for key in _KEYS if _PREFIX + key in header}
+    if any(plane.ndim != 2 or plane.dtype.kind != "f" or plane.shape != planes[0].shape for plane in planes):
+        raise CameraFileError(path, "content", "red and green are not float, or not of one size")
     return np.stack(planes, -1), stated
 
 
@@ -137,6 +138,8 @@ def _from_tiff(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
             if height * width > MOST_PIXELS or len(page.shape) != 3 or page.shape[2] < 2 or page.dtype.kind != "f":
                 raise ValueError(f"{page.dtype} of shape {page.shape}")
             pixels, text = page.asarray(), page.description
+            if pixels.ndim != 3 or pixels.shape[2] < 2 or not pixels.size or pixels.dtype.kind != "f":
+                raise ValueError(f"{pixels.dtype} of shape {pixels.shape}")
     except Exception as error:  # whatever a damaged file makes of its tags
         raise CameraFileError(path, "content", f"no TIFF of float with red and green: {error}") from None
     try:

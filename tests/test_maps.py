@@ -1,0 +1,632 @@
+"""Maps of warps for other runtimes: each format read by a decoder of the tests, which measures its error as well."""
+
+import base64
+import json
+import math
+import os
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.cli.main import main
+from camtorch.maps.formats import FORMATS
+
+NOTES = [356.0, 356.0, 647.3, 404.8], [-0.0514, -0.0002, -0.0026, 0.0002]
+
+
+def fisheye(scale=1.0):
+    """A real lens, of 1280x800 at full scale."""
+    fx, fy, cx, cy = NOTES[0]
+    intrinsics = [fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5]
+    size = (round(800 * scale), round(1280 * scale))
+    return ct.KannalaBrandt(intrinsics, NOTES[1], image_size=size).double().requires_grad_(False)
+
+
+def small():
+    """All of its target shows the image, whose sides are no multiples of 16."""
+    return ct.Dewarp(fisheye(0.25), image_size=(184, 312))
+
+
+def partial():
+    """A lens whose rays end within the image, on a wide target."""
+    lens = ct.KannalaBrandt([60.0, 60, 127.5, 87.5], [-0.1, -0.1, -0.05, -0.02], image_size=(176, 256))
+    return ct.Dewarp(lens.double().requires_grad_(False), projection="equirectangular", fov=5.0, image_size=(160, 320))
+
+
+def positions(warp):
+    """(H', W', 2) in pixels of the source, and which pixels show it, by the warp's own grid."""
+    height, width = warp.source.image_size
+    grid = warp.grid()[0].double()
+    return ((grid + 1) * grid.new_tensor([width, height]) - 1) / 2, warp.valid_mask()[0, 0]
+
+
+def off(found, warp):
+    """Distances at the pixels that show the image, edges repeated."""
+    wanted, shown = positions(warp)
+    limit = torch.tensor(warp.source.image_size[::-1]) - 1.0
+    pair = [torch.minimum(p.clamp(min=0), limit) for p in (torch.as_tensor(found, dtype=torch.float64), wanted)]
+    return (pair[0] - pair[1]).norm(dim=-1)[shown]
+
+
+def between(nodes, step, size):
+    """Bilinear, of nodes (n, m, 2), by torch."""
+    n, m = nodes.shape[:2]
+    planes = torch.as_tensor(np.ascontiguousarray(nodes), dtype=torch.float64).movedim(-1, 0)[None]
+    fine = ((n - 1) * step + 1, (m - 1) * step + 1)
+    fine = torch.nn.functional.interpolate(planes, fine, mode="bilinear", align_corners=True)
+    return fine[0, :, : size[0], : size[1]].movedim(0, -1)
+
+
+# -- decoders that know nothing of ours
+
+
+def with_opencv(path, **_):
+    if path.endswith(".npz"):
+        arrays = np.load(path)
+        maps = arrays["map1"], arrays["map2"]
+    else:
+        storage = cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
+        maps = storage.getNode("map1").mat(), storage.getNode("map2").mat()
+    if maps[0].ndim == 3:
+        assert (maps[0].dtype, maps[1].dtype) == (np.int16, np.uint16)
+        maps = cv2.convertMaps(*maps, cv2.CV_32FC1)
+    assert maps[0].dtype == np.float32
+    return np.stack(maps[:2], -1)
+
+
+def with_ffmpeg(path, warp, v="up", **_):
+    av = pytest.importorskip("av")
+    with av.open(path) as file:
+        frame = next(file.decode(video=0))
+    assert frame.format.name.startswith("gbrpf32")
+    return from_uv(frame.to_ndarray()[..., :2], warp, v)
+
+
+def with_opencv_tiff(path, warp, v="up", **_):
+    return from_uv(cv2.imread(path, cv2.IMREAD_UNCHANGED)[..., :0:-1], warp, v)
+
+
+def from_uv(uv, warp, v):
+    height, width = warp.source.image_size
+    u, w = uv[..., 0].astype(float), uv[..., 1].astype(float)
+    return np.stack((u * width - 0.5, (1 - w if v == "up" else w) * height - 0.5), -1)
+
+
+def with_dw100(path, warp, **_):
+    height, width = warp.target.image_size
+    words = np.fromfile(path, "<u4").reshape(math.ceil(height / 16) + 1, math.ceil(width / 16) + 1)
+    return between(np.stack((words & 0xFFFF, words >> 16), -1) / 16, 16, (height, width))
+
+
+def with_ti(path, warp, step=8, **_):
+    height, width = warp.target.image_size
+    n, m = math.ceil(height / step) + 1, math.ceil(width / step) + 1
+    pitch = (4 * m + 15) // 16 * 16
+    raw = Path(path).read_bytes()
+    assert len(raw) == n * pitch
+    nodes = np.empty((n, m, 2))
+    for i in range(n):
+        for j in range(m):
+            dx, dy = struct.unpack_from("<hh", raw, i * pitch + 4 * j)
+            nodes[i, j] = step * j + dx / 8, step * i + dy / 8
+    return between(nodes, step, (height, width))
+
+
+def with_depthai(path, warp, order="yx", step=16, **_):
+    height, width = warp.target.image_size
+    nodes = np.fromfile(path, "<f4").reshape(math.ceil(height / step) + 1, math.ceil(width / step) + 1, 2)
+    return between(nodes[..., :: -1 if order == "yx" else 1], step, (height, width))
+
+
+def with_triangles(points, uv, triangles, warp):
+    """Every triangle filled by its own affine map."""
+    (height, width), (rows, columns) = warp.target.image_size, warp.source.image_size
+    found = np.full((height, width, 2), np.nan)
+    source = uv * (columns, rows) - 0.5
+    for corners in triangles:
+        a, b, c = points[corners]
+        low, high = points[corners].min(0), points[corners].max(0)
+        x, y = np.meshgrid(np.arange(int(low[0]), math.ceil(high[0])), np.arange(int(low[1]), math.ceil(high[1])))
+        weights = np.linalg.solve(np.stack((b - a, c - a), -1), np.stack((x.ravel(), y.ravel())) + 0.5 - a[:, None])
+        inside = (weights >= -1e-9).all(0) & (weights.sum(0) <= 1 + 1e-9)
+        value = np.stack((1 - weights.sum(0), *weights), -1) @ source[corners]
+        found[y.ravel()[inside], x.ravel()[inside]] = value[inside]
+    return found
+
+
+def with_obj(path, warp, **_):
+    lines = [line.split() for line in Path(path).read_text().splitlines()]
+    height = warp.target.image_size[0]
+    points = np.array([[float(x), height - float(y)] for kind, x, y, *_ in lines if kind == "v"])
+    uv = np.array([[float(u), 1 - float(v)] for kind, u, v, *_ in lines if kind == "vt"])
+    triangles = [[int(word.split("/")[0]) - 1 for word in line[1:]] for line in lines if line[0] == "f"]
+    assert all(word.split("/")[0] == word.split("/")[1] for line in lines if line[0] == "f" for word in line[1:])
+    return with_triangles(points, uv, np.array(triangles), warp)
+
+
+def with_gltf(path, warp, **_):
+    raw = Path(path).read_bytes()
+    if raw[:4] == b"glTF":
+        assert struct.unpack_from("<II", raw, 4) == (2, len(raw))
+        length = struct.unpack_from("<I", raw, 12)[0]
+        document, buffer = json.loads(raw[20 : 20 + length]), raw[28 + length :]
+        assert length % 4 == 0
+    else:
+        document = json.loads(raw)
+        buffer = base64.b64decode(document["buffers"][0]["uri"].split(",")[1])
+    assert len(buffer) == document["buffers"][0]["byteLength"]
+    views, height = document["bufferViews"], warp.target.image_size[0]
+    parts = [buffer[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in views]
+    points = np.frombuffer(parts[0], "<f4").reshape(-1, 3).astype(float)
+    assert points.min(0).tolist() == document["accessors"][0]["min"]
+    assert points.max(0).tolist() == document["accessors"][0]["max"]
+    uv = np.frombuffer(parts[1], "<f4").reshape(-1, 2).astype(float)
+    points = np.stack((points[:, 0], height - points[:, 1]), -1)
+    return with_triangles(points, uv, np.frombuffer(parts[2], "<u4").reshape(-1, 3), warp)
+
+
+CASES = [
+    ("map.yml", "opencv", {}, with_opencv, 2e-5),
+    ("map.xml", "opencv", {}, with_opencv, 2e-5),
+    ("map.npz", "opencv", {}, with_opencv, 2e-5),
+    ("map.yml", "opencv_fixed", {}, with_opencv, 0.0222),
+    ("map.npz", "opencv_fixed", {}, with_opencv, 0.0222),
+    ("map.exr", "stmap", {}, with_ffmpeg, 2e-5),
+    ("map.exr", "stmap", {"v": "down"}, with_ffmpeg, 2e-5),
+    ("map.tif", "stmap", {}, with_opencv_tiff, 2e-5),
+    ("map.bin", "dw100", {}, with_dw100, 0.5),
+    ("map.bin", "ti_ldc", {}, with_ti, 0.2),
+    ("map.bin", "ti_ldc", {"step": 16}, with_ti, 0.5),
+    ("map.bin", "depthai", {}, with_depthai, 0.5),
+    ("map.bin", "depthai", {"order": "xy", "step": 8}, with_depthai, 0.2),
+    ("map.obj", "obj", {"step": 8}, with_obj, 0.2),
+    ("map.glb", "gltf", {"step": 8}, with_gltf, 0.2),
+    ("map.gltf", "gltf", {"step": 16}, with_gltf, 0.5),
+]
+
+
+@pytest.mark.parametrize(("name", "format", "options", "decode", "most"), CASES)
+def test_what_another_decoder_reads_is_as_far_off_as_the_report_says(name, format, options, decode, most, tmp_path):
+    warp, path = small(), str(tmp_path / name)
+    report = warp.save(path, format, **options)
+    found = off(decode(path, warp=warp, **options), warp)
+    assert float(found.max()) == pytest.approx(report.max_error, abs=1e-6)
+    assert float(found.square().mean().sqrt()) == pytest.approx(report.rms_error, abs=1e-6)
+    assert report.max_error < most
+    assert (report.format, report.shown, report.stray) == (format, warp.target.image_size[0] * 312, 0)
+    again = ct.load_map(path)
+    assert again.format == format
+    assert float(again.error(warp).max()) == report.max_error
+    assert (again.source_size, again.target_size) == ((200, 320), (184, 312))
+
+
+def test_opencv_remaps_as_the_warp_does(tmp_path):
+    images = torch.rand(1, 3, 200, 320, generator=torch.Generator().manual_seed(0), dtype=torch.float32)
+    smooth = torch.nn.functional.avg_pool2d(images, 15, 1, 7)
+    warp = small()
+    for format, image, most in (("opencv", images, 1e-3), ("opencv_fixed", smooth, 2e-3)):
+        warp.save(tmp_path / "map.npz", format)
+        maps = np.load(tmp_path / "map.npz")
+        array = image[0].permute(1, 2, 0).numpy()
+        result = cv2.remap(array, maps["map1"], maps["map2"], cv2.INTER_LINEAR)
+        assert (torch.from_numpy(result).permute(2, 0, 1) - warp(image)[0]).abs().max() < most
+
+
+@pytest.mark.parametrize("step", [8, 16])
+def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(step, tmp_path):
+    """The panorama of 170 degrees, the hardest: an eighth of a pixel alone is off by 0.0884."""
+    warp = ct.Dewarp(fisheye(), projection="cylindrical", fov=math.radians(170))
+    format, most = ("ti_ldc", 0.09) if step == 8 else ("dw100", 0.15)
+    assert warp.save(tmp_path / "map.bin", format).max_error <= most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fov", [None, 100])
+def test_meshes_of_perspective_views_are_near(fov, tmp_path):
+    warp = ct.Dewarp(fisheye(), fov=fov and math.radians(fov))
+    assert warp.save(tmp_path / "map.bin", "ti_ldc").max_error <= 0.09
+    assert warp.save(tmp_path / "map.bin", "dw100").max_error <= 0.15
+    assert warp.save(tmp_path / "map.bin", "ti_ldc", step=16).max_error <= 0.15
+
+
+def test_vertices_are_the_exact_positions_but_for_a_fraction(tmp_path):
+    warp = small()
+    warp.save(tmp_path / "map.bin", "dw100")
+    words = np.fromfile(tmp_path / "map.bin", "<u4").reshape(13, 21)
+    wanted = positions(warp)[0][::16, ::16]
+    found = np.stack((words & 0xFFFF, words >> 16), -1)[:12, :20] / 16
+    assert np.abs(found - wanted.numpy()).max() < 1 / 16
+
+
+# -- onnx
+
+
+@pytest.mark.parametrize(
+    ("mode", "padding", "fill", "dtype"),
+    [
+        ("bilinear", "zeros", 0.0, "float32"),
+        ("bilinear", "zeros", (0.1, 0.2, 0.9), "float32"),
+        ("bilinear", "border", 0.5, "float32"),
+        ("nearest", "reflection", 7, "uint8"),
+        ("bicubic", "zeros", 200, "uint8"),
+    ],
+)
+def test_onnx_runtime_makes_the_same_images(mode, padding, fill, dtype, tmp_path):
+    lens = partial().source.float()
+    warp = ct.Dewarp(lens, fov=2.6, image_size=(90, 160), mode=mode, padding_mode=padding, fill=fill, tolerance=0)
+    report = warp.save(tmp_path / "warp.onnx", dtype=None if dtype == "float32" else dtype)
+    session = onnxruntime.InferenceSession(tmp_path / "warp.onnx", providers=["CPUExecutionProvider"])
+    for batch in (1, 3):
+        images = torch.rand(batch, 3, 176, 256, generator=torch.Generator().manual_seed(batch))
+        images = images if dtype == "float32" else (255 * images).byte()
+        (result,) = session.run(None, {"images": images.numpy()})
+        difference = (torch.from_numpy(result).double() - warp(images).double()).abs()
+        assert result.dtype == dtype
+        if dtype == "float32":
+            assert difference.max() < 1e-5
+        else:  # where a value lies half-way between two
+            assert difference.max() <= 1
+            assert difference.mean() < 1e-4
+    assert report.max_error < 1e-3
+    assert ct.load_map(tmp_path / "warp.onnx").valid_mask().equal(warp.valid_mask())
+
+
+def test_onnx_refuses_what_runtimes_do_in_their_own_ways(tmp_path):
+    camera = fisheye(0.25)
+    with pytest.raises(ValueError, match="bicubic"):
+        ct.Dewarp(camera, mode="bicubic", padding_mode="border").save(tmp_path / "a.onnx")
+    with pytest.raises(ValueError, match="antialias"):
+        ct.Dewarp(camera, antialias=True).save(tmp_path / "a.onnx")
+    with pytest.raises(ValueError, match="float16"):
+        ct.Dewarp(camera).save(tmp_path / "a.onnx", dtype="float16")
+
+
+# -- where rays end
+
+
+@pytest.mark.parametrize("name", ["map.npz", "map.exr", "map.onnx"])
+def test_pixels_without_a_ray_are_marked(name, tmp_path):
+    warp = partial()
+    report = warp.save(tmp_path / name)
+    read = ct.load_map(tmp_path / name)
+    assert 0.1 < report.shown / warp.valid_mask().numel() < 0.6
+    assert report.shown == int(warp.valid_mask().sum())
+    assert report.stray == 0
+    assert read.valid_mask().equal(warp.valid_mask())
+    image = torch.rand(1, 2, 176, 256, dtype=torch.float64)
+    assert (read(image) - warp(image)).abs().max() < 1e-4
+    assert (read.grid()[0] == -9).all(-1).equal((warp.grid()[0] == -9).all(-1))
+
+
+@pytest.mark.parametrize("format", ["dw100", "ti_ldc", "depthai"])
+def test_meshes_go_on_where_rays_end(format, tmp_path):
+    camera = partial().source
+    warp = ct.Warp(camera, ct.KannalaBrandt([55.0, 55, 130, 80], image_size=(160, 256)).double(), tolerance=0)
+    report = warp.save(tmp_path / "map.bin", format)
+    assert report.stray > 0
+    assert report.rms_error < (0.25 if format == "ti_ldc" else 1.0)  # lens and steps are of the same size
+    assert report.max_error < 7
+    moved = ct.load_map(tmp_path / "map.bin").positions
+    # hardware reads small blocks of the source, also outside
+    assert max(float(moved.diff(dim=dim).abs().max()) for dim in (0, 1)) < 20
+
+
+@pytest.mark.parametrize("name", ["map.obj", "map.glb"])
+def test_triangles_that_show_nothing_are_left_out(name, tmp_path):
+    warp = partial()
+    report = warp.save(tmp_path / name, step=4)
+    read = ct.load_map(tmp_path / name)
+    drawn = ~read.positions[..., 0].isnan()
+    shown = warp.valid_mask()[0, 0]
+    assert (drawn | ~shown).all()
+    assert (drawn & ~shown).sum() < 0.1 * shown.sum()
+    assert report.triangles < 2 * (report.nodes[0] - 1) * (report.nodes[1] - 1)
+
+
+def test_a_seam_is_no_mesh(tmp_path):
+    panorama = ct.Equirectangular([256 / math.tau, 256 / math.tau, 127.5, 63.5], image_size=(128, 256)).double()
+    back = torch.tensor([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]).double()
+    view = ct.Pinhole.from_fov(60, image_size=(160, 200)).double()
+    warp = ct.Warp(panorama, view, back)
+    for format in ("depthai", "obj"):
+        with pytest.raises(ct.CameraFileError, match="leap across"):
+            warp.save(tmp_path / "map.obj", format)
+    assert warp.save(tmp_path / "map.npz").max_error < 1e-4
+
+
+# -- what a format cannot hold
+
+
+def upside_down():
+    camera = ct.Pinhole([300.0, 300, 159.5, 119.5], image_size=(240, 320)).double().requires_grad_(False)
+    return ct.Warp(camera, camera, torch.diag(torch.tensor([-1.0, -1, 1])).double())
+
+
+def test_positions_beyond_the_format_are_an_error_and_clipping_is_told(tmp_path):
+    path = tmp_path / "map.bin"
+    with pytest.raises(ct.CameraFileError, match=r"vertices: lie at x -1.0 .* dw100 does not hold.*clip=True"):
+        upside_down().save(path, "dw100")
+    assert not os.listdir(tmp_path)
+    report = upside_down().save(path, "dw100", clip=True)
+    assert 0.5 < report.max_error < 2
+    assert float(off(with_dw100(path, upside_down()), upside_down()).max()) == pytest.approx(report.max_error, abs=1e-6)
+    assert upside_down().save(path, "ti_ldc").max_error < 1e-9
+    wide = ct.Pinhole([2000.0, 2000, 6000, 119.5], image_size=(240, 8000)).double()
+    with pytest.raises(ct.CameraFileError, match="ti_ldc does not hold"):
+        ct.Warp(wide, ct.Pinhole([2000.0, 2000, 160, 119.5], image_size=(240, 320)).double()).save(path, "ti_ldc")
+
+
+def test_sizes_beyond_the_hardware_are_errors(tmp_path):
+    def warp(source, target):
+        make = [ct.Pinhole.from_fov(60, image_size=size).double() for size in (source, target)]
+        return ct.Warp(*make)
+
+    for source, target, format, match in (
+        ((144, 160), (144, 176), "dw100", "source size: 160x144"),
+        ((144, 176), (3080, 176), "dw100", "target size: 176x3080"),
+        ((17, 8200), (17, 17), "ti_ldc", "8192"),
+        ((9, 32767), (17, 17), "opencv", "32767 px"),
+    ):
+        with pytest.raises(ct.CameraFileError, match=match):
+            warp(source, target).save(tmp_path / "map.npz", format)
+
+
+@pytest.mark.parametrize("block", [None, (8, 32)])
+def test_blocks_with_their_padding_hold_what_they_need(block, tmp_path):
+    warp = ct.Dewarp(fisheye(0.25), projection="equirectangular", image_size=(90, 160))
+    report = warp.save(tmp_path / "map.bin", "ti_ldc", block=block)
+    (height, width), padding = report.block_size, report.pixel_padding
+    assert block in (None, (height, width))
+    assert width % 8 == 0
+    assert height % 2 == 0
+    found = ct.load_map(tmp_path / "map.bin").positions.numpy().clip(0, (319, 199))
+    needed, largest = 0, np.zeros(2)
+    for top in range(0, 90, height):
+        for left in range(0, 160, width):
+            part = found[top : top + height, left : left + width]
+            corners = np.stack((part[0, 0], part[0, -1], part[-1, 0], part[-1, -1]))
+            first, last = np.floor(corners.min(0)), np.ceil(corners.max(0))
+            for position in part.reshape(-1, 2):  # a bicubic filter reads one pixel before and two after
+                reads = np.floor(position) - 1, np.floor(position) + 2
+                needed = max(needed, *(first - reads[0]), *(reads[1] - last))
+            largest = np.maximum(largest, last - first + 1)
+    assert padding == needed
+    assert report.source_block == tuple((largest[::-1] + 2 * padding).astype(int))
+
+
+def test_blocks_that_need_more_padding_than_there_is_are_refused(tmp_path):
+    lens = ct.KannalaBrandt([60.0, 60, 319.5, 239.5], [0.0] * 4, image_size=(480, 640)).double()
+    wide = ct.Warp(lens, ct.Pinhole([10.0, 10, 63.5, 63.5], image_size=(128, 128)).double(), tolerance=0)
+    with pytest.raises(ct.CameraFileError, match=r"blocks of 128x128 need \d+ pixels .* smaller blocks"):
+        wide.save(tmp_path / "map.bin", "ti_ldc", block=(128, 128))
+    report = wide.save(tmp_path / "map.bin", "ti_ldc")
+    assert report.block_size[0] <= 64
+    assert report.pixel_padding <= 15
+
+
+# -- calls
+
+
+def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
+    warp = small()
+    for name, format in (("a.yaml", "opencv"), ("a.TIF", "stmap"), ("a.glb", "gltf")):
+        assert warp.save(tmp_path / name).format == format
+    with pytest.raises(ValueError, match="does not say the format") as raised:
+        warp.save(tmp_path / "map.bin")
+    assert all(format in str(raised.value) for format in FORMATS)
+    with pytest.raises(ValueError, match="unknown format 'nvidia'"):
+        warp.save(tmp_path / "map.yml", "nvidia")
+    with pytest.raises(ValueError, match=r"maps of OpenCV are called \.yml"):
+        warp.save(tmp_path / "map.png", "opencv")
+
+
+@pytest.mark.parametrize(
+    ("format", "options", "match"),
+    [
+        ("opencv", {"step": 8}, "opencv has no step"),
+        ("dw100", {"step": 8}, "dw100 has no step; it takes clip"),
+        ("ti_ldc", {"step": 12}, "step must be one of"),
+        ("ti_ldc", {"block": (8, 12)}, "multiple of 8"),
+        ("depthai", {"order": "uv"}, "order must be 'yx'"),
+        ("depthai", {"step": 0}, "step must be 1"),
+        ("stmap", {"v": "left"}, "v must be 'up'"),
+    ],
+)
+def test_options_that_are_none_are_errors(format, options, match, tmp_path):
+    with pytest.raises(ValueError, match=match):
+        small().save(tmp_path / ("map.exr" if format == "stmap" else "map.npz"), format, **options)
+
+
+def test_one_warp_is_saved_whether_it_learns_or_not(tmp_path):
+    camera = fisheye(0.25)
+    learning = ct.Warp(ct.KannalaBrandt(camera.intrinsics.tolist(), image_size=(200, 320)), small().target)
+    assert learning.source.intrinsics.requires_grad
+    assert learning.save(tmp_path / "map.npz").max_error < 1e-4
+    batch = ct.KannalaBrandt(camera.intrinsics.expand(2, 4), camera.distortion.expand(2, 4), image_size=(200, 320))
+    with pytest.raises(ValueError, match="a batch of 2"):
+        ct.Dewarp(batch).save(tmp_path / "map.npz")
+    single = ct.KannalaBrandt(camera.intrinsics[None], camera.distortion[None], image_size=(200, 320))
+    assert ct.Dewarp(single).save(tmp_path / "map.npz").max_error < 1e-4
+
+
+def test_a_warp_that_shows_nothing_is_an_error(tmp_path):
+    camera = ct.Pinhole.from_fov(60, image_size=(160, 200)).double()
+    back = torch.diag(torch.tensor([-1.0, 1, -1])).double()
+    with pytest.raises(ValueError, match="no pixel of the target shows"):
+        ct.Warp(camera, camera, back).save(tmp_path / "map.npz")
+
+
+def test_warps_over_a_plane_are_saved(tmp_path):
+    camera = fisheye(0.25)
+    pose = ct.Extrinsics([math.radians(125), 0.0, 0.0], [0.0, 1.0, 0.5]).double().requires_grad_(False)
+    warp = ct.BirdsEye(camera, pose, x=(-1, 1), y=(1, 2.5), resolution=0.01)
+    warp.save(tmp_path / "map.npz")
+    assert off(ct.load_map(tmp_path / "map.npz").positions, warp).max() < 1e-4
+
+
+def test_float32_cameras_are_measured_in_float64(tmp_path):
+    warp = ct.Dewarp(fisheye(0.25).float())
+    assert warp.tolerance > 0
+    assert warp.save(tmp_path / "map.npz").max_error < 2e-5
+
+
+def test_what_stood_there_stays_where_saving_fails(tmp_path, monkeypatch):
+    path = tmp_path / "map.bin"
+    small().save(path, "dw100")
+    before = {name: (tmp_path / name).read_bytes() for name in sorted(os.listdir(tmp_path))}
+    assert list(before) == ["map.bin", "map.bin.json"]
+    with pytest.raises(ct.CameraFileError):
+        upside_down().save(path, "dw100")
+
+    def full(file):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="disk full"):
+        small().save(path, "ti_ldc")
+    assert {name: (tmp_path / name).read_bytes() for name in sorted(os.listdir(tmp_path))} == before
+
+
+# -- maps that others wrote, or nobody
+
+
+def test_maps_of_opencv_that_others_wrote_are_read(tmp_path):
+    warp = small()
+    wanted = positions(warp)[0].numpy().astype(np.float32)
+    for path, names in (("a.yml", ("map_x", "map_y")), ("b.xml", ("map1", "map2"))):
+        storage = cv2.FileStorage(str(tmp_path / path), cv2.FILE_STORAGE_WRITE)  # as text
+        for name, plane in zip(names, np.moveaxis(wanted, -1, 0), strict=True):
+            storage.write(name, np.ascontiguousarray(plane[:20]))
+        storage.release()
+        read = ct.load_map(tmp_path / path, source_size=(200, 320))
+        assert np.abs(read.positions.numpy() - wanted[:20]).max() < 1e-4
+        assert torch.equal(read.map_x, read.positions[..., 0].float())
+        with pytest.raises(ct.CameraFileError, match="source_size="):
+            ct.load_map(tmp_path / path)
+    np.savez(tmp_path / "c.npz", map1=wanted)  # CV_32FC2
+    assert np.array_equal(ct.load_map(tmp_path / "c.npz", source_size=(200, 320)).positions.numpy(), wanted)
+    np.savez(tmp_path / "d.npz", K=np.eye(3))
+    with pytest.raises(ct.CameraFileError, match="no map of that name; it has K"):
+        ct.load_map(tmp_path / "d.npz", source_size=(200, 320))
+
+
+def test_bare_tables_are_read_without_their_description_if_somebody_says_the_sizes(tmp_path):
+    warp = small()
+    report = warp.save(tmp_path / "map.bin", "ti_ldc", step=16)
+    described = json.loads((tmp_path / "map.bin.json").read_text())
+    assert described["format"] == "ti_ldc"
+    assert described["block_size"] == list(report.block_size)
+    assert report.files == (str(tmp_path / "map.bin"), str(tmp_path / "map.bin.json"))
+    (tmp_path / "map.bin.json").unlink()
+    with pytest.raises(ct.CameraFileError, match="say format, one of opencv"):
+        ct.load_map(tmp_path / "map.bin")
+    with pytest.raises(ct.CameraFileError, match="say source_size="):
+        ct.load_map(tmp_path / "map.bin", "ti_ldc")
+    sizes = {"source_size": (200, 320), "target_size": (184, 312)}
+    with pytest.raises(ct.CameraFileError, match="bytes"):
+        ct.load_map(tmp_path / "map.bin", "ti_ldc", **sizes)
+    read = ct.load_map(tmp_path / "map.bin", "ti_ldc", step=16, **sizes)
+    assert float(read.error(warp).max()) == report.max_error
+    with pytest.raises(ValueError, match="from images of"):
+        read.error(ct.Dewarp(fisheye(0.25)))
+
+
+def test_an_stmap_says_which_way_it_runs(tmp_path):
+    warp = small()
+    warp.save(tmp_path / "map.tif", v="down")
+    assert ct.load_map(tmp_path / "map.tif").facts == {"v": "down"}
+    with pytest.raises(ct.CameraFileError, match="runs 'down', and was said to run 'up'"):
+        ct.load_map(tmp_path / "map.tif", v="up")
+    plain = np.zeros((20, 30, 3), np.float32)
+    plain[..., 2], plain[..., 1] = (np.arange(30) + 0.5) / 30, (np.arange(20)[:, None] + 0.5) / 20
+    cv2.imwrite(str(tmp_path / "plain.tif"), plain)
+    read = ct.load_map(tmp_path / "plain.tif", v="down", source_size=(40, 60))
+    assert read.positions[3, 4].tolist() == pytest.approx([(4.5 / 30) * 60 - 0.5, (3.5 / 20) * 40 - 0.5], abs=1e-4)
+
+
+def spoiled(content, random):
+    """What a disk, a network or somebody mean makes of a file."""
+    kind = random.integers(4)
+    at = int(random.integers(len(content)))
+    if kind == 0:
+        return content[:at]
+    if kind == 1:
+        return content[:at] + bytes(random.integers(0, 256, 20, np.uint8)) + content[at + 20 :]
+    if kind == 2:  # where what is said of the data stands
+        at = int(random.integers(min(300, len(content))))
+        return content[:at] + bytes([random.integers(256)]) + content[at + 1 :]
+    return content + b"9" * 40
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "npz", "exr", "tif", "bin", "obj", "glb", "gltf", "onnx"])
+@pytest.mark.parametrize("times", [8, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.filterwarnings("ignore")
+def test_spoiled_maps_are_one_kind_of_error(suffix, times, tmp_path):
+    view = ct.Pinhole.from_fov(60, image_size=(40, 50)).double().requires_grad_(False)
+    path = tmp_path / f"map.{suffix}"
+    ct.Warp(view, view).save(path, "depthai" if suffix == "bin" else None)
+    content, random = path.read_bytes(), np.random.default_rng(times)
+    for _ in range(times):
+        path.write_bytes(spoiled(content, random))
+        try:
+            read = ct.load_map(path)
+        except ct.CameraFileError:
+            continue
+        assert read.positions.shape[-1] == 2
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"format": 3}', '{"format": "dw100", "source_height": -1}', "{" * 9999])
+def test_spoiled_descriptions_are_one_kind_of_error(content, tmp_path):
+    small().save(tmp_path / "map.bin", "dw100")
+    (tmp_path / "map.bin.json").write_text(content)
+    with pytest.raises(ct.CameraFileError):
+        ct.load_map(tmp_path / "map.bin")
+
+
+# -- the command
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ct.save(fisheye(0.25), "camera.json")
+    return tmp_path
+
+
+def test_the_command_writes_a_map_and_measures_one(folder, capsys):
+    assert main(["map", "camera.json", "-o", "maps/ti.bin", "--format", "ti_ldc", "--block", "32x16"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("maps/ti.bin: ti_ldc, 320x200 from 320x200, off by at most 0.")
+    assert "block size 32x16; pixel padding 2" in told
+    assert main(["map", "camera.json", "--check", "maps/ti.bin"]) == 0
+    assert capsys.readouterr().out.split(";")[0] == told.split(";")[0]
+    assert main(["map", "camera.json", "--fov", "60", "--check", "maps/ti.bin"]) == 0
+    assert "off by at most 0." not in capsys.readouterr().out
+    ct.save(ct.Pinhole.from_fov(50, image_size=(60, 80)), "view.json")
+    assert main(["map", "camera.json", "--target", "view.json", "-o", "a.exr", "--v", "down"]) == 0
+    assert "80x60 from 320x200" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        ("", "-o OUT writes one, --check MAP measures one"),
+        ("-o a.bin", "does not say the format"),
+        ("-o camera.json --format obj", "would overwrite camera.json"),
+        ("-o a.npz --fov 200", "--projection cylindrical goes to 360"),
+        ("-o a.npz --target camera.json --size 10x10", "--size is for a dewarping"),
+        ("-o camera --format dw100 --force", "camera.json: would overwrite"),
+        ("-o a.npz --step 8", "opencv has no step"),
+        ("--check camera.json", "say format"),
+    ],
+)
+def test_the_command_says_what_it_cannot_do(words, match, folder, capsys):
+    assert main(["map", "camera.json", *words.split()]) == 2
+    assert match in capsys.readouterr().err
+    assert os.listdir(folder) == ["camera.json"]
