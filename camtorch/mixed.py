@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate
@@ -49,6 +50,7 @@ class Mixed(Camera):
     Args:
         cameras: single cameras, and batches of one dim, whose rows follow each other. They are kept as they are, as in
             an `nn.ModuleList`: what learns in them goes on learning here, and `camera[i]` is the i-th one.
+        order: which of these cameras, counted one by one, each row of the batch is; each once, in turn, by default.
 
     Its `intrinsics`, `K`, `fx` and so on are those of all; there is no common `distortion`. All that learns computes in
     the widest dtype among the cameras and the points. `groups` are the batches of one model that it is made of.
@@ -62,40 +64,30 @@ class Mixed(Camera):
     cameras: nn.ModuleList
     """What it was made of: single cameras and batches."""
 
-    def __init__(self, cameras: Iterable[Camera]):
+    def __init__(self, cameras: Iterable[Camera], order: Sequence[int] | None = None):
         members = _members(cameras)
-        self._arrange(members, [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))])
-
-    def _arrange(self, members: Sequence[Camera], places: Sequence[tuple[int, int]]) -> None:
-        """Be a batch of whose rows each is a row of one of the members."""
-        if not places:
-            raise ValueError("Mixed: cameras without a row")
-        nn.Module.__init__(self)
+        given = [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))]
+        super(Camera, self).__init__()  # it has no numbers of its own
         self.cameras = nn.ModuleList(members)
         self.image_size = members[0].image_size
-        self._places, self._rays, self._fields = tuple(places), Memo(), Memo()
+        self._places = tuple(given if order is None else [given[i] for i in _as_order(order, len(given))])
+        self._rays, self._fields = Memo(), Memo()
         kinds: dict[tuple[object, ...], list[int]] = {}
         for row, (i, _) in enumerate(self._places):
             kinds.setdefault(kind(members[i]), []).append(row)
         self._groups = tuple(self._group(members, rows) for rows in kinds.values())
         places_in_groups = {row: n for n, row in enumerate(row for group in self._groups for row in group.rows)}
-        self._order = tuple(places_in_groups[row] for row in range(len(places)))
+        self._order = tuple(places_in_groups[row] for row in range(len(self._places)))
 
     def _group(self, members: Sequence[Camera], rows: Sequence[int]) -> _Group:
         places = [self._places[row] for row in rows]
         used = tuple(dict.fromkeys(i for i, _ in places))
-        starts = [0, *accumulate(_count(members[i]) for i in used)]
+        starts = list(accumulate((_count(members[i]) for i in used), initial=0))
         index = tuple(starts[used.index(i)] + row for i, row in places)
         whole = index == tuple(range(starts[-1]))
         model: type[Camera] = type_before_parametrizations(members[used[0]])
         counts = tuple(len(members[i]) if members[i].batch_shape else None for i in used)
         return _Group(model, used, counts, None if whole else index, tuple(rows), Memo())
-
-    @classmethod
-    def _of(cls, members: Sequence[Camera], places: Sequence[tuple[int, int]]) -> Self:
-        made = cls.__new__(cls)
-        made._arrange(members, places)
-        return made
 
     @classmethod
     def of_groups(cls, groups: Sequence[tuple[Sequence[int], Camera]]) -> Self:
@@ -104,12 +96,11 @@ class Mixed(Camera):
         Args:
             groups: the rows of the batch, and as many cameras; as of `groups`.
         """
-        places: dict[int, tuple[int, int]] = {}
-        for i, (rows, _) in enumerate(groups):
-            places.update({int(row): (i, n) for n, row in enumerate(rows)})
-        if sorted(places) != list(range(sum(len(rows) for rows, _ in groups))):
-            raise ValueError(f"Mixed: groups must fill every row once; got {[list(map(int, r)) for r, _ in groups]}")
-        return cls._of(_checked([camera for _, camera in groups]), [places[row] for row in range(len(places))])
+        rows = [int(row) for of_group, _ in groups for row in of_group]
+        place = {row: i for i, row in enumerate(rows)}
+        if sorted(place) != list(range(len(rows))):
+            raise ValueError(f"Mixed: groups must fill every row once; got rows {rows}")
+        return cls([camera for _, camera in groups], [place[row] for row in range(len(rows))])
 
     # -- what it holds
 
@@ -140,8 +131,10 @@ class Mixed(Camera):
         for group in self._groups:
             pairs = [members[i]._tensors for i in group.members]
             tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
+        if all(t.dtype == tensors[0].dtype for t in tensors):
+            return tuple(tensors)
         wide = working_dtype(tensors[0], *tensors)
-        return tuple(t if t.dtype == wide else t.to(wide) for t in tensors)
+        return tuple(t.to(wide) for t in tensors)
 
     @staticmethod
     def _pairs(tensors: Sequence[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
@@ -244,8 +237,11 @@ class Mixed(Camera):
         places = [self._places[row] for row in taken.tolist()]
         if not places:
             raise IndexError(f"Mixed: {index!r} leaves no camera of a batch ({len(self._places)},)")
-        used = list(dict.fromkeys(i for i, _ in places))
-        return type(self)._of([self._member(i) for i in used], [(used.index(i), row) for i, row in places])
+        members = [self._member(i) for i in dict.fromkeys(i for i, _ in places)]
+        starts = dict(
+            zip(dict.fromkeys(i for i, _ in places), accumulate(map(_count, members), initial=0), strict=False)
+        )
+        return type(self)(members, [starts[i] + row for i, row in places])
 
     def with_tensors(self, **tensors: Tensor) -> NoReturn:
         """There are none to give."""
@@ -295,8 +291,15 @@ def _members(cameras: Any) -> list[Camera]:
     return _checked([one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))])
 
 
+def _as_order(order: Sequence[int], count: int) -> list[int]:
+    places = [operator.index(place) for place in order]
+    if not places or min(places) < 0 or max(places) >= count:
+        raise ValueError(f"Mixed: order must be places among {count} cameras, from 0; got {places}")
+    return places
+
+
 def _checked(members: list[Camera]) -> list[Camera]:
-    if not members:
+    if not any(map(_count, members)):
         raise ValueError("Mixed: an empty list of cameras")
     for i, camera in enumerate(members):
         if len(camera.batch_shape) > 1:

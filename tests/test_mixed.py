@@ -1,14 +1,19 @@
 """Batches of cameras of several models: to the bit what each camera gives by itself, and a camera in all it does."""
 
 import copy
+import pickle
 
 import pytest
 import torch
 from cameras import KEYS, make, real
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.data import DataLoader
 
 import camtorch as ct
+import camtorch.mixed
 
 SIZE = (48, 64)
+EIGHT = {"brown_conrady", "double_sphere", "eucm", "fisheye624", "kannala_brandt", "pinhole", "ucm", "woodscape"}
 DIRECTIONS = {"project": 3, "unproject": 2}
 
 
@@ -57,3 +62,339 @@ def test_one_by_one_to_the_bit_with_gradients(direction):
         assert torch.equal(given.grad[i], mine.grad), camera
         for tensor, its in zip(tensors(camera), tensors(alone), strict=True):
             assert torch.equal(tensor.grad, its.grad), camera
+
+
+@pytest.mark.parametrize("as_source", [True, False])
+def test_warps_are_those_of_each_camera_with_gradients(as_source):
+    cameras = one_of_each()
+    mixed, view = ct.Mixed(cameras), ct.Pinhole.from_fov(70, image_size=(17, 23)).double().requires_grad_(False)
+    torch.manual_seed(0)
+    images = torch.rand(len(cameras), 2, *(SIZE if as_source else view.image_size), dtype=torch.float64)
+
+    def warp(camera):
+        return ct.Warp(camera, view) if as_source else ct.Warp(view, camera)
+
+    result, points = warp(mixed)(images), torch.rand(len(cameras), 5, 2, dtype=torch.float64) * 15
+    weight = torch.rand_like(result)
+    (result * weight).sum().backward()
+    moved = warp(mixed).transform_points(points)
+    for i, camera in enumerate(cameras):
+        alone = copy.deepcopy(camera)
+        expected = warp(alone)(images[i : i + 1])
+        (expected * weight[i]).sum().backward()
+        assert torch.equal(result[i], expected[0]), camera
+        for tensor, its in zip(tensors(camera), tensors(alone), strict=True):
+            assert torch.equal(tensor.grad, its.grad), camera
+        for both, of_one in zip(moved, warp(camera).transform_points(points[i]), strict=True):
+            assert torch.equal(both[i], of_one), camera
+    kept = warp(mixed.requires_grad_(False))
+    before = kept(images)
+    assert (before - result).abs().max() < 1e-12
+    mixed[3].intrinsics.data[0] *= 1.1  # which a warp that keeps its grid has to see
+    assert not torch.equal(kept(images)[3], before[3])
+
+
+def models(learns=True):
+    cameras = [
+        ct.Pinhole([50.0, 50.0, 31.5, 23.5], image_size=SIZE),
+        ct.BrownConrady([50.0, 50.0, 31.5, 23.5], [-0.1, 0.01, 0.0, 0.0], image_size=SIZE),
+        ct.BrownConrady([50.0, 51.0, 31.5, 23.5], [-0.1, 0.01, 0.0, 0.0, 0.001], image_size=SIZE),
+        ct.BrownConrady([52.0, 50.0, 31.5, 23.5], [-0.1, 0.01, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0], image_size=SIZE),
+        ct.KannalaBrandt([30.0, 30.0, 31.5, 23.5], [0.02, -0.01, 0.003, -0.001], image_size=SIZE),
+        ct.KannalaBrandt([31.0, 30.0, 31.5, 23.5], [0.01, -0.01, 0.003, -0.001], image_size=SIZE),
+    ]
+    return [camera.requires_grad_(learns) for camera in cameras]
+
+
+def same(batch, cameras):
+    """Whether a batch is of the same numbers as cameras, one by one."""
+    return len(batch) == len(cameras) and all(
+        type(one) is type(other) and all(map(torch.equal, tensors(one), tensors(other)))
+        for one, other in zip(batch, cameras, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda c: c.crop(3, 4, 20, 30),
+        lambda c: c.resize(24, 32),
+        lambda c: c.pad(1, 2, 3, 4),
+        lambda c: c.hflip(),
+        lambda c: c.vflip(),
+        lambda c: c.rot90(),
+    ],
+)
+def test_edits_are_those_of_each_camera_and_gradients_go_there(edit):
+    cameras = models()
+    edited = edit(ct.Mixed(cameras))
+    assert isinstance(edited, ct.Mixed)
+    assert edited.image_size == edit(cameras[0]).image_size
+    assert same(edited, [edit(camera) for camera in cameras])
+    edited.intrinsics.sum().backward()
+    assert all((camera.intrinsics.grad != 0).all() for camera in cameras)
+    assert not any(p.requires_grad for p in edit(ct.Mixed(models(learns=False))).parameters())
+
+
+def test_parts_and_members():
+    cameras = models()
+    mixed = ct.Mixed(cameras)
+    assert len(mixed) == 6
+    assert mixed.batch_shape == (6,)
+    assert mixed[4] is cameras[4]
+    assert mixed[-1] is cameras[5]
+    assert list(mixed) == cameras
+    for index in (slice(1, 5), [5, 0, 0], torch.tensor([1, 3]), torch.tensor([True] + [False] * 4 + [True])):
+        rows = torch.arange(6)[index].tolist()
+        part = mixed[index]
+        assert isinstance(part, ct.Mixed)
+        assert list(part) == [cameras[row] for row in rows]
+        points = torch.randn(len(rows), 4, 3)
+        assert torch.equal(part.project(points)[0][0], cameras[rows[0]].project(points[0])[0])
+    for wrong in (6, -7, [7], torch.zeros(1, 2, dtype=torch.long), []):
+        with pytest.raises(IndexError, match="Mixed"):
+            mixed[wrong]
+    assert "1 Pinhole(), 1 BrownConrady(k1 k2 p1 p2), 1 BrownConrady(k1 k2 p1 p2 k3)" in repr(mixed)
+    assert "2 KannalaBrandt(k1 k2 k3 k4), image_size=(48, 64)" in repr(mixed)
+    assert [rows for rows, _ in mixed.groups] == [[0], [1], [2], [3], [4, 5]]
+    assert torch.equal(mixed.K[4], cameras[4].K)
+    assert torch.equal(mixed.field_of_view[4], cameras[4].field_of_view)
+
+
+def test_batches_mixed_batches_and_orders_among_the_cameras():
+    cameras = models()
+    batch = ct.KannalaBrandt(
+        torch.stack([c.intrinsics.detach() for c in cameras[4:]]), cameras[4].distortion.detach(), image_size=SIZE
+    )
+    mixed = ct.Mixed([cameras[0], batch, ct.Mixed([cameras[1]])])
+    points = torch.randn(4, 7, 3)
+    pixels, _ = mixed.project(points)
+    assert torch.equal(pixels[1], cameras[4].project(points[1])[0])
+    assert torch.equal(pixels[1:3], batch.project(points[1:3])[0])
+    turned = ct.Mixed([cameras[0], batch, cameras[1]], order=[3, 2, 1, 0])
+    assert torch.equal(turned.project(points.flip(0))[0], pixels.flip(0))
+    assert torch.equal(mixed[torch.tensor([3, 2, 1, 0])].intrinsics, turned.intrinsics)
+    again = ct.Mixed.of_groups(turned.groups)
+    assert torch.equal(again.project(points)[0], turned.project(points)[0])
+    with pytest.raises(ValueError, match="every row once"):
+        ct.Mixed.of_groups([([0, 2], batch)])
+    with pytest.raises(ValueError, match="order must be places among 2"):
+        ct.Mixed([batch], order=[0, 2])
+
+
+def test_one_camera_serves_any_number_of_rows_as_a_batch_of_one_does():
+    (camera,) = models()[:1]
+    points = torch.randn(5, 4, 3)
+    assert torch.equal(ct.Mixed([camera]).project(points)[0], camera.project(points)[0])
+
+
+def test_the_widest_dtype_is_that_of_all():
+    cameras = [models()[0], models()[4].double()]
+    pixels, _ = ct.Mixed(cameras).project(torch.randn(2, 3, 3))
+    assert pixels.dtype == torch.float64
+
+
+def test_it_is_a_module():
+    mixed, points = ct.Mixed(models()), torch.randn(6, 3, 3)
+    expected = mixed(points)[0]
+    for twin in (copy.deepcopy(mixed), pickle.loads(pickle.dumps(mixed))):
+        assert torch.equal(twin(points)[0], expected)
+        twin[0].intrinsics.data += 1
+    assert torch.equal(mixed(points)[0], expected)
+    other = ct.Mixed(models())
+    other[4].intrinsics.data += 1
+    other.load_state_dict(mixed.state_dict())
+    assert torch.equal(other(points)[0], expected)
+    assert other.double()(points)[0].dtype == torch.float64
+    assert other.half()[0].intrinsics.dtype == torch.float64  # never of less than float32
+    doubled = {name: 2 * value for name, value in mixed.state_dict().items() if "intrinsics" in name}
+    called = torch.func.functional_call(mixed, doubled, (points,))[0]
+    valid = mixed(points)[1]
+    assert torch.allclose(called[valid], 2 * expected[valid])
+    assert mixed.to("meta").project(points.to("meta"))[0].shape == (6, 3, 2)
+
+
+def test_an_optimizer_moves_each_camera_and_the_batch_follows():
+    cameras = models()
+    mixed, points = ct.Mixed(cameras), torch.rand(6, 20, 3) + torch.tensor([-0.5, -0.5, 1.0])
+    target = mixed(points)[0].detach() + 1
+    optimizer = torch.optim.Adam(mixed.parameters(), 0.1)
+    losses = []
+    for _ in range(20):
+        optimizer.zero_grad()
+        loss = (mixed(points)[0] - target).square().mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.1 * losses[0]
+    assert all(not torch.equal(one.intrinsics, other.intrinsics) for one, other in zip(cameras, models(), strict=True))
+
+
+def test_predicted_cameras_inside():
+    features, points = torch.randn(2, 8), torch.rand(4, 5, 3) + 0.5
+    network = torch.nn.Linear(8, 4)
+    batch = ct.Pinhole(50 + network(features), image_size=SIZE)
+    mixed = ct.Mixed([models(learns=False)[4], batch, ct.KannalaBrandt(40 + network(features[0]), image_size=SIZE)])
+    pixels, _ = mixed.project(points)
+    (by_weight,) = torch.autograd.grad(pixels.sum(), network.weight, retain_graph=True)
+    expected = batch.project(points[1:3])[0].sum() + mixed[3].project(points[3])[0].sum()
+    (wanted,) = torch.autograd.grad(expected, network.weight)
+    assert torch.allclose(by_weight, wanted, rtol=1e-4)
+
+
+def test_calls_are_as_many_as_models(monkeypatch):
+    calls = []
+    evaluated = camtorch.mixed.evaluated
+    monkeypatch.setattr(camtorch.mixed, "evaluated", lambda *a: calls.append(a[1]) or evaluated(*a))
+    chosen = [camera for camera in one_of_each() if camera.key in EIGHT]
+    cameras = [copy.deepcopy(chosen[i % 8]) for i in range(64)]
+    mixed, points = ct.Mixed(cameras), values(3, 64)
+    pixels, _ = mixed.project(points)
+    assert len(calls) == len(set(calls)) == 8
+    assert torch.equal(pixels[13], cameras[13].project(points[13])[0])
+    mixed.resize(24, 32).hflip().unproject(values(2, 64))
+    assert len(calls) == 16
+    ct.Warp(mixed.requires_grad_(False), chosen[0])(torch.rand(64, 1, *SIZE, dtype=torch.float64))
+    assert len(calls) == 24
+
+
+class Counting(TorchDispatchMode):
+    """Counts torch's operations."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("learns", [True, False])
+def test_one_model_costs_what_its_batch_does(direction, learns):
+    cameras = models(learns)[4:] * 8
+    numbers = [torch.stack([t.detach() for t in ts]) for ts in zip(*map(tensors, cameras), strict=True)]
+    batch = ct.KannalaBrandt(*numbers, image_size=SIZE).requires_grad_(learns)
+    given, counts = torch.rand(16, 50, DIRECTIONS[direction]) + 0.5, []
+    for camera in (batch, ct.Mixed([batch]), ct.Mixed(cameras)):
+        getattr(camera, direction)(given)  # what is made once
+        with Counting() as counting:
+            getattr(camera, direction)(given)
+        counts.append(counting.count)
+    assert counts[1] == counts[0]
+    assert counts[2] <= counts[0] + 2  # and one for each number, that joins them
+
+
+def test_compiled_where_the_groups_are_fixed():
+    mixed, points = ct.Mixed(models()), torch.randn(6, 3, 3)
+    compiled = torch.compile(mixed.project, fullgraph=True, backend="eager")
+    pixels, valid = compiled(points)
+    assert torch.allclose(pixels, mixed.project(points)[0])
+    assert torch.equal(valid, mixed.project(points)[1])
+    frozen, images = mixed.requires_grad_(False), torch.rand(6, 3, *SIZE)
+    augment = ct.augment.RandomMount(yaw=2, pitch=2, roll=2, p=0.5)
+    draw = augment.draw(6)
+
+    def step(images):
+        moved = augment(image=images, camera=frozen, draw=draw)
+        return moved["image"], moved["camera"].rays(stride=8)[0]
+
+    for now, then in zip(torch.compile(step, fullgraph=True, backend="eager")(images), step(images), strict=True):
+        assert torch.allclose(now, then, atol=1e-4)
+
+
+@pytest.mark.parametrize("p", [1.0, 0.5])
+def test_augmented_as_a_list_of_cameras_is(p):
+    cameras, images = models(learns=False), torch.rand(6, 3, *SIZE)
+    fields = {"image": images, "keypoints": torch.rand(6, 4, 2) * 40, "gaze": torch.randn(6, 3)}
+    for augment in (
+        ct.augment.RandomCamera(yaw=3, pitch=3, roll=3, p=p, min_filled=0.8),
+        ct.augment.RandomLens("kannala_brandt", fov=(80, 90), p=p, min_filled=0),
+    ):
+        draw = augment.draw(6)
+        listed = augment(**fields, camera=cameras, draw=draw)
+        mixed = augment(**fields, camera=ct.Mixed(cameras), draw=draw)
+        assert isinstance(mixed["camera"], ct.Mixed)
+        assert same(mixed["camera"], listed["camera"])
+        for name in ("image", "keypoints", "keypoints_valid", "gaze", "rotation"):
+            assert torch.equal(mixed[name], listed[name]), name
+        back = augment.inverse(mixed)
+        assert same(back["camera"], cameras)
+        assert (back["gaze"] - fields["gaze"]).abs().max() < 1e-5
+
+
+def test_a_bad_row_is_invalid_and_its_camera_says_so():
+    cameras = models()
+    mixed = ct.Mixed(cameras)
+    cameras[5].intrinsics.data[0] = -1
+    with pytest.warns(UserWarning, match="intrinsics became unusable"):
+        pixels, valid = mixed.project(torch.ones(6, 2, 3))
+    assert not valid[5].any()
+    assert valid[:5].all()
+    assert torch.isfinite(pixels).all()
+    mixed.project(torch.ones(6, 2, 3))  # once
+
+
+def test_what_it_cannot_be_is_told():
+    pinhole, fisheye = models()[0], models()[4]
+    mixed = ct.Mixed([pinhole, fisheye])
+    for wrong, error, match in (
+        ([], ValueError, "empty list"),
+        (3, TypeError, "list of cameras; got int"),
+        ([pinhole, 3], TypeError, r"cameras\[1\] must be a Camera; got int"),
+        ({"left": pinhole}, TypeError, "values"),
+        ([pinhole, fisheye.resize(10, 20)], ValueError, r"one size; got cameras of \(48, 64\), \(10, 20\)"),
+        ([ct.Pinhole(torch.ones(2, 3, 4))], ValueError, r"batch dims \(2, 3\)"),
+        ([pinhole, copy.deepcopy(fisheye).to("meta")], ValueError, "cpu and meta"),
+    ):
+        with pytest.raises(error, match=match):
+            ct.Mixed(wrong)
+    for call, match in (
+        (lambda: mixed.distortion, r"camera\[i\]\.distortion"),
+        (lambda: mixed.convert("fisheye624"), r"by_groups\(lambda group: group.convert"),
+        (lambda: ct.Mixed.from_matrix(torch.eye(3)), r"ct.Mixed\(\[...\]\)"),
+        (lambda: ct.Mixed.from_fov(60, image_size=SIZE), r"ct.Mixed\(\[...\]\)"),
+        (lambda: ct.save(mixed, "mixed.json"), "files hold cameras by name"),
+        (lambda: ct.solve_pnp(mixed, torch.rand(2, 8, 3), torch.rand(2, 8, 2)), r"camera\.groups are batches"),
+        (lambda: ct.calibrate(mixed, torch.rand(9, 3), torch.rand(2, 9, 2) * 40, image_size=SIZE), "camera model"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            call()
+    with pytest.raises(ValueError, match=r"points must be \(\*B, \*N, 3\) with batch dims \*B = \(2,\)"):
+        mixed.project(torch.rand(3, 5, 3))
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_training_on_samples_from_eight_models(workers):
+    """Samples, batches, augmentation, rays, network and loss: a gaze that the images show is learned."""
+    cameras = [camera.float().requires_grad_(False) for camera in one_of_each() if camera.key in EIGHT]
+    assert len(cameras) == 8
+    torch.manual_seed(0)
+    samples = []
+    for i in range(32):
+        gaze = torch.nn.functional.normalize(torch.tensor([*torch.rand(2) - 0.5, 2.0]), dim=0)
+        pixel, _ = cameras[i % 8].project(gaze)
+        spot = (-(cameras[i % 8].pixel_grid() - pixel).square().sum(-1) / 18).exp()
+        samples.append({"image": spot[None], "gaze": gaze, "camera": cameras[i % 8]})
+    loader = DataLoader(samples, 16, shuffle=True, collate_fn=ct.augment.collate, num_workers=workers)
+    augment = ct.augment.RandomCamera(yaw=3, pitch=3, roll=3, distortion=0.01, min_filled=0)
+    network = torch.nn.Sequential(
+        torch.nn.Conv2d(4, 16, 8, 8), torch.nn.ReLU(), torch.nn.Conv2d(16, 1, 1), torch.nn.Flatten(2)
+    )
+    optimizer, losses = torch.optim.Adam(network.parameters(), 0.02), []
+    for _ in range(12):
+        for batch in loader:
+            assert isinstance(batch["camera"], ct.Mixed)
+            batch = augment(batch)
+            rays, _ = batch["camera"].rays(stride=8)  # on the centres of the patches that the network sees
+            maps = torch.cat((torch.nn.functional.max_pool2d(batch["image"], 8), rays.movedim(-1, 1)), 1)
+            wide = torch.nn.functional.interpolate(maps, SIZE, mode="nearest")
+            weight = network(wide).softmax(-1)
+            found = torch.nn.functional.normalize((weight.movedim(1, 2) * rays.flatten(1, 2)).sum(1), dim=-1)
+            loss = (found - batch["gaze"]).norm(dim=-1).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(loss.item())
+    assert sum(losses[-4:]) < 0.5 * sum(losses[:4]), losses

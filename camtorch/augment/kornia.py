@@ -320,7 +320,7 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
     """
     if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
         cameras = collate_cameras(cameras)
-    if not isinstance(cameras, Camera):
+    if not isinstance(cameras, Camera) or cameras.is_mixed:
         raise TypeError("with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size")
     found: list[Params] = []
 

@@ -134,6 +134,9 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
     if not rig.cameras:
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
     for name, camera in rig.cameras.items():
+        if camera.is_mixed:
+            by_name = "ct.Rig({f'camera{i}': one for i, one in enumerate(camera)})"
+            raise TypeError(f"{path}: {name} is a Mixed, and files hold cameras by name: save {by_name}")
         if not camera.key:
             raise TypeError(f"{path}: {name} is a {type(camera).__name__}, which has no key of its own to be loaded by")
     format = _known(format) or _format_of(rig, path)
