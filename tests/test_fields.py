@@ -10,6 +10,7 @@ from test_mixed import one_of_each
 import camtorch as ct
 
 SIZE = (224, 224)
+PIXELS = torch.tensor([[20.0, 40.0], [150.0, 30.0]], dtype=torch.float64)
 FISHEYE = [70.0, 71.0, 111.0, 112.5], [0.05, -0.01, 0.002, 0.0]
 
 
@@ -162,21 +163,27 @@ def test_the_local_pinhole_of_a_pinhole_is_itself():
     assert torch.equal(matrix, eye)
 
 
-def test_local_pinholes_in_compiled_code_in_vmap_and_with_gradients():
-    camera = fisheye().requires_grad_(False)
-    pixels = torch.tensor([[20.0, 40.0], [150.0, 30.0]], dtype=torch.float64)
-    expected = camera.local_pinhole(pixels)
-    mapped = torch.func.vmap(camera.local_pinhole)(pixels)
-    compiled = torch.compile(camera.local_pinhole, fullgraph=True, backend="eager")(pixels)
-    for one, other, wanted in zip(mapped, compiled, expected, strict=True):
+def test_local_pinholes_in_vmap_and_with_gradients():
+    camera, pixels = fisheye().requires_grad_(False), PIXELS
+    for one, wanted in zip(torch.func.vmap(camera.local_pinhole)(pixels), camera.local_pinhole(pixels), strict=True):
         assert (one - wanted).abs().max() < 1e-10
-        assert (other - wanted).abs().max() < 1e-10
 
     def matrices(pixels, intrinsics, distortion):
         return ct.KannalaBrandt(intrinsics, distortion).local_pinhole(pixels)[1]
 
     numbers = [torch.tensor(t, dtype=torch.float64, requires_grad=True) for t in FISHEYE]
-    assert torch.autograd.gradcheck(matrices, (pixels.requires_grad_(), *numbers))
+    assert torch.autograd.gradcheck(matrices, (pixels.clone().requires_grad_(), *numbers))
+
+
+@pytest.mark.slow
+def test_fields_in_compiled_code():
+    camera, pose = fisheye().requires_grad_(False), ct.Extrinsics([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
+
+    def fields(pixels):
+        return *camera.local_pinhole(pixels), *camera.plucker(pose, 32), *camera.perspective_field((0, 1, 0.1), 32)
+
+    for one, wanted in zip(torch.compile(fields, fullgraph=True, backend="eager")(PIXELS), fields(PIXELS), strict=True):
+        assert torch.allclose(one, wanted, atol=1e-10)
 
 
 @pytest.mark.parametrize("level", [True, False])

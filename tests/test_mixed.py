@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 import torch
-from cameras import KEYS, make, real
+from cameras import DISTINCT, KEYS, make, real
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.data import DataLoader
 
@@ -45,7 +45,8 @@ def tensors(camera):
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_one_by_one_to_the_bit_with_gradients(direction):
-    cameras = one_of_each() + one_of_each()[::-1]
+    cameras = one_of_each()
+    cameras += [copy.deepcopy(camera) for camera in cameras[::-1] if camera.key in DISTINCT]
     mixed = ct.Mixed(cameras)
     assert len(mixed.groups) == len(KEYS)
     given = values(DIRECTIONS[direction], len(cameras)).requires_grad_()
@@ -287,17 +288,21 @@ def test_one_model_costs_what_its_batch_does(direction, learns):
 
 
 def test_compiled_where_the_groups_are_fixed():
-    mixed, points = ct.Mixed(models()), torch.randn(6, 3, 3)
-    compiled = torch.compile(mixed.project, fullgraph=True, backend="eager")
-    pixels, valid = compiled(points)
-    assert torch.allclose(pixels, mixed.project(points)[0])
+    pinhole, *_, division = models()
+    mixed, points = ct.Mixed([division, pinhole, division]), torch.randn(3, 3, 3)
+    pixels, valid = torch.compile(mixed.project, fullgraph=True, backend="eager")(points)
+    assert torch.allclose(pixels, mixed.project(points)[0], atol=1e-4)
     assert torch.equal(valid, mixed.project(points)[1])
-    frozen, images = mixed.requires_grad_(False), torch.rand(6, 3, *SIZE)
+
+
+@pytest.mark.slow
+def test_augmentations_are_compiled_too():
+    mixed, images = ct.Mixed([models(learns=False)[i] for i in (4, 0, 5)]), torch.rand(3, 3, *SIZE)
     augment = ct.augment.RandomMount(yaw=2, pitch=2, roll=2, p=0.5)
-    draw = augment.draw(6)
+    draw = augment.draw(3)
 
     def step(images):
-        moved = augment(image=images, camera=frozen, draw=draw)
+        moved = augment(image=images, camera=mixed, draw=draw)
         return moved["image"], moved["camera"].rays(stride=8)[0]
 
     for now, then in zip(torch.compile(step, fullgraph=True, backend="eager")(images), step(images), strict=True):
@@ -367,34 +372,30 @@ def test_what_it_cannot_be_is_told():
 
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_training_on_samples_from_eight_models(workers):
-    """Samples, batches, augmentation, rays, network and loss: a gaze that the images show is learned."""
+    """Samples, batches, augmentation, rays, network and loss: where a spot lies, as a direction, is learned."""
     cameras = [camera.float().requires_grad_(False) for camera in one_of_each() if camera.key in EIGHT]
     assert len(cameras) == 8
     torch.manual_seed(0)
     samples = []
-    for i in range(32):
-        gaze = torch.nn.functional.normalize(torch.tensor([*torch.rand(2) - 0.5, 2.0]), dim=0)
+    for i in range(16):
+        gaze = torch.nn.functional.normalize(torch.tensor([*torch.rand(2) - 0.5, 0.8]), dim=0)
         pixel, _ = cameras[i % 8].project(gaze)
         spot = (-(cameras[i % 8].pixel_grid() - pixel).square().sum(-1) / 18).exp()
         samples.append({"image": spot[None], "gaze": gaze, "camera": cameras[i % 8]})
-    loader = DataLoader(samples, 16, shuffle=True, collate_fn=ct.augment.collate, num_workers=workers)
-    augment = ct.augment.RandomCamera(yaw=3, pitch=3, roll=3, distortion=0.01, min_filled=0)
-    network = torch.nn.Sequential(
-        torch.nn.Conv2d(4, 16, 8, 8), torch.nn.ReLU(), torch.nn.Conv2d(16, 1, 1), torch.nn.Flatten(2)
-    )
-    optimizer, losses = torch.optim.Adam(network.parameters(), 0.02), []
-    for _ in range(12):
+    loader = DataLoader(samples, 8, shuffle=True, collate_fn=ct.augment.collate, num_workers=workers)
+    augment = ct.augment.RandomMount(yaw=3, pitch=3, roll=3, min_filled=0)
+    network = torch.nn.Conv2d(1, 1, 8, 8)  # how much each patch counts
+    optimizer, losses = torch.optim.Adam(network.parameters(), 0.1), []
+    for _ in range(6):
         for batch in loader:
             assert isinstance(batch["camera"], ct.Mixed)
             batch = augment(batch)
-            rays, _ = batch["camera"].rays(stride=8)  # on the centres of the patches that the network sees
-            maps = torch.cat((torch.nn.functional.max_pool2d(batch["image"], 8), rays.movedim(-1, 1)), 1)
-            wide = torch.nn.functional.interpolate(maps, SIZE, mode="nearest")
-            weight = network(wide).softmax(-1)
-            found = torch.nn.functional.normalize((weight.movedim(1, 2) * rays.flatten(1, 2)).sum(1), dim=-1)
+            rays, _ = batch["camera"].rays(stride=8)  # at the centres of the patches that the network sees
+            share = network(batch["image"]).flatten(1).softmax(-1)
+            found = torch.nn.functional.normalize((share[..., None] * rays.flatten(1, 2)).sum(1), dim=-1)
             loss = (found - batch["gaze"]).norm(dim=-1).mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             losses.append(loss.item())
-    assert sum(losses[-4:]) < 0.5 * sum(losses[:4]), losses
+    assert sum(losses[-2:]) < 0.6 * sum(losses[:2]), losses

@@ -239,7 +239,7 @@ def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
     return torch.nan_to_num(lens.at(a, b).orientation, nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
 
 
-_KEPT = 8
+_KEPT = 24  # of a batch of eight models before, while and after it changes
 _domains: list[tuple[str, Tensor, Domain]] = []
 
 
