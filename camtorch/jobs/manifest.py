@@ -6,10 +6,11 @@ in the file, so it never matters whether a line is old.
 
     {"settings": DIGEST, "is": {...}}      what the job was told, as of here
     {"begun": [OUTPUT, ...]}               from here on these files are the job's own
-    {"made": {OUTPUT: HASH, ...}, "of": {INPUT: HASH, ...}, "variant": ..., "settings": DIGEST, "result": ...}
+    {"made": {OUTPUT: SUM, ...}, "of": {INPUT: HASH, ...}, "variant": ..., "settings": DIGEST, "result": ...}
     {"failed": [OUTPUT, ...], "reason": ...}
 
-Outputs are relative to the folder. Hashes are of files, BLAKE2b, 16 bytes, hexadecimal.
+Outputs are relative to the folder. Hashes are of files, BLAKE2b, 16 bytes, hexadecimal. A sum is "SIZE-CRC32": it
+has to tell what befell a file by accident, and takes a fifth of the time.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ import errno
 import hashlib
 import json
 import os
+import zlib
 from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from camtorch.io.hashing import hash_of
 from camtorch.jobs.items import Item, Json, Shard
 
 try:
@@ -61,7 +62,7 @@ class Terms:
 
     def record(self, item: Item, hashes: dict[str, str], result: Json) -> dict[str, Json]:
         """A line about an item whose outputs were made of inputs with these hashes."""
-        made = {self.name(path): hash_of(path) for path in item.outputs}
+        made = {self.name(path): _sum_of(path) for path in item.outputs}
         return {"made": made, "of": hashes, "variant": item.variant, "settings": self.settings, "result": result}
 
     def standing(self, item: Item, records: list[dict[str, Json]], hashes: dict[str, str]) -> dict[str, Json] | None:
@@ -70,8 +71,16 @@ class Terms:
         fitting = [line for line in records if (list(line["of"].values()), line["variant"], line["settings"]) == wanted]
         if not fitting or not all(path.is_file() for path in item.outputs):
             return None
-        made = {self.name(path): hash_of(path) for path in item.outputs}
+        made = {self.name(path): _sum_of(path) for path in item.outputs}
         return next((line for line in fitting if line["made"] == made), None)
+
+
+def _sum_of(path: Path) -> str:
+    size = found = 0
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            size, found = size + len(block), zlib.crc32(block, found)
+    return f"{size}-{found:08x}"
 
 
 class Manifest:

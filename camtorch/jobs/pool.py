@@ -7,8 +7,10 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+import types
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import connection, forkserver
 from multiprocessing.connection import Connection
@@ -28,7 +30,19 @@ def prepare(modules: Sequence[str]) -> None:
     """Have these modules imported, once for all processes of pools to come, while this one does something else."""
     if _HOW == "forkserver":
         multiprocessing.set_forkserver_preload([__name__, *modules])
-        forkserver.ensure_running()
+        with _without_main():
+            forkserver.ensure_running()
+
+
+@contextlib.contextmanager
+def _without_main() -> Iterator[None]:
+    """New processes do not run the script of this one, which they do not need, and which may start processes itself."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def run(
@@ -127,10 +141,11 @@ class _Pool:
         with there:
             arguments = there, self._work, os.getcwd()
             process = self._context.Process(target=_serve, args=arguments, daemon=True)  # type: ignore[attr-defined]
-            process.start()
+            with _without_main():
+                process.start()
         self._workers.append(_Worker(process, here))
 
-    def run(self, tasks: Any, receive: Callable[[Any, str, Any], None]) -> None:
+    def run(self, tasks: Iterator[Any], receive: Callable[[Any, str, Any], None]) -> None:
         left = True
         while left or any(worker.is_busy for worker in self._workers):
             while left and len(self._workers) < self._count:
