@@ -63,7 +63,8 @@ def carry_out(
     if arguments.dry_run:
         return _dry_run(items, faults, manifest, arguments.resume), None
     shard = manifest.shard
-    bar = Bar(doing if shard.count == 1 else f"{doing}, shard {shard.rank + 1} of {shard.count}", units)
+    part = "" if shard.count == 1 else f", shard {shard.rank + 1} of {shard.count}"
+    bar = Bar(doing + part, units)
     try:
         with manifest:
             report = run.run(
@@ -89,7 +90,7 @@ def carry_out(
         parts.append(f"{report.kept} were there already")
     if failed:
         parts.append(f"{len(failed)} failed")
-    print(f"{manifest.folder}: {'; '.join(parts)}")
+    print(f"{manifest.folder}{part}: {'; '.join(parts)}")
     return (1 if failed else 0), report
 
 

@@ -87,7 +87,8 @@ def _below(
     except OSError:
         skipped = None
     found: list[Found] = []
-    waiting: list[tuple[Path, Path, frozenset[tuple[int, int]]]] = [(root, place, frozenset())]
+    around = [os.stat(parent) for parent in root.resolve().parents]
+    waiting = [(root, place, frozenset((status.st_dev, status.st_ino) for status in around))]
     while waiting:
         folder, place, above = waiting.pop()
         try:

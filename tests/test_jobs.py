@@ -1,0 +1,326 @@
+"""Many files at once: what is found, what is kept, what is made anew, and processes that die."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from copying import Doubling
+
+from camtorch.io.writing import all_left_over
+from camtorch.jobs import inputs, items
+from camtorch.jobs.items import Item, Shard
+from camtorch.jobs.manifest import Manifest
+from camtorch.jobs.run import pending, run
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, with files in folders."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("in/10.jpg", "in/2.JPG", "in/deep/1.png", "in/deep/notes.txt", "in/.hidden.jpg", "in/.git/3.jpg"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(name)
+    return tmp_path
+
+
+def found(*words, output="out"):
+    there = inputs.find(words, inputs.IMAGES, Path(output))
+    return {str(one.path): str(one.place) for one in there.files}, dict(there.faults)
+
+
+# -- inputs
+
+
+def test_a_folder_is_a_tree(folder):
+    # 2 before 10
+    files, faults = found("in")
+    assert list(files.items()) == [
+        ("in/2.JPG", "2.JPG"),
+        ("in/10.jpg", "10.jpg"),
+        ("in/deep/1.png", "deep/1.png"),
+    ]
+    assert faults == {}
+
+
+def test_several_words_keep_their_names(folder):
+    files, _ = found("in/deep", "in/2.JPG", "in/2.JPG")
+    assert files == {"in/2.JPG": "2.JPG", "in/deep/1.png": "deep/1.png"}
+
+
+def test_a_pattern_keeps_the_tree_below_its_folder(folder):
+    assert found("in/**/*")[0] == {"in/2.JPG": "2.JPG", "in/10.jpg": "10.jpg", "in/deep/1.png": "deep/1.png"}
+    assert found("in/d*/*")[0] == {"in/deep/1.png": "deep/1.png"}
+    Path("in/[1].jpg").write_text("the name of a file, not a pattern")
+    assert found("in/[1].jpg")[0] == {"in/[1].jpg": "[1].jpg"}
+
+
+def test_outputs_are_not_read_again(folder):
+    Path("in/out").mkdir()
+    Path("in/out/2.JPG").write_text("made")
+    for word in ("in", "in/**/*", "."):
+        assert not any("out" in name for name in found(word, output="in/out")[0])
+    assert found("in/out", output="in/out")[0] == {"in/out/2.JPG": "2.JPG"}  # and is refused by `items.check`
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["none"], "none: no such file or folder"),
+        (["in/*.gif"], "in/.*gif: no file of a known type"),
+        (["in/empty"], "in/empty: nothing in there ends in .bmp"),
+    ],
+)
+def test_words_that_mean_nothing(folder, words, text):
+    Path("in/empty").mkdir()
+    with pytest.raises(ValueError, match=text):
+        found(*words)
+
+
+def test_links(folder):
+    Path("elsewhere").mkdir()
+    Path("elsewhere/5.jpg").touch()
+    Path("in/there").symlink_to("../elsewhere")
+    Path("in/deep/up").symlink_to("..")
+    Path("in/me").symlink_to("me")
+    Path("in/gone.jpg").symlink_to("nowhere.jpg")
+    Path("in/gone.txt").symlink_to("nowhere.txt")
+    os.mkfifo("in/pipe.jpg")
+    files, faults = found("in")
+    assert files.keys() == {"in/2.JPG", "in/10.jpg", "in/deep/1.png", "in/there/5.jpg"}
+    assert {str(path): reason for path, reason in faults.items()} == {
+        "in/deep/up": "a link to a folder that it lies in",
+        "in/gone.jpg": "No such file or directory",
+        "in/me": "a link to itself",
+        "in/pipe.jpg": "not an ordinary file",
+    }
+    assert found("in/**/*.jpg")[0].keys() == {"in/10.jpg", "in/there/5.jpg"}
+
+
+def test_outputs_that_would_be_lost(folder):
+    one, other = (Item((Path(name),), (Path("out/x.png"),)) for name in ("in/2.JPG", "in/10.jpg"))
+    with pytest.raises(ValueError, match=r"in/2.JPG and in/10.jpg would both be written to out/x.png"):
+        items.check([one, other])
+    Path("link").symlink_to("in")
+    with pytest.raises(ValueError, match=r"link/2.JPG: would overwrite in/2.JPG, which is read"):
+        items.check([Item((Path("in/2.JPG"),), (Path("link/2.JPG"),))])
+    with pytest.raises(ValueError, match=r"would overwrite in/10.jpg"):
+        items.check([Item((Path("in/2.JPG"),), (Path("in/10.jpg"),))], [Path("in/10.jpg")])
+
+
+# -- shards
+
+
+@pytest.mark.parametrize(
+    ("environment", "shard"),
+    [
+        ({}, Shard()),
+        ({"WORLD_SIZE": "1"}, Shard()),
+        ({"RANK": "1", "WORLD_SIZE": "3", "LOCAL_WORLD_SIZE": "2"}, Shard(1, 3, 2)),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard(0, 4)),
+        ({"SLURM_NTASKS": "4"}, Shard()),  # a script that sbatch runs, and no step of it
+        ({"RANK": "0", "WORLD_SIZE": "2", "SLURM_PROCID": "3", "SLURM_NTASKS": "4"}, Shard(0, 2)),
+    ],
+)
+def test_shards(environment, shard):
+    assert Shard.of_environment(environment) == shard
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [{"WORLD_SIZE": "2"}, {"RANK": "2", "WORLD_SIZE": "2"}, {"RANK": "-1", "WORLD_SIZE": "2"}, {"RANK": "0"}],
+)
+def test_shards_that_are_none(environment):
+    with pytest.raises(ValueError, match="which shard"):
+        Shard.of_environment(environment)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_shards_are_the_whole(count):
+    parts = [Shard(rank, count).of(range(5)) for rank in range(count)]
+    assert sorted(number for part in parts for number in part) == list(range(5))
+
+
+# -- jobs
+
+
+def jobs_of(texts):
+    """Items whose inputs say that, in order of their names."""
+    Path("in").mkdir(exist_ok=True)
+    made = []
+    for name, text in sorted(texts.items()):
+        Path("in", name).write_text(text)
+        made.append(Item((Path("in", name),), (Path("out", name), Path("out/more", name))))
+    return made
+
+
+def carried_out(todo, *, settings=0, shard=None, **options):
+    with Manifest(Path("out"), "doubling", settings, shard) as manifest:
+        return run(todo, Doubling(), manifest, **options)
+
+
+def contents():
+    """Of all files but the accounts."""
+    files = [path for path in Path("out").rglob("*") if path.is_file() and not path.name.startswith(".camtorch")]
+    return {str(path.relative_to("out")): path.read_text() for path in files}
+
+
+@pytest.fixture
+def empty(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_job_goes_on(empty):
+    todo = jobs_of({"a": "1", "b": "fail", "c": "3", "d": "note"})
+    seen = []
+    report = carried_out(todo, watch=lambda progress: seen.append((progress.done, progress.total)))
+    assert (report.made, report.kept) == (3, 0)
+    assert report.failed == [("in/b", "it says so")]
+    assert report.notes == {"is a note": ["in/d"]}
+    assert list(report.results.values()) == [{"size": 2}, {"size": 2}, {"size": 8}]
+    assert seen == [(0.5, 4), (1, 4), (2, 4), (2.5, 4), (3, 4), (3.5, 4), (4, 4)]
+    assert contents() == {"a": "11", "c": "33", "d": "notenote", "more/a": "11", "more/c": "33", "more/d": "notenote"}
+    with pytest.raises(FileExistsError, match="out/a: exists already, and 5 more of 8"):
+        carried_out(todo)
+    Path("in/b").write_text("2")
+    times = {name: Path("out", name).stat().st_mtime_ns for name in contents()}
+    report = carried_out(todo, resume=True)
+    assert (report.made, report.kept, report.failed) == (1, 3, [])
+    assert {name: Path("out", name).stat().st_mtime_ns for name in times} == times
+    assert list(report.results.values()) == [{"size": 2}, {"size": 2}, {"size": 2}, {"size": 8}]
+    assert contents()["b"] == "22"
+
+
+@pytest.mark.parametrize("change", ["input", "settings", "variant", "output", "gone", "account"])
+def test_what_has_changed_is_made_anew(empty, change):
+    todo = jobs_of({"a": "1", "b": "2"})
+    carried_out(todo)
+    settings = 0
+    if change == "input":
+        Path("in/a").write_text("9")
+    elif change == "settings":
+        settings = {"other": 1.5}
+    elif change == "variant":
+        todo[0] = Item(todo[0].inputs, todo[0].outputs, variant="seed 7")
+    elif change == "output":
+        Path("out/more/a").write_text("1?")
+    elif change == "gone":
+        Path("out/a").unlink()
+    else:  # cut off in the middle of what it says of b, as by a crash
+        (account,) = Path("out").glob(".camtorch*")
+        account.write_bytes(account.read_bytes()[:-40])
+    with Manifest(Path("out"), "doubling", settings) as manifest:
+        again = [item.name for item in pending(todo, manifest, resume=True)]
+    assert again == {"settings": ["in/a", "in/b"], "account": ["in/b"]}.get(change, ["in/a"])
+    report = carried_out(todo, settings=settings, resume=True)
+    assert (report.made, report.kept) == (len(again), 2 - len(again))
+    first = {"input": "99", "variant": "11seed 7"}.get(change, "11")
+    assert contents() == {"a": first, "more/a": first, "b": "22", "more/b": "22"}
+    assert carried_out(todo, settings=settings, resume=True).kept == 2
+
+
+def test_what_is_not_of_the_job_is_not_overwritten(empty):
+    todo = jobs_of({"a": "1", "b": "2"})
+    Path("out").mkdir()
+    Path("out/a").write_text("mine")
+    for _ in range(2):  # nor is it later
+        report = carried_out(todo, resume=True)
+        assert report.failed == [("in/a", "out/a exists already, and is not of this job")]
+        assert Path("out/a").read_text() == "mine"
+    assert carried_out(todo, resume=True, force=True).made == 1
+    assert Path("out/a").read_text() == "11"
+
+
+def test_shards_know_of_each_other(empty):
+    todo = jobs_of({name: name for name in "abcde"})
+    for rank in range(2):
+        shard = Shard(rank, 2)
+        assert carried_out(shard.of(todo), shard=shard).failed == []
+    assert len(contents()) == 10
+    assert carried_out(todo, resume=True).kept == 5
+    assert carried_out(Shard(1, 3).of(todo), shard=Shard(1, 3), resume=True).kept == 2
+
+
+def test_nobody_does_the_same_at_the_same_time(empty):
+    with Manifest(Path("out"), "doubling", 0):
+        with pytest.raises(BlockingIOError, match="another process does this right now"):
+            carried_out([])
+        with Manifest(Path("out"), "doubling", 0, Shard(0, 2)), Manifest(Path("out"), "other", 0):
+            pass
+
+
+@pytest.mark.slow
+def test_what_a_crash_left_is_removed(empty):
+    todo = jobs_of({"a" * 30 + "1": "1", "a" * 30 + "2": "wait"})
+    code = (
+        "from copying import *; from test_jobs import *; "
+        "carried_out(jobs_of({'a' * 30 + '1': '1', 'a' * 30 + '2': 'wait'}))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)})
+    try:
+        while not Path("out/waiting").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+    finally:
+        process.kill()
+        process.wait()
+    Path("out/waiting").unlink()
+    outputs = [os.path.realpath(path) for item in todo for path in item.outputs]
+    assert len(all_left_over(outputs)) == 1
+    assert all_left_over(outputs[:2]) == []  # another name that begins alike
+    Path("in", "a" * 30 + "2").write_text("2")
+    report = carried_out(todo, resume=True)
+    assert (report.made, report.kept) == (1, 1)
+    assert all_left_over(outputs) == []
+    assert len(contents()) == 4
+
+
+def test_a_process_that_dies_takes_its_item_along(empty):
+    todo = jobs_of({"a": "1", "b": "die", "c": "fail", "d": "note", "e": "5"})
+    report = carried_out(todo, processes=2)
+    assert report.made == 3
+    assert report.failed == [("in/b", "the process at work on it was killed by SIGKILL"), ("in/c", "it says so")]
+    assert report.notes == {"is a note": ["in/d"]}
+    assert contents().keys() == {"a", "d", "e", "more/a", "more/d", "more/e"}
+    lines = [json.loads(line) for line in Path("out/.camtorch-doubling.jsonl").read_text().splitlines()]
+    assert sorted(line["failed"] for line in lines if "failed" in line) == [["b", "more/b"], ["c", "more/c"]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_processes_end_with_who_started_them(empty, number):
+    code = (
+        "from copying import *; from test_jobs import *; import multiprocessing as m; "
+        "carried_out(jobs_of({'a': 'wait', 'b': 'wait', 'c': '3'}), processes=2)"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE, text=True,
+                               start_new_session=True)  # fmt: skip
+    try:
+        while not Path("out/waiting").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(0.5)
+        process.send_signal(number)
+        process.wait(15)
+    finally:
+        process.kill()
+    begin = time.monotonic()
+    while time.monotonic() < begin + 15:  # until nobody of them is there
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            break
+        time.sleep(0.05)
+    else:
+        os.killpg(process.pid, signal.SIGKILL)
+        pytest.fail("processes that stay")
+    assert contents() == {"waiting": ""} or number == signal.SIGKILL  # what an interrupt leaves is in order
+    if number == signal.SIGINT:
+        assert "KeyboardInterrupt" in process.stderr.read()
+    process.stderr.close()
