@@ -50,6 +50,7 @@ from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
 from camtorch.warp import views
 from camtorch.warp.dewarp import Dewarp
+from camtorch.warp.light import vignetting
 from camtorch.warp.plane import BirdsEye, PlaneWarp
 from camtorch.warp.reproject import Reproject
 from camtorch.warp.shutter import RollingShutter
@@ -121,5 +122,6 @@ __all__ = [
     "surround",
     "triangulate",
     "views",
+    "vignetting",
     "write_report",
 ]

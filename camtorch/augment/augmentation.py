@@ -22,6 +22,7 @@ from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_wo
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, kind
 from camtorch.warp.sampling import as_options
+from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
 
 _FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
@@ -354,7 +355,7 @@ class Augmentation(SampleTransform):
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_too_few(found, self.min_filled)
-        warp = self._warp(source, target, rotation)
+        warp = self._warp(source, target, rotation, self._shutter(values))
         return Part(rows, warp, source, *self._seen_through(warp, values))
 
     def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -366,8 +367,14 @@ class Augmentation(SampleTransform):
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
 
-    def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
-        return Warp(source, target, rotation, **self.options)
+    def _warp(
+        self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
+    ) -> Warp:
+        return Warp(source, target, rotation, **self.options, target_shutter=shutter)
+
+    def _shutter(self, values: Mapping[str, Tensor]) -> RollingShutter | None:
+        """By which the new images are taken."""
+        return None
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         """What the lens does to colours and light: `shades` and `light` of the part of a batch."""

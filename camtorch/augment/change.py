@@ -59,20 +59,24 @@ def _rows_of_warp(warp: Warp, camera: Camera, index: Tensor) -> Warp:
     if isinstance(warp, AffineWarp):
         matrix = warp.matrix if warp.matrix.ndim == 2 else warp.matrix[index]
         return AffineWarp(camera, target, matrix, rotation, **warp.options)
-    return (MirrorWarp if isinstance(warp, MirrorWarp) else Warp)(camera, target, rotation, **warp.options)
+    shutters = {name: each and each.rows_of(index) for name, each in warp.shutters.items()}
+    kind_of_warp = MirrorWarp if isinstance(warp, MirrorWarp) else Warp
+    return kind_of_warp(camera, target, rotation, **warp.options, **shutters)
 
 
 def _joined(a: Part, b: Part) -> Part:
     """One part that does with one warp what two do one after the other.
 
     Raises:
-        ValueError: the colours or the light of a lens seen through another one.
+        ValueError: the colours or the light of a lens seen through another one, or a shutter before the last warp.
     """
     if b.warp is None:
         return a
     first = a.warp
     if first is None:
         return replace(b, rows=a.rows, camera=a.camera)
+    if first.target_shutter is not None:
+        raise ValueError("Compose: what comes after a rolling shutter or an exposure would move its rows; rates go last")
     rotation = _both_turns(first.rotation, b.warp.rotation)
     if not isinstance(b.warp, AffineWarp):
         if a.shades is not None or a.light is not None:
@@ -82,7 +86,7 @@ def _joined(a: Part, b: Part) -> Part:
             )
 
         def of(warp: Warp) -> Warp:
-            return MirrorWarp(a.camera, warp.target, rotation)
+            return MirrorWarp(a.camera, warp.target, rotation, **warp.shutters)
 
         shades = None if b.shades is None else (of(b.shades[0]), of(b.shades[1]))
         return Part(a.rows, of(b.warp), a.camera, shades, b.light)
@@ -102,7 +106,7 @@ def _joined(a: Part, b: Part) -> Part:
 def _optioned(warp: Warp, options: Options) -> Warp:
     if isinstance(warp, AffineWarp):
         return AffineWarp(warp.source, warp.target, warp.matrix, warp.rotation, **options)
-    return MirrorWarp(warp.source, warp.target, warp.rotation, **options)
+    return MirrorWarp(warp.source, warp.target, warp.rotation, **options, **warp.shutters)
 
 
 def _both_turns(first: Tensor | None, second: Tensor | None) -> Tensor | None:

@@ -24,6 +24,8 @@ from camtorch.projection.domain import Domain, domain_of, keep
 from camtorch.projection.rays import field_of_view, image_lattice
 from camtorch.projection.unproject import shown
 from camtorch.rotations import mount_rotation
+from camtorch.warp.light import vignetting
+from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp, along_edges
 
 RangeLike = float | Sequence[float]
@@ -74,6 +76,13 @@ class RandomCamera(Augmentation):
             green. Shown by images of three channels, taken as red, green, blue.
         vignetting: the part of the light that is lost in the image's farthest corner; it grows with the square of
             the distance from the principal point.
+        cos4: natural vignetting: the light falls by this power of cos^4 of a pixel's angle to the axis; 1 is the law,
+            fisheyes have less, below 0 it is undone. See `ct.vignetting`.
+        rates: degrees per second by which the new camera turns while it takes its image: about x (up), y (right) and
+            z (clockwise), each drawn for itself. What comes of it say readout and exposure, of which one is needed. See
+            `RollingShutter`; points in space, gaze and poses are of the middle of the readout.
+        readout: seconds from the first row of a rolling shutter to the last; below 0 it reads from the bottom up.
+        exposure: seconds for which a row gathers light, which blurs images. Labels are of its middle.
         image_size: (height, width) to come out; the sample's by default. Fields of view are those in width.
         options: p, same_on_batch, camera, fields, mode, padding_mode, fill, antialias, tolerance, mask_fill, valid_mask
             and min_filled; see `Augmentation`.
@@ -103,6 +112,10 @@ class RandomCamera(Augmentation):
         crop: RangeLike | None = _CROP,
         chromatic: RangeLike | None = None,
         vignetting: RangeLike | None = None,
+        cos4: RangeLike | None = None,
+        rates: RangeLike | None = None,
+        readout: RangeLike | None = None,
+        exposure: RangeLike | None = None,
         image_size: tuple[int, int] | None = None,
         **options: Any,
     ):
@@ -133,8 +146,17 @@ class RandomCamera(Augmentation):
             "place": (None if crop is None else (0, 1), {"size": 2}),
             "chromatic": (chromatic, {"least": -0.5, "most": 0.5, "size": 2}),
             "vignetting": (_pair(vignetting), {"least": 0, "most": 1}),
+            "cos4": (_pair(cos4), {"least": -2, "most": 2}),
+            "rates": (rates, {"least": -3600, "most": 3600, "size": 3}),
+            "readout": (_pair(readout), {"least": -1, "most": 1}),
+            "exposure": (_pair(exposure), {"least": 0, "most": 1}),
         }
         self.ranges = {n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None}
+        if ("rates" in self.ranges) != bool({"readout", "exposure"} & set(self.ranges)):
+            raise ValueError(
+                f"{self._name}: rates, in degrees per second, show by a readout or an exposure, in seconds, and those "
+                f"by rates; got rates={rates!r}, readout={readout!r}, exposure={exposure!r}"
+            )
         among = self.ranges.pop("fov", None) if self._is_real else None
         self._among = None if among is None else (among.low, among.high)
 
@@ -158,10 +180,21 @@ class RandomCamera(Augmentation):
         shades = light = None
         if "chromatic" in values:
             red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
-            shades = self._warp(warp.source, red, warp.rotation), self._warp(warp.source, blue, warp.rotation)
+            how = warp.rotation, warp.target_shutter
+            shades = self._warp(warp.source, red, *how), self._warp(warp.source, blue, *how)
         if "vignetting" in values:
             light = _light(warp.target, values["vignetting"])
+        if "cos4" in values:
+            natural = vignetting(warp.target, values["cos4"])
+            light = natural if light is None else light * natural
         return shades, light
+
+    def _shutter(self, values: Mapping[str, Tensor]) -> RollingShutter | None:
+        if "rates" not in values:
+            return None
+        return RollingShutter(
+            values.get("readout", 0.0), torch.deg2rad(values["rates"]), exposure=values.get("exposure", 0.0)
+        )
 
     def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
         size = self.image_size or size_of(source)

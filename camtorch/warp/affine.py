@@ -14,6 +14,7 @@ from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
 from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, narrow, render, widen
+from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
 
 SHRINKS = 1.5
@@ -59,7 +60,7 @@ class MirrorWarp(Warp):
         fill: Fill | None = None,
     ) -> Tensor:
         """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
-        if self._decides and not torch.compiler.is_compiling() and not in_transform():
+        if self._decides and not self._moments() and not torch.compiler.is_compiling() and not in_transform():
             sampled = self._checked(images, mode, padding_mode, fill)
             inputs = self._inputs()
             smooth = sampled[0] != "nearest" and images.dtype != torch.bool
@@ -115,7 +116,11 @@ class MirrorWarp(Warp):
     def inverse(self) -> Warp:
         """The warp from target to source."""
         rotation = None if self.rotation is None else self.rotation.mT
-        return MirrorWarp(self.target, self.source, rotation, **self.options)
+        return MirrorWarp(self.target, self.source, rotation, **self.options, **self._shutters_back)
+
+    def _at(self, shutter: RollingShutter) -> Warp:
+        shutters = {**self.shutters, "target_shutter": shutter}
+        return MirrorWarp(self.source, self.target, self.rotation, **self.options, **shutters)
 
 
 class AffineWarp(MirrorWarp):

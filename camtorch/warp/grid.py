@@ -21,7 +21,7 @@ OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its i
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 _STRIP = 1 << 19  # pixels
 _FEWEST = 8  # cells along a side from which on a lattice pays
-_STEP = 8  # pixels between the nodes of a lattice
+STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
 _MARGIN = 0.05  # of half an image: what lies beyond is not sampled
 _MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
@@ -91,18 +91,18 @@ class Lattice:
         """Pixel by pixel."""
         height, width = self.size
         _, n, m = self.cells.shape
-        planes = _interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
-        blocks = planes.unflatten(2, (n, _STEP)).unflatten(4, (m, _STEP))
+        planes = interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+        blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
         some = self.cells != EMPTY
         camera, i, j = (~some).nonzero(as_tuple=True)
         blocks[camera, :, i, :, j] = OUTSIDE
-        seen = some[:, :, None, :, None].expand(-1, -1, _STEP, -1, _STEP).flatten(3, 4).flatten(1, 2)
+        seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
         camera, i, j = (self.cells >= 0).nonzero(as_tuple=True)
         if len(camera):
             exact = self.exact[:, self.cells[camera, i, j].long()].transpose(0, 1)  # (K, 2, 8, 8)
             known = ~exact[:, 0].isnan()
             blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
-            seen.unflatten(1, (n, _STEP)).unflatten(3, (m, _STEP))[camera, i, :, j] = known
+            seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
         return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
 
 
@@ -278,7 +278,7 @@ def on_lattice(
             "border" draws in, keep no tolerance. For "reflection" all do, and so serve every padding.
     """
     like, (height, width) = _like(target), (len(rows), target._size("Warp")[1])
-    n, m = math.ceil(height / _STEP), math.ceil(width / _STEP)  # cells
+    n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
     if min(n, m) < _FEWEST:
         return None
     keeps = in_memory(like) and (n + 5) * (m + 5) <= _MOST_KEPT
@@ -294,7 +294,7 @@ def on_lattice(
         classes = classify(probed._replace(nodes=lattice.float()))
     cells, most = classes or _classified(probed)
     if not most:
-        return Lattice(lattice, cells, like.new_empty(2, 0, _STEP, _STEP), (height, width))
+        return Lattice(lattice, cells, like.new_empty(2, 0, STEP, STEP), (height, width))
     todo = cells == TODO
     smooth = todo & _smooth(lattice, mapped_nodes, size, tolerance)
     if not bool(rim.all()):  # at the rim of the target the nodes do not tell all
@@ -332,7 +332,7 @@ def _looks(rows: range, width: int, like: Tensor) -> Tensor:
     """(N, 2): the nodes of a lattice, and the pixels at the rim of the target, which may tell what nodes do not."""
     # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
     v, u = (
-        (torch.arange(math.ceil(side / _STEP) + 5, dtype=like.dtype, device=like.device) - 2) * _STEP
+        (torch.arange(math.ceil(side / STEP) + 5, dtype=like.dtype, device=like.device) - 2) * STEP
         for side in (len(rows), width)
     )
     nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
@@ -364,20 +364,20 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
         todo: (B, n, m) bool, those to begin with: where what is mapped ends in one, its neighbours follow.
         like: a tensor of the dtype to compute in.
     """
-    parts, count = [like.new_empty(2, 0, _STEP, _STEP)], 0
+    parts, count = [like.new_empty(2, 0, STEP, STEP)], 0
     done, places = torch.zeros_like(todo), cells.flatten(1)
-    offset = torch.arange(_STEP, dtype=like.dtype, device=like.device)
+    offset = torch.arange(STEP, dtype=like.dtype, device=like.device)
     while bool(todo.any()):
         # as many cells of every camera as the one with the most has: more of them computed does no harm
         most = int(todo.sum((1, 2)).max())
         chosen = todo.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
         wanted = todo.flatten(1).gather(1, chosen)
         i, j = chosen // todo.shape[2], chosen % todo.shape[2]
-        down, across = (i[..., None, None] * _STEP + offset[:, None]), (j[..., None, None] * _STEP + offset)
+        down, across = (i[..., None, None] * STEP + offset[:, None]), (j[..., None, None] * STEP + offset)
         pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, most, 8, 8, 2)
         positions, known = exact(pixels.flatten(2, 3))
         part = torch.where(known, positions.movedim(-1, 0), torch.nan)
-        parts.append(part.flatten(1, 2).unflatten(-1, (_STEP, _STEP)))
+        parts.append(part.flatten(1, 2).unflatten(-1, (STEP, STEP)))
         place = torch.arange(count, count + chosen.numel(), dtype=cells.dtype, device=cells.device).view_as(chosen)
         places.scatter_(1, chosen, torch.where(wanted, place, places.gather(1, chosen)))
         count += chosen.numel()
@@ -409,7 +409,7 @@ def _classified(probed: Probed) -> tuple[Tensor, int]:
     sampled = near.all(1) if padding == "zeros" else every
     todo = some & (~every | (sampled & (torch.hypot(*missed.unbind(1)) > tolerance)))
     # where a pixel at the rim says that nodes do not tell all
-    v, u = (torch.arange(side, device=nodes.device) // _STEP for side in size)
+    v, u = (torch.arange(side, device=nodes.device) // STEP for side in size)
     top, left = torch.zeros_like(u), torch.zeros_like(v)
     i, j = torch.cat((top, top + v[-1], v, v)), torch.cat((u, u, left, left + u[-1]))
     camera, pixel = (rim != some[:, i, j]).nonzero(as_tuple=True)
@@ -483,16 +483,16 @@ def _quintic(nodes: Tensor, camera: Tensor, i: Tensor, j: Tensor) -> Tensor:
     flat = nodes.contiguous().flatten()
     windows = torch.stack([flat.index_select(0, place + axis * height * width) for axis in (0, 1)])
     windows = windows.to(torch.promote_types(nodes.dtype, wide)).unflatten(1, (-1, 36))
-    t = torch.arange(_STEP, dtype=torch.float64, device=nodes.device)[:, None] / _STEP
+    t = torch.arange(STEP, dtype=torch.float64, device=nodes.device)[:, None] / STEP
     at = range(-2, 4)
     terms = [reduce(torch.mul, [(t - b) / (a - b) for b in at if b != a]) for a in at]
     weights = torch.cat(terms, 1)  # (8, 6)
     with torch.autocast(nodes.device.type, enabled=False):
         planes = windows @ torch.kron(weights, weights).T.to(windows)
-    return planes.to(nodes.dtype).unflatten(-1, (_STEP, _STEP))
+    return planes.to(nodes.dtype).unflatten(-1, (STEP, STEP))
 
 
-def _interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
+def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     """(B, 2, rows + 3, columns + 3) to (B, 2, 8 rows, 8 columns)."""
     weights = _weights(nodes)
     terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
@@ -500,22 +500,22 @@ def _interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     # torch may be told to multiply matrices in less than float32
     wide = torch.float32 if torch.get_float32_matmul_precision() == "highest" else torch.float64
     lines = lines.to(torch.promote_types(lines.dtype, wide))
-    result = nodes.new_empty(*lines.shape[:-1], columns * _STEP)
-    cells = _BLOCK // _STEP
-    spread = lines.new_zeros(cells + 3, cells, _STEP)
+    result = nodes.new_empty(*lines.shape[:-1], columns * STEP)
+    cells = _BLOCK // STEP
+    spread = lines.new_zeros(cells + 3, cells, STEP)
     for cell in range(cells):
         spread[cell : cell + 4, cell] = weights.T
     with torch.autocast(nodes.device.type, enabled=False):
         for first in range(0, columns, cells):
             n = min(cells, columns - first)
             block = lines[..., first : first + n + 3] @ spread[: n + 3, :n].flatten(1)
-            result[..., first * _STEP : (first + n) * _STEP] = block
+            result[..., first * STEP : (first + n) * STEP] = block
     return result
 
 
 def _weights(like: Tensor) -> Tensor:
     """(8, 4): of the nodes at -1, 0, 1, 2 in the cubic through them, at 0, 1/8, ..., 7/8."""
-    t = torch.arange(_STEP, dtype=torch.float64, device=like.device) / _STEP
+    t = torch.arange(STEP, dtype=torch.float64, device=like.device) / STEP
     before, at, after, beyond = t + 1, t, t - 1, t - 2
     terms = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
     return torch.stack(terms, -1).to(like.dtype)

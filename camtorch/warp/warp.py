@@ -174,10 +174,8 @@ class Warp(GeometryModule):
             ValueError: another shape or size. TypeError: no tensor, or a complex one.
         """
         sampled = self._checked(images, mode, padding_mode, fill)
-        if self.target_shutter is not None and sampled[0] != "nearest":
-            moments = self.target_shutter.moments(self.target)
-            if moments:
-                return averaged(images, [self._at(moment) for moment in moments], self.target_shutter.gamma, *sampled)
+        if sampled[0] != "nearest" and self.target_shutter is not None and (moments := self._moments()):
+            return averaged(images, [self._at(moment) for moment in moments], self.target_shutter.gamma, *sampled)
         inputs = self._inputs()
         learns = images.is_floating_point() and self._learns(inputs)
         if self._is_operator() and not learns and compiled.takes(images, inputs):
@@ -375,6 +373,10 @@ class Warp(GeometryModule):
         """Source and target, each behind its shutter."""
         return in_motion(self.source, self.shutter), in_motion(self.target, self.target_shutter)
 
+    def _moments(self) -> list[RollingShutter]:
+        """Of an exposure that blurs."""
+        return [] if self.target_shutter is None else self.target_shutter.moments(self.target)
+
     def _at(self, shutter: RollingShutter) -> Warp:
         """This warp at a moment of the exposure."""
         return Warp(
@@ -467,8 +469,16 @@ class Warp(GeometryModule):
     def inverse(self) -> Warp:
         """The warp from target to source. What lay outside the image, or between its pixels, stays lost."""
         rotation = None if self.rotation is None else self.rotation.mT
-        shutters = {"shutter": self.target_shutter, "target_shutter": self.shutter}
-        return Warp(self.target, self.source, rotation, **self.options, **shutters)
+        return Warp(self.target, self.source, rotation, **self.options, **self._shutters_back)
+
+    @property
+    def shutters(self) -> dict[str, RollingShutter | None]:
+        """Of source and target, as another Warp takes them."""
+        return {"shutter": self.shutter, "target_shutter": self.target_shutter}
+
+    @property
+    def _shutters_back(self) -> dict[str, RollingShutter | None]:
+        return {"shutter": self.target_shutter, "target_shutter": self.shutter}
 
     @property
     def options(self) -> Options:

@@ -1,0 +1,122 @@
+"""Augmentations whose new camera turns while it takes its image, and whose lens darkens the rim."""
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.augment import RandomCamera, RandomLens, RandomMount
+
+
+def camera(size=(120, 160)):
+    return ct.Pinhole.from_fov(80, image_size=size).requires_grad_(False)
+
+
+STILL = {"yaw": None, "pitch": None, "roll": None, "zoom": None}
+
+
+def test_a_sample_moves_by_the_warp_of_its_shutter():
+    source = camera()
+    augment = RandomMount(**STILL, rates=120, readout=(0.02, 0.03), camera=source)
+    draw = augment.draw(3, torch.Generator().manual_seed(0))
+    assert draw["rates"].shape == (3, 3)
+    assert (draw["rates"].abs() <= 120).all()
+    image, keypoints = torch.rand(3, 3, 120, 160), torch.rand(3, 5, 2) * 100
+    gaze, mask = torch.randn(3, 3), torch.randint(0, 5, (3, 1, 120, 160))
+    sample = augment(image=image, keypoints=keypoints, gaze=gaze, mask=mask, draw=draw)
+    rates = torch.deg2rad(draw["rates"].float())
+    shutter = ct.RollingShutter(draw["readout"].float(), rates)
+    warp = ct.Warp(source, source, target_shutter=shutter, tolerance=0.001)
+    assert torch.equal(sample["image"], warp(image))
+    assert torch.equal(sample["mask"], warp(mask, mode="nearest"))
+    assert torch.equal(sample["keypoints"], warp.transform_points(keypoints)[0])
+    assert torch.allclose(sample["gaze"], gaze)
+    assert (sample["keypoints"] - keypoints).abs().max() > 1
+    back = augment.inverse(sample)
+    seen = sample["keypoints_valid"]
+    assert (back["keypoints"] - keypoints)[seen].abs().max() < 1e-3
+
+
+def test_some_of_a_batch_and_cameras_of_several_models():
+    cameras = [camera(), ct.KannalaBrandt.from_fov(90, image_size=(120, 160)).requires_grad_(False), camera()]
+    augment = RandomCamera(rates=200, readout=0.03, exposure=0.005, p=0.6)
+    draw = augment.draw(3, torch.Generator().manual_seed(2))
+    draw["apply"] = torch.tensor([True, True, False])
+    images = torch.rand(3, 3, 120, 160)
+    sample = augment(image=images, camera=cameras, draw=draw)
+    change = augment.last
+    assert torch.equal(sample["image"][2], images[2])
+    for i in range(2):
+        alone = augment(image=images[i : i + 1], camera=[cameras[i]], draw={n: v[i : i + 1] for n, v in draw.items()})
+        # the most blurred of a batch says how many moments are averaged
+        assert torch.allclose(alone["image"][0], sample["image"][i], atol=0.05)
+    points = torch.full((3, 4, 2), 50.0)
+    assert torch.equal(change.row(1).points(points[:1])[0], change.points(points)[0][1:2])
+
+
+def test_chromatic_aberration_goes_through_the_shutter_too():
+    source, image = camera(), torch.rand(2, 1, 120, 160).expand(-1, 3, -1, -1)
+    augment = RandomMount(**STILL, rates=120, readout=0.03, chromatic=(0.0, 0.0), camera=source)
+    draw = augment.draw(2, torch.Generator().manual_seed(0))
+    result = augment(image=image, draw=draw)["image"]
+    assert torch.equal(result[:, 0], result[:, 1])
+    assert torch.equal(result[:, 2], result[:, 1])
+
+
+def test_a_chain_ends_with_its_shutter():
+    source, image = camera(), torch.rand(2, 3, 120, 160)
+    flip = ct.augment.HorizontalFlip()
+    moves = RandomMount(**STILL, rates=200, readout=0.03, exposure=0.01)
+    chain = ct.augment.Compose([flip, moves], camera=source)
+    draw = chain.draw(2, torch.Generator().manual_seed(0))
+    points = torch.rand(2, 5, 2) * 80 + 30
+    once = chain(image=image, keypoints=points, draw=draw)
+    first = flip(image=image, keypoints=points, camera=source)
+    own = {key[2:]: value for key, value in draw.items() if key.startswith("1.")}
+    second = moves({name: first[name] for name in ("image", "keypoints", "camera")}, draw=own)
+    assert (once["keypoints"] - second["keypoints"]).abs().max() < 1e-3
+    assert (once["image"] - second["image"]).abs().max() < 2e-3
+    with pytest.raises(ValueError, match="rates go to the last augmentation"):
+        ct.augment.Compose([moves, flip], camera=source)
+
+
+def test_rates_want_a_readout_or_an_exposure():
+    for options in ({"rates": 30}, {"readout": 0.03}, {"exposure": (0, 0.01)}):
+        with pytest.raises(ValueError, match="rates, in degrees per second, show by a readout or an exposure"):
+            RandomLens(**options)
+    with pytest.raises(ValueError, match=r"readout must lie within \[-1, 1\]"):
+        RandomLens(rates=30, readout=33)
+
+
+@pytest.mark.parametrize("fov", [60, 120, 170])
+def test_natural_vignetting_is_of_the_true_angle(fov):
+    lens = ct.KannalaBrandt.from_fov(fov, image_size=(240, 320)).double().requires_grad_(False)
+    rays, valid = lens.rays()
+    light = ct.vignetting(lens)
+    assert light.shape == (1, 1, 240, 320)
+    cosine = rays[..., 2].clamp(min=0.1)
+    assert (light[0, 0] - cosine**4)[valid].abs().max() < 1e-3
+    assert (light[0, 0] / cosine**4 - 1)[valid & (rays[..., 2] > 0.2)].abs().max() < 0.01
+    # on and off again is nothing, and so is the power 0
+    image = torch.rand(2, 3, 240, 320, dtype=torch.float64)
+    assert torch.allclose(image * light * ct.vignetting(lens, -1.0), image, atol=1e-12)
+    assert torch.equal(ct.vignetting(lens, 0.0), torch.ones_like(light))
+    batch = ct.vignetting(lens, torch.tensor([0.5, 1.0], dtype=torch.float64))
+    assert torch.allclose(batch[1:], light)
+    assert torch.allclose(batch[:1] ** 2, light)
+
+
+def test_a_rim_beyond_ninety_degrees_keeps_its_light():
+    lens = ct.KannalaBrandt.from_fov(220, image_size=(120, 160)).requires_grad_(False)
+    light = ct.vignetting(lens)
+    assert light.min() > 0.99e-4
+    assert abs(float(light.max()) - 1) < 1e-3
+
+
+def test_an_augmentation_darkens_the_rim():
+    source, image = camera(), torch.ones(4, 1, 120, 160)
+    augment = RandomMount(**STILL, cos4=(0.2, 1), vignetting=0.3, camera=source)
+    draw = augment.draw(4, torch.Generator().manual_seed(0))
+    result = augment(image=image, draw=draw)["image"]
+    plain = RandomMount(**STILL, vignetting=0.3, camera=source)(image=image, draw=draw)["image"]
+    expected = plain * ct.vignetting(source, draw["cos4"].float())
+    assert torch.allclose(result, expected, atol=1e-6)
