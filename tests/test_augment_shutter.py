@@ -64,7 +64,7 @@ def test_chromatic_aberration_goes_through_the_shutter_too():
 
 def test_a_chain_ends_with_its_shutter():
     source, image = camera(), torch.rand(2, 3, 120, 160)
-    flip = ct.augment.HorizontalFlip()
+    flip = ct.augment.HorizontalFlip(p=1.0)
     moves = RandomMount(**STILL, rates=200, readout=0.03, exposure=0.01)
     chain = ct.augment.Compose([flip, moves], camera=source)
     draw = chain.draw(2, torch.Generator().manual_seed(0))

@@ -15,6 +15,7 @@ from camtorch.camera import Camera
 from camtorch.mixed import Mixed, held, kind, remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.sampling import Mode, Options, narrow, widen
+from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
 
 
@@ -59,7 +60,8 @@ def _rows_of_warp(warp: Warp, camera: Camera, index: Tensor) -> Warp:
     if isinstance(warp, AffineWarp):
         matrix = warp.matrix if warp.matrix.ndim == 2 else warp.matrix[index]
         return AffineWarp(camera, target, matrix, rotation, **warp.options)
-    shutters = {name: each and each.rows_of(index) for name, each in warp.shutters.items()}
+    first, last = warp.shutter, warp.target_shutter
+    shutters: Shutters = {"shutter": first and first.rows_of(index), "target_shutter": last and last.rows_of(index)}
     kind_of_warp = MirrorWarp if isinstance(warp, MirrorWarp) else Warp
     return kind_of_warp(camera, target, rotation, **warp.options, **shutters)
 
@@ -76,7 +78,9 @@ def _joined(a: Part, b: Part) -> Part:
     if first is None:
         return replace(b, rows=a.rows, camera=a.camera)
     if first.target_shutter is not None:
-        raise ValueError("Compose: what comes after a rolling shutter or an exposure would move its rows; rates go last")
+        raise ValueError(
+            "Compose: what comes after a rolling shutter or an exposure would move its rows; rates go last"
+        )
     rotation = _both_turns(first.rotation, b.warp.rotation)
     if not isinstance(b.warp, AffineWarp):
         if a.shades is not None or a.light is not None:

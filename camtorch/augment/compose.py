@@ -44,8 +44,8 @@ class Compose(Augmentation):
 
     Raises:
         TypeError: something that is no augmentation. ValueError: none; two tables of landmarks that differ; a part that
-            wants other images than the whole; chromatic aberration or vignetting before another lens; rates that are not
-            in the last part.
+            wants other images than the whole; chromatic aberration or vignetting before another lens; rates before the
+            last part.
     """
 
     def __init__(
@@ -100,8 +100,8 @@ class Compose(Augmentation):
             drawn = {key.rpartition(".")[2] for key in part.ranges}
             if "rates" in drawn and parts[i + 1 :]:
                 raise ValueError(
-                    f"{self._name}: what comes after the rolling shutter or the exposure of {type(part).__name__} would "
-                    "move its rows; rates go to the last augmentation"
+                    f"{self._name}: what comes after the rolling shutter of {type(part).__name__} would move its "
+                    "rows; rates go to the last augmentation"
                 )
             coloured = {"chromatic", "vignetting", "cos4"} & drawn
             if coloured and any(not _is_edit(later) for later in parts[i + 1 :]):

@@ -14,7 +14,7 @@ from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
 from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, narrow, render, widen
-from camtorch.warp.shutter import RollingShutter
+from camtorch.warp.shutter import RollingShutter, Shutters
 from camtorch.warp.warp import Warp
 
 SHRINKS = 1.5
@@ -119,7 +119,7 @@ class MirrorWarp(Warp):
         return MirrorWarp(self.target, self.source, rotation, **self.options, **self._shutters_back)
 
     def _at(self, shutter: RollingShutter) -> Warp:
-        shutters = {**self.shutters, "target_shutter": shutter}
+        shutters: Shutters = {"shutter": self.shutter, "target_shutter": shutter}
         return MirrorWarp(self.source, self.target, self.rotation, **self.options, **shutters)
 
 

@@ -320,12 +320,12 @@ def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype
         width: of the target.
         dtype: of the lattice.
     """
-    count, n, m = len(matrix), math.ceil(len(rows) / _STEP), math.ceil(width / _STEP)
-    v, u = ((torch.arange(k + 5, dtype=matrix.dtype, device=matrix.device) - 2) * _STEP for k in (n, m))
+    count, n, m = len(matrix), math.ceil(len(rows) / STEP), math.ceil(width / STEP)
+    v, u = ((torch.arange(k + 5, dtype=matrix.dtype, device=matrix.device) - 2) * STEP for k in (n, m))
     across, down, shift = (column[..., None, None] for column in matrix.unbind(-1))
     nodes = (across * u + (down * (v + rows.start)[:, None] + shift)).to(dtype)
     cells = torch.full((count, n, m), CUBIC, dtype=torch.int32, device=matrix.device)
-    return Lattice(nodes, cells, nodes.new_empty(2, 0, _STEP, _STEP), (len(rows), width))
+    return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), (len(rows), width))
 
 
 def _looks(rows: range, width: int, like: Tensor) -> Tensor:

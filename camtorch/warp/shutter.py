@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, TypedDict, cast, get_args
 
 import torch
 from torch import Tensor, nn
@@ -180,6 +180,13 @@ class RollingShutter(GeometryModule):
             return f"batch_shape={tuple(self.batch_shape)}, direction={self.direction!r}"
         parts = [f"readout={float(self.readout):g}", f"rates={self.rates.tolist()}", f"direction={self.direction!r}"]
         return ", ".join([*parts, f"exposure={float(self.exposure):g}"])
+
+
+class Shutters(TypedDict):
+    """What a `Warp` takes of shutters by name."""
+
+    shutter: RollingShutter | None
+    target_shutter: RollingShutter | None
 
 
 def _lead(value: Tensor, ndim: int, inner: int = 0) -> Tensor:

@@ -35,7 +35,7 @@ from camtorch.warp.sampling import (
     one_of,
     render,
 )
-from camtorch.warp.shutter import RollingShutter, averaged, in_motion
+from camtorch.warp.shutter import RollingShutter, Shutters, averaged, in_motion
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
@@ -472,12 +472,12 @@ class Warp(GeometryModule):
         return Warp(self.target, self.source, rotation, **self.options, **self._shutters_back)
 
     @property
-    def shutters(self) -> dict[str, RollingShutter | None]:
+    def shutters(self) -> Shutters:
         """Of source and target, as another Warp takes them."""
         return {"shutter": self.shutter, "target_shutter": self.target_shutter}
 
     @property
-    def _shutters_back(self) -> dict[str, RollingShutter | None]:
+    def _shutters_back(self) -> Shutters:
         return {"shutter": self.target_shutter, "target_shutter": self.shutter}
 
     @property
