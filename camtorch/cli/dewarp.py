@@ -217,7 +217,7 @@ def _item(found: Any, output: Path, suffix: str | None) -> Item:
     from camtorch.jobs.items import Item
 
     place = found.place
-    if suffix is not None and videos.is_video(place) == videos.is_video(Path(suffix)):
+    if suffix is not None and videos.is_video(place) == videos.is_video(Path("any" + suffix)):
         place = place.with_suffix(suffix)
     return Item((found.path,), (output / place,))
 

@@ -419,10 +419,11 @@ class _Read:
     def _converted(self, frame: Any, format: str | None) -> Any:
         if frame.format.name == format:
             return frame
-        if not frame.format.is_rgb:
-            return frame.reformat(format=format)
-        new = frame.reformat(format=format, dst_colorspace="ITU709", dst_color_range="MPEG")
-        new.colorspace, new.color_range = 1, 1  # as just said
+        # of RGB nothing else is known, and this is what players take for granted; all else keeps its range
+        is_full = _is_full(frame) and not frame.format.is_rgb
+        options = {"dst_colorspace": "ITU709"} if frame.format.is_rgb else {}
+        new = frame.reformat(format=format, dst_color_range="JPEG" if is_full else "MPEG", **options)
+        new.colorspace, new.color_range = 1 if frame.format.is_rgb else frame.colorspace, 2 if is_full else 1
         return new
 
     def check_end(self) -> None:

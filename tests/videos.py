@@ -1,0 +1,104 @@
+"""Small videos: a pattern that moves, with sound."""
+
+from fractions import Fraction
+
+import numpy as np
+
+
+def pattern(height, width, shift=0):
+    """(H, W, 3) uint8 without edges, which encoders keep nearly as it is."""
+    y, x = np.mgrid[:height, :width].astype(float)
+    waves = [np.sin((x + 3 * shift) / 9), np.cos(y / 7 + 0.2 * shift), np.sin((x + y) / 11)]
+    return np.stack([128 + 100 * wave for wave in waves], -1).astype(np.uint8)
+
+
+def write_video(
+    path,
+    times,
+    *,
+    size=(64, 96),
+    codec="mpeg4",
+    pixels="yuv420p",
+    tick=Fraction(1, 30),
+    rate=30,
+    rotation=None,
+    sound=None,
+    words=None,
+    matrix=None,
+    full=None,
+):
+    """A video with a frame at each of these multiples of `tick`.
+
+    Args:
+        path: its suffix says the format.
+        times: of frames.
+        size: (height, width).
+        codec: of frames; likewise `pixels`, their format.
+        tick: seconds.
+        rate: frames a second, as the file says it.
+        rotation: degrees with which it is to be shown.
+        sound: an encoder, of a tone as long as the video.
+        words: a file of subtitles.
+        matrix, full: what colours mean, as ffmpeg numbers it.
+    """
+    import av
+
+    with av.open(path, "w") as file:
+        file.metadata["title"] = "waves"
+        stream = file.add_stream(codec, rate=rate, time_base=tick)
+        stream.width, stream.height, stream.pix_fmt = size[1], size[0], pixels
+        stream.codec_context.qscale, stream.codec_context.global_quality = True, 2 * 118
+        if matrix is not None:
+            stream.codec_context.colorspace, stream.codec_context.color_range = matrix, full
+        if rotation is not None:
+            stream.set_display_rotation(rotation)
+        tone = None if sound is None else file.add_stream(sound, rate=48000, layout="mono")
+        if tone is not None:
+            tone.metadata["language"] = "fin"
+        if words is not None:
+            with av.open(words) as text:
+                said = file.add_stream_from_template(text.streams[0])
+                packets = [packet for packet in text.demux() if packet.dts is not None]
+        for number, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(pattern(*size, number), format="rgb24").reformat(format=pixels)
+            frame.pts, frame.time_base = time, tick
+            file.mux(stream.encode(frame))
+        if tone is not None:
+            count = tone.codec_context.frame_size or 1024
+            for number in range(int((times[-1] + 1) * tick * 48000 / count)):
+                wave = 0.2 * np.sin(0.05 * np.arange(number * count, (number + 1) * count))
+                frame = av.AudioFrame.from_ndarray(wave[None].astype(np.float32), format="fltp", layout="mono")
+                frame.sample_rate, frame.pts = 48000, number * count
+                file.mux(tone.encode(frame))
+            file.mux(tone.encode(None))
+        file.mux(stream.encode(None))
+        if words is not None:
+            for packet in packets:
+                packet.stream = said
+                file.mux(packet)
+
+
+def read_video(path):
+    """What a video says of itself, in a dictionary."""
+    import av
+
+    with av.open(path) as file:
+        stream = file.streams.video[0]
+        frames = list(file.decode(stream))
+        context = stream.codec_context
+        about = {
+            "times": [float(frame.pts * frame.time_base) for frame in frames],
+            "frames": frames,
+            "rate": stream.average_rate,
+            "rotation": frames[0].rotation,
+            "matrix": (frames[0].colorspace, frames[0].color_range),
+            "codec": context.name,
+            "pixels": context.pix_fmt,
+            "title": file.metadata.get("title"),
+            "languages": [other.language for other in file.streams.audio],
+        }
+    with av.open(path) as file:
+        others = [stream for stream in file.streams if stream.type in ("audio", "subtitle")]
+        packets = [packet for packet in file.demux(others) if packet.dts is not None] if others else []
+        about["packets"] = [(packet.stream.type, packet.pts * packet.time_base, bytes(packet)) for packet in packets]
+    return about
