@@ -18,10 +18,10 @@ import torch
 from albumentations.core.type_definitions import Targets
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, draw
+from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change, copied, singles, size_of
 from camtorch.augment.numpy import as_array, as_tensor
-from camtorch.augment.sample import moves
+from camtorch.augment.sample import Unknown, moves
 from camtorch.camera import Camera
 
 _OWNER = "albumentations.Transform"
@@ -46,7 +46,7 @@ class Transform(A.DualTransform):
     Under their own names, `gaze`, `directions`, `points`, `pitch_yaw`, `head_pose`, `rvec`, `tvec`, `depth` and
     `distance` move as well; see `Augmentation`. A `camera` in the sample is that of its images, and every sample comes
     out with the new `camera`, from which the next transform of camtorch goes on. What albumentations itself does
-    in between to where pixels lie, as a crop or a flip, no camera knows of.
+    in between to where pixels lie, as a crop or a flip, no camera knows of; the edits of camtorch tell it.
 
     Keypoints and boxes are given and filtered as `keypoint_params` and `bbox_params` of the pipeline say. That is
     where their validity goes: a keypoint without a place on the new camera becomes (-1, -1), off the image, and
@@ -91,13 +91,14 @@ class Transform(A.DualTransform):
     def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> dict[str, Any]:
         """Transform a sample of keyword arguments; see the class."""
         result: dict[str, Any] = super().__call__(*args, force_apply=force_apply, **data)
-        result.setdefault("camera", self._source(data))
+        if result.get("camera") is None and not isinstance(source := self._source(data), Unknown):
+            result["camera"] = source
         return result
 
     def get_params(self) -> dict[str, Any]:
         """A draw, of plain numbers."""
         generator = torch.Generator().manual_seed(self.py_random.getrandbits(63))
-        drawn = draw(self.augmentation.ranges, 1, 1.0, False, generator)
+        drawn = self.augmentation.drawn(1, 1.0, False, generator)
         return {"draw": {name: value.tolist() for name, value in drawn.items()}}
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
@@ -108,10 +109,13 @@ class Transform(A.DualTransform):
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.last = self.augmentation.change(camera, drawn)
             moved: dict[str, Any] = super().apply_with_params({**params, "change": change}, *args, **data)
-            return {**moved, "camera": self.apply_to_camera(camera, change)}
+            return moved if isinstance(camera, Unknown) else {**moved, "camera": self.apply_to_camera(camera, change)}
 
     def _source(self, data: Mapping[str, Any]) -> Camera:
         camera = data.get("camera", self.augmentation.camera if self.camera is None else self.camera)
+        known = next((data[name] for name in ("image", "mask") if data.get(name) is not None), None)
+        if camera is None and known is not None and not self.augmentation.needs_camera:
+            return Unknown.of(np.shape(known)[:2])
         if not isinstance(camera, Camera):
             raise ValueError(
                 f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation; got {camera!r}"
@@ -144,7 +148,11 @@ class Transform(A.DualTransform):
         """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
         moved = change.points(torch.as_tensor(keypoints[:, :2])[None])[0][0].numpy()
         lost = (keypoints[:, :2] == -1).all(1, keepdims=True)
-        return np.concatenate((np.where(lost, -1, moved), keypoints[:, 2:]), 1)
+        moved, mirroring = np.where(lost, -1, moved), self.augmentation.mirroring
+        if mirroring is not None and change.mirrored is not None:
+            order = mirroring.order("keypoints", "keypoints", len(moved))
+            moved = moved if order is None else moved[list(order)]
+        return np.concatenate((moved, keypoints[:, 2:]), 1)
 
     def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""
@@ -165,7 +173,9 @@ class Transform(A.DualTransform):
     def _mover(self, kind: str) -> Callable[..., np.ndarray]:
         def move(value: np.ndarray, change: Change, **params: Any) -> np.ndarray:
             tensor = torch.as_tensor(np.asarray(value))[None]
-            moved: Tensor = moves(kind, tensor)(change, tensor, {})
+            mirroring = self.augmentation.mirroring
+            options = {} if mirroring is None else {"lateral": mirroring.lateral}
+            moved: Tensor = moves(kind, tensor)(change, tensor, options)
             return moved[0].numpy()
 
         return move

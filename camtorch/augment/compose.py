@@ -10,9 +10,7 @@ from torch import Tensor, nn
 
 from camtorch.augment.augmentation import Augmentation, Range, draw
 from camtorch.augment.change import Change
-from camtorch.augment.edits import Edit
 from camtorch.augment.landmarks import Mirroring
-from camtorch.augment.sample import Named
 from camtorch.camera import Camera
 
 _OF_IMAGES = ("mode", "padding_mode", "fill", "tolerance")
@@ -80,6 +78,7 @@ class Compose(Augmentation):
         super().__init__(ranges, camera=camera, fields=fields, antialias=bool(antialias), **options)
         self.antialias = antialias
         self.augmentations = nn.ModuleList(parts)
+        self.needs_camera = any(part.needs_camera for part in parts)
         self._check_options(parts)
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
         if len(mirrorings) > 1:
@@ -104,7 +103,7 @@ class Compose(Augmentation):
                     "rows; rates go to the last augmentation"
                 )
             coloured = {"chromatic", "vignetting", "cos4"} & drawn
-            if coloured and any(not _is_edit(later) for later in parts[i + 1 :]):
+            if coloured and any(later.needs_camera for later in parts[i + 1 :]):
                 raise ValueError(
                     f"{self._name}: the {' and '.join(sorted(coloured))} of {type(part).__name__} would be seen "
                     "through another lens; only edits may follow it"
@@ -145,10 +144,6 @@ class Compose(Augmentation):
             raise ValueError(f"{self._name}: samples would come out with cameras of several models")
         return target, change.rotation
 
-    def _camera_of(self, named: Named) -> Camera | list[Camera]:
-        first = self.parts[0]
-        return first._camera_of(named) if _is_edit(self) else super()._camera_of(named)
-
     def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
         """What the augmentations tell of images of such a camera."""
         for part in self.parts:
@@ -175,10 +170,6 @@ class Compose(Augmentation):
         """The options."""
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
-
-
-def _is_edit(part: nn.Module) -> bool:
-    return isinstance(part, Edit) or (isinstance(part, Compose) and all(map(_is_edit, part.parts)))
 
 
 def _alone(step: Change) -> Camera | list[Camera]:

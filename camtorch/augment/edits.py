@@ -15,7 +15,6 @@ from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import Change, Part, alone, edited, expanded, joined, size_of
 from camtorch.augment.landmarks import Mirroring, TableLike
-from camtorch.augment.sample import IMAGES, Named, Unknown
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, kind
 from camtorch.warp.affine import AffineWarp, on_rays
@@ -47,6 +46,8 @@ class Edit(Augmentation):
         super().__init__(ranges, antialias=bool(antialias), **options)
         self.antialias = antialias
 
+    needs_camera = False
+
     # -- what a subclass writes
 
     @abstractmethod
@@ -74,17 +75,6 @@ class Edit(Augmentation):
         matrix, size = self.edit(size_of(source), {name: value.double() for name, value in values.items()})
         return edited(source, matrix, size), _turn(matrix, source)
 
-    def _camera_of(self, named: Named) -> Camera | list[Camera]:
-        for found, value in named.values():
-            if found in IMAGES and isinstance(value, list):
-                return [Unknown.of(one) for one in map(torch.as_tensor, value)]
-            if found in IMAGES:
-                return Unknown.of(value)
-        raise ValueError(
-            f"{self._name}: the sample holds neither an image nor a camera, and how large the image is decides where "
-            f"labels go; give one as sample['camera'] or {self._name}(camera=...)"
-        )
-
     def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
         """Nothing is empty that is not asked for."""
 
@@ -111,8 +101,6 @@ class Edit(Augmentation):
 
     def _edited_part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         applied, size = draw["apply"], size_of(source)
-        if may_look(applied) and not bool(applied.any()):
-            return Part(rows, None, source)
         device = source.intrinsics.device
         values = {name: value.double() for name, value in draw.items() if name != "apply"}
         matrix, after = self.edit(size, values)
@@ -124,6 +112,8 @@ class Edit(Augmentation):
                     f"become {after}, and were {size}"
                 )
             still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+            if may_look(applied) and not bool(applied.any()):
+                return Part(rows, None, source)
             matrix = torch.where(applied[:, None, None].to(matrix.device), matrix, still)
         if matrix.ndim == 3 and may_look(matrix) and not source.batch_shape and bool((matrix == matrix[:1]).all()):
             matrix = matrix[0]

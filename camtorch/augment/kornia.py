@@ -20,15 +20,30 @@ from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._module import Memo
-from camtorch.augment import random_camera
-from camtorch.augment.augmentation import Augmentation, draw
+from camtorch.augment import compose, edits, random_camera
+from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change, camera_like
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode, narrow, widen
 
-__all__ = ["CameraAugmentation", "RandomCamera", "RandomLens", "RandomMount", "with_cameras"]
+__all__ = [
+    "CameraAugmentation",
+    "CenterCrop",
+    "Compose",
+    "HorizontalFlip",
+    "Pad",
+    "RandomCamera",
+    "RandomCrop",
+    "RandomLens",
+    "RandomMount",
+    "RandomResizedCrop",
+    "Resize",
+    "Rotate90",
+    "VerticalFlip",
+    "with_cameras",
+]
 
 Params: TypeAlias = dict[str, Tensor]
 Flags: TypeAlias = dict[str, Any]
@@ -61,6 +76,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
           the light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft ones.
         - the warp is no matrix: ``transform_matrix`` is NaN, also of a container that holds the augmentation. ``last``
           and ``change(params)`` give what there is instead: the cameras before and after, and how far it turned.
+        - edits of camtorch move the camera along, which kornia's own do not; ``landmarks`` of a flip are for keypoints.
+          A chain in one `Compose` samples images once.
         - gaze, poses and 3D points have no data key in kornia, and containers leave them as they are. Turn them
           by ``aug.last.rays(...)``, or call the augmentation itself with samples.
         - ``inverse`` takes everything back by the inverse warp. What left the image, or fell between its pixels, is
@@ -97,7 +114,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         self.augmentation, self.camera = augmentation, camera
         self.flags = {"resample": Resample.get(augmentation.options["mode"]), "align_corners": False}
         self.flags["padding_mode"] = SamplePadding.get(augmentation.options["padding_mode"])
-        size = getattr(augmentation, "image_size", None) or camera.image_size
+        size = augmentation.size_after(camera.image_size)
         if size != camera.image_size:
             self.flags["size"] = size
         self._kind = _kind(camera)
@@ -122,7 +139,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
             )
         if count:
             self.augmentation.tell_of_empty_images(self.camera)
-        drawn = draw(self.augmentation.ranges, count, 1.0, self.same_on_batch, None)
+        drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)
         del drawn["apply"]
         drawn[_KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()
         if "size" in self.flags:
@@ -193,10 +210,19 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
         moved, valid = self._move(params, rows, lambda change, pixels: change.points(pixels), back)
         lost = (rows == -1).all(-1)
+        moved, valid, lost = self._mirrored(params, moved, valid, lost)
         result = input.clone()
         result._data = torch.where(lost.unsqueeze(-1), -1.0, moved).reshape(input.shape)
         self.keypoints_valid = (valid & ~lost).reshape(input.shape[:-1])
         return result
+
+    def _mirrored(self, params: Params, *values: Tensor) -> list[Tensor]:
+        """Landmarks (B, N, ...) in their order in a mirror, where the augmentation has a table of them."""
+        mirroring = self.augmentation.mirroring
+        mirrored = None if mirroring is None else self.change(params, values[0].device).mirrored
+        if mirroring is None or mirrored is None:
+            return list(values)
+        return [mirroring.swapped("keypoints", "keypoints", value, mirrored, True) for value in values]
 
     def apply_transform_box(
         self, input: Boxes, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
@@ -256,7 +282,7 @@ class _Random(CameraAugmentation):
         self,
         *given: Camera | PresetName | str,
         camera: Camera | None = None,
-        p: float = 1.0,
+        p: float | None = None,
         p_batch: float = 1.0,
         same_on_batch: bool = False,
         keepdim: bool = False,
@@ -303,6 +329,87 @@ class RandomCamera(_Random):
     """
 
     _wraps = random_camera.RandomCamera
+
+
+class RandomResizedCrop(_Random):
+    """`camtorch.augment.RandomResizedCrop` for kornia: a box at random, of another size.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.RandomResizedCrop`.
+    """
+
+    _wraps = edits.RandomResizedCrop
+
+
+class RandomCrop(_Random):
+    """`camtorch.augment.RandomCrop` for kornia: a box of a size at random.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.RandomCrop`.
+    """
+
+    _wraps = edits.RandomCrop
+
+
+class CenterCrop(_Random):
+    """`camtorch.augment.CenterCrop` for kornia: the middle of the image.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.CenterCrop`.
+    """
+
+    _wraps = edits.CenterCrop
+
+
+class Resize(_Random):
+    """`camtorch.augment.Resize` for kornia: the image in another size.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Resize`.
+    """
+
+    _wraps = edits.Resize
+
+
+class Pad(_Random):
+    """`camtorch.augment.Pad` for kornia: a rim around the image.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Pad`.
+    """
+
+    _wraps = edits.Pad
+
+
+class HorizontalFlip(_Random):
+    """`camtorch.augment.HorizontalFlip` for kornia: mirrored left to right, landmarks in their order in a mirror.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.HorizontalFlip`.
+    """
+
+    _wraps = edits.HorizontalFlip
+
+
+class VerticalFlip(_Random):
+    """`camtorch.augment.VerticalFlip` for kornia: mirrored top to bottom.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.VerticalFlip`.
+    """
+
+    _wraps = edits.VerticalFlip
+
+
+class Rotate90(_Random):
+    """`camtorch.augment.Rotate90` for kornia: turned by quarters.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Rotate90`.
+    """
+
+    _wraps = edits.Rotate90
+
+
+class Compose(_Random):
+    """`camtorch.augment.Compose` for kornia: several augmentations of camtorch, not of kornia, as one.
+
+    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Compose`.
+    """
+
+    _wraps = compose.Compose
 
 
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:

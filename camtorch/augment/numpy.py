@@ -40,7 +40,7 @@ class Transform:
       the centre of the top-left one at (0, 0). Boxes between pixel edges, albumentations' "pascal_voc", are these
       plus 0.5.
     * `gaze` (3,), `head_pose` (4, 4), `rvec` (3,), `tvec` (3,), `points` (N, 3), and all other fields.
-    * `camera`: the camera of the images, unless the augmentation has one.
+    * `camera`: the camera of the images, unless the augmentation has one. Edits, and `Compose` of them, need none.
 
     Whatever is no field is passed on as it is. All arrays come out with the layout and the dtype that they came in
     with, but coordinates of whole numbers come out in float32. Beside them come `keypoints_valid` (N,), `bboxes_valid`
@@ -128,13 +128,16 @@ class Transform:
             inside.update({name: value} if restore is None else tensors)
         with torch.no_grad():
             moved = move(inside, **{key: value for key, value in options.items() if value is not None})
-        camera = moved["camera"]
+        camera = moved.get("camera")
         if isinstance(camera, Camera) and camera.batch_shape:
             camera = moved["camera"] = singles(camera)[0]
+        after: Any = camera
+        if camera is None and isinstance(self.last, Change):
+            after = self.last.parts[0].camera if self.last.parts[0].warp is None else self.last.parts[0].warp.target
         result = {}
         for name, (tensors, restore) in entries.items():
             if restore is not None and tensors.keys() <= moved.keys():
-                result[name] = restore([moved.pop(key)[0] for key in tensors], camera.image_size)
+                result[name] = restore([moved.pop(key)[0] for key in tensors], after.image_size)
             elif name in moved:
                 result[name] = moved.pop(name)
         for name, value in moved.items():

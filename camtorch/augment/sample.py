@@ -249,11 +249,9 @@ class Unknown(Pinhole):
     """The camera of images of which only the size is known, while they are edited; no sample comes out with it."""
 
     @classmethod
-    def of(cls, like: Tensor) -> Unknown:
-        """For images (..., H, W)."""
-        dtype = like.dtype if like.dtype == torch.float64 else torch.float32
-        numbers = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=dtype, device=like.device)
-        return cls(numbers, image_size=(like.shape[-2], like.shape[-1])).requires_grad_(False)
+    def of(cls, size: tuple[int, int]) -> Unknown:
+        """For images of a size."""
+        return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
 def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
@@ -287,9 +285,29 @@ class SampleTransform(nn.Module):
     mirroring: Mirroring | None = None
     """What changes places where an augmentation mirrors; None: it never does."""
 
+    needs_camera: bool = True
+    """Whether samples, or it, need a camera; edits do not."""
+
     def _camera_of(self, named: Named) -> Camera | list[Camera]:
         """The camera of a sample that has none, nor the augmentation."""
-        raise ValueError(f"{self._name}: no camera; give one as sample['camera'] or {self._name}(camera=...)")
+        how = f"give one as sample['camera'] or {self._name}(camera=...)"
+        if self.needs_camera:
+            raise ValueError(f"{self._name}: no camera; {how}")
+        for name, (found, value) in named.items():
+            first = value[0] if isinstance(value, list) and value else value
+            if found == "image" and isinstance(first, Tensor) and first.shape[-1] <= 4 < first.shape[-3:][0]:
+                raise ValueError(
+                    f"{self._name}: {name} is {tuple(first.shape)}, which seems to have its channels last; they come "
+                    f"first, (B, C, H, W), and camtorch.augment.numpy takes arrays as they are. A camera tells: {how}"
+                )
+            if found in IMAGES and isinstance(value, list):
+                return [Unknown.of((one.shape[-2], one.shape[-1])) for one in value]
+            if found in IMAGES:
+                return Unknown.of((value.shape[-2], value.shape[-1]))
+        raise ValueError(
+            f"{self._name}: the sample holds neither an image nor a camera, and how large the image is decides where "
+            f"labels go; {how}"
+        )
 
     # -- moving
 

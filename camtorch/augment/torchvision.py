@@ -19,6 +19,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change, singles
 from camtorch.augment.numpy import as_array, as_tensor
+from camtorch.augment.sample import Unknown
 from camtorch.camera import Camera
 
 try:
@@ -48,7 +49,8 @@ class Transform(v2.Transform):
       new ones enclose all of what the old ones did, with whole numbers too, and are not clamped:
       `v2.ClampBoundingBoxes` and `v2.SanitizeBoundingBoxes` follow where wanted. One that has no place on the new
       camera becomes (-1, -1, -1, -1) in XYXY, which has no area.
-    * A `Camera` in the sample is the sample's camera, and comes out as that of the new image.
+    * A `Camera` in the sample is the sample's camera, and comes out as that of the new image. Edits, and `Compose` of
+      them alone, need none.
 
     `valid=True` gives all `KeyPoints` and `BoundingBoxes` that are values of dicts a flag for each point or box beside
     them: `target["keypoints_valid"]`, a plain bool tensor, for `target["keypoints"]`. It says that the point, or a part
@@ -105,6 +107,9 @@ class Transform(v2.Transform):
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample has one camera; here are {len(cameras)}")
         camera = cameras[0] if cameras else self.augmentation.camera if self.camera is None else self.camera
+        if camera is None and not self.augmentation.needs_camera:
+            size = next((size for one in flat_inputs if (size := _size(one)) is not None), None)
+            camera = None if size is None else Unknown.of(size)
         if camera is None:
             raise ValueError(f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation")
         if camera.image_size is None or camera.batch_shape:
@@ -139,6 +144,11 @@ class Transform(v2.Transform):
         if isinstance(inpt, _PLACES):
             of_boxes = isinstance(inpt, tv_tensors.BoundingBoxes)
             moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else _points(change, plain)
+            mirroring = self.augmentation.mirroring
+            if mirroring is not None and change.mirrored is not None and not of_boxes and plain.ndim > 1:
+                order = mirroring.order("keypoints", "keypoints", plain.shape[-2])
+                if order is not None:
+                    moved, valid = moved[..., order, :], valid[..., order]
             if change.parts[0].warp is None:
                 moved = plain
             result = tv_tensors.wrap(moved, like=inpt, canvas_size=camera.image_size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -22,6 +23,7 @@ SHRINKS = 1.5
 _MOST = 8  # times that an image is halved
 _PLAIN = (torch.uint8, torch.float32, torch.float64)  # that torch interpolates as they are
 _WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
+_NEARLY = 1e-6  # and those of the way back
 
 
 class MirrorWarp(Warp):
@@ -168,7 +170,24 @@ class AffineWarp(MirrorWarp):
             made = self._shrunk(images, mode) if made is None else made
             if made is not None:
                 return made
+            if padding_mode == "zeros" and self._is_inside:
+                padding_mode = "border"  # up to the outer edges of its pixels an image ends nowhere
         return super().forward(images, mode=mode, padding_mode=padding_mode, fill=values)
+
+    @cached_property
+    def _is_inside(self) -> bool:
+        """Whether the edited images show nothing but the image."""
+        low, high = self._edges.amin(1), self._edges.amax(1)
+        size = self._edges.new_tensor(self.source._size("Warp")[::-1])
+        return bool((low > -_NEARLY).all() & (high < size + _NEARLY).all())
+
+    @cached_property
+    def _edges(self) -> Tensor:
+        """(B or 1, 2, 2): where two opposite corners of the edited image lie, from the corner of the image's pixels."""
+        height, width = self.target._size("Warp")
+        back = inverted(self._maps.detach())
+        ends = back.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
+        return (back[:, None, :, :2] * ends[None, :, None]).sum(-1) + back[:, None, :, 2] + 0.5
 
     def _copied(self, images: Tensor, fill: tuple[float, ...]) -> Tensor | None:
         """By pixels copied, if the map brings whole pixels to whole pixels."""
@@ -208,19 +227,14 @@ class AffineWarp(MirrorWarp):
         if not (self.antialias or self._decides) or mode == "nearest" or images.dtype == torch.bool:
             return None
         height, width = self.target._size("Warp")
-        rows, cols = self.source._size("Warp")
         back = inverted(self._maps)
         scale = back[:, :, :2].abs().sum(-1)
         if not bool((back[:, 0, 1] == 0).all() & (scale > (1 if self.antialias else SHRINKS)).any()):
             return None
-        # the outer edges of the result, on the source
-        ends = back.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
-        edges = ends * back[:, None, [0, 1], [0, 1]] + back[:, None, :, 2] + 0.5
-        low, high = edges.amin(1), edges.amax(1)
-        inside = bool((low > -_WHOLE).all() & (high < back.new_tensor([cols, rows]) + _WHOLE).all())
-        if not (inside and bool((edges - edges.round()).abs().max() < 1e-6)):
+        edges = self._edges
+        if not (self._is_inside and bool((edges - edges.round()).abs().max() < _NEARLY)):
             return None
-        boxes = torch.cat((low, high), 1).round().long().tolist()
+        boxes = torch.cat((edges.amin(1), edges.amax(1)), 1).round().long().tolist()
         flips = [[dim for dim, sign in ((-1, a), (-2, d)) if sign < 0] for ((a, *_), (_, d, _)) in back.tolist()]
         together = boxes[1:] == boxes[:-1] and flips[1:] == flips[:-1]
         parts = [slice(None)] if together else [slice(i, i + 1) for i in range(len(boxes))]

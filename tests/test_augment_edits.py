@@ -1,0 +1,689 @@
+"""Edits with all that a sample holds: the camera, the labels and the image agree, along any chain of them."""
+
+import copy
+import itertools
+import json
+import pickle
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch.utils.data import DataLoader
+
+import camtorch as ct
+from camtorch.warp import sampling
+
+A = ct.augment
+SIZE = (48, 64)
+DISTORTION = {
+    ct.Pinhole: None,
+    ct.BrownConrady: [-0.2, 0.05, 0.002, -0.003, 0.01, 0.0, 0.0, 0.0, 1e-3, 2e-3, -1e-3, 1e-3, 0.0, 0.01],
+    ct.Fisheye624: [0.02, -0.01, 0.003, 0.0, 0.0, 0.0, 2e-3, -1e-3, 1e-3, 0.0, 2e-3, 1e-3],
+    ct.OCamCalib: [0.01, -0.02, 0.0, -0.2, 0.01, 0.001],
+}
+
+
+def camera(model=ct.BrownConrady, dtype=torch.float64, size=SIZE):
+    scale = size[0] / 48
+    k = DISTORTION[model]
+    numbers = [torch.tensor([60.0 * scale, 62.0 * scale, 33.0 * scale, 22.0 * scale], dtype=dtype)]
+    numbers += [] if k is None else [torch.tensor(k, dtype=dtype)]
+    return model(*numbers, image_size=size).requires_grad_(False)
+
+
+def sample(lens, count=3, number=12, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    dtype = lens.intrinsics.dtype
+    points = torch.randn(count, number, 3, generator=generator, dtype=torch.float64) * 0.3
+    points = (points + torch.tensor([0.0, 0.0, 1.5])).to(dtype)
+    pose = torch.eye(4).repeat(count, 1, 1).double()
+    pose[:, :3, :3] = ct.rotations.rotation_matrix(torch.randn(count, 3, generator=generator).double())
+    pose[:, :3, 3] = torch.randn(count, 3, generator=generator).double() + 2
+    return {
+        "keypoints": lens.project(points)[0],
+        "points": points,
+        "gaze": torch.randn(count, 3, generator=generator).to(dtype),
+        "head_pose": pose.to(dtype),
+        "rvec": torch.randn(count, 3, generator=generator).to(dtype),
+        "tvec": torch.randn(count, 3, generator=generator).to(dtype),
+        "camera": lens,
+    }
+
+
+def missed(out):
+    """The largest distance in pixels between keypoints and the points where the new camera sees them."""
+    pixels, valid = out["camera"].project(out["points"])
+    use = out["keypoints_valid"] & valid
+    assert use.sum() > 3
+    return (pixels - out["keypoints"]).norm(dim=-1)[use].max().item()
+
+
+EDITS = {
+    "hflip": lambda: A.HorizontalFlip(p=0.5),
+    "vflip": lambda: A.VerticalFlip(p=1.0),
+    "resize": lambda: A.Resize((30, 100)),
+    "shorter": lambda: A.Resize(24),
+    "pad": lambda: A.Pad((1, 2, 3, 4)),
+    "pad to": lambda: A.Pad(size=(64, 64)),
+    "centre": lambda: A.CenterCrop((60, 40)),
+    "crop": lambda: A.RandomCrop(40),
+    "resized crop": lambda: A.RandomResizedCrop(SIZE, scale=(0.3, 1.0)),
+    "quarter turn": lambda: A.Rotate90(1),
+    "half turns": lambda: A.Rotate90(step=2),
+}
+
+
+@pytest.mark.parametrize("model", DISTORTION)
+@pytest.mark.parametrize("name", EDITS)
+def test_the_camera_follows_every_edit(name, model):
+    lens = camera(model)
+    torch.manual_seed(2)
+    edit = EDITS[name]()
+    given = sample(lens)
+    out = edit(given)
+    assert missed(out) < 1e-9
+    assert edit.size_after(SIZE) == out["camera"].image_size
+    back = edit.inverse(out)
+    for key in ("keypoints", "points", "gaze", "head_pose"):
+        torch.testing.assert_close(back[key], given[key], atol=1e-9, rtol=0)
+    turns = [ct.rotations.rotation_matrix(s["rvec"]) for s in (back, given)]
+    torch.testing.assert_close(*turns, atol=1e-9, rtol=0)
+
+
+def wandering(lens, count, seed):
+    """Random edits: where the view has gone far, those that bring it back. torch's generator draws them as they did."""
+    rng = random.Random(seed)
+    torch.manual_seed(seed)
+    edits, view = [], lens
+    for _ in range(count):
+        (fx, fy, cx, cy), (height, width) = view.intrinsics.flatten().tolist(), view.image_size
+        right, down = cx / width - 0.5, cy / height - 0.5
+        if max(abs(right), abs(down)) > 0.15:
+            pads = (-2 * right * width, -2 * down * height, 2 * right * width, 2 * down * height)
+            edit = A.Pad([max(0, round(side)) for side in pads])
+        elif max(fx / width, fy / height) > 1.5:
+            edit = A.Pad((width // 4, height // 4))
+        elif not 0.7 < fx / fy < 1.4:
+            edit = A.Resize((height, max(round(width * fy / fx), 1)))
+        elif max(height, width) > 360 or min(height, width) < 200:
+            edit = A.Resize(rng.randint(210, 250))
+        else:
+            edit = rng.choice(
+                [
+                    A.HorizontalFlip(),
+                    A.VerticalFlip(),
+                    A.Rotate90(rng.randint(0, 3)),
+                    A.RandomResizedCrop((240, 320), scale=(0.5, 1.0)),
+                    A.RandomCrop(200),
+                    A.CenterCrop((rng.randint(180, 300), rng.randint(180, 320))),
+                    A.Resize((rng.randint(200, 300), rng.randint(200, 340))),
+                    A.Pad((rng.randint(0, 30), rng.randint(0, 30))),
+                ]
+            )
+        view = edit.change(view, edit.draw(1)).target
+        edits.append(edit)
+    return edits
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_chain_of_a_thousand_edits(seed):
+    lens = camera(size=(240, 320))
+    lens = ct.BrownConrady(lens.intrinsics, lens.distortion[:5], image_size=(240, 320)).requires_grad_(False)
+    edits = wandering(lens, 1000, seed)
+    chain = A.Compose(edits)
+    torch.manual_seed(seed)
+    draw = chain.draw(1)
+    for dtype, bound in ((torch.float64, 1e-9), (torch.float32, 1e-4)):
+        own = lens.to(dtype)
+        change = chain.change(own, draw)
+        last = change.target
+        pixels = torch.rand(1, 60, 2, dtype=dtype) * torch.tensor(last.image_size[::-1])
+        rays, _ = last.unproject(pixels)
+        points = change.inverse().rays(rays)
+        given = {"keypoints": own.project(points)[0], "points": points, "camera": own}
+        out = chain(given, draw=draw)
+        assert missed(out) < bound
+        torch.testing.assert_close(out["keypoints"], pixels, atol=bound, rtol=0)
+        step = given
+        for i, edit in enumerate(edits):
+            mine = {name.removeprefix(f"{i}."): value for name, value in draw.items() if name.startswith(f"{i}.")}
+            step = edit({name: step[name] for name in ("keypoints", "points", "camera")}, draw=mine)
+        # each step rounds both to the dtype
+        assert missed(step) < 30 * bound
+
+
+@pytest.mark.parametrize(
+    ("dtype", "bound", "rounds"), [(torch.float64, 1e-9, 4), (torch.float32, 1e-4, 4)], ids=["float64", "float32"]
+)
+def test_a_thousand_chains(dtype, bound, rounds):
+    rng = random.Random(3)
+    lens = camera(dtype=dtype, size=(240, 320))
+    makers = [
+        A.HorizontalFlip,
+        A.VerticalFlip,
+        lambda: A.Rotate90(rng.randint(0, 3)),
+        lambda: A.Resize((rng.randint(200, 300), rng.randint(200, 400))),
+        lambda: A.Pad(rng.randint(0, 40)),
+        lambda: A.CenterCrop((rng.randint(180, 300), rng.randint(180, 320))),
+        lambda: A.RandomResizedCrop((240, 320), scale=(0.3, 1.0)),
+    ]
+    lens = ct.BrownConrady(lens.intrinsics, lens.distortion[:5], image_size=(240, 320)).requires_grad_(False)
+    for seed in range(rounds):
+        chain = A.Compose([rng.choice(makers)() for _ in range(rng.randint(1, 7))])
+        torch.manual_seed(seed)
+        assert missed(chain(sample(lens, count=1000 // rounds))) < bound
+
+
+# -- what an independent computation says
+
+MIRRORS = {"hflip": np.diag([-1.0, 1, 1]), "vflip": np.diag([1.0, -1, 1])}
+
+
+def by_numpy(image, pixels, name):
+    """The image (H, W), pixels (N, 2), and what the rays become, by the definition of an edit."""
+    (height, width), (u, v) = image.shape, pixels.T
+    if name == "hflip":
+        return image[:, ::-1], np.stack((width - 1 - u, v), 1), MIRRORS[name]
+    if name == "vflip":
+        return image[::-1], np.stack((u, height - 1 - v), 1), MIRRORS[name]
+    if name == "turn":
+        return np.rot90(image), np.stack((v, width - 1 - u), 1), np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    if name == "pad":
+        return np.pad(image, ((2, 4), (1, 3))), pixels + np.array([1, 2]), np.eye(3)
+    if name == "crop":
+        top, left = (height - 30) // 2, (width - 40) // 2
+        padded = np.pad(image, 100)[100 + top : 130 + top, 100 + left : 140 + left]
+        return padded, pixels - np.array([left, top]), np.eye(3)
+    assert name == "triple"
+    return image.repeat(3, 0).repeat(3, 1), (pixels + 0.5) * 3 - 0.5, np.eye(3)
+
+
+MAKERS = {
+    "hflip": lambda size: A.HorizontalFlip(p=1.0),
+    "vflip": lambda size: A.VerticalFlip(p=1.0),
+    "turn": lambda size: A.Rotate90(1),
+    "pad": lambda size: A.Pad((1, 2, 3, 4)),
+    "crop": lambda size: A.CenterCrop((30, 40)),
+    "triple": lambda size: A.Resize((3 * size[0], 3 * size[1])),
+}
+
+
+@pytest.mark.parametrize(
+    "names", [*((n,) for n in MAKERS), ("hflip", "triple", "pad", "turn", "vflip", "crop", "hflip")]
+)
+def test_an_independent_computation_agrees(names):
+    lens = camera(ct.Fisheye624)
+    given = sample(lens, count=1, number=5)
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 2, SIZE)
+    total, pixels, shown, edits = np.eye(3), given["keypoints"][0].numpy(), depth, []
+    crops = False
+    for name in names:
+        edits.append(MAKERS[name](shown.shape))
+        shown, pixels, turn = by_numpy(shown, pixels, name)
+        total, crops = turn @ total, crops or name == "crop"
+    chain = A.Compose(edits) if len(edits) > 1 else edits[0]
+    fields = {"depth": depth, "distance_2": depth, "mask": (depth * 100).astype(np.int64)}
+    out = chain(given, **{name: torch.from_numpy(value)[None] for name, value in fields.items()})
+    np.testing.assert_allclose(out["keypoints"][0], pixels, atol=1e-9)
+    for name in ("gaze", "tvec"):
+        np.testing.assert_allclose(out[name][0], total @ given[name][0].numpy(), atol=1e-12)
+    np.testing.assert_allclose(out["points"][0], given["points"][0].numpy() @ total.T, atol=1e-12)
+    np.testing.assert_allclose(out["rotation"][0], total, atol=1e-12)
+    mirror = np.diag([np.linalg.det(total), 1, 1])
+    head = total @ given["head_pose"][0, :3, :3].numpy() @ mirror
+    np.testing.assert_allclose(out["head_pose"][0, :3, :3], head, atol=1e-12)
+    np.testing.assert_allclose(out["head_pose"][0, :3, 3], total @ given["head_pose"][0, :3, 3].numpy(), atol=1e-12)
+    assert np.linalg.det(out["head_pose"][0, :3, :3]) == pytest.approx(1)
+    rvec = ct.rotations.rotation_matrix(out["rvec"][0]).numpy()
+    np.testing.assert_allclose(
+        rvec, total @ ct.rotations.rotation_matrix(given["rvec"][0]).numpy() @ mirror, atol=1e-12
+    )
+    # where a crop cut something off, and the last camera sees it again, it is shown
+    same = shown != 0 if crops else np.ones_like(shown, bool)
+    for name in ("depth", "distance_2"):
+        assert out[name].shape == (1, *shown.shape)
+        np.testing.assert_array_equal(out[name][0].numpy()[same], shown[same])
+    np.testing.assert_array_equal(out["mask"][0].numpy()[same], (shown * 100).astype(np.int64)[same])
+
+
+def test_depth_through_edits_and_another_mount():
+    lens = camera(ct.Fisheye624)
+    chain = A.Compose([A.HorizontalFlip(p=1.0), A.RandomMount(yaw=(8, 8), pitch=(3, 3), roll=(20, 20)), A.Resize(40)])
+    rays, _ = lens.rays()
+    distance = torch.full((1, 1, *SIZE), 2.0, dtype=torch.float64)
+    out = chain(distance=distance, depth=distance * rays[..., 2], camera=lens)
+    z = out["camera"].rays()[0][..., 2].numpy()
+    seen = out["distance"][0, 0].numpy() != 0
+    assert 0.6 < seen.mean() < 1
+    np.testing.assert_allclose(out["distance"][0, 0].numpy()[seen], 2.0)
+    np.testing.assert_allclose(out["depth"][0].numpy()[0, seen], 2 * z.reshape(seen.shape)[seen], atol=1e-9)
+
+
+# -- images
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.int64, torch.bool])
+def test_whole_steps_copy_pixels(dtype):
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 2 if dtype == torch.bool else 200, (4, 3, *SIZE), generator=generator).to(dtype)
+    assert torch.equal(A.HorizontalFlip(p=1.0)(image=image)["image"], image.flip(-1))
+    assert torch.equal(A.VerticalFlip(p=1.0)(image=image[0])["image"], image[0].flip(-2))
+    for k in range(4):
+        assert torch.equal(A.Rotate90(k)(image=image)["image"], torch.rot90(image, k, (-2, -1)))
+    padded = A.Pad((1, 2, 3, 4), fill=1)(image=image)["image"]
+    assert torch.equal(padded, F.pad(image, (1, 3, 2, 4), value=1))
+    assert torch.equal(A.CenterCrop((30, 40))(image=image)["image"], image[..., 9:39, 12:52])
+    torch.manual_seed(4)
+    some = A.HorizontalFlip()
+    out = some(image=image, mask=image)
+    rows = some.last.mirrored
+    assert rows.tolist() == [False, False, True, True] or 0 < rows.sum() < 4
+    expected = torch.where(rows[:, None, None, None], image.flip(-1), image)
+    assert torch.equal(out["image"], expected)
+    assert torch.equal(out["mask"], expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_what_shrinks_is_what_torchvision_makes(dtype):
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (3, 3, 96, 128), generator=generator).to(dtype)
+    small = F.interpolate(image, (20, 30), mode="bilinear", antialias=True)
+    assert torch.equal(A.Resize((20, 30))(image=image)["image"], small)
+    crop = A.Compose([A.RandomResizedCrop((20, 30), scale=(0.5, 1.0)), A.HorizontalFlip()])
+    torch.manual_seed(0)
+    out = crop(image=image, keypoints=torch.zeros(3, 1, 2))
+    for i, part in enumerate(out["image"]):
+        edges = torch.tensor([[-0.5, -0.5], [29.5, 19.5]])
+        corners = crop.last.row(i).inverse().points(edges[None])[0][0] + 0.5
+        (left, top), (right, bottom) = corners.amin(0).round().int().tolist(), corners.amax(0).round().int().tolist()
+        box = image[i : i + 1, :, top:bottom, left:right]
+        expected = F.interpolate(box, (20, 30), mode="bilinear", antialias=True)[0]
+        assert torch.equal(part, expected.flip(-1) if bool(crop.last.mirrored[i]) else expected)
+    large = A.Resize((200, 300))(image=image.float())["image"]
+    torch.testing.assert_close(large, F.interpolate(image.float(), (200, 300), mode="bilinear"), atol=0.01, rtol=0)
+    aliased = A.Resize((20, 30), antialias=False)(image=image.float())["image"]
+    torch.testing.assert_close(aliased, F.interpolate(image.float(), (20, 30), mode="bilinear"), atol=0.01, rtol=0)
+
+
+def scene(rays):
+    """Smooth colours of the directions."""
+    x, y, z = rays.unbind(-1)
+    return torch.stack((x, y, x * y, z), -1).movedim(-1, -3)
+
+
+def mixture(**options):
+    return A.Compose(
+        [
+            A.RandomResizedCrop((96, 128), scale=(0.4, 0.9), ratio=(0.9, 1.1)),
+            A.HorizontalFlip(),
+            A.RandomLens("kannala_brandt", fov=(40, 50)),
+            A.RandomMount(yaw=5, pitch=5, roll=20),
+            A.Rotate90(step=2),
+            A.VerticalFlip(),
+        ],
+        **options,
+    )
+
+
+def test_a_chain_shows_what_its_last_camera_sees():
+    lens = camera(ct.Fisheye624, torch.float32, (96, 128))
+    image = scene(lens.rays()[0]).expand(4, -1, -1, -1)
+    torch.manual_seed(1)
+    out = mixture(valid_mask=True)(image=image, camera=lens, **{k: sample(lens, 4)[k] for k in ("keypoints", "points")})
+    assert missed(out) < 1e-3
+    rays, _ = out["camera"].rays()
+    expected = scene(torch.einsum("bij,bhwi->bhwj", out["rotation"], rays))
+    inner = -F.max_pool2d(-out["image_valid"].float(), 5, 1, 2) > 0
+    error = (out["image"] - expected).abs() * inner
+    assert inner.float().mean() > 0.5
+    assert error.max() < 2e-3
+    assert {int(d.sign()) for d in torch.linalg.det(out["rotation"])} == {-1, 1}
+
+
+def test_a_chain_is_one_resampling(monkeypatch):
+    lens, calls = camera(dtype=torch.float32, size=(96, 128)), []
+    for name in ("_natively", "_by_torch"):
+        real = getattr(sampling, name)
+        monkeypatch.setattr(sampling, name, lambda *a, real=real, **k: calls.append(r := real(*a, **k)) or r)
+    image = torch.randint(0, 256, (4, 3, 96, 128), dtype=torch.uint8)
+    mixture()(image=image, camera=lens)
+    assert sum(call is not None for call in calls) == 1
+
+
+def test_a_chain_is_its_parts_one_after_the_other():
+    lens = camera(ct.Fisheye624)
+    given = sample(lens, count=5)
+    chain = mixture()
+    torch.manual_seed(7)
+    out = chain(given)
+    torch.manual_seed(7)
+    steps = torch.nn.Sequential(*chain.augmentations)(given)
+    for name in ("points", "gaze", "head_pose", "rotation"):
+        torch.testing.assert_close(out[name], steps[name], atol=1e-9, rtol=0)
+    both = steps["keypoints_valid"]  # all the way
+    assert bool((out["keypoints_valid"] >= both).all())
+    assert both.float().mean() > 0.4
+    torch.testing.assert_close(out["keypoints"][both], steps["keypoints"][both], atol=1e-9, rtol=0)
+    torch.testing.assert_close(out["camera"].intrinsics, steps["camera"].intrinsics)
+    draw = chain.draw(5, torch.Generator().manual_seed(2))
+    again = chain(given, draw=draw)
+    assert torch.equal(again["keypoints"], chain(given, draw=draw)["keypoints"])
+    back = chain.inverse(again)
+    torch.testing.assert_close(back["keypoints"], given["keypoints"], atol=1e-8, rtol=0)
+    torch.testing.assert_close(back["head_pose"], given["head_pose"], atol=1e-9, rtol=0)
+    nested = A.Compose([A.Compose(chain.parts[:2]), *chain.parts[2:]])
+    torch.manual_seed(7)
+    torch.testing.assert_close(nested(given)["keypoints"], out["keypoints"], atol=1e-9, rtol=0)
+    assert torch.equal(pickle.loads(pickle.dumps(chain))(given, draw=draw)["keypoints"], again["keypoints"])
+    copied = copy.deepcopy(chain)(given, draw=draw)
+    assert torch.equal(copied["keypoints"], again["keypoints"])
+
+
+def test_rows_that_nothing_applies_to_stay():
+    lens = camera(dtype=torch.float32)
+    image = torch.rand(40, 1, *SIZE)
+    chain = A.Compose([A.HorizontalFlip(), A.RandomLens(p=0.5), A.VerticalFlip(p=0.2)], camera=lens)
+    torch.manual_seed(0)
+    out = chain(image=image, keypoints=torch.rand(40, 3, 2) * 40)
+    still = (chain.last.rotation == torch.eye(3)).all((1, 2)) & (out["camera"].intrinsics == lens.intrinsics).all(1)
+    assert 3 < still.sum() < 30
+    assert torch.equal(out["image"][still], image[still])
+    never = A.Compose([A.HorizontalFlip(p=1.0)], p=0.0)
+    assert torch.equal(never(image=image)["image"], image)
+    whole = A.Compose([A.HorizontalFlip(p=1.0)], same_on_batch=True, p=0.5)
+    flipped = {tuple(whole(image=image)["rotation"][:, 0, 0].unique().tolist()) for _ in range(20)}
+    assert flipped == {(1.0,), (-1.0,)}
+
+
+def test_light_and_colours_go_through_edits():
+    lens = camera(dtype=torch.float32)
+    image = torch.full((2, 3, *SIZE), 200, dtype=torch.uint8)
+    shade = A.RandomLens(vignetting=0.6, chromatic=(0.02, 0.02), focal=(1.2, 1.2), centre=0, distortion=0, camera=lens)
+    torch.manual_seed(0)
+    alone = shade(image=image, draw=(draw := shade.draw(2)))["image"]
+    chain = A.Compose([shade, A.HorizontalFlip(p=1.0), A.Rotate90(1), A.Pad(3)])
+    values = {f"0.{name}": value for name, value in draw.items()}
+    out = chain(image=image, draw={**chain.draw(2), **values})["image"]
+    expected = torch.rot90(alone.flip(-1), 1, (-2, -1)).int()
+    assert (out[..., 4:-4, 4:-4].int() - expected[..., 1:-1, 1:-1]).abs().max() <= 2
+    assert expected.float().std() > 10
+    with pytest.raises(ValueError, match="chromatic and vignetting of RandomLens would be seen through another lens"):
+        A.Compose([shade, A.RandomMount()])
+
+
+def test_large_images_are_smoothed_before_a_lens():
+    lens = camera(ct.Pinhole, torch.float32, (480, 640))
+    stripes = (torch.arange(640) % 2 * 255).to(torch.uint8).expand(1, 1, 480, 640)
+    chain = A.Compose([A.Resize(120), A.RandomMount(roll=(10, 10), yaw=0, pitch=0)], camera=lens)
+    inner = chain(image=stripes)["image"][..., 30:-30, 30:-30].float()
+    assert (inner - 127.5).abs().max() < 3
+    rough = A.Compose(chain.parts, antialias=False, camera=lens)(image=stripes)["image"][..., 30:-30, 30:-30].float()
+    assert rough.std() > 40
+
+
+# -- landmarks
+
+
+def mean_faces():
+    return json.loads((Path(__file__).parent / "files" / "mean_faces.json").read_text())
+
+
+@pytest.mark.parametrize("name", A.LANDMARKS)
+def test_landmark_tables(name):
+    order = A.LANDMARKS[name]
+    assert len(order) == int(name[-3:].lstrip("0aku"[:3]) if name[-3:].isdigit() else name[-2:])
+    assert [order[i] for i in order] == list(range(len(order)))
+    points = torch.rand(3, len(order), 2) * 40
+    flip = A.HorizontalFlip(p=1.0, landmarks=name)
+    once = flip(keypoints=points, image=torch.zeros(3, 1, *SIZE))
+    assert torch.equal(once["keypoints"], (points * torch.tensor([-1, 1]) + torch.tensor([63, 0]))[:, list(order)])
+    twice = flip(keypoints=once["keypoints"], image=torch.zeros(3, 1, *SIZE))
+    torch.testing.assert_close(twice["keypoints"], points)
+    in_one = A.Compose([flip, A.VerticalFlip(p=1.0, landmarks=name)])
+    half_turn = in_one(keypoints=points, image=torch.zeros(3, 1, *SIZE))["keypoints"]
+    torch.testing.assert_close(half_turn, torch.tensor([63.0, 47.0]) - points)
+
+
+@pytest.mark.parametrize("name", ["ibug68", "wflw98", "lapa106"])
+def test_landmarks_mirror_the_mean_face(name):
+    """Of the mean face of a data set, every landmark's mirror image is nearest to the one that the table says."""
+    face = torch.tensor(mean_faces()[name])
+    face = face - face.mean(0)
+    order = list(A.LANDMARKS[name])
+    # the face's own middle line, which leans a little
+    mirrored = (face * torch.tensor([-1.0, 1.0]))[order]
+    u, _, v = torch.linalg.svd(mirrored.T @ face)
+    mirrored = mirrored @ (u @ v)
+    assert (mirrored - face).norm(dim=1).max() < 0.05
+    nearest = torch.cdist(face, mirrored).argmin(1)
+    # lips that are closed nearly touch
+    assert (nearest == torch.arange(len(face))).float().mean() > 0.93
+
+
+def test_coco_by_its_names():
+    names = ["nose", *(f"{side}_{part}" for part in PARTS for side in ("left", "right"))]
+    other = {"left": "right", "right": "left"}
+    expected = [names.index("_".join([other.get(n.split("_")[0], n.split("_")[0]), *n.split("_")[1:]])) for n in names]
+    assert list(A.LANDMARKS["coco17"]) == expected
+
+
+PARTS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+
+
+def test_landmarks_by_field_and_by_pairs():
+    image = torch.zeros(2, 1, *SIZE)
+    five = torch.rand(2, 5, 2) * 40
+    flip = A.HorizontalFlip(p=1.0, landmarks=[(0, 1), (3, 4)])
+    order = [1, 0, 2, 4, 3]
+    valid = torch.tensor([[True, False, True, True, True]] * 2)
+    out = flip(image=image, landmarks=five, landmarks_valid=valid, points=torch.rand(2, 7, 3))
+    assert torch.equal(out["landmarks"][..., 1], five[:, order, 1])
+    assert out["landmarks_valid"][0].tolist() == [False, True, True, True, True]
+    listed = flip(image=image, landmarks=[five[0], torch.rand(8, 2)])
+    assert torch.equal(listed["landmarks"][0], out["landmarks"][0])
+    by_name = A.HorizontalFlip(p=1.0, landmarks={"keypoints": "coco17", "landmarks": [1, 0, 2, 4, 3]})
+    body = torch.rand(2, 17, 2) * 40
+    both = by_name(image=image, landmarks=five, keypoints=body, points=torch.rand(2, 5, 3), keypoints_3=five)
+    assert torch.equal(both["landmarks"], out["landmarks"])
+    assert torch.equal(both["keypoints"][..., 1], body[:, list(A.LANDMARKS["coco17"]), 1])
+    assert torch.equal(both["keypoints_3"][..., 1], five[..., 1])
+    with pytest.raises(ValueError, match="keypoints holds 5 points, the table of landmarks 68"):
+        A.HorizontalFlip(p=1.0, landmarks="ibug68")(image=image, keypoints=five)
+    for bad in ("ibug", [1, 2, 0], [(0, 1), (1, 2)], [(0, 1, 2)], [0, 0]):
+        with pytest.raises(ValueError, match="landmarks must"):
+            A.HorizontalFlip(landmarks=bad)
+
+
+def test_left_and_right_change_places():
+    image, left, right = torch.zeros(6, 1, *SIZE), torch.randn(6, 3), torch.randn(6, 3)
+    flip = A.HorizontalFlip()
+    torch.manual_seed(1)
+    out = flip(image=image, gaze_left=left, gaze_right=right)
+    rows, mirror = flip.last.mirrored, torch.tensor([-1.0, 1.0, 1.0])
+    assert 0 < rows.sum() < 6
+    torch.testing.assert_close(out["gaze_left"][rows], (right * mirror)[rows])
+    assert torch.equal(out["gaze_left"][~rows], left[~rows])
+    torch.testing.assert_close(out["gaze_right"][rows], (left * mirror)[rows])
+    single = A.HorizontalFlip(p=1.0)(image=image[0], gaze_left=left[0], gaze_right=right[0])
+    assert torch.equal(single["gaze_left"], right[0] * mirror)
+    with pytest.raises(ValueError, match="gaze_left has no gaze_right to change places with"):
+        A.HorizontalFlip(p=0.0)(image=image, gaze_left=left)
+    kept = A.HorizontalFlip(p=1.0, swap_sides=False)(image=image, gaze_left=left)
+    assert torch.equal(kept["gaze_left"], left * mirror)
+
+
+def test_a_mirrored_head_is_a_mirrored_model():
+    """Points of a symmetric head, posed: the mirrored pose puts landmark i where the mirrored image shows it."""
+    lens = camera()
+    for axis in "xyz":
+        model = torch.rand(4, 3).double() * 0.2
+        other = model.clone()
+        other[:, "xyz".index(axis)] *= -1
+        model = torch.stack((model, other), 1).flatten(0, 1)  # 0 and 1, 2 and 3 ... are pairs
+        pose = sample(lens)["head_pose"]
+        pose[:, :3, 3] = torch.tensor([0.1, -0.05, 1.5])
+        points = model @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+        pairs = [(i, i + 1) for i in range(0, 8, 2)]
+        flip = A.HorizontalFlip(p=1.0, landmarks=pairs, lateral_axis=axis)
+        out = flip(keypoints=lens.project(points)[0], head_pose=pose, camera=lens)
+        new = out["head_pose"]
+        seen = out["camera"].project(model @ new[:, :3, :3].mT + new[:, None, :3, 3])[0]
+        torch.testing.assert_close(seen, out["keypoints"], atol=1e-9, rtol=0)
+
+
+# -- without a camera, of several models, in loaders
+
+
+def test_samples_without_a_camera():
+    edits = A.Compose([A.Resize((24, 32)), A.HorizontalFlip(p=1.0), A.Pad(2)])
+    out = edits(image=torch.rand(3, *SIZE), keypoints=torch.tensor([[0.0, 0.0], [63.0, 47.0]]), gaze=torch.ones(3))
+    assert "camera" not in out
+    assert out["image"].shape == (3, 28, 36)
+    torch.testing.assert_close(out["keypoints"], torch.tensor([[33.25, 1.75], [1.75, 25.25]]))
+    assert out["gaze"].tolist() == [-1.0, 1.0, 1.0]
+    back = edits.inverse(image=out["image"], keypoints=out["keypoints"])
+    torch.testing.assert_close(back["keypoints"], torch.tensor([[0.0, 0.0], [63.0, 47.0]]), atol=1e-5, rtol=0)
+    images = [torch.rand(1, 20, 30), torch.rand(1, 40, 30)]
+    listed = A.HorizontalFlip(p=1.0)(image=images, keypoints=[torch.zeros(1, 2), torch.zeros(2, 2)])
+    assert [k[0, 0].item() for k in listed["keypoints"]] == [29.0, 29.0]
+    assert torch.equal(listed["image"][1], images[1].flip(-1))
+    with pytest.raises(ValueError, match="HorizontalFlip: the sample holds neither an image nor a camera"):
+        A.HorizontalFlip()(keypoints=torch.zeros(1, 2))
+    with pytest.raises(ValueError, match="Compose: no camera"):
+        A.Compose([A.HorizontalFlip(), A.RandomLens()])(image=torch.rand(1, 3, *SIZE))
+    with pytest.raises(ValueError, match="channels last"):
+        A.HorizontalFlip()(image=torch.rand(*SIZE, 3))
+
+
+def test_pixels_without_a_ray_move_as_well():
+    """A fisheye's black corners, and what somebody wrote there."""
+    lens = ct.KannalaBrandt([20.0, 20, 31.5, 23.5], [-0.1, 0, 0, 0], image_size=SIZE).requires_grad_(False)
+    corner = torch.tensor([[[1.0, 1.0]]])
+    assert not lens.unproject(corner)[1].any()
+    image = torch.rand(1, 1, *SIZE)
+    out = A.Compose([A.HorizontalFlip(p=1.0), A.Pad(1)])(image=image, keypoints=corner, camera=lens)
+    assert out["keypoints"].tolist() == [[[63.0, 2.0]]]
+    assert out["keypoints_valid"].all()
+    assert torch.equal(out["image"][..., 1:-1, 1:-1], image.flip(-1))
+    bad = A.HorizontalFlip(p=1.0)(image=image, keypoints=torch.tensor([[[torch.nan, 1.0], [1e30, 0.0]]]), camera=lens)
+    assert bad["keypoints_valid"].tolist() == [[False, False]]
+    assert torch.isfinite(bad["keypoints"]).all()
+
+
+def test_cameras_of_several_models():
+    cameras = [camera(model) for model in DISTORTION]
+    given = [sample(lens, 1, seed=i) for i, lens in enumerate(cameras)]
+    fields = {name: torch.cat([one[name] for one in given]) for name in ("keypoints", "points")}
+    torch.manual_seed(0)
+    for many in (cameras, ct.Mixed(cameras)):
+        chain = A.Compose([A.RandomResizedCrop(SIZE, scale=(0.5, 1)), A.HorizontalFlip(), A.RandomMount(p=0.5)])
+        out = chain(image=torch.rand(4, 3, *SIZE), camera=many, **fields)
+        for i, lens in enumerate(out["camera"]):
+            pixels, valid = lens.project(out["points"][i])
+            use = valid & out["keypoints_valid"][i]
+            torch.testing.assert_close(pixels[use], out["keypoints"][i][use], atol=1e-9, rtol=0)
+        assert type(out["camera"]) is type(many)
+
+
+def test_gradients_reach_images_labels_and_cameras():
+    lens = camera().requires_grad_(True)
+    image = torch.rand(2, 1, *SIZE, dtype=torch.float64, requires_grad=True)
+    points = torch.rand(2, 3, 2, dtype=torch.float64, requires_grad=True)
+    for chain in (
+        A.HorizontalFlip(),
+        A.Compose([A.Resize(20), A.HorizontalFlip()]),
+        A.Compose([A.Pad(3), A.RandomMount()]),
+    ):
+        out = chain(image=image, keypoints=points, camera=lens)
+        ((out["image"] ** 2).sum() + out["keypoints"].sum() + out["camera"].intrinsics.sum()).backward()
+        for tensor in (image, points, lens.intrinsics):
+            assert tensor.grad.abs().sum() > 0
+            tensor.grad = None
+
+
+class Faces(torch.utils.data.Dataset):
+    def __init__(self):
+        self.chain = A.Compose([A.RandomResizedCrop(32), A.HorizontalFlip()], camera=camera(dtype=torch.float32))
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, i):
+        return self.chain(image=torch.rand(3, *SIZE), keypoints=torch.rand(5, 2))
+
+
+def test_a_loader():
+    (batch,) = DataLoader(Faces(), 4, collate_fn=A.collate)
+    assert batch["image"].shape == (4, 3, 32, 32)
+    assert batch["camera"].batch_shape == (4,)
+
+
+def test_empty_batches():
+    lens = camera(dtype=torch.float32)
+    fields = {"image": torch.rand(0, 3, *SIZE), "keypoints": torch.rand(0, 5, 2), "camera": lens}
+    for chain in (A.HorizontalFlip(), A.RandomResizedCrop(20), A.Compose([A.Resize(20), A.HorizontalFlip()])):
+        out = chain(**fields)
+        assert out["image"].shape[0] == out["keypoints"].shape[0] == 0
+
+
+# -- what goes wrong is told
+
+
+def test_wrong_arguments_are_told():
+    for make, text in (
+        (lambda: A.Pad(), "give either padding or size"),
+        (lambda: A.Pad(-1), "none negative"),
+        (lambda: A.Pad((1, 2, 3)), "padding must be one number"),
+        (lambda: A.Resize((0, 3)), "image_size must be positive"),
+        (lambda: A.Rotate90(0.5), "times must be a whole number"),
+        (lambda: A.RandomResizedCrop(20, scale=(0.5, 2.0)), "scale must lie within"),
+        (lambda: A.HorizontalFlip(prob=0.3), "unknown keyword 'prob'"),
+        (lambda: A.HorizontalFlip(min_filled=0.3), "there is no min_filled here"),
+        (lambda: A.HorizontalFlip(lateral_axis="left"), "lateral_axis must be"),
+        (lambda: A.Compose([]), "no augmentations"),
+        (lambda: A.Compose([torch.nn.Identity()]), "must be a list of augmentations of camtorch; got Identity"),
+        (lambda: A.Compose([A.Resize(3, mode="nearest")]), "mode='nearest' of Resize goes to Compose itself"),
+        (lambda: A.Compose([A.HorizontalFlip(landmarks="ibug68"), A.VerticalFlip()]), "the same landmarks"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=text):
+            make()
+    image = torch.rand(2, 1, *SIZE)
+    with pytest.raises(
+        ValueError, match=r"RandomCrop: the box \(50, 50\) must lie within the image, which is \(48, 64\)"
+    ):
+        A.RandomCrop(50)(image=image)
+    with pytest.raises(ValueError, match="with p < 1 images must keep their size"):
+        A.Resize(20, p=0.5)(image=image)
+    turn = A.Rotate90()
+    draw = {"apply": torch.ones(2, dtype=torch.bool), "times": torch.tensor([0.1, 0.3])}
+    with pytest.raises(ValueError, match="same_on_batch=True turns all alike"):
+        turn(image=image, draw=draw)
+    with pytest.raises(ValueError, match="a quarter turn of the image has no camera of this model"):
+        A.Rotate90(1)(image=image, camera=ct.Cylindrical([20.0, 20, 32, 24], image_size=SIZE).requires_grad_(False))
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_they_say_what_they_are(name):
+    edit = EDITS[name]()
+    assert type(edit).__name__ in repr(edit)
+    assert "antialias=None" in repr(edit)
+    assert isinstance(edit, A.Edit)
+
+
+def test_every_pair_of_edits_commutes_with_its_camera():
+    lens = camera()
+    given = sample(lens, count=2)
+    for one, two in itertools.product(EDITS, repeat=2):
+        if one == "resize" and two == "crop":
+            continue  # 30 rows have no box of 40
+        if two == "crop" and one == "shorter":
+            continue
+        out = A.Compose([EDITS[one](), EDITS[two]()])(given)
+        pixels, valid = out["camera"].project(out["points"])
+        use = valid & out["keypoints_valid"]
+        assert not use.any() or (pixels - out["keypoints"]).norm(dim=-1)[use].max() < 1e-9
