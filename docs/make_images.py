@@ -10,7 +10,9 @@ from camtorch.cli.labelled_image import LabelledImage, rendered
 from camtorch.cli.labels import Labels
 from camtorch.cli.main import main
 from camtorch.cli.sheet import marked
+from camtorch.demo import room
 from camtorch.demo.example import driver
+from camtorch.rotations import mount_rotation
 
 SEED = 4
 HERE = Path(__file__).parent / "images"
@@ -55,7 +57,56 @@ def overview() -> Image.Image:
     return sheet
 
 
+def mounted(pitch: float, roll: float) -> torch.Tensor:
+    """(3, 3) camera from room, of a camera that looks up by `pitch` and leans right by `roll` degrees."""
+    return mount_rotation(*(torch.tensor(float(angle), dtype=torch.float64) for angle in (0, pitch, roll)))
+
+
+def fields() -> Image.Image:
+    """Latitude and up over images of a room, by cameras that hang in it differently."""
+    size = (480, 640)
+    lens = ct.KannalaBrandt.from_fov(170, image_size=size, distortion=[0.02, -0.01, 0.003, -0.001]).double()
+    narrow = ct.Pinhole.from_fov(80, image_size=size).double()
+    panels = [
+        (narrow, (0, 0), "a pinhole camera, level"),
+        (narrow, (-12, 14), "looking down, leaning"),
+        (lens, (-12, 14), "a fisheye of 170 degrees, likewise"),
+    ]
+    gap, band = 16, 34
+    sheet = Image.new("RGB", (len(panels) * (size[1] + gap) + gap, size[0] + band + 2 * gap), PAPER)
+    font = ImageFont.load_default(size=24)
+    for i, (camera, (pitch, roll), title) in enumerate(panels):
+        turned = mounted(pitch, roll)
+        image = (room.render(camera, turned, samples=3) * 255).byte().permute(1, 2, 0).numpy()
+        tile = Image.fromarray((0.45 * image + 0.55 * 255).astype("uint8"))
+        down = turned[:, 1]  # y of the room
+        latitude, _, valid = camera.perspective_field(down)
+        bands = (latitude.rad2deg() / 15).floor()
+        edge = torch.zeros_like(valid)
+        edge[1:, 1:] = (bands[1:, 1:] != bands[:-1, 1:]) | (bands[1:, 1:] != bands[1:, :-1])
+        horizon = edge & (latitude.abs() < 0.02)
+        draw = ImageDraw.Draw(tile)
+        for where, colour in ((edge & valid, (60, 110, 180)), (horizon & valid, (200, 60, 50))):
+            for v, u in where.nonzero().tolist():
+                draw.rectangle((u - 1, v - 1, u, v), colour)
+        _, up, seen = camera.perspective_field(down, stride=40)
+        for (u, v), (x, y), shown in zip(
+            camera.pixel_grid(40).flatten(0, 1).tolist(),
+            up.flatten(0, 1).tolist(),
+            seen.flatten().tolist(),
+            strict=True,
+        ):
+            if shown:
+                draw.line((u, v, u + 18 * x, v + 18 * y), INK, 2)
+                draw.ellipse((u - 3, v - 3, u + 3, v + 3), INK)
+        left = gap + i * (size[1] + gap)
+        sheet.paste(tile, (left, gap + band))
+        ImageDraw.Draw(sheet).text((left, gap - 4), title, INK, font)
+    return sheet.resize((sheet.width // 2, sheet.height // 2), Image.Resampling.LANCZOS)
+
+
 if __name__ == "__main__":
+    fields().save(HERE / "fields.jpg", quality=85)
     overview().save(HERE / "overview.jpg", quality=88)
     full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]
     for words in (["augment", *full], ["demo"], ["demo", "stereo"], ["demo", "surround"]):
