@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import camtorch as ct
+from camtorch.cli.main import main
 from camtorch.lenses.collection import columns
 from camtorch.lenses.drawing import lenses_for
 from camtorch.warp.warp import along_edges
@@ -201,3 +203,24 @@ def test_a_sample_comes_with_a_real_lens():
     assert isinstance(sample["camera"], ct.KannalaBrandt)
     assert sample["camera"].image_size == (240, 320)
     assert (sample["image"] > 0).double().mean() > 0.85
+
+
+def test_the_command_line_knows_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["lenses", "GoPro", "HERO9", "wide", "-n", "2", "-o", "hero.json"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("GoPro HERO9 Black Wide: 3840x2160, 116 degrees wide")
+    assert lines[2] == "and 12 more; -n 14 lists them all"
+    camera = ct.lenses.find("GoPro HERO9 wide")
+    assert torch.equal(ct.load("hero.json").camera.intrinsics, camera.intrinsics)
+    Image.new("RGB", (384, 216), (90, 120, 30)).save("photo.png")
+    assert main(["dewarp", "photo.png", "--lens", "GoPro HERO9 wide"]) == 2
+    assert "--rescale scales the camera" in capsys.readouterr().err
+    assert main(["dewarp", "photo.png", "--lens", "GoPro HERO9 wide", "--rescale"]) == 0
+    told = capsys.readouterr()
+    assert "the best of 14" in told.err
+    assert Path("dewarped.png").exists()
+    assert main(["show", "lens:GoPro HERO9 wide"]) == 0
+    assert "KannalaBrandt" in capsys.readouterr().out
+    assert main(["lenses", "GoPro", "HERO99"]) == 2
+    assert "the nearest are" in capsys.readouterr().err

@@ -6,7 +6,9 @@ import argparse
 import warnings
 from pathlib import Path
 
+from camtorch import lenses
 from camtorch.camera import Camera
+from camtorch.cli.options import LENS
 from camtorch.cli.terminal import note
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, opencv
@@ -27,7 +29,7 @@ def read_rig(
     """The cameras of a file.
 
     Args:
-        path: a file of any format.
+        path: a file of any format, or `LENS` and the name of a real lens.
         name: the only camera wanted.
         model: a key of `camtorch.MODELS`, for OpenCV's files, which may not say it.
         size: (height, width), for cameras whose file does not say it.
@@ -37,6 +39,8 @@ def read_rig(
         CameraFileError: the file cannot be used. ValueError: no camera of that name, or of another size; a model for a
             file that says its own, or none for one that leaves it open and has to say it.
     """
+    if str(path).startswith(LENS):
+        return _of_lens(str(path).removeprefix(LENS))
     rig = load(path) if model is None else _of_model(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
         raise ValueError(
@@ -53,6 +57,14 @@ def read_rig(
             raise ValueError(f"{path}: {found} is for {_shown(camera.image_size)}, not {_shown(size)}")
         camera.image_size = camera.image_size or size
     return rig
+
+
+def _of_lens(words: str) -> Rig:
+    found = lenses.search(words)
+    camera = lenses.find(words)
+    others = f", the best of {len(found)} that camtorch lenses lists" if len(found) > 1 else ""
+    note(f"{words}: {found[0]!r}{others}")
+    return Rig({"camera": camera})
 
 
 def _leaves_open(path: Path) -> bool:
@@ -130,7 +142,8 @@ def _unfitted(image: Path, arguments: argparse.Namespace) -> tuple[Rig, str, Cam
     path: Path | None = arguments.camera
     if path is None:
         raise ValueError(
-            f"{image}: which camera took it? --camera FILE, its calibration, says so: an image alone does not tell"
+            f"{image}: which camera took it? --camera FILE, its calibration, says so, or --lens NAME: an image alone "
+            "does not tell"
         )
     rig = read_rig(path, arguments.name, arguments.from_model)
     name, camera = _only(path, rig)

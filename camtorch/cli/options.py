@@ -49,9 +49,25 @@ def parse_fov(text: str) -> float | tuple[float, float] | str:
     return text if text == "source" else parse_range(text)
 
 
+LENS = "lens:"
+"""What the name of a real lens begins with, in the place of a calibration file."""
+
+
+def parse_lens(text: str) -> Path:
+    """The name of a real lens, in the place of a calibration file."""
+    return parse_path(LENS + text)
+
+
 def add_photograph(command: argparse.ArgumentParser) -> None:
     """The calibration of an image."""
     command.add_argument("--camera", type=parse_path, metavar="FILE", help="its calibration, of any format")
+    command.add_argument(
+        "--lens",
+        type=parse_lens,
+        dest="camera",
+        metavar="NAME",
+        help="instead of a calibration, a real lens by its name: camtorch lenses lists them",
+    )
     _add_from_model(command, "--model")
     command.add_argument("--name", help="which camera, in a file with several")
     _add_rescale(command)
