@@ -12,6 +12,7 @@ from camtorch.cli.main import main
 from camtorch.cli.sheet import marked
 from camtorch.demo import room
 from camtorch.demo.example import driver
+from camtorch.demo.exposure import expose
 from camtorch.rotations import mount_rotation
 
 SEED = 4
@@ -55,6 +56,54 @@ def overview() -> Image.Image:
         draw.rectangle((left - 1, gap + band - 1, left + tile.width, gap + band + tile.height), outline=RIM)
         draw.text((left, gap), title, INK, font)
     return sheet
+
+
+def tiles(panels: list[tuple[torch.Tensor, str]], columns: int) -> Image.Image:
+    """Images (3, H, W) in [0, 1] of one size with their titles, in rows."""
+    (height, width), gap, band = panels[0][0].shape[1:], 16, 30
+    rows = -(-len(panels) // columns)
+    sheet = Image.new("RGB", (columns * (width + gap) + gap, rows * (height + band + gap) + gap), PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=18)
+    for i, (image, title) in enumerate(panels):
+        left, top = gap + i % columns * (width + gap), gap + i // columns * (height + band + gap)
+        tile = Image.fromarray((image * 255).round().byte().permute(1, 2, 0).numpy())
+        sheet.paste(tile, (left, top + band))
+        draw.rectangle((left - 1, top + band - 1, left + width, top + band + height), outline=RIM)
+        draw.text((left, top), title, INK, font)
+    return sheet
+
+
+def lenses() -> Image.Image:
+    """One fisheye image as lenses that exist would have seen it."""
+    source = ct.KannalaBrandt.from_fov(200, image_size=(900, 1200)).requires_grad_(False)
+    image, panels = room.render(source, samples=4)[None], []
+    names = "Laowa 7.5mm Panasonic G7", "GoPro HERO9 wide", "DJI Osmo Action", "Sony ZV-E10 16mm", "iPhone 13 pro"
+    for name in (*names, "Pixel 6"):
+        camera = ct.lenses.find(name, image_size=(1080, 1920)).float().resize(270, 480)
+        degrees = float(camera.field_of_view[0].rad2deg())
+        panels.append((ct.Warp(source, camera, antialias=True)(image)[0], f"{name}: {degrees:.0f} degrees"))
+    return tiles(panels, 3)
+
+
+def shutters() -> Image.Image:
+    """An image as a rolling shutter takes it while the camera turns, that undone, and the blur of an exposure."""
+    source = ct.KannalaBrandt.from_fov(130, image_size=(300, 400)).requires_grad_(False)
+    rates = torch.tensor([1.0, -5.0, 4.0])
+    times = 0.03 * ((torch.arange(300) + 0.5) / 300 - 0.5)
+    x, y, z = rates.tolist()
+    turns = torch.linalg.matrix_exp(times[:, None, None] * torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    rolled = expose(source, lambda rays: room.radiance((turns[:, None] @ rays[..., None])[..., 0]), samples=8)
+    straight = ct.Pinhole.from_fov(95, image_size=(300, 400)).requires_grad_(False)
+    shutter = ct.RollingShutter(0.03, rates)
+    blur = ct.RollingShutter(0.0, rates, exposure=0.01, gamma=2.2)
+    still = room.render(source, samples=8)
+    panels = [
+        (rolled, "rows rendered one by one, turning"),
+        (ct.Warp(source, straight)(rolled[None])[0], "lens undone"),
+        (ct.Warp(source, straight, shutter=shutter)(rolled[None])[0], "lens and shutter undone"),
+        (ct.Warp(source, straight, target_shutter=blur)(still[None])[0], "an exposure put on"),
+    ]
+    return tiles(panels, 4)
 
 
 def mounted(pitch: float, roll: float) -> torch.Tensor:
@@ -106,6 +155,8 @@ def fields() -> Image.Image:
 
 
 if __name__ == "__main__":
+    lenses().save(HERE / "lenses.jpg", quality=85)
+    shutters().save(HERE / "shutter.jpg", quality=85)
     fields().save(HERE / "fields.jpg", quality=85)
     overview().save(HERE / "overview.jpg", quality=88)
     full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]

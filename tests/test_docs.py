@@ -72,6 +72,7 @@ def folder(tmp_path, monkeypatch, request):
     height, width = camera.image_size
     ct.save(camera, "other.yml", format="opencv")
     Image.fromarray(np.full((height, width, 3), 128, np.uint8)).save("photo.jpg")
+    Image.new("RGB", (480, 270), (90, 120, 30)).save("gopro.jpg")
     if "images/*.jpg" in request.getfixturevalue("page").read_text():
         write_calibration_data()
     known = dict(ct.MODELS)
