@@ -1,19 +1,24 @@
 """Edits with all that a sample holds: the camera, the labels and the image agree, along any chain of them."""
 
 import copy
+import importlib
 import itertools
 import json
 import pickle
 import random
 from pathlib import Path
 
+import kornia.augmentation as K  # noqa: N812
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch.utils.data import DataLoader
+from torchvision_stand_in import torchvision_of
 
 import camtorch as ct
+import camtorch.augment.kornia as fronts
+import camtorch.augment.numpy
 from camtorch.warp import sampling
 
 A = ct.augment
@@ -76,7 +81,9 @@ EDITS = {
 }
 
 
-@pytest.mark.parametrize("model", DISTORTION)
+@pytest.mark.parametrize(
+    "model", [m if m is ct.Fisheye624 else pytest.param(m, marks=pytest.mark.slow) for m in DISTORTION]
+)
 @pytest.mark.parametrize("name", EDITS)
 def test_the_camera_follows_every_edit(name, model):
     lens = camera(model)
@@ -631,6 +638,91 @@ def test_empty_batches():
         assert out["image"].shape[0] == out["keypoints"].shape[0] == 0
 
 
+# -- in other pipelines
+
+
+def by_hand(image, keypoints, lens):
+    """The chain of the front ends: mirrored, then padded; landmarks 0 and 1 change places."""
+    chain = A.Compose([A.HorizontalFlip(p=1.0, landmarks=[(0, 1)]), A.Pad((1, 2, 3, 4))])
+    return chain, chain(image=image, keypoints=keypoints, **({} if lens is None else {"camera": lens}))
+
+
+@pytest.mark.parametrize("lens", [None, camera(dtype=torch.float32)], ids=["no camera", "camera"])
+def test_arrays(lens):
+    image, points = torch.randint(0, 256, (3, *SIZE), dtype=torch.uint8), torch.rand(4, 2) * 40
+    chain, expected = by_hand(image, points, lens)
+    given = {} if lens is None else {"camera": lens}
+    array = image.permute(1, 2, 0).numpy()
+    out = ct.augment.numpy.Transform(chain)(image=array, keypoints=points.numpy(), masks=[array], **given)
+    np.testing.assert_array_equal(out["image"], expected["image"].permute(1, 2, 0).numpy())
+    np.testing.assert_array_equal(out["masks"][0], out["image"])
+    np.testing.assert_array_equal(out["keypoints"], expected["keypoints"].numpy())
+    assert ("camera" in out) == (lens is not None)
+    empty = ct.augment.numpy.Transform(chain)(image=array, masks=np.zeros((0, *SIZE), np.uint8), **given)
+    assert empty["masks"].shape == (0, 54, 68)
+
+
+@pytest.mark.parametrize("kind", ["stand-in", "real"])
+@pytest.mark.parametrize("lens", [None, camera(dtype=torch.float32)], ids=["no camera", "camera"])
+def test_torchvision(kind, lens, monkeypatch):
+    with torchvision_of(kind, monkeypatch) as tv_tensors:
+        front = importlib.import_module("camtorch.augment.torchvision")
+        image, points = torch.randint(0, 256, (3, *SIZE), dtype=torch.uint8), torch.rand(4, 2) * 40
+        chain, expected = by_hand(image, points, lens)
+        given = {"image": tv_tensors.Image(image)}
+        if hasattr(tv_tensors, "KeyPoints"):
+            given["points"] = tv_tensors.KeyPoints(points, canvas_size=SIZE)
+        out = front.Transform(chain, lens)(given)
+        assert torch.equal(out["image"].as_subclass(torch.Tensor), expected["image"])
+        if "points" in given:
+            assert torch.equal(out["points"].as_subclass(torch.Tensor), expected["keypoints"])
+            assert tuple(out["points"].canvas_size) == (54, 68)
+        with pytest.raises(ValueError, match="no camera"):
+            front.Transform(A.Compose([A.HorizontalFlip(), A.RandomLens()]))(given)
+
+
+def test_kornia():
+    lens = camera(dtype=torch.float32)
+    image, points = torch.rand(2, 3, *SIZE), torch.rand(2, 4, 2) * 40
+    chain, expected = by_hand(image, points, lens)
+    pipeline = K.AugmentationSequential(fronts.CameraAugmentation(chain, lens), data_keys=["input", "keypoints"])
+    moved, keypoints = pipeline(image, points)
+    torch.testing.assert_close(moved, expected["image"])
+    torch.testing.assert_close(keypoints, expected["keypoints"])
+    flip = fronts.HorizontalFlip(lens, landmarks=[(0, 1)], p=1.0)
+    both = fronts.Compose(lens, [A.RandomResizedCrop(SIZE), A.HorizontalFlip(), A.RandomLens()])
+    half = fronts.HorizontalFlip(lens)
+    assert (flip.p, both.p, half.p) == (1.0, 1.0, 0.5)
+    back = flip.inverse_keypoints
+    mirrored = flip(image)
+    assert torch.equal(mirrored, image.flip(-1))
+    assert callable(back)
+    torch.manual_seed(0)
+    seen = both(image)
+    assert seen.shape == image.shape
+    last = both.last.target
+    assert last.batch_shape == (2,)
+    torch.manual_seed(0)
+    direct = both.augmentation(image=image, camera=lens)
+    torch.testing.assert_close(direct["camera"].intrinsics, last.intrinsics)
+    turned = K.AugmentationSequential(fronts.Rotate90(lens, 1), data_keys=["input"])(image)
+    assert torch.equal(turned, torch.rot90(image, 1, (-2, -1)))
+
+
+def test_albumentations():
+    albumentations = pytest.importorskip("albumentations", reason="albumentations is not installed")
+    front = importlib.import_module("camtorch.augment.albumentations")
+    image, points = torch.randint(0, 256, (3, *SIZE), dtype=torch.uint8), torch.rand(4, 2) * 40
+    for lens in (None, camera(dtype=torch.float32)):
+        chain, expected = by_hand(image, points, lens)
+        keypoints = albumentations.KeypointParams(format="xy", remove_invisible=False)
+        pipeline = albumentations.Compose([front.Transform(chain, lens)], keypoint_params=keypoints)
+        out = pipeline(image=image.permute(1, 2, 0).numpy(), keypoints=points.numpy())
+        np.testing.assert_array_equal(out["image"], expected["image"].permute(1, 2, 0).numpy())
+        np.testing.assert_allclose(out["keypoints"], expected["keypoints"].numpy(), atol=1e-4)
+        assert ("camera" in out) == (lens is not None)
+
+
 # -- what goes wrong is told
 
 
@@ -675,6 +767,7 @@ def test_they_say_what_they_are(name):
     assert isinstance(edit, A.Edit)
 
 
+@pytest.mark.slow
 def test_every_pair_of_edits_commutes_with_its_camera():
     lens = camera()
     given = sample(lens, count=2)
