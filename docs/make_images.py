@@ -45,16 +45,22 @@ def overview() -> Image.Image:
         (straight, "dewarped"),
         *((other, "another lens and mount") for other in others),
     ]
+    return in_rows(panels, len(panels))
+
+
+def in_rows(panels: list[tuple[LabelledImage, str]], columns: int) -> Image.Image:
+    """Labelled images with their titles above them."""
     height, width, gap, band = 300, 400, 16, 34
-    sheet = Image.new("RGB", (len(panels) * (width + gap) + gap, height + band + 2 * gap), PAPER)
+    rows = -(-len(panels) // columns)
+    sheet = Image.new("RGB", (columns * (width + gap) + gap, rows * (height + band + gap) + gap), PAPER)
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=18)
     for i, (view, title) in enumerate(panels):
-        left = gap + i * (width + gap)
+        left, top = gap + i % columns * (width + gap), gap + i // columns * (height + band + gap)
         tile = marked(view, height, width)
-        sheet.paste(tile, (left, gap + band))
-        draw.rectangle((left - 1, gap + band - 1, left + tile.width, gap + band + tile.height), outline=RIM)
-        draw.text((left, gap), title, INK, font)
+        sheet.paste(tile, (left, top + band))
+        draw.rectangle((left - 1, top + band - 1, left + tile.width, top + band + tile.height), outline=RIM)
+        draw.text((left, top), title, INK, font)
     return sheet
 
 
@@ -154,11 +160,40 @@ def fields() -> Image.Image:
     return sheet.resize((sheet.width // 2, sheet.height // 2), Image.Resampling.LANCZOS)
 
 
+def edits() -> Image.Image:
+    """Edits of a fisheye image, and a chain of them with another lens."""
+    augment = ct.augment
+    lens = ct.KannalaBrandt.from_fov(130, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
+    before = rendered(driver(lens.double().requires_grad_(False)))
+    crop, flip = augment.RandomResizedCrop((480, 640), scale=(0.5, 0.5)), augment.HorizontalFlip(p=1.0)
+    whole = augment.RandomResizedCrop((480, 640), scale=(0.85, 0.85))
+    other = augment.RandomCamera("dms130", fov="source", min_filled=0.97, yaw=4, pitch=4, roll=(18, 18), crop=None)
+    chain = augment.Compose([whole, flip, other])
+    named = {
+        "RandomResizedCrop": crop,
+        "HorizontalFlip": flip,
+        "Rotate90": augment.Rotate90(1),
+        "Pad": augment.Pad(size=(640, 640), fill=210),
+        "crop, flip, another lens and mount: one warp": chain,
+    }
+    panels = [(before, "an image with its labels")]
+    for title, edit in named.items():
+        torch.manual_seed(SEED)
+        labels = before.labels
+        given = {"keypoints": labels.keypoints, "boxes": labels.boxes, "points": labels.eyes, "gaze": labels.gaze}
+        out = edit(image=before.image, camera=before.camera, **given)
+        moved_labels = Labels(out["keypoints"], out["boxes"], out["points"], out["gaze"])
+        flags = out["keypoints_valid"], out["boxes_valid"]
+        panels.append((LabelledImage(out["image"], out["camera"], moved_labels, [], *flags), title))
+    return in_rows(panels, 3)
+
+
 if __name__ == "__main__":
     lenses().save(HERE / "lenses.jpg", quality=85)
     shutters().save(HERE / "shutter.jpg", quality=85)
     fields().save(HERE / "fields.jpg", quality=85)
     overview().save(HERE / "overview.jpg", quality=88)
+    edits().save(HERE / "edits.jpg", quality=85)
     full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]
     for words in (["augment", *full], ["demo"], ["demo", "stereo"], ["demo", "surround"]):
         path = HERE / f"{words[1] if words[0] == 'demo' and words[1:] else words[0]}.jpg"
