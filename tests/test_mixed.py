@@ -29,13 +29,14 @@ def one_of_each(dtype=torch.float64):
     return cameras
 
 
-def values(size, count, dtype=torch.float64):
-    """(count, 101, size): points all around, or pixels; some that no camera takes."""
-    torch.manual_seed(0)
-    given = torch.randn(count, 101, size, dtype=dtype)
+def values(size, count, bad=True):
+    """(count, 1025, size): points all around, or pixels; some that no camera takes."""
+    torch.manual_seed(3)
+    given = torch.randn(count, 1025, size, dtype=torch.float64)
     if size == 2:
         given = (given * 0.3 + 0.5) * torch.tensor(SIZE[::-1])
-    given[:, 0], given[:, 1, 0] = 0, torch.nan
+    if bad:
+        given[:, 0], given[:, 1, 0] = 0, torch.nan
     return given
 
 
@@ -43,13 +44,14 @@ def tensors(camera):
     return [t for t in (camera.intrinsics, camera.distortion) if t.numel()]
 
 
+@pytest.mark.parametrize("bad", [True, False])
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_one_by_one_to_the_bit_with_gradients(direction):
+def test_one_by_one_to_the_bit_with_gradients(direction, bad):
     cameras = one_of_each()
     cameras += [copy.deepcopy(camera) for camera in cameras[::-1] if camera.key in DISTINCT]
     mixed = ct.Mixed(cameras)
     assert len(mixed.groups) == len(KEYS)
-    given = values(DIRECTIONS[direction], len(cameras)).requires_grad_()
+    given = values(DIRECTIONS[direction], len(cameras), bad).requires_grad_()
     result, valid = getattr(mixed, direction)(given)
     weight = torch.rand(result.shape[-2:], dtype=torch.float64)
     (result * weight).sum().backward()
@@ -314,6 +316,7 @@ def test_augmented_as_a_list_of_cameras_is(p):
     cameras, images = models(learns=False), torch.rand(6, 3, *SIZE)
     fields = {"image": images, "keypoints": torch.rand(6, 4, 2) * 40, "gaze": torch.randn(6, 3)}
     for augment in (
+        ct.augment.Compose([ct.augment.RandomResizedCrop(SIZE, p=p), ct.augment.HorizontalFlip(p=p)]),
         ct.augment.RandomCamera(yaw=3, pitch=3, roll=3, p=p, min_filled=0.8),
         ct.augment.RandomLens("kannala_brandt", fov=(80, 90), p=p, min_filled=0),
     ):

@@ -221,7 +221,8 @@ class Project(Function):
             here, chart = block.here, block.domain.chart
             x, y, z = planes_of(points[here])
             shrink = mask = None
-            gu, gv = by_pixels[0][here], by_pixels[1][here]
+            # a sum is rounded by how what it adds lies in memory
+            gu, gv = planes_of(by_pixels.movedim(0, -1)[here])
             if not plain:
                 x, y, z, shrink, _ = normalise(chart, x, y, z, looks)
                 mask = valid[here].to(x.dtype)
