@@ -1,7 +1,10 @@
 """The images of the documentation, rendered: `python docs/make_images.py`."""
 
+import io
+import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
@@ -192,6 +195,50 @@ if __name__ == "__main__":
     lenses().save(HERE / "lenses.jpg", quality=85)
     shutters().save(HERE / "shutter.jpg", quality=85)
     fields().save(HERE / "fields.jpg", quality=85)
+def maps() -> Image.Image:
+    """What meshes of a fisheye are off by: on the source, and over the target."""
+    lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
+    fisheye = rendered(driver(lens.double().requires_grad_(False)))
+    warp = ct.Dewarp(fisheye.camera, projection="cylindrical", fov=2.9, image_size=(480, 640))
+    images = [image[0].permute(1, 2, 0) for image in (fisheye.image[None], warp(fisheye.image[None]))]
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/map.bin"
+        found = []
+        for format, title in (("dw100", "DW100: every 16 px, in 1/16 px"), ("ti_ldc", "TI LDC: every 8 px, in 1/8 px")):
+            report = warp.save(path, format)
+            found.append(
+                (
+                    f"{title}\n{report.max_error:.2f} px at most, rms {report.rms_error:.2f}",
+                    ct.load_map(path).error(warp),
+                )
+            )
+        warp.save(path, "depthai")
+        mesh = ct.load_map(path).positions
+    paper = [value / 255 for value in PAPER]
+    figure, axes = plt.subplots(1, 4, figsize=(16.4, 3.9), facecolor=paper, layout="constrained")
+    for axis, image, title in zip(
+        axes, images, ("a fisheye, and a mesh of every 16 px", "dewarped"), strict=False
+    ):
+        axis.imshow(image)
+        axis.set_title(title)
+    for lines, ends in ((mesh[::16], mesh.shape[1]), (mesh[:, ::16].transpose(0, 1), mesh.shape[0])):
+        for line in lines[:, :ends]:
+            axes[0].plot(*line.T, color="white", linewidth=0.5)
+    most = max(float(error.nan_to_num(0).max()) for _, error in found)
+    for axis, (title, error) in zip(axes[2:], found, strict=True):
+        shown = axis.imshow(error, cmap="magma", vmin=0, vmax=most)
+        axis.set_title(title)
+    figure.colorbar(shown, ax=axes[2:], label="px of the source", pad=0.01)
+    for axis in axes:
+        axis.set(xticks=[], yticks=[], xlim=(-0.5, 639.5), ylim=(479.5, -0.5))
+    file = io.BytesIO()
+    figure.savefig(file, dpi=100)
+    plt.close(figure)
+    return Image.open(file).convert("RGB")
+
+
+if __name__ == "__main__":
+    maps().save(HERE / "maps.jpg", quality=85)
     overview().save(HERE / "overview.jpg", quality=88)
     edits().save(HERE / "edits.jpg", quality=85)
     full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]
