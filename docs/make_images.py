@@ -216,9 +216,7 @@ def maps() -> Image.Image:
         mesh = ct.load_map(path).positions
     paper = [value / 255 for value in PAPER]
     figure, axes = plt.subplots(1, 4, figsize=(16.4, 3.9), facecolor=paper, layout="constrained")
-    for axis, image, title in zip(
-        axes, images, ("a fisheye, and a mesh of every 16 px", "dewarped"), strict=False
-    ):
+    for axis, image, title in zip(axes, images, ("a fisheye, and a mesh of every 16 px", "dewarped"), strict=False):
         axis.imshow(image)
         axis.set_title(title)
     for lines, ends in ((mesh[::16], mesh.shape[1]), (mesh[:, ::16].transpose(0, 1), mesh.shape[0])):
@@ -232,7 +230,7 @@ def maps() -> Image.Image:
     for axis in axes:
         axis.set(xticks=[], yticks=[], xlim=(-0.5, 639.5), ylim=(479.5, -0.5))
     file = io.BytesIO()
-    figure.savefig(file, dpi=100)
+    figure.savefig(file, dpi=100, bbox_inches="tight")
     plt.close(figure)
     return Image.open(file).convert("RGB")
 

@@ -443,6 +443,18 @@ def test_options_that_are_none_are_errors(format, options, match, tmp_path):
         small().save(tmp_path / ("map.exr" if format == "stmap" else "map.npz"), format, **options)
 
 
+def test_what_is_no_size_is_told_by_its_name(tmp_path):
+    with pytest.raises(TypeError, match=r"Warp.save: block must be two integers \(height, width\); got 32"):
+        small().save(tmp_path / "map.bin", "ti_ldc", block=32)
+    with pytest.raises(TypeError, match=r"step must be a whole number; got 8.0"):
+        small().save(tmp_path / "map.bin", "ti_ldc", step=8.0)
+    small().save(tmp_path / "map.bin", "ti_ldc")
+    with pytest.raises(ValueError, match=r"load_map: source_size must be positive"):
+        ct.load_map(tmp_path / "map.bin", source_size=(0, 3))
+    with pytest.raises(TypeError, match="takes the path of a file; got int"):
+        ct.load_map(3)
+
+
 def test_one_warp_is_saved_whether_it_learns_or_not(tmp_path):
     camera = fisheye(0.25)
     learning = ct.Warp(ct.KannalaBrandt(camera.intrinsics.tolist(), image_size=(200, 320)), small().target)
@@ -465,7 +477,7 @@ def test_a_warp_that_shows_nothing_is_an_error(tmp_path):
 def test_warps_over_a_plane_are_saved(tmp_path):
     camera = fisheye(0.25)
     pose = ct.Extrinsics([math.radians(125), 0.0, 0.0], [0.0, 1.0, 0.5]).double().requires_grad_(False)
-    warp = ct.BirdsEye(camera, pose, x=(-1, 1), y=(1, 2.5), resolution=0.01)
+    warp = ct.BirdsEye(camera, pose, x=(-1, 1), y=(1, 2.5), resolution=0.02)
     warp.save(tmp_path / "map.npz")
     assert off(ct.load_map(tmp_path / "map.npz").positions, warp).max() < 1e-4
 

@@ -22,6 +22,7 @@ _LETTERS = {np.dtype(code): letter for letter, code in _TYPES.items()}
 _HEADER = 24  # bytes before the data in base64, which say the type once more
 _LINE = 76  # characters of base64 in a line
 _MOST_ARRAYS = 100
+_MOST_NUMBERS = 2 * MOST_PIXELS + _MOST_ARRAYS
 
 
 def as_archive(arrays: dict[str, Any]) -> bytes:
@@ -43,13 +44,15 @@ def from_archive(path: str, content: bytes) -> Arrays:
             entries = archive.infolist()
             if len(entries) > _MOST_ARRAYS:
                 raise ValueError(f"{len(entries)} arrays")
+            total = 0
             for entry in entries:
                 with archive.open(entry) as file:
                     version = np.lib.format.read_magic(file)
                     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else _later_header
                     shape, fortran, dtype = header(file)
                     count = int(np.prod([1, *shape], dtype=object))
-                    if dtype.kind not in "fiu" or not 0 <= count <= 2 * MOST_PIXELS:
+                    total += max(count, 0)
+                    if dtype.kind not in "fiu" or not 0 <= count <= total <= _MOST_NUMBERS:
                         raise ValueError(f"{entry.filename}: {dtype} of shape {shape} is no part of a map")
                     data = file.read(count * dtype.itemsize)
                 array = np.frombuffer(data, dtype, count)
@@ -130,7 +133,7 @@ def from_storage(path: str, content: bytes) -> Arrays:
         else:
             end = content.find(b"]", found.end())
         letter = found[5].decode()
-        if end < 0 or letter not in _TYPES or rows * columns * channels > 2 * MOST_PIXELS:
+        if end < 0 or letter not in _TYPES or rows * columns * channels > _MOST_NUMBERS:
             raise CameraFileError(
                 path, name, f"{rows}x{columns} of type {channels}{letter} without an end, or too large"
             )

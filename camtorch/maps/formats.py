@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
+from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import check_ordinary
 from camtorch.io.writing import as_json, replacing
@@ -50,6 +51,10 @@ def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, optio
     """See `Warp.save`."""
     name = _path(path, "Warp.save")
     chosen = _chosen(name, format)
+    if options.step is not None:
+        options = replace(options, step=as_whole(options.step, "step", "Warp.save"))
+    if options.block is not None:
+        options = replace(options, block=_as_size(options.block, "block", "Warp.save"))
     for option in fields(options):
         if getattr(options, option.name) is not None and option.name not in chosen.options:
             takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
@@ -99,8 +104,13 @@ def load_map(
             format. ImportError: a library that the format needs is missing; the error names the extra.
     """
     name = _path(path, "load_map")
-    given: dict[str, Any] = {"step": step, "v": v, "order": order}
-    given |= {"source_size": source_size, "target_size": target_size}
+    given: dict[str, Any] = {
+        "step": None if step is None else as_whole(step, "step", "load_map"),
+        "v": v,
+        "order": order,
+    }
+    for key, size in (("source_size", source_size), ("target_size", target_size)):
+        given[key] = None if size is None else _as_size(size, key, "load_map")
     content = _content(name)
     if format is not None:
         chosen = _named(format)
@@ -112,8 +122,7 @@ def load_map(
     if all(key in described for key in _SIZES):
         stated["source_size"] = described["source_height"], described["source_width"]
         stated["target_size"] = described["target_height"], described["target_width"]
-    for key, value in stated.items():
-        given[key] = value
+    given |= stated
     if given["step"] is not None and not isinstance(given["step"], int):
         raise CameraFileError(name, "step", f"{given['step']!r:.60} is no number of pixels")
     try:
@@ -213,6 +222,14 @@ def _content(path: str) -> bytes:
     if not content:
         raise CameraFileError(path, "content", "the file is empty")
     return content
+
+
+def _as_size(size: Any, name: str, owner: str) -> tuple[int, int] | None:
+    """(height, width), with errors that name the argument."""
+    try:
+        return as_image_size(size, owner)
+    except (TypeError, ValueError) as error:
+        raise type(error)(str(error).replace("image_size", name)) from None
 
 
 def _path(path: Any, owner: str) -> str:

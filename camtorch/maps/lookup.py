@@ -104,12 +104,10 @@ class LookupMap:
                 f"LookupMap.error: the map is from images of (height, width) {mine[0]} to {mine[1]}, the warp from "
                 f"{wanted[0]} to {wanted[1]}"
             )
-        limit = self.positions.new_tensor([side - 1 for side in reversed(self.source_size)])
-        limit, zero = limit.to(self.positions), self.positions.new_zeros(2)
-        drawn = [
-            torch.minimum(torch.maximum(p, zero), limit) for p in (self.positions, torch.from_numpy(exact.positions))
-        ]
-        distance = torch.linalg.vector_norm(drawn[0] - drawn[1], dim=-1).nan_to_num(math.inf)
+        height, width = self.source_size
+        limits = self.positions.new_zeros(2), self.positions.new_tensor([width - 1.0, height - 1.0])
+        off = self.positions.clamp(*limits) - torch.from_numpy(exact.positions).clamp(*limits)
+        distance = torch.hypot(*off.unbind(-1)).nan_to_num(math.inf)
         return torch.where(torch.from_numpy(exact.shown), distance, math.nan)
 
     def __repr__(self) -> str:

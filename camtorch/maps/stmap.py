@@ -27,6 +27,7 @@ _WAYS = ("up", "down")
 _KEYS = ("v", "source_height", "source_width")
 _PREFIX = "camtorch_"  # of attributes of an EXR
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_MOST_CHANNELS = 4  # of the largest map
 _EXR = b"\x76\x2f\x31\x01"
 
 
@@ -108,8 +109,9 @@ def _from_exr(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
         try:
             header = openexr.File(file, header_only=True).parts[0].header
             (left, top), (right, bottom) = header["dataWindow"]
-            if (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) > MOST_PIXELS:
-                raise ValueError(f"more than {MOST_PIXELS} pixels")
+            pixels = (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1)
+            if pixels * len(header["channels"]) > _MOST_CHANNELS * MOST_PIXELS:
+                raise ValueError(f"{len(header['channels'])} channels of {pixels} pixels")
             with openexr.File(file, separate_channels=True) as image:
                 channels = image.parts[0].channels
                 planes = [np.array(channels[name].pixels) for name in "RG"]
@@ -134,8 +136,7 @@ def _from_tiff(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
     try:
         with tifffile.TiffFile(io.BytesIO(content)) as file:
             page = file.pages[0]
-            height, width = page.shape[:2]
-            if height * width > MOST_PIXELS or len(page.shape) != 3 or page.shape[2] < 2 or page.dtype.kind != "f":
+            if len(page.shape) != 3 or np.prod(page.shape, dtype=object) > _MOST_CHANNELS * MOST_PIXELS:
                 raise ValueError(f"{page.dtype} of shape {page.shape}")
             pixels, text = page.asarray(), page.description
             if pixels.ndim != 3 or pixels.shape[2] < 2 or not pixels.size or pixels.dtype.kind != "f":
