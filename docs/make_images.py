@@ -195,6 +195,8 @@ if __name__ == "__main__":
     lenses().save(HERE / "lenses.jpg", quality=85)
     shutters().save(HERE / "shutter.jpg", quality=85)
     fields().save(HERE / "fields.jpg", quality=85)
+
+
 def maps() -> Image.Image:
     """What meshes of a fisheye are off by: on the source, and over the target."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])

@@ -482,6 +482,16 @@ def test_warps_over_a_plane_are_saved(tmp_path):
     assert off(ct.load_map(tmp_path / "map.npz").positions, warp).max() < 1e-4
 
 
+def test_shutters_are_saved_but_for_their_blur(tmp_path):
+    warp = ct.Warp(small().source, small().target, shutter=ct.RollingShutter(0.03, [1.0, -5.0, 4.0]))
+    assert warp.save(tmp_path / "map.npz").max_error < 1e-4
+    assert off(ct.load_map(tmp_path / "map.npz").positions, warp).max() < 1e-4
+    assert off(positions(small())[0], warp).max() > 1
+    blurred = ct.Warp(warp.source, warp.target, target_shutter=ct.RollingShutter(0.0, [0.0, 5.0, 0.0], exposure=0.03))
+    with pytest.raises(ValueError, match="blur of an exposure"):
+        blurred.save(tmp_path / "map.npz")
+
+
 def test_float32_cameras_are_measured_in_float64(tmp_path):
     warp = ct.Dewarp(fisheye(0.25).float())
     assert warp.tolerance > 0

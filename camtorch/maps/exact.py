@@ -25,7 +25,7 @@ class Exact:
         warp: a single one; what of it learns is taken as it is.
 
     Raises:
-        ValueError: a batch of warps.
+        ValueError: a batch of warps, or one that blurs.
     """
 
     def __init__(self, warp: Warp):
@@ -34,6 +34,11 @@ class Exact:
             raise ValueError(
                 f"Warp.save: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
                 "cameras, so save each of ct.Warp(source[i], target[i], rotation[i])"
+            )
+        if warp._moments():
+            raise ValueError(
+                "Warp.save: the blur of an exposure takes each pixel from many positions, and a map holds one; a "
+                "target_shutter with exposure=0 has one"
             )
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source._size("Warp.save")
