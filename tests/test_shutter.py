@@ -270,6 +270,37 @@ def test_the_mean_of_an_exposure_is_that_of_its_moments():
     assert torch.allclose(made[inside], ((parts[0] + parts[1]) / 2)[inside], atol=1e-9)
 
 
+def test_times_are_those_of_rows():
+    down = shutter()
+    rows = torch.tensor([[5.0, 0.0], [9.0, 119.5], [0.0, 239.0]], dtype=torch.float64)
+    expected = READOUT * torch.tensor([0.5 / 240 - 0.5, 0.0, 0.5 - 0.5 / 240], dtype=torch.float64)
+    assert torch.allclose(down.times(rows, (240, 320)), expected, atol=1e-15)
+    assert torch.equal(shutter(direction="up").times(rows, (240, 320)), -down.times(rows, (240, 320)))
+    assert torch.equal(shutter(readout=-READOUT).times(rows, (240, 320)), -down.times(rows, (240, 320)))
+
+
+def test_transforms_of_functions_and_a_batch_of_several_models():
+    camera = fisheye()
+    pixels = torch.tensor([[100.0, 60.0], [160.0, 200.0]], dtype=torch.float64)
+
+    def moved(rates):
+        warp = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(torch.tensor(READOUT).double(), rates))
+        return warp.transform_points(pixels)[0]
+
+    rates = torch.tensor(RATES, dtype=torch.float64)
+    expected = torch.autograd.functional.jacobian(moved, rates)
+    assert torch.allclose(torch.func.jacrev(moved)(rates), expected, atol=1e-7)
+    assert torch.allclose(torch.func.jacfwd(moved)(rates), expected, atol=1e-5)
+    mixed = ct.Mixed([camera, ct.Pinhole.from_fov(80, image_size=(240, 320)).double().requires_grad_(False)])
+    together = ct.Warp(mixed, mixed, shutter=shutter())
+    result, valid = together.transform_points(pixels.expand(2, -1, -1))
+    for i in range(2):
+        alone, also = ct.Warp(mixed[i], mixed[i], shutter=shutter()).transform_points(pixels)
+        assert torch.allclose(result[i], alone, atol=1e-12)
+        assert torch.equal(valid[i], also)
+    assert together(torch.rand(2, 1, 240, 320)).shape == (2, 1, 240, 320)
+
+
 def test_it_is_copied_pickled_and_moved():
     camera = fisheye((60, 80), dtype=torch.float32)
     warp = ct.Warp(camera, camera, shutter=ct.RollingShutter(0.03, torch.nn.Parameter(torch.tensor(RATES))))
@@ -307,6 +338,7 @@ def test_it_compiles_as_one_graph():
         ((33.0, RATES), "readout is in seconds; got 33.0"),
         ((0.03, (1.0, 2.0)), r"rates must be \(\*B, 3\); got shape \(2,\)"),
         ((0.03, (1.0, math.nan, 2.0)), "rates must be finite"),
+        ((0.03, (0.0, 90.0, 0.0)), "rates are in radians per second"),
         (([[0.03]], RATES), r"readout must be a number or \(B,\)"),
         (([0.03, 0.02], [RATES] * 3), "do not fit together"),
     ],

@@ -39,7 +39,7 @@ _PARTS = -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step that is too lo
 _REAL = "real"
 _FOCAL, _CENTRE, _DISTORTION, _CROP = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02), (0.9, 1.0)
 _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05)
-_USUAL = tuple(map(id, (_FOCAL, _CENTRE, _DISTORTION, _CROP, _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION)))
+_USUAL = _FOCAL, _CENTRE, _DISTORTION, _CROP, _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION
 _SIDE = 9
 _EDGE_SAMPLES = 32
 _AZIMUTHS = 128
@@ -127,7 +127,8 @@ class RandomCamera(Augmentation):
         self.like = None if self._is_real else _as_like(like, self._name)
         if self._is_real:
             focal, centre, distortion, crop = (
-                None if id(given) in _USUAL else given for given in (focal, centre, distortion, crop)
+                None if any(given is usual for usual in _USUAL) else given
+                for given in (focal, centre, distortion, crop)
             )
         if self.like is not None and self.like.image_size is None and fov is None:
             raise ValueError(f"{self._name}: like={like!r} says nothing of the field of view; give fov=(low, high)")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from camtorch._arguments import Numbers, as_batch, as_points, as_real, as_values, as_vectors, broadcast_shapes
 from camtorch._module import GeometryModule
-from camtorch._tracing import in_graph, is_concrete, keeps_graph
+from camtorch._tracing import in_graph, in_transform, is_concrete, keeps_graph
 from camtorch.camera import Camera
 from camtorch.optics.special import cosc_root, sinc_root
 from camtorch.warp.sampling import narrow, widen
@@ -21,6 +21,7 @@ Direction = Literal["down", "up", "right", "left"]
 DIRECTIONS: tuple[Direction, ...] = get_args(Direction)
 
 _LONGEST = 2.0  # seconds
+_FASTEST = 70.0  # radians per second: twice what gyroscopes measure
 _BEYOND = 1.0  # readouts from the middle of the image, half an image beyond its rim: further out time stands still
 _STEPS = 6  # of the secant method: three digits each in the end
 _SETTLED = 0.01  # pixels by which the row of a point may be off when it is said to be found
@@ -44,14 +45,16 @@ class RollingShutter(GeometryModule):
         direction: in which the sensor is read: "down", "up", "right" or "left", as seen in the image.
         exposure: seconds for which each row gathers light, or (B,). A warp that puts the shutter on blurs its images
             by the turn meanwhile; a blur cannot be undone. Labels are of the middle of the exposure.
-        samples: moments of the exposure that are averaged at most, one for each pixel of the blur.
+        samples: moments of the exposure that are averaged, at the cost of a warp each. Where the blur is many more
+            pixels long, its steps show.
         gamma: images are averaged as their power gamma: 2.2 is in linear light for those made for a screen.
 
     Plain values are kept as they are and do not learn; Parameters and tensors of a graph do.
 
     Raises:
         ValueError: numbers that are not finite, shapes that do not fit, times of more than two seconds (they may be
-            milliseconds), an unknown direction. TypeError: no numbers.
+            milliseconds), rates of more than 70 radians per second (degrees), an unknown direction. TypeError: no
+            numbers.
     """
 
     readout: Tensor
@@ -65,7 +68,7 @@ class RollingShutter(GeometryModule):
         *,
         direction: Direction = "down",
         exposure: Numbers = 0.0,
-        samples: int = 16,
+        samples: int = 8,
         gamma: float = 1.0,
     ):
         super().__init__()
@@ -81,6 +84,10 @@ class RollingShutter(GeometryModule):
                 raise ValueError(
                     f"{owner}: {name} is in seconds; got {value.tolist()}, which would be milliseconds: {name} / 1000"
                 )
+        if is_concrete(rates) and not bool((rates.detach().abs() < _FASTEST).all()):
+            raise ValueError(
+                f"{owner}: rates are in radians per second; got {rates.tolist()}, which would be degrees: numpy.deg2rad"
+            )
         if is_concrete(times["exposure"]) and not bool((times["exposure"].detach() >= 0).all()):
             raise ValueError(f"{owner}: exposure must not be negative; got {times['exposure'].tolist()}")
         if samples < 1 or not (math.isfinite(gamma) and gamma > 0):
@@ -96,6 +103,7 @@ class RollingShutter(GeometryModule):
                 self.register_buffer(name, value if in_graph(value) else value.detach().clone())
         self.direction, self.samples, self.gamma = direction, int(samples), float(gamma)
         self._moment: float | None = None
+        self._blurs = not is_concrete(self.exposure) or bool((self.exposure.detach() > 0).any())
 
     def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
         """(*B, *N): seconds from the middle of the readout at which pixels (*B, *N, 2) of an image are seen."""
@@ -130,18 +138,12 @@ class RollingShutter(GeometryModule):
         made._moment = moment
         return made
 
-    def moments(self, camera: Camera) -> list[RollingShutter]:
+    def moments(self) -> list[RollingShutter]:
         """The shutter at moments of its exposure, spread evenly; none if it blurs nothing, or is at one."""
-        if self._moment is not None:
+        blurs = bool((self.exposure.detach() > 0).any()) if is_concrete(self.exposure) else self._blurs
+        if self._moment is not None or not blurs:
             return []
-        if is_concrete(self.exposure) and is_concrete(self.rates):
-            angle = float((torch.linalg.vector_norm(self.rates.detach(), dim=-1) * self.exposure.detach()).max())
-            count = min(math.ceil(angle * float(camera.intrinsics.detach()[..., :2].max())), self.samples)
-        else:
-            count = self.samples
-        if count < 2:
-            return []
-        parts = ((i + 0.5) / count - 0.5 for i in range(count))
+        parts = ((i + 0.5) / self.samples - 0.5 for i in range(self.samples))
         return [self._with(self.readout, self.rates, self.exposure, part) for part in parts]
 
     def _share(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
@@ -241,7 +243,7 @@ class _InMotion:
             pixels, valid, found = seen(share)
             settled = ((found - share).abs() * side < _SETTLED) | (found.abs() >= _BEYOND)
         tensors = (rays, *self.camera._tensors, *self.shutter.tensors)
-        if keeps_graph(*tensors):
+        if keeps_graph(*tensors) or in_transform():
             with torch.no_grad():
                 h = 1e-4 if share.dtype == torch.float64 else 1e-2
                 slope = (seen(share + h)[2] - seen(share - h)[2]) / (2 * h)

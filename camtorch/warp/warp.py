@@ -375,7 +375,7 @@ class Warp(GeometryModule):
 
     def _moments(self) -> list[RollingShutter]:
         """Of an exposure that blurs."""
-        return [] if self.target_shutter is None else self.target_shutter.moments(self.target)
+        return [] if self.target_shutter is None else self.target_shutter.moments()
 
     def _at(self, shutter: RollingShutter) -> Warp:
         """This warp at a moment of the exposure."""
