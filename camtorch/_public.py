@@ -44,6 +44,7 @@ from camtorch.models import (
 )
 from camtorch.native.library import native_available
 from camtorch.networks import losses
+from camtorch.networks.canonical import CanonicalCamera
 from camtorch.networks.head import CameraHead
 from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.rig import Rig
@@ -68,6 +69,7 @@ __all__ = [
     "Camera",
     "CameraFileError",
     "CameraHead",
+    "CanonicalCamera",
     "Conversion",
     "Cylindrical",
     "Dewarp",

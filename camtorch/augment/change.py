@@ -398,6 +398,26 @@ def _handedness(rotation: Tensor) -> Tensor:
     return (torch.linalg.cross(x, y) * z).sum(-1)
 
 
+def by_kinds(count: int, camera: Camera | Sequence[Camera], part: Callable[[Tensor | None, Camera], Part]) -> Change:
+    """The change of samples by one camera, a batch of them, or a list: `part` makes the part of each kind of camera.
+
+    Its arguments are those rows, None for all, and their cameras.
+    """
+    camera = alone(camera) if isinstance(camera, Camera) else camera
+    if isinstance(camera, Camera) and not isinstance(camera, Mixed):
+        return Change(count, [part(None, camera)])
+    if isinstance(camera, Mixed):
+        groups = camera.groups
+        return Change(
+            count, [part(torch.tensor(rows), source) for rows, source in groups], mixed=[r for r, _ in groups]
+        )
+    kinds: dict[object, list[int]] = {}
+    for i, one in enumerate(camera):
+        kinds.setdefault(kind(one), []).append(i)
+    sources = ((rows, joined([expanded(camera[i], 1) for i in rows])) for rows in kinds.values())
+    return Change(count, [part(torch.tensor(rows), source) for rows, source in sources], listed=True)
+
+
 def _forward(camera: Camera, like: Tensor) -> Tensor:
     """(n or 1, 1, H, W): the z of every pixel's ray, 0 without one."""
     rays, valid = camera.rays()

@@ -13,10 +13,9 @@ from torch import Tensor
 from camtorch._arguments import as_image_size, as_whole
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.augmentation import Augmentation, Range, as_range
-from camtorch.augment.change import Change, Part, alone, edited, expanded, joined, size_of
+from camtorch.augment.change import Change, Part, by_kinds, edited, size_of
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.camera import Camera
-from camtorch.mixed import Mixed, kind
 from camtorch.warp.affine import AffineWarp, on_rays
 
 Size = int | Sequence[int]
@@ -79,25 +78,12 @@ class Edit(Augmentation):
         """Nothing is empty that is not asked for."""
 
     def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
-        count = len(draw["apply"])
-        camera = alone(camera) if isinstance(camera, Camera) else camera
-        if isinstance(camera, Camera) and not isinstance(camera, Mixed):
-            return Change(count, [self._edited_part(None, camera, draw)])
-        if isinstance(camera, Mixed):
-            groups = camera.groups
-        else:
-            kinds: dict[object, list[int]] = {}
-            for i, one in enumerate(camera):
-                kinds.setdefault(kind(one), []).append(i)
-            groups = [(rows, joined([expanded(camera[i], 1) for i in rows])) for rows in kinds.values()]
-        parts = []
-        for rows, source in groups:
-            index = torch.tensor(rows)
-            here = {name: value[index.to(value.device)] for name, value in draw.items()}
-            parts.append(self._edited_part(index, source, here))
-        if isinstance(camera, Mixed):
-            return Change(count, parts, mixed=[rows for rows, _ in groups])
-        return Change(count, parts, listed=True)
+        def part(rows: Tensor | None, source: Camera) -> Part:
+            if rows is None:
+                return self._edited_part(None, source, draw)
+            return self._edited_part(rows, source, {name: value[rows.to(value.device)] for name, value in draw.items()})
+
+        return by_kinds(len(draw["apply"]), camera, part)
 
     def _edited_part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         applied, size = draw["apply"], size_of(source)

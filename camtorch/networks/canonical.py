@@ -1,0 +1,217 @@
+"""Depth that means the same behind any lens: a canonical focal length, for the images or for the depth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import as_image_size
+from camtorch._threads import as_cores_are_free
+from camtorch.augment.change import Change, Part, alone, by_kinds, copied, edited, size_of
+from camtorch.augment.sample import Named, Sample, SampleTransform, without_graph_in_workers
+from camtorch.camera import Camera
+from camtorch.mixed import Mixed
+from camtorch.projection.rays import slopes_at_axis
+from camtorch.warp.affine import AffineWarp
+from camtorch.warp.sampling import as_options
+
+_LENGTHS = ("depth", "distance", "points", "tvec")
+
+
+class CanonicalCamera(SampleTransform):
+    """Samples as if by cameras of one focal length, so that a network learns metric depth from cameras of many.
+
+    How large a thing of known size is in an image tells how far away it is only once the focal length is known. With
+    s = `focal` / the focal length of the camera, either
+
+    * the depth becomes s times as large, and the image stays (`scales="depth"`); with it all that is a length of the
+      camera's frame: distances, 3D points and landmarks, translations of poses. The scene is scaled, and the same
+      camera sees it the same;
+    * or the image becomes s times as large, and the depth keeps its values (`scales="image"`): the lens is the same,
+      with exactly that focal length, and all labels of the image move with it.
+
+    `inverse` is for what a network predicts: depth in the unit that came in, on the image that came in.
+
+    The focal length of a camera of any model is the number of pixels that it has for a radian at the axis, of fx and fy
+    the geometric mean: that of a pinhole camera, and for a lens the same by whichever model it is described. For images
+    of wide lenses it holds where the axis is; what a fisheye shows at its rim is smaller, and says so by its place.
+
+    Source: Yin et al., "Metric3D: Towards zero-shot metric 3D prediction from a single image", ICCV 2023: the
+    transforms of labels (CSTM_label) and of images (CSTM_image).
+
+    Args:
+        focal: in pixels; 1000 in Metric3D.
+        scales: "depth" or "image".
+        image_size: (height, width) that images come out with, their middle in the middle; that of the image times s if
+            left out, and rounded. Batches of several focal lengths need it.
+        camera: of samples that do not bring one.
+        mode, padding_mode, fill, antialias, tolerance: of images, see `Warp`; antialias=None is on where they shrink.
+        fields, mask_fill, valid_mask: see `Augmentation`.
+
+    A sample has the fields of an `Augmentation`. Beside them come `scale` (B,), s, and with "image" the new `camera`,
+    and `source_camera`.
+
+    Raises:
+        ValueError: a focal length that is not positive, another word for `scales`, a size beside "depth".
+    """
+
+    def __init__(
+        self,
+        focal: float,
+        *,
+        scales: Literal["depth", "image"] = "depth",
+        image_size: tuple[int, int] | None = None,
+        camera: Camera | None = None,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+        fill: float | Sequence[float] = 0.0,
+        antialias: bool | None = None,
+        tolerance: float = 0.001,
+        fields: Mapping[str, str] | None = None,
+        mask_fill: float = 0.0,
+        valid_mask: bool = False,
+    ):
+        super().__init__(camera, fields, mask_fill, valid_mask)
+        if not 0 < focal < math.inf:
+            raise ValueError(f"{self._name}: focal must be positive pixels; got {focal!r}")
+        if scales not in ("depth", "image"):
+            raise ValueError(f'{self._name}: scales must be "depth" or "image"; got {scales!r}')
+        if image_size is not None and scales == "depth":
+            raise ValueError(f"{self._name}: images keep their size where depth is scaled; got image_size={image_size}")
+        self.focal, self.scales = float(focal), scales
+        self.image_size = as_image_size(image_size, self._name)
+        self.options = as_options(self._name, mode, padding_mode, fill, bool(antialias), tolerance)
+        self.antialias = antialias
+
+    def scale(self, camera: Camera) -> Tensor:
+        """(*B,): s of cameras (*B), `focal` by their focal length. Its gradients go to fx and fy."""
+        if isinstance(camera, Mixed):
+            rows = [row for rows, _ in camera.groups for row in rows]
+            order = torch.tensor(rows, device=camera.intrinsics.device).argsort()
+            return torch.cat([self.scale(group).to(camera.intrinsics.dtype) for _, group in camera.groups])[order]
+        k = camera.distortion.detach()
+        batch, count = k.shape[:-1], k.shape[-1]
+        slopes = slopes_at_axis(camera.optics, k.reshape(batch.numel(), count)).view(*batch, 2)
+        return self.focal / ((camera.fx * camera.fy).sqrt() * slopes.prod(-1).sqrt())
+
+    @as_cores_are_free
+    @without_graph_in_workers
+    def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
+        """Make a sample canonical, a dict or keyword arguments, single or a batch.
+
+        Raises:
+            ValueError: no camera, images that would come out in several sizes, depth in whole numbers; and as
+                `Augmentation`.
+        """
+        sample = self._given(sample, fields)
+        named, batched, count, camera = self._batch(sample)
+        scale = self._scale_of_each(camera, count)
+        if self.scales == "depth":
+            moved = self._scaled(sample, named, batched, scale)
+        else:
+            moved = self._resized(sample, named, batched, self._change(camera, count))
+            moved["source_camera"] = copied(camera) if isinstance(camera, Camera) else [copied(one) for one in camera]
+        moved["scale"] = scale if batched else scale.squeeze(0)
+        return moved
+
+    @as_cores_are_free
+    @without_graph_in_workers
+    def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
+        """Undo it, of a sample as it came out, or of what was predicted of one.
+
+        The sample has the `camera` of the images; with "image" instead the `source_camera` as it came out.
+
+        Raises:
+            ValueError: no such camera; and as `forward`.
+        """
+        sample = self._given(sample, fields)
+        sample.pop("scale", None)
+        if self.scales == "depth":
+            named, batched, count, camera = self._batch(sample)
+            return self._scaled(sample, named, batched, 1 / self._scale_of_each(camera, count))
+        source = sample.pop("source_camera", None)
+        if source is None:
+            raise ValueError(f"{self._name}: to go back, the sample needs source_camera as it came out")
+        several = len(source) if not isinstance(source, Camera) or source.batch_shape else 1
+        change = self._change(source, several)
+        target = change.target
+        if isinstance(source, Camera) and isinstance(target, Camera) and not source.batch_shape:
+            target = alone(target)  # a batch dim would say that the sample has one
+        named, batched, count, _ = self._batch({**sample, "camera": target})
+        change = change if change.count == count else self._change(source, count)
+        return self._resized(sample, named, batched, change.inverse())
+
+    if TYPE_CHECKING:
+        __call__ = forward  # whose types nn.Module does not tell
+
+    def _scale_of_each(self, camera: Camera | Sequence[Camera], count: int) -> Tensor:
+        """(count,)."""
+        if isinstance(camera, Camera):
+            return self.scale(camera).expand(count)
+        return torch.stack([self.scale(one) for one in camera]).expand(count)
+
+    def _scaled(self, sample: Sample, named: Named, batched: bool, scale: Tensor) -> Sample:
+        """The sample with every length of the camera's frame times a factor (B,)."""
+        moved = dict(sample)
+        for name, (found, value) in named.items():
+            if isinstance(value, list):
+                moved[name] = [self._lengths(found, v, s, name) for v, s in zip(value, scale, strict=True)]
+            else:
+                new = self._lengths(found, value, scale, name)
+                moved[name] = new if batched else new.squeeze(0)
+        return moved
+
+    def _lengths(self, found: str, value: Tensor, scale: Tensor, name: str) -> Tensor:
+        """Values (*B, ...) of a kind with all lengths in them times (*B)."""
+        poses = found in ("head_pose", "pose")
+        if not poses and found not in _LENGTHS and (found != "landmarks" or value.shape[-1] != 3):
+            return value
+        if not value.is_floating_point():
+            raise ValueError(f"{self._name}: {name} must be floating point, to be scaled; got {value.dtype}")
+        factor = scale.to(value).reshape(*scale.shape, *[1] * (value.ndim - scale.ndim))
+        if not poses:
+            return value * factor
+        lengths = torch.zeros_like(value, dtype=torch.bool)
+        lengths[..., :3, 3] = True
+        return torch.where(lengths, value * factor, value)
+
+    def _resized(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
+        moved = self._moved(sample, named, batched, change)
+        if "rotation" not in sample:  # nothing turns
+            del moved["rotation"]
+        return moved
+
+    def _change(self, camera: Camera | Sequence[Camera], count: int) -> Change:
+        """From the cameras to those with the focal length."""
+
+        def part(rows: Tensor | None, source: Camera) -> Part:
+            scale = self.scale(source).double()
+            height, width = size_of(source)
+            size = self.image_size
+            if size is None:
+                sizes = {(max(round(height * s), 1), max(round(width * s), 1)) for s in scale.flatten().tolist()}
+                if len(sizes) > 1:
+                    raise ValueError(
+                        f"{self._name}: images of several focal lengths would come out in the sizes {sorted(sizes)}; "
+                        "image_size=(height, width) cuts or fills them to one"
+                    )
+                size = sizes.pop()
+            zero = torch.zeros_like(scale)
+            # the middle, from outer edge to outer edge, stays in the middle
+            left, top = (
+                (new - 1) / 2 - (old - 1) / 2 * scale for new, old in zip(size[::-1], (width, height), strict=True)
+            )
+            matrix = torch.stack((scale, zero, left, zero, scale, top), -1).unflatten(-1, (2, 3))
+            options = {**self.options, "antialias": self.antialias}
+            return Part(rows, AffineWarp(source, edited(source, matrix, size), matrix, None, **options), source)
+
+        return by_kinds(count, camera, part)
+
+    def extra_repr(self) -> str:
+        """The focal length, what is scaled, and the size of images."""
+        size = "" if self.image_size is None else f", image_size={self.image_size}"
+        return f"focal={self.focal:g}, scales={self.scales!r}{size}"
