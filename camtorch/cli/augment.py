@@ -1,19 +1,31 @@
-"""The command `camtorch augment`: a sheet of an image with its labels as other cameras see them."""
+"""The command `camtorch augment`: an image, or a whole data set, with its labels as other cameras see them."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from camtorch.cli.demo import GET_IT, installed
-from camtorch.cli.options import add_output, add_photograph, parse_fov, parse_path, parse_range, parse_size
+from camtorch.cli.options import (
+    add_jobs,
+    add_output,
+    add_photograph,
+    checked_ranges,
+    parse_fov,
+    parse_path,
+    parse_range,
+    parse_size,
+)
 from camtorch.cli.terminal import note
+from camtorch.jobs import pool
 
 if TYPE_CHECKING:
     from camtorch.cli.labelled_image import LabelledImage
     from camtorch.cli.options import Commands
 
-_MOST_IMAGES = 100
+_SHEET = "augment.png"
+_COUNT, _MOST_IMAGES, _MOST_COPIES = 8, 100, 10000
 _MUCH = 1 / 3  # of the new images
 
 
@@ -21,14 +33,17 @@ def add(commands: Commands) -> None:
     """Add the command to a command line."""
     command = commands.add_parser(
         "augment",
-        help="a sheet of an image with its labels as other cameras see them",
+        help="a sheet of an image with its labels, or a data set, as other cameras see them",
         description="A sheet of an image with its labels as other cameras see them. Without IMAGE, in a checkout of "
-        "the repository, the image is a rendered driver. A RANGE is LOW,HIGH, as in --yaw=-5,20, or a number: so far "
-        "to either side of doing nothing, or just that --fov.",
+        "the repository, the image is a rendered driver. With --dataset a new data set: camtorch augment images/ "
+        "--dataset annotations.json --camera camera.yml -o new/. A RANGE is LOW,HIGH, as in --yaw=-5,20, or a number: "
+        "so far to either side of doing nothing, or just that --fov.",
         allow_abbrev=False,
     )
-    command.set_defaults(run=run)
-    command.add_argument("image", type=parse_path, nargs="?", metavar="IMAGE", help="the image")
+    command.set_defaults(run=run, prepare=prepare)
+    command.add_argument(
+        "image", type=parse_path, nargs="?", metavar="IMAGE", help="the image; the folder of images of a data set"
+    )
     command.add_argument(
         "--labels",
         type=parse_path,
@@ -37,7 +52,7 @@ def add(commands: Commands) -> None:
     )
     command.add_argument("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
     command.add_argument("--list", action="store_true", help="print the presets, and nothing else")
-    command.add_argument("-n", type=int, default=8, metavar="COUNT", help="how many other cameras; 8 by default")
+    command.add_argument("-n", type=int, metavar="COUNT", help=f"how many other cameras; {_COUNT} by default")
     command.add_argument("--seed", type=int, default=0, help="of what is drawn; 0 by default")
     command.add_argument("--size", type=parse_size, metavar="WxH", help="of the new images; by default the old one's")
     for name, text in (
@@ -61,23 +76,58 @@ def add(commands: Commands) -> None:
         help="of each new image that has to show something, 0 to 1: it zooms until it does; 0 by default",
     )
     add_photograph(command)
-    add_output(command, "augment.png", "the sheet")
+    add_output(command, None, f"the sheet, {_SHEET} by default; of a data set, a folder")
+    many = add_jobs(command)
+    many.add_argument(
+        "--dataset",
+        type=parse_path,
+        metavar="LABELS",
+        help="of all images of the folder IMAGE: a JSON file in COCO's format, or a folder of a JSON file for each",
+    )
+    many.add_argument("--copies", type=_parse_copies, metavar="N", help="new images of each; 1 by default")
 
 
-def run(arguments: argparse.Namespace) -> None:
+def _parse_copies(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 0 < int(text) <= _MOST_COPIES):
+        raise argparse.ArgumentTypeError(f"{text!r} is not 1 to {_MOST_COPIES} copies")
+    return int(text)
+
+
+def prepare(arguments: argparse.Namespace) -> None:
+    """Before torch is imported: let processes begin to do so as well."""
+    if arguments.dataset is not None and arguments.jobs != 1 and not arguments.dry_run:
+        pool.prepare(["camtorch.cli.augmenting"])
+
+
+def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
-    from camtorch.cli import images, labelled_image, sheet
+    from camtorch.cli import labelled_image
 
     if arguments.list:
         print("\n".join(labelled_image.presets()))
-        return
+        return 0
+    of_datasets = ("jobs", "resume", "dry_run", "copies")
+    for name in ("n", "labels") if arguments.dataset is not None else of_datasets:
+        if getattr(arguments, name):
+            option = "-n" if name == "n" else f"--{name.replace('_', '-')}"
+            raise ValueError(f"{option} is for {'--dataset' if name in of_datasets else 'a sheet, without --dataset'}")
+    if arguments.dataset is not None:
+        from camtorch.cli import dataset
+
+        return dataset.run(arguments)
+    _sheet(arguments)
+    return 0
+
+
+def _sheet(arguments: argparse.Namespace) -> None:
+    from camtorch.cli import images, labelled_image, sheet
+
+    arguments.output = arguments.output or Path(_SHEET)
+    arguments.n = _COUNT if arguments.n is None else arguments.n
     lens = labelled_image.lens(arguments.preset)
     if not 1 <= arguments.n <= _MOST_IMAGES:
         raise ValueError(f"-n must be 1 to {_MOST_IMAGES}; got {arguments.n}")
-    if not 0 <= arguments.seed < 1 << 63:
-        raise ValueError(f"--seed must be 0 or more, and below 2 to the 63rd; got {arguments.seed}")
-    if not 0 <= arguments.min_filled <= 1:
-        raise ValueError(f"--min-filled must be 0 to 1; got {arguments.min_filled:g}")
+    ranges = checked_ranges(arguments)
     needs = {"camera": ("from_model", "name"), "image": ("labels", "rescale")}
     for needed, names in needs.items():
         idle = [name for name in names if getattr(arguments, needed) is None and getattr(arguments, name)]
@@ -86,8 +136,6 @@ def run(arguments: argparse.Namespace) -> None:
     inputs = (arguments.image, arguments.camera, arguments.labels)
     images.check_target(arguments.output, force=arguments.force, inputs=inputs)
     before = _scene(arguments) if arguments.image is None else _photograph(arguments)
-    ranges = {name: getattr(arguments, name) for name in ("yaw", "pitch", "roll", "zoom", "fov")}
-    ranges = {name: value for name, value in ranges.items() if value is not None}
     shown = [before]
     for new in labelled_image.augmented(
         before, lens, arguments.n, arguments.seed, arguments.size, arguments.min_filled, **ranges

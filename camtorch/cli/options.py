@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -110,6 +110,20 @@ def checked_fov(arguments: argparse.Namespace) -> float | None:
         allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
         raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
     return None if fov is None else math.radians(fov)
+
+
+def checked_ranges(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the options of `camtorch augment` say of the ranges of `RandomCamera`.
+
+    Raises:
+        ValueError: a seed or a --min-filled that is none.
+    """
+    if not 0 <= arguments.seed < 1 << 63:
+        raise ValueError(f"--seed must be 0 or more, and below 2 to the 63rd; got {arguments.seed}")
+    if not 0 <= arguments.min_filled <= 1:
+        raise ValueError(f"--min-filled must be 0 to 1; got {arguments.min_filled:g}")
+    ranges = {name: getattr(arguments, name) for name in ("yaw", "pitch", "roll", "zoom", "fov")}
+    return {name: value for name, value in ranges.items() if value is not None}
 
 
 def add_calibration(
