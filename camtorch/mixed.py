@@ -52,8 +52,8 @@ class Mixed(Camera):
             an `nn.ModuleList`: what learns in them goes on learning here, and `camera[i]` is the i-th one.
         order: which of these cameras, counted one by one, each row of the batch is; each once, in turn, by default.
 
-    Its `intrinsics`, `K`, `fx` and so on are those of all; there is no common `distortion`. All that learns computes in
-    the widest dtype among the cameras and the points. `groups` are the batches of one model that it is made of.
+    Its `intrinsics`, `K`, `fx` and so on are those of all; there is no common `distortion`. Results are of the widest
+    dtype among the cameras and the points. `groups` are the batches of one model that it is made of.
 
     Raises:
         TypeError: what is no camera. ValueError: no cameras, more than one batch dim, images of different sizes,
@@ -82,9 +82,10 @@ class Mixed(Camera):
     def _group(self, members: Sequence[Camera], rows: Sequence[int]) -> _Group:
         places = [self._places[row] for row in rows]
         used = tuple(dict.fromkeys(i for i, _ in places))
-        starts = list(accumulate((_count(members[i]) for i in used), initial=0))
-        index = tuple(starts[used.index(i)] + row for i, row in places)
-        whole = index == tuple(range(starts[-1]))
+        *starts, end = accumulate((_count(members[i]) for i in used), initial=0)
+        first = dict(zip(used, starts, strict=True))
+        index = tuple(first[i] + row for i, row in places)
+        whole = index == tuple(range(end))
         model: type[Camera] = type_before_parametrizations(members[used[0]])
         counts = tuple(len(members[i]) if members[i].batch_shape else None for i in used)
         return _Group(model, used, counts, None if whole else index, tuple(rows), Memo())
@@ -237,11 +238,10 @@ class Mixed(Camera):
         places = [self._places[row] for row in taken.tolist()]
         if not places:
             raise IndexError(f"Mixed: {index!r} leaves no camera of a batch ({len(self._places)},)")
-        members = [self._member(i) for i in dict.fromkeys(i for i, _ in places)]
-        starts = dict(
-            zip(dict.fromkeys(i for i, _ in places), accumulate(map(_count, members), initial=0), strict=False)
-        )
-        return type(self)(members, [starts[i] + row for i, row in places])
+        used = list(dict.fromkeys(i for i, _ in places))
+        *starts, _ = accumulate((_count(self._member(i)) for i in used), initial=0)
+        first = dict(zip(used, starts, strict=True))
+        return type(self)([self._member(i) for i in used], [first[i] + row for i, row in places])
 
     def with_tensors(self, **tensors: Tensor) -> NoReturn:
         """There are none to give."""

@@ -344,6 +344,20 @@ def test_a_bad_row_is_invalid_and_its_camera_says_so():
     mixed.project(torch.ones(6, 2, 3))  # once
 
 
+def test_poses_seen_by_each_camera():
+    torch.manual_seed(0)
+    mixed = ct.Mixed([camera.double() for camera in models()])
+    points = torch.rand(12, 3, dtype=torch.float64) - 0.5
+    poses = ct.Extrinsics(0.2 * torch.randn(6, 3).double(), torch.tensor([[0.0, 0.0, 2.0]] * 6).double())
+    pixels, _ = mixed.project(poses(points.expand(6, -1, -1)))
+    found, rms, valid = ct.solve_pnp(mixed, points, pixels.detach(), weights=torch.ones(12))
+    assert valid.all()
+    assert rms.max() < 1e-9
+    assert (found.matrix() - poses.matrix()).abs().max() < 1e-9
+    with pytest.raises(ValueError, match=r"a Mixed of 6 cameras takes batch dims \(\) or \(6,\)"):
+        ct.solve_pnp(mixed, points.expand(5, -1, -1), pixels)
+
+
 def test_what_it_cannot_be_is_told():
     pinhole, fisheye = models()[0], models()[4]
     mixed = ct.Mixed([pinhole, fisheye])
@@ -364,7 +378,6 @@ def test_what_it_cannot_be_is_told():
         (lambda: ct.Mixed.from_matrix(torch.eye(3)), r"ct.Mixed\(\[...\]\)"),
         (lambda: ct.Mixed.from_fov(60, image_size=SIZE), r"ct.Mixed\(\[...\]\)"),
         (lambda: ct.save(mixed, "mixed.json"), "files hold cameras by name"),
-        (lambda: ct.solve_pnp(mixed, torch.rand(2, 8, 3), torch.rand(2, 8, 2)), r"camera\.groups are batches"),
         (lambda: ct.calibrate(mixed, torch.rand(9, 3), torch.rand(2, 9, 2) * 40, image_size=SIZE), "camera model"),
     ):
         with pytest.raises(TypeError, match=match):

@@ -17,6 +17,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.least_squares.implicit import attached
 from camtorch.least_squares.levenberg_marquardt import minimise
+from camtorch.mixed import Mixed
 from camtorch.rotations import rotation_matrix, rotation_vector
 
 _LEAST = 4  # points
@@ -69,6 +70,8 @@ def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weight
         TypeError: no camera, or no numbers. ValueError: shapes that do not fit, less than four points, negative
             weights.
     """
+    if isinstance(camera, Mixed):
+        return _of_each_model(camera, object_points, pixels, weights)
     task = _Task.of(camera, object_points, pixels, weights)
     with torch.no_grad():
         unknowns, valid = _solved(task)
@@ -83,6 +86,31 @@ def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weight
     return Pose(
         Extrinsics(rotation[..., None], translation), rms.to(task.dtype).view(task.batch), valid.view(task.batch)
     )
+
+
+def _of_each_model(camera: Mixed, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> Pose:
+    """`solve_pnp` of each group, whose poses are put together again."""
+    owner, count, device = "solve_pnp", len(camera), camera.intrinsics.device
+    points = as_vectors(object_points, "object_points", 3, owner, device)
+    seen_at = as_vectors(pixels, "pixels", 2, owner, device)
+    given = seen_at.new_ones(seen_at.shape[-2]) if weights is None else as_tensor(weights, "weights", owner, device)
+    fields = points, seen_at, given[..., None]
+    leads = [tuple(field.shape[:-2]) for field in fields]
+    if any(lead not in ((), (1,), (count,)) for lead in leads):
+        raise ValueError(f"{owner}: a Mixed of {count} cameras takes batch dims () or ({count},); got {leads}")
+    poses, order = [], []
+    for rows, group in camera.groups:
+        mine = [field[rows] if field.shape[:-2] == (count,) else field for field in fields]
+        poses.append(solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0]))
+        order += rows
+    place = torch.tensor(order, device=device).argsort()
+    rotation, translation, rms, valid = (
+        torch.cat(parts)[place]
+        for parts in zip(
+            *((p.extrinsics.rotation, p.extrinsics.translation, p.rms, p.valid) for p in poses), strict=True
+        )
+    )
+    return Pose(Extrinsics(rotation[..., None], translation), rms, valid)
 
 
 class _Task(NamedTuple):
