@@ -153,23 +153,26 @@ def augmented(
         )
 
 
+_REAL = "another of 7,000 calibrated lenses for each image, of the field of view that --fov says"
+
+
 def lens(preset: str) -> str | None:
     """What `augmented` gets as `like` for the name of a preset, or for "none".
 
     Raises:
         ValueError: no preset has this name; the text lists those there are.
     """
-    if preset == "none" or preset in PRESETS:
+    if preset in ("none", "real") or preset in PRESETS:
         return None if preset == "none" else preset
     known = "; ".join(f"{name}, {known.origin}" for name, known in PRESETS.items())
-    raise ValueError(f"there is no preset {preset!r}. There are none, the image's own lens; {known}")
+    raise ValueError(f"there is no preset {preset!r}. There are none, the image's own lens; real, {_REAL}; {known}")
 
 
 def origin(like: str | None, before: LabelledImage) -> str:
     """Where the lens of the new images comes from."""
     if like is None:
         return f"{before.camera.key}: the image's own lens, as lenses made alike differ"
-    return f"{like}: {PRESETS[like].origin}"
+    return f"{like}: {_REAL if like == 'real' else PRESETS[like].origin}"
 
 
 def presets() -> Iterator[str]:
@@ -177,6 +180,7 @@ def presets() -> Iterator[str]:
     for name, preset in PRESETS.items():
         height, width = preset.image_size
         yield f"{name:<12} {preset.model:<15} {f'{width}x{height}':<10} {preset.origin}"
+    yield f"{'real':<12} {'kannala_brandt':<15} {'any':<10} {_REAL}"
 
 
 def _mount_angles(rotation: Tensor) -> tuple[float, float, float]:
