@@ -43,8 +43,8 @@ _LAMBDA = 118  # FF_QP2LAMBDA
 _THREADS = 4  # of an encoder: what it makes depends on their number, and shall not depend on the machine's
 _AHEAD = 8  # frames
 _OFTEN = 0.1  # seconds between two reports
-# how they weigh blocks by what refers to them is not the same each time
-_STEADY = {"libx264": {"mbtree": "0"}, "libx265": {"x265-params": "cutree=0:log-level=error"}}
+# how x264 weighs blocks by what refers to them is not the same each time; x265 says much
+_OPTIONS = {"libx264": {"mbtree": "0"}, "libx265": {"x265-params": "log-level=error"}}
 _EVEN = ("libx264", "libx265")
 _BY_QUANTISER = ("mpeg4", "mpeg2video", "mjpeg")
 _CUT = 0.5  # seconds that may be missing at the end
@@ -469,7 +469,7 @@ class _Written:
         context.thread_count = _THREADS
         if _has_crf(codec):
             stream.options = {"crf": str(_QUALITIES.get(codec, 20) if crf is None else crf)}
-            stream.options |= _STEADY.get(codec, {})
+            stream.options |= _OPTIONS.get(codec, {})
         elif codec in _BY_QUANTISER:
             context.qscale, context.global_quality = True, _QUANTISER * _LAMBDA
         if format == "avi":
