@@ -13,6 +13,7 @@ import torch
 from boards import opencv_left, stereo
 from photographs import fisheye, photograph
 from PIL import Image
+from videos import write_video
 
 import camtorch as ct
 from camtorch.calibration.boards import Chessboard
@@ -73,7 +74,15 @@ def folder(tmp_path, monkeypatch, request):
     ct.save(camera, "other.yml", format="opencv")
     Image.fromarray(np.full((height, width, 3), 128, np.uint8)).save("photo.jpg")
     Image.new("RGB", (480, 270), (90, 120, 30)).save("gopro.jpg")
-    if "images/*.jpg" in request.getfixturevalue("page").read_text():
+    text = request.getfixturevalue("page").read_text()
+    if " drive/" in text:
+        for name in ("drive/front/1.jpg", "drive/rear/1.jpg"):
+            Path(name).parent.mkdir(parents=True)
+            shutil.copy("photo.jpg", name)
+    if "clip.mp4" in text:
+        pytest.importorskip("av")
+        write_video("drive/clip.mp4", range(3), size=(height, width))
+    if "images/*.jpg" in text:
         write_calibration_data()
     known = dict(ct.MODELS)
     yield tmp_path
