@@ -108,6 +108,8 @@ def _joined(a: Part, b: Part) -> Part:
 
 
 def _optioned(warp: Warp, options: Options) -> Warp:
+    if isinstance(warp, MirrorWarp) and warp.options == options:
+        return warp
     if isinstance(warp, AffineWarp):
         return AffineWarp(warp.source, warp.target, warp.matrix, warp.rotation, **options)
     return MirrorWarp(warp.source, warp.target, warp.rotation, **options, **warp.shutters)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from camtorch.augment.augmentation import Augmentation, Range, draw
 from camtorch.augment.change import Change
+from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
 from camtorch.camera import Camera
 
@@ -150,21 +152,30 @@ class Compose(Augmentation):
             part.tell_of_empty_images(camera)
 
     def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
-        applied, total = draw["apply"], None
-        for i, part in enumerate(self.parts):
-            prefix = f"{i}."
-            own = {key.removeprefix(prefix): value for key, value in draw.items() if key.startswith(prefix)}
-            own["apply"] = (own["apply"] > 0.5) & applied
-            step = part._change(camera, own)
-            total = step if total is None else total.then(step)
-            camera = _alone(step)
+        total, options = None, {**self.options, "antialias": self.antialias}
+        # edits that follow each other are one
+        for are_edits, steps in itertools.groupby(self._steps(draw), lambda step: isinstance(step[0], Edit)):
+            for group in [list(steps)] if are_edits else [[step] for step in steps]:
+                if are_edits:
+                    step = change_by(cast("list[tuple[Edit, dict[str, Tensor]]]", group), camera, options)
+                else:
+                    step = group[0][0]._change(camera, group[0][1])
+                total = step if total is None else total.then(step)
+                camera = _alone(step)
         assert total is not None
         sizes = {one.image_size for one in ([camera] if isinstance(camera, Camera) else camera)}
         if len(sizes) > 1 and not total.listed:
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {sorted(map(str, sizes))}"
             )
-        return total.with_options({**self.options, "antialias": self.antialias})  # type: ignore[typeddict-item]
+        return total.with_options(options)  # type: ignore[arg-type]
+
+    def _steps(self, draw: Mapping[str, Tensor]) -> Iterator[tuple[Augmentation, dict[str, Tensor]]]:
+        """The augmentations, and what each was drawn."""
+        for i, part in enumerate(self.parts):
+            prefix = f"{i}."
+            own = {key.removeprefix(prefix): value for key, value in draw.items() if key.startswith(prefix)}
+            yield part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}
 
     def extra_repr(self) -> str:
         """The options."""

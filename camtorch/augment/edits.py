@@ -16,7 +16,7 @@ from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import Change, Part, by_kinds, edited, size_of
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.camera import Camera
-from camtorch.warp.affine import AffineWarp, on_rays
+from camtorch.warp.affine import AffineWarp, after, on_rays
 
 Size = int | Sequence[int]
 
@@ -78,39 +78,52 @@ class Edit(Augmentation):
         """Nothing is empty that is not asked for."""
 
     def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
-        def part(rows: Tensor | None, source: Camera) -> Part:
-            if rows is None:
-                return self._edited_part(None, source, draw)
-            return self._edited_part(rows, source, {name: value[rows.to(value.device)] for name, value in draw.items()})
+        return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
 
-        return by_kinds(len(draw["apply"]), camera, part)
-
-    def _edited_part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
-        applied, size = draw["apply"], size_of(source)
-        device = source.intrinsics.device
-        values = {name: value.double() for name, value in draw.items() if name != "apply"}
-        matrix, after = self.edit(size, values)
-        some = self.p < 1 if not may_look(applied) else not bool(applied.all())
-        if some or (0 < self.p < 1 and after != size):
-            if after != size:
-                raise ValueError(
-                    f"{self._name}: with p < 1 images must keep their size, so that all come out alike; here they "
-                    f"become {after}, and were {size}"
-                )
-            still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-            if may_look(applied) and not bool(applied.any()):
-                return Part(rows, None, source)
-            matrix = torch.where(applied[:, None, None].to(matrix.device), matrix, still)
-        if matrix.ndim == 3 and may_look(matrix) and not source.batch_shape and bool((matrix == matrix[:1]).all()):
-            matrix = matrix[0]
-        matrix = matrix.to(device)
-        target = edited(source, matrix, after)
-        options = {**self.options, "antialias": self.antialias}
-        return Part(rows, AffineWarp(source, target, matrix, _turn(matrix, source), **options), source)
+    def map_of(self, draw: Mapping[str, Tensor], size: tuple[int, int]) -> tuple[Tensor | None, tuple[int, int]]:
+        """What a draw does to images of a size: `edit`, where it applies; None where it never does."""
+        applied = draw["apply"]
+        matrix, new = self.edit(size, {name: value.double() for name, value in draw.items() if name != "apply"})
+        looks = may_look(applied)
+        all_are = bool(applied.all()) if looks else self.p == 1
+        if new != size and (not all_are or 0 < self.p < 1):
+            raise ValueError(
+                f"{self._name}: with p < 1 images must keep their size, so that all come out alike; here they "
+                f"become {new}, and were {size}"
+            )
+        if all_are:
+            return matrix, new
+        if looks and not bool(applied.any()):
+            return None, new
+        still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
 
     def extra_repr(self) -> str:
         """What is drawn from, and the options."""
         return super().extra_repr().replace(f"antialias={bool(self.antialias)}", f"antialias={self.antialias}")
+
+
+def change_by(
+    edits: Sequence[tuple[Edit, Mapping[str, Tensor]]], camera: Camera | Sequence[Camera], options: Mapping[str, Any]
+) -> Change:
+    """What edits and their draws, one after the other, do to images of `camera`, by warps of these options."""
+
+    def part(rows: Tensor | None, source: Camera) -> Part:
+        matrix, size = None, size_of(source)
+        for edit, draw in edits:
+            here = draw if rows is None else {name: value[rows.to(value.device)] for name, value in draw.items()}
+            one, size = edit.map_of(here, size)
+            if one is not None:
+                matrix = one if matrix is None else after(one, matrix)
+        if matrix is None:
+            return Part(rows, None, source)
+        if matrix.ndim == 3 and may_look(matrix) and not source.batch_shape and bool((matrix == matrix[:1]).all()):
+            matrix = matrix[0]  # one map serves the whole batch
+        matrix = matrix.to(source.intrinsics.device)
+        warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
+        return Part(rows, warp, source)
+
+    return by_kinds(len(edits[0][1]["apply"]), camera, part)
 
 
 def _turn(matrix: Tensor, source: Camera) -> Tensor | None:

@@ -309,7 +309,7 @@ def _halvings(where: Sampling | Lattice, size: tuple[int, int]) -> list[int]:
     total, count = planes.new_zeros(len(planes)), planes.new_zeros(len(planes))
     for dim in (-1, -2):
         n = planes.shape[dim] - 1
-        steps = torch.linalg.vector_norm(planes.diff(dim=dim), dim=1)
+        steps = torch.hypot(*planes.diff(dim=dim).unbind(1))
         both = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n)
         total, count = total + (steps * both).sum((1, 2)), count + both.sum((1, 2))
     scale = total / (count.clamp(min=1) * apart * every)
