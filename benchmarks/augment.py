@@ -4,11 +4,15 @@ Every call draws anew and moves the image, a mask and 68 keypoints of each sampl
 a lens that it knows to a turned pinhole camera, and cannot do the other cases. kornia's RandomAffine moves the same
 data by an affine map, which needs no camera; it takes floats only, so that uint8 is converted there and back.
 
+A chain, a resized crop, a flip and another lens, is timed beside the crop and the flip alone as torchvision's v2 makes
+them, sample by sample and with one draw for the whole batch, written here in the operators that it calls.
+
 What is required is judged by the fastest rounds.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +21,7 @@ import cv2
 import kornia.augmentation as K  # noqa: N812 (kornia's own name for it)
 import numpy as np
 import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 import camtorch as ct
@@ -26,12 +31,14 @@ from benchmarks.point_peers import COMPILED, OPENCV, OURS
 from benchmarks.tables import Record, only, table
 from benchmarks.timing import Run, measure
 from benchmarks.verdict import Requirement, figures, times_faster, verdict
-from camtorch.augment import RandomCamera
+from camtorch.augment import Compose, HorizontalFlip, RandomCamera, RandomLens, RandomResizedCrop
 from camtorch.augment.kornia import RandomCamera as KorniaRandomCamera
 
 ADAPTER, AFFINE = "camtorch in kornia", "kornia RandomAffine"
 BATCH, SIZE, QUICK_SIZE, LANDMARKS = 8, (480, 640), (120, 160), 68
 FLOAT, BYTE = OPERATIONS = ("float32", "uint8")
+CHAIN, CHAIN_EDITS = "crop, flip, lens", "camtorch crop, flip"
+VISION, VISION_BATCH = "torchvision crop, flip", "torchvision, one draw"
 ANGLES = {"yaw": 10, "pitch": 10, "roll": 10, "min_filled": 0}
 _DEGREES = np.radians(10)
 _COMPILED = 1  # cases whose compiled contestants are timed: to compile takes longer than everything else
@@ -65,6 +72,7 @@ def run(options: Options) -> tuple[list[Record], list[str]]:
         for operation in OPERATIONS:
             runs = contestants(case, size, data_of(operation, size, options), options, compiled=i < _COMPILED)
             records += measure(case.name, operation, runs, options)
+    chain = measure(CHAIN, BYTE, chains(size, options), options)
     loaded = loader.measured(options)
     shape = f"{BATCH}x1x{size[0]}x{size[1]}"
     tables = [
@@ -74,16 +82,26 @@ def run(options: Options) -> tuple[list[Record], list[str]]:
             scale=1e3,
             beside=OURS,
         ),
+        table(
+            f"Chain of {BATCH}x3x{size[0]}x{size[1]}, uint8, {LANDMARKS} keypoints: milliseconds (times camtorch)",
+            only(chain, "seconds"),
+            scale=1e3,
+            beside=OURS,
+        ),
         table(loader.title(options), only(loaded, "per second"), beside=OURS),
-        verdict(requirements([*records, *loaded])),
+        verdict(requirements([*records, *chain, *loaded])),
     ]
-    return [*records, *loaded], tables
+    return [*records, *chain, *loaded], tables
 
 
 def requirements(records: Sequence[Record]) -> list[Requirement]:
     """What has to hold of the times."""
     rows = figures(records, "fastest")
-    found = []
+    chain = {row: times for row, times in rows.items() if row[0] == CHAIN}
+    rows = {row: times for row, times in rows.items() if row[0] != CHAIN}
+    found = [
+        Requirement(f"{CHAIN}: faster than torchvision's without the lens", 1.0, times_faster(chain, OURS, [VISION]))
+    ]
     for case, bound in zip(CASES[:2], (1.5, 5.0), strict=True):
         ratios = times_faster({row: times for row, times in rows.items() if row[0] == case.name}, OURS, [OPENCV])
         found.append(Requirement(f"{case.name}: {bound:g} times OpenCV", bound, ratios))
@@ -145,6 +163,49 @@ def contestants(
     if case.like == "pinhole":
         runs[OPENCV] = _opencv(case, camera, data)
     return runs
+
+
+def chains(size: tuple[int, int], options: Options) -> dict[str, Run]:
+    """Name -> what is timed: a batch of colour images and their landmarks through a chain, each by its own draw."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (BATCH, 3, *size), dtype=torch.uint8, generator=generator).to(options.device)
+    landmarks = (torch.rand(BATCH, LANDMARKS, 2, generator=generator) * torch.tensor(size[::-1])).to(options.device)
+    camera = cameras.camera("kannala_brandt", options.device, size=size).requires_grad_(False)
+    edits = [RandomResizedCrop(size), HorizontalFlip()]
+    chain = Compose([*edits, RandomLens("pinhole", fov=(65, 80), min_filled=0)], camera=camera)
+    alone = Compose(edits, camera=camera)
+
+    def by_sample() -> tuple[Tensor, Tensor]:
+        pairs = [as_torchvision(image[None], points) for image, points in zip(images, landmarks, strict=True)]
+        return torch.cat([image for image, _ in pairs]), torch.stack([points for _, points in pairs])
+
+    return {
+        OURS: lambda: chain(image=images, keypoints=landmarks),
+        CHAIN_EDITS: lambda: alone(image=images, keypoints=landmarks),
+        VISION: by_sample,
+        VISION_BATCH: lambda: as_torchvision(images, landmarks),
+    }
+
+
+def as_torchvision(images: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """`RandomResizedCrop` of the images' own size and `RandomHorizontalFlip` of v2: the operators that both call."""
+    height, width = images.shape[-2:]
+    for _ in range(10):
+        area = height * width * float(torch.empty(1).uniform_(0.08, 1.0))
+        ratio = float(torch.exp(torch.empty(1).uniform_(math.log(3 / 4), math.log(4 / 3))))
+        w, h = round(math.sqrt(area * ratio)), round(math.sqrt(area / ratio))
+        if 0 < w <= width and 0 < h <= height:
+            break
+    else:
+        w, h = width, height
+    top, left = int(torch.randint(0, height - h + 1, (1,))), int(torch.randint(0, width - w + 1, (1,)))
+    images = images[..., top : top + h, left : left + w]
+    images = F.interpolate(images, (height, width), mode="bilinear", align_corners=False, antialias=True)
+    points = (points - points.new_tensor([left, top])) * points.new_tensor([width / w, height / h])
+    if float(torch.rand(1)) < 0.5:
+        images = images.flip(-1)
+        points = torch.stack((width - 1 - points[..., 0], points[..., 1]), -1)
+    return images, points
 
 
 def affine_of(keys: list[str]) -> K.AugmentationSequential:
