@@ -281,14 +281,20 @@ def test_what_a_crash_left_is_removed(empty):
 
 
 def test_a_process_that_dies_takes_its_item_along(empty):
-    todo = jobs_of({"a": "1", "b": "die", "c": "fail", "d": "note", "e": "5"})
+    texts = {f"{i:02}": "1" for i in range(20)} | {"03": "die", "04": "fail", "05": "note", "19": "die"}
+    todo = jobs_of(texts)
     report = carried_out(todo, processes=2)
-    assert report.made == 3
-    assert report.failed == [("in/b", "the process at work on it was killed by SIGKILL"), ("in/c", "it says so")]
-    assert report.notes == {"is a note": ["in/d"]}
-    assert contents().keys() == {"a", "d", "e", "more/a", "more/d", "more/e"}
+    dead = "the process at work on it was killed by SIGKILL"
+    assert report.failed == [("in/03", dead), ("in/04", "it says so"), ("in/19", dead)]
+    assert report.made == 17
+    assert report.notes == {"is a note": ["in/05"]}
+    expected = {
+        f"{place}{name}" for name, text in texts.items() if text not in ("die", "fail") for place in ("", "more/")
+    }
+    assert contents().keys() == expected
     lines = [json.loads(line) for line in Path("out/.camtorch-doubling.jsonl").read_text().splitlines()]
-    assert sorted(line["failed"] for line in lines if "failed" in line) == [["b", "more/b"], ["c", "more/c"]]
+    failed = sorted(line["failed"] for line in lines if "failed" in line)
+    assert failed == [[name, f"more/{name}"] for name in ("03", "04", "19")]
 
 
 @pytest.mark.slow

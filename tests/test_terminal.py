@@ -58,3 +58,37 @@ def test_short_work_and_files_show_nothing(monkeypatch, clock):
 def test_messages_are_one_line(capsys):
     terminal.note("what\n  pillow said")
     assert capsys.readouterr().err == "camtorch: note: what pillow said\n"
+
+
+def bar(monkeypatch, clock, *, tty, seconds, steps=((10, 0), (30, 10), (100, 10))):
+    stream = Terminal(tty)
+    monkeypatch.setattr(sys, "stderr", stream)
+    shown = terminal.Bar("dewarping", "images")
+    for done, kept in steps:
+        clock[0] += seconds
+        shown.show(done, 100, kept)
+    shown.close()
+    return stream.text
+
+
+def test_a_bar_has_the_rate_and_the_time_left(monkeypatch, clock):
+    text = bar(monkeypatch, clock, tty=True, seconds=2)
+    _, first, second, third, blank, end = text.split("\r")
+    assert first == "dewarping [==                  ]  10 %, 10 of 100 images, 5/s, 18 s left"
+    # what was done before counts for nothing
+    assert second.startswith("dewarping [======              ]  30 %, 30 of 100 images, 5/s, 14 s left")
+    assert third.startswith("dewarping [====================] 100 %, 100 of 100 images, 15/s, 0 s left")
+    assert blank.isspace()
+    assert end == ""
+
+
+def test_a_bar_in_a_file_is_a_line_now_and_then(monkeypatch, clock):
+    assert bar(monkeypatch, clock, tty=False, seconds=20) == (
+        "camtorch: dewarping: 30 of 100 images, 0.5/s, 2 min left\n"
+    )
+    assert bar(monkeypatch, clock, tty=True, seconds=0.1) == ""
+
+
+def test_a_bar_fits_its_terminal(monkeypatch, clock):
+    monkeypatch.setenv("COLUMNS", "40")
+    assert max(map(len, bar(monkeypatch, clock, tty=True, seconds=9999).split("\r"))) == 39

@@ -9,9 +9,11 @@ import pickle
 import signal
 import sys
 import threading
+import time
 import types
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import connection, forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -20,6 +22,8 @@ from typing import Any, NoReturn, TypeVar
 T = TypeVar("T")
 
 _PATIENCE = 10.0  # seconds that processes have to leave things in order when all is broken off
+_SHORT = 0.5  # seconds of a task that leave no process waiting for the next one
+_END = object()
 _HOW = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 Tell = Callable[[Any], None]
@@ -103,15 +107,32 @@ def reason(error: Exception) -> str:
     return " ".join(text.split())
 
 
-@dataclass
+@dataclass(eq=False)
 class _Worker:
-    """A process, the end of the pipe to it, and the task it is at."""
+    """A process, the end of the pipe to it, and the tasks that it has: one it is at, and one that waits."""
 
     process: BaseProcess
     pipe: Connection
-    task: Any = None
-    is_ready: bool = False
-    is_busy: bool = False
+    tasks: deque[Any] = field(default_factory=deque)
+    room: int = 0
+    """For how many tasks: it is ready if there is any."""
+    begin: float = 0.0
+    """When it began the first one."""
+
+    def take(self, task: Any) -> None:
+        """Give it one more."""
+        if not self.tasks:
+            self.begin = time.monotonic()
+        self.tasks.append(task)
+        with contextlib.suppress(OSError):  # it is dead, as will be found
+            self.pipe.send_bytes(pickle.dumps(task))
+
+    def next(self) -> None:
+        """It is through with its first task."""
+        now = time.monotonic()
+        self.tasks.popleft()
+        # of long ones none waits for one process while another has nothing to do
+        self.room, self.begin = (2 if now < self.begin + _SHORT else 1), now
 
 
 class _Pool:
@@ -121,6 +142,8 @@ class _Pool:
         prepare([type(work).__module__])
         self._context = multiprocessing.get_context(_HOW)
         self._workers: list[_Worker] = []
+        self._returned: list[Any] = []
+        """Tasks that waited for a process which died."""
 
     def __enter__(self) -> _Pool:
         return self
@@ -146,22 +169,22 @@ class _Pool:
         self._workers.append(_Worker(process, here))
 
     def run(self, tasks: Iterator[Any], receive: Callable[[Any, str, Any], None]) -> None:
-        left = True
-        while left or any(worker.is_busy for worker in self._workers):
-            while left and len(self._workers) < self._count:
+        more = True
+        while True:
+            more = more or bool(self._returned)
+            while more and len(self._workers) < self._count:
                 self._start()
             for worker in self._workers:
-                if left and worker.is_ready and not worker.is_busy:
-                    try:
-                        worker.task, worker.is_busy = next(tasks), True
-                    except StopIteration:
-                        left = False
-                        break
-                    with contextlib.suppress(OSError):  # it is dead, as is found below
-                        worker.pipe.send_bytes(pickle.dumps(worker.task))
-            if left or any(worker.is_busy for worker in self._workers):
-                for ready in connection.wait([worker.pipe for worker in self._workers]):
-                    self._hear(next(worker for worker in self._workers if worker.pipe is ready), receive)
+                while more and len(worker.tasks) < worker.room:
+                    task = self._returned.pop() if self._returned else next(tasks, _END)
+                    if task is _END:
+                        more = False
+                    else:
+                        worker.take(task)
+            if not more and not any(worker.tasks for worker in self._workers):
+                return
+            for ready in connection.wait([worker.pipe for worker in self._workers]):
+                self._hear(next(worker for worker in self._workers if worker.pipe is ready), receive)
 
     def _hear(self, worker: _Worker, receive: Callable[[Any, str, Any], None]) -> None:
         try:
@@ -170,13 +193,13 @@ class _Pool:
             self._bury(worker, receive)
             return
         if kind == "ready":
-            worker.is_ready = True
+            worker.room = 1
             return
         if kind == "broken":
             raise RuntimeError(f"a process could not begin its work: {what}")
-        task = worker.task
+        task = worker.tasks[0]
         if kind != "told":
-            worker.task, worker.is_busy = None, False
+            worker.next()
         receive(task, kind, what)
 
     def _bury(self, worker: _Worker, receive: Callable[[Any, str, Any], None]) -> None:
@@ -185,10 +208,12 @@ class _Pool:
         worker.process.join()
         code = worker.process.exitcode or 0
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-        if not worker.is_ready:
+        if not worker.room:
             raise RuntimeError(f"a process {how} before it began its work; is memory short?")
-        if worker.is_busy:
-            receive(worker.task, "failed", f"the process at work on it {how}")
+        if worker.tasks:
+            task, *rest = worker.tasks
+            self._returned += rest
+            receive(task, "failed", f"the process at work on it {how}")
 
 
 def _serve(pipe: Connection, pickled: bytes, folder: str) -> None:
