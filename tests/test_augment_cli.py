@@ -131,7 +131,7 @@ def test_mostly_empty_images_are_said_and_mended(folder, capsys):
 def test_the_list_of_presets(folder, capsys):
     augment("--list")
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(ct.augment.PRESETS)
+    assert [line.split()[0] for line in lines] == [*ct.augment.PRESETS, "real"]
     assert "EuRoC" in lines[2]
     assert not Path("augment.png").exists()
 

@@ -165,7 +165,7 @@ def lens(preset: str) -> str | None:
     if preset in ("none", "real") or preset in PRESETS:
         return None if preset == "none" else preset
     known = "; ".join(f"{name}, {known.origin}" for name, known in PRESETS.items())
-    raise ValueError(f"there is no preset {preset!r}. There are none, the image's own lens; real, {_REAL}; {known}")
+    raise ValueError(f"there is no preset {preset!r}. There are none, the image's own lens; {known}; real, {_REAL}")
 
 
 def origin(like: str | None, before: LabelledImage) -> str:
