@@ -64,7 +64,7 @@ class Mixed(Camera):
     cameras: nn.ModuleList
     """What it was made of: single cameras and batches."""
 
-    def __init__(self, cameras: Iterable[Camera], order: Sequence[int] | None = None):
+    def __init__(self, cameras: Iterable[Camera], *, order: Sequence[int] | None = None):
         members = _members(cameras)
         given = [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))]
         super(Camera, self).__init__()  # it has no numbers of its own
@@ -101,7 +101,7 @@ class Mixed(Camera):
         place = {row: i for i, row in enumerate(rows)}
         if sorted(place) != list(range(len(rows))):
             raise ValueError(f"Mixed: groups must fill every row once; got rows {rows}")
-        return cls([camera for _, camera in groups], [place[row] for row in range(len(rows))])
+        return cls([camera for _, camera in groups], order=[place[row] for row in range(len(rows))])
 
     # -- what it holds
 
@@ -241,7 +241,7 @@ class Mixed(Camera):
         used = list(dict.fromkeys(i for i, _ in places))
         *starts, _ = accumulate((_count(self._member(i)) for i in used), initial=0)
         first = dict(zip(used, starts, strict=True))
-        return type(self)([self._member(i) for i in used], [first[i] + row for i, row in places])
+        return type(self)([self._member(i) for i in used], order=[first[i] + row for i, row in places])
 
     def with_tensors(self, **tensors: Tensor) -> NoReturn:
         """There are none to give."""
