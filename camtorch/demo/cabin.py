@@ -111,9 +111,17 @@ def _turn(angle: Tensor, axis: int) -> Tensor:
 def _rays(corners: Tensor, across: float, down: float, turn: Tensor | None) -> Tensor:
     """(B, P, 3) unit rays at a place within each pixel, from the rays of its corners (B, H + 1, W + 1, 3)."""
     rows = torch.lerp(corners[..., :-1, :], corners[..., 1:, :], across)
-    rays = torch.lerp(rows[:, :-1], rows[:, 1:], down).flatten(1, 2)
-    rays = rays if turn is None else rays @ turn
+    rays = torch.lerp(rows[:, :-1], rows[:, 1:], down)
+    rays = (rays if turn is None else rays @ turn).flatten(1, 2)
     return rays / rays.norm(dim=-1, keepdim=True)
+
+
+def _by_rows(rotation: Tensor | None, rays: Tensor) -> Tensor | None:
+    """Rotations (3, 3), (B, 3, 3) or (B, H, 3, 3) as (B or 1, H or 1, 3, 3), of the rays' dtype."""
+    if rotation is None:
+        return None
+    rotation = rotation.to(rays)
+    return rotation if rotation.ndim == 4 else rotation.reshape(-1, 1, 3, 3)
 
 
 def _corners_of(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -163,7 +171,8 @@ def render(
     Args:
         camera: with image_size; no batch dims (all drivers share it) or a batch of B.
         drivers: B of them.
-        rotation: (3, 3) or (B, 3, 3), turns the camera: what was at p is seen at `rotation @ p`.
+        rotation: (3, 3) or (B, 3, 3), turns the camera: what was at p is seen at `rotation @ p`; (B, H, 3, 3) while it
+            reads row after row, one rotation each.
         samples: rays per pixel, spread over it as a lattice; their mean is the pixel, as on a sensor.
         generator: shifts the lattice at random; without it the same image comes out each time.
         dots: (B, N, 3) points, not turned by `rotation`, that are painted over everything else in the colour `DOT`.
@@ -171,7 +180,7 @@ def render(
         grey: see as an infrared camera does that brings its own light.
     """
     corners, valid = _corners_of(camera)
-    turn = None if rotation is None else rotation.to(corners)
+    turn = _by_rows(rotation, corners)
     scene = Scene(drivers.pose, drivers.gaze, drivers.looks, grey)
     # the lattice's step is a golden section of its size: even over each axis and over the square
     step = max(1, round(samples * 0.618))
@@ -193,7 +202,7 @@ def render(
 def render_classes(camera: Camera, drivers: Drivers, rotation: Tensor | None = None) -> Tensor:
     """What is seen at the pixels' centres, (B, 1, H, W) uint8: indices of `CLASSES`; background has no ray."""
     corners, valid = _corners_of(camera)
-    turn = None if rotation is None else rotation.to(corners)
+    turn = _by_rows(rotation, corners)
     classes = _scan(_rays(corners, 0.5, 0.5, turn), Scene(drivers.pose, drivers.gaze, drivers.looks, False), None, 0.0)[
         1
     ]
