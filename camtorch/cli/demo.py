@@ -26,7 +26,7 @@ def add(commands: Commands) -> None:
         choices=("room", "stereo", "surround", "training"),
         default="room",
         help="room: dewarp a room seen by five lenses (the default); stereo: measure it by two fisheyes (with OpenCV); "
-        "surround: a car park from above, by four; training: teach networks with augmentation",
+        "surround: a car park from above, by four; training: teach networks with augmentation (some minutes)",
     )
     add_output(command, "demo.png", "the image")
 
