@@ -19,6 +19,7 @@ from camtorch.camera import Camera
 from camtorch.demo import cabin
 from camtorch.models import Pinhole
 from camtorch.rotations import rotation_matrix
+from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
 
 NAMES = (
@@ -234,32 +235,28 @@ def augmentation(name: str, seen: Photographs) -> Augment:
 
 def _seen(seen: Photographs, index: Tensor, warp: Warp, whole: Tensor) -> Samples:
     """What becomes of photographs by a warp."""
-    turn = torch.eye(3) if warp.rotation is None else warp.rotation
-    points, gaze = (value[index].to(turn) @ turn.mT for value in (seen.points[:, : len(NAMES)], seen.gaze[:, None]))
-    keypoints = warp.target.project(points)[0]
-    return Samples(warp(seen.image[index]), keypoints.float(), gaze[:, 0].float(), _rays(warp.target), whole.float())
+    pixels = seen.camera.project(seen.points[index, : len(NAMES)])[0]
+    keypoints = warp.transform_points(pixels)[0]
+    gaze = warp.transform_rays(seen.gaze[index][:, None])[:, 0]
+    return Samples(warp(seen.image[index]), keypoints.float(), gaze.float(), _rays(warp.target), whole.float())
 
 
 def _by_camera(seen: Photographs) -> Augment:
-    """Real lenses, mounted anywhere, of whose images the faces are cut: one warp from the first image to the cut."""
+    """Real lenses, mounted anywhere and turning, of whose images the faces are cut: one warp from the first to the cut.
+
+    What it needs beyond `RandomCamera` is that the cut follows the face.
+    """
     yaw, pitch, roll = _WIDER
-    augment = RandomCamera(
-        "real",
-        fov=(60, 160),
-        yaw=yaw,
-        pitch=pitch,
-        roll=roll,
-        crop=None,
-        min_filled=0,
-    )
+    augment = RandomCamera("real", fov=(60, 160), yaw=yaw, pitch=pitch, roll=roll, crop=None, min_filled=0)
 
     def by_camera(index: Tensor, generator: torch.Generator) -> Samples:
         change = augment.change(seen.camera, augment.draw(len(index), generator))
         camera, turn = cast(Camera, change.target), change.rotation
-        points = seen.points[index].to(turn) @ turn.mT
-        jitter = 2 * torch.rand(len(index), 3, generator=generator) - 1
-        near, whole = cut(camera, *camera.project(points), jitter)
-        return _seen(seen, index, Warp(seen.camera, near, turn, padding_mode="border"), whole)
+        jitter, rates = (2 * torch.rand(2, len(index), 3, generator=generator) - 1).unbind()
+        near, whole = cut(camera, *camera.project(seen.points[index].to(turn) @ turn.mT), jitter)
+        readout = SIDE * _READOUT / SIZE[0] * camera.fx / near.fx
+        shutter = RollingShutter(readout, _RATE * rates)
+        return _seen(seen, index, Warp(seen.camera, near, turn, target_shutter=shutter, padding_mode="border"), whole)
 
     return by_camera
 
