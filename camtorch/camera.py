@@ -516,7 +516,7 @@ class Camera(BatchedModule):
 
         Args:
             stride: of a feature map: pixels along each side of a patch. Patch i has its middle at
-                `stride * i + (stride - 1) / 2`, half a pixel off its corner pixel's centre even at stride 2.
+                `stride * i + (stride - 1) / 2`, the first one of stride 16 at 7.5.
 
         Raises:
             ValueError: no image size, or one that is not a multiple of the stride: crop, pad or resize the camera as
