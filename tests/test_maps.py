@@ -545,6 +545,8 @@ def test_bare_tables_are_read_without_their_description_if_somebody_says_the_siz
     assert described["format"] == "ti_ldc"
     assert described["block_size"] == list(report.block_size)
     assert report.files == (str(tmp_path / "map.bin"), str(tmp_path / "map.bin.json"))
+    with pytest.raises(ct.CameraFileError, match="describes 'ti_ldc', not dw100"):
+        ct.load_map(tmp_path / "map.bin", "dw100")
     (tmp_path / "map.bin.json").unlink()
     with pytest.raises(ct.CameraFileError, match="say format, one of opencv"):
         ct.load_map(tmp_path / "map.bin")

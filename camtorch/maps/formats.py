@@ -117,6 +117,8 @@ def load_map(
     else:
         chosen = next((known for known in _FORMATS if known.matches(name, content)), None) or _from_description(name)
     described = _read_description(name) if chosen.described else {}
+    if described.get("format", chosen.name) != chosen.name:
+        raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
     facts = {key: _as_fact(value) for key, value in described.items() if key not in _SIZES_AND_ERRORS}
     stated: dict[str, Any] = {key: facts[key] for key in ("step", "order") if key in facts}
     if all(key in described for key in _SIZES):
