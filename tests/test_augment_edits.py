@@ -780,3 +780,17 @@ def test_every_pair_of_edits_commutes_with_its_camera():
         pixels, valid = out["camera"].project(out["points"])
         use = valid & out["keypoints_valid"]
         assert not use.any() or (pixels - out["keypoints"]).norm(dim=-1)[use].max() < 1e-9
+
+
+@pytest.mark.slow
+def test_chains_compile():
+    lens = camera(ct.Fisheye624, torch.float32, (96, 128))
+    given = {"image": torch.rand(2, 3, 96, 128), "keypoints": torch.rand(2, 5, 2) * 90, "gaze": torch.ones(2, 3)}
+    for chain in (A.HorizontalFlip(camera=lens), mixture(camera=lens)):
+        draw = chain.draw(2, torch.Generator().manual_seed(0))
+        expected = chain(given, draw=draw)
+        compiled = torch.compile(lambda sample, draw, chain=chain: chain(sample, draw=draw), fullgraph=True, backend="aot_eager")
+        out = compiled(given, draw)
+        torch.testing.assert_close(out["keypoints"], expected["keypoints"], atol=1e-3, rtol=0)
+        torch.testing.assert_close(out["gaze"], expected["gaze"])
+        assert (out["image"] - expected["image"]).abs().mean() < 1e-3

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -153,15 +152,18 @@ class Compose(Augmentation):
 
     def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
         total, options = None, {**self.options, "antialias": self.antialias}
-        # edits that follow each other are one
-        for are_edits, steps in itertools.groupby(self._steps(draw), lambda step: isinstance(step[0], Edit)):
-            for group in [list(steps)] if are_edits else [[step] for step in steps]:
-                if are_edits:
-                    step = change_by(cast("list[tuple[Edit, dict[str, Tensor]]]", group), camera, options)
-                else:
-                    step = group[0][0]._change(camera, group[0][1])
-                total = step if total is None else total.then(step)
-                camera = _alone(step)
+        steps = self._steps(draw)
+        while steps:
+            edits = []
+            while steps and isinstance(steps[0][0], Edit):  # those that follow each other are one
+                edits.append(cast("tuple[Edit, dict[str, Tensor]]", steps.pop(0)))
+            if edits:
+                step = change_by(edits, camera, options)
+            else:
+                part, own = steps.pop(0)
+                step = part._change(camera, own)
+            total = step if total is None else total.then(step)
+            camera = _alone(step)
         assert total is not None
         sizes = {one.image_size for one in ([camera] if isinstance(camera, Camera) else camera)}
         if len(sizes) > 1 and not total.listed:
@@ -170,12 +172,13 @@ class Compose(Augmentation):
             )
         return total.with_options(options)  # type: ignore[arg-type]
 
-    def _steps(self, draw: Mapping[str, Tensor]) -> Iterator[tuple[Augmentation, dict[str, Tensor]]]:
+    def _steps(self, draw: Mapping[str, Tensor]) -> list[tuple[Augmentation, dict[str, Tensor]]]:
         """The augmentations, and what each was drawn."""
+        steps = []
         for i, part in enumerate(self.parts):
-            prefix = f"{i}."
-            own = {key.removeprefix(prefix): value for key, value in draw.items() if key.startswith(prefix)}
-            yield part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}
+            own = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges)}
+            steps.append((part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}))
+        return steps
 
     def extra_repr(self) -> str:
         """The options."""

@@ -136,7 +136,8 @@ def _turn(matrix: Tensor, source: Camera) -> Tensor | None:
 def _map(across: Tensor | float, left: Tensor | float, down: Tensor | float, top: Tensor | float) -> Tensor:
     """(*B, 2, 3): (across u + left, down v + top)."""
     numbers = [torch.as_tensor(n, dtype=torch.float64) for n in (across, 0.0, left, 0.0, down, top)]
-    return torch.stack(torch.broadcast_tensors(*numbers), -1).unflatten(-1, (2, 3))
+    matrix: Tensor = torch.stack(torch.broadcast_tensors(*numbers), -1).unflatten(-1, (2, 3))
+    return matrix
 
 
 def _box_to(size: tuple[int, int], left: Any, top: Any, width: Any, height: Any) -> Tensor:

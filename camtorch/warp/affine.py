@@ -14,7 +14,7 @@ from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
-from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, narrow, render, widen
+from camtorch.warp.sampling import Fill, Mode, PaddingMode, narrow, render, widen
 from camtorch.warp.shutter import RollingShutter, Shutters
 from camtorch.warp.warp import Warp
 
@@ -108,12 +108,6 @@ class MirrorWarp(Warp):
         if images.requires_grad or not images.is_cpu:
             return images.new_empty(count, images.shape[1], *size)
         return sampler.empty(images, count, size)
-
-    @property
-    def options(self) -> Options:
-        """What another warp takes to sample in the same way."""
-        options = super().options
-        return {**options, "antialias": None} if self._decides else options  # type: ignore[typeddict-item]
 
     def inverse(self) -> Warp:
         """The warp from target to source."""

@@ -87,6 +87,7 @@ class Warp(GeometryModule):
         TypeError: source or target is not a Camera.
     """
 
+    _decides = False  # for itself where to antialias
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
     source: Camera
@@ -487,7 +488,7 @@ class Warp(GeometryModule):
             "mode": self.mode,
             "padding_mode": self.padding_mode,
             "fill": self.fill,
-            "antialias": self.antialias,
+            "antialias": None if self._decides else self.antialias,  # type: ignore[typeddict-item]
             "tolerance": self._tolerance,
         }
 
