@@ -136,7 +136,7 @@ def wandering(lens, count, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_chain_of_a_thousand_edits(seed):
     lens = camera(size=(240, 320))
     lens = ct.BrownConrady(lens.intrinsics, lens.distortion[:5], image_size=(240, 320)).requires_grad_(False)
@@ -786,11 +786,11 @@ def test_every_pair_of_edits_commutes_with_its_camera():
 def test_chains_compile():
     lens = camera(ct.Fisheye624, torch.float32, (96, 128))
     given = {"image": torch.rand(2, 3, 96, 128), "keypoints": torch.rand(2, 5, 2) * 90, "gaze": torch.ones(2, 3)}
-    for chain in (A.HorizontalFlip(camera=lens), mixture(camera=lens)):
-        draw = chain.draw(2, torch.Generator().manual_seed(0))
-        expected = chain(given, draw=draw)
-        compiled = torch.compile(lambda sample, draw, chain=chain: chain(sample, draw=draw), fullgraph=True, backend="aot_eager")
-        out = compiled(given, draw)
-        torch.testing.assert_close(out["keypoints"], expected["keypoints"], atol=1e-3, rtol=0)
-        torch.testing.assert_close(out["gaze"], expected["gaze"])
-        assert (out["image"] - expected["image"]).abs().mean() < 1e-3
+    chain = mixture(camera=lens)
+    draw = chain.draw(2, torch.Generator().manual_seed(0))
+    expected = chain(given, draw=draw)
+    compiled = torch.compile(lambda sample, draw: chain(sample, draw=draw), fullgraph=True, backend="aot_eager")
+    out = compiled(given, draw)
+    torch.testing.assert_close(out["keypoints"], expected["keypoints"], atol=1e-3, rtol=0)
+    torch.testing.assert_close(out["gaze"], expected["gaze"])
+    assert (out["image"] - expected["image"]).abs().mean() < 1e-3
