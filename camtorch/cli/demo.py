@@ -23,10 +23,11 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "subject",
         nargs="?",
-        choices=("room", "stereo", "surround", "training"),
+        choices=("room", "stereo", "surround", "training", "camera"),
         default="room",
         help="room: dewarp a room seen by five lenses (the default); stereo: measure it by two fisheyes (with OpenCV); "
-        "surround: a car park from above, by four; training: teach networks with augmentation (some minutes)",
+        "surround: a car park from above, by four; training: teach networks with augmentation (some minutes); camera: "
+        "teach one to tell the lens of an image (a minute)",
     )
     add_output(command, "demo.png", "the image")
 
@@ -44,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"the demo comes with the repository, not with the installed package: {GET_IT}")
     images.check_target(arguments.output, force=arguments.force)
     # not before: what is installed may be without it
-    from camtorch.demo import dewarping, stereo, surround, training
+    from camtorch.demo import dewarping, prediction, stereo, surround, training
 
     if arguments.subject == "stereo":
         image = stereo.drawing(*stereo.run(_line))
@@ -55,6 +56,9 @@ def run(arguments: argparse.Namespace) -> None:
     elif arguments.subject == "training":
         image = training.drawing(training.run(_line))
         caption = "what each network learned from, and what it finds behind the fisheye"
+    elif arguments.subject == "camera":
+        image = prediction.drawing(prediction.run(_line))
+        caption = "images of lenses that the network has not seen, and what it found"
     else:
         image = dewarping.drawing(dewarping.run(_line))
         caption = "the sources, what became of them, and what separates that from the truth"
