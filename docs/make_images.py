@@ -296,7 +296,10 @@ if __name__ == "__main__":
     overview().save(HERE / "overview.jpg", quality=88)
     edits().save(HERE / "edits.jpg", quality=85)
     full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]
-    for words in (["augment", *full], ["demo"], ["demo", "stereo"], ["demo", "surround"]):
+    for words in (["augment", *full], ["demo"], ["demo", "stereo"], ["demo", "surround"], ["demo", "camera"]):
         path = HERE / f"{words[1] if words[0] == 'demo' and words[1:] else words[0]}.jpg"
         main([*words, "-o", str(path), "--force"])
-        Image.open(path).save(path, quality=85)
+        image = Image.open(path)
+        if words[1:] == ["camera"]:
+            image = image.resize((image.width * 3 // 4, image.height * 3 // 4), Image.Resampling.LANCZOS)
+        image.save(path, quality=85)
