@@ -316,8 +316,8 @@ def test_wrong_words_and_files_are_told(folder, capsys):
 
 
 @pytest.mark.slow
-def test_killed_runs_of_several_processes_end_as_one_that_was_not(tmp_path):
-    make(tmp_path, 40)
+def test_ranks_and_killed_runs_of_several_processes_end_as_one_process_does(tmp_path):
+    make(tmp_path, 24)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
 
     def start(*words):
@@ -326,9 +326,12 @@ def test_killed_runs_of_several_processes_end_as_one_that_was_not(tmp_path):
 
     assert start("-o", "whole", "--jobs", "1").wait(120) == 0
     whole = files(tmp_path / "whole")
+    ranks = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "camtorch"]
+    subprocess.run([*ranks, *WORDS, "-o", "ranks"], cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert files(tmp_path / "ranks") == whole
     rng = np.random.default_rng(0)
     killed = 0
-    for _ in range(4):
+    for _ in range(3):
         process = start("-o", "new", "--jobs", "2", "--resume")
         deadline = time.monotonic() + 60
         there = len(files(tmp_path / "new"))

@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import json
 import re
 import shlex
 import shutil
@@ -82,6 +83,12 @@ def folder(tmp_path, monkeypatch, request):
     if "clip.mp4" in text:
         pytest.importorskip("av")
         write_video("drive/clip.mp4", range(3), size=(height, width))
+    if "--dataset faces.json" in text:
+        Path("faces").mkdir()
+        shutil.copy("photo.jpg", "faces/0.jpg")
+        labels = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [300, 200, 90, 99], "keypoints": [330, 250, 2]}
+        content = {"images": [{"id": 1, "file_name": "0.jpg"}], "annotations": [labels], "categories": [{"id": 1}]}
+        Path("faces.json").write_text(json.dumps(content))
     if "images/*.jpg" in text:
         write_calibration_data()
     known = dict(ct.MODELS)
