@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from camtorch import __version__
 from camtorch.camera import Camera
 from camtorch.cli import cameras, images, videos
 from camtorch.jobs.items import Item, Listener
@@ -40,11 +41,12 @@ class Dewarping:
         camera = self.camera
         intrinsics, distortion = (values.detach().tolist() for values in (camera.intrinsics, camera.distortion))
         return {
+            "camtorch": __version__,
             "camera": {
                 "model": camera.key,
                 "image_size": camera.image_size,
                 "intrinsics": intrinsics,
-                "distortion": distortion,
+                "distortion": dict(zip(camera.distortion_names, distortion, strict=True)),
             },
             "rescale": self.rescale,
             "projection": self.projection,

@@ -97,7 +97,8 @@ def carry_out(
 def _dry_run(items: Sequence[Item], faults: Sequence[tuple[Path, str]], manifest: Manifest, resume: bool) -> int:
     count = 0
     for item in run.pending(items, manifest, resume=resume):
-        print(f"{item.name} -> {', '.join(map(str, item.outputs))}")
+        line = f"{item.name} -> {', '.join(map(str, item.outputs))}"
+        print(line.encode(errors="backslashreplace").decode())  # names of files may be no text
         count += 1
     for path, why in faults:
         say(f"error: {path}: {why}")

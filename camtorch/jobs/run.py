@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from camtorch.io.hashing import hash_of
 from camtorch.io.writing import all_left_over
 from camtorch.jobs import pool
-from camtorch.jobs.items import Item, Json, Work
+from camtorch.jobs.items import Item, Json, Work, real_paths
 from camtorch.jobs.manifest import Manifest, Terms
 
 
@@ -69,7 +69,7 @@ def run(
     if there and not (resume or force):
         more = f", and {len(there) - 1} more of {sum(len(item.outputs) for item in items)}" if len(there) > 1 else ""
         raise FileExistsError(f"{there[0]}: exists already{more}")
-    for path in all_left_over(os.path.realpath(path) for item in items for path in item.outputs):
+    for path in all_left_over(real_paths(path for item in items for path in item.outputs)):
         _unlink(path)
     report, progress = Report(), Progress(sum(item.size for item in items))
     parts: dict[Item, float] = {}
@@ -108,7 +108,7 @@ def run(
         failed[item] = reason
         manifest.failed(item, reason)
         # by a process that died
-        for path in all_left_over(map(os.path.realpath, item.outputs)):
+        for path in all_left_over(real_paths(item.outputs)):
             _unlink(path)
         advance(item, item.size)
 
