@@ -71,6 +71,11 @@ is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compili
 """Whether what is traced shall run elsewhere, where there are no operators of our own. Newer than torch 2.6."""
 
 
+def is_for_here() -> bool:
+    """Whether what is traced is compiled for this machine."""
+    return torch.compiler.is_compiling() and not is_exporting()
+
+
 def keeps_graph(*tensors: Tensor) -> bool:
     """Whether derivatives by any of the tensors are to be recorded: not in a file for another runtime."""
     if not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):

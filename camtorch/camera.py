@@ -26,8 +26,9 @@ from camtorch._arguments import (
     broadcast_shapes,
     is_predicted,
 )
-from camtorch._module import BatchedModule, Memo
-from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, is_concrete
+from camtorch._module import BatchedModule, Memo, is_constant, with_values
+from camtorch._portable import for_elsewhere
+from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, is_concrete, keeps_graph
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
@@ -461,6 +462,13 @@ class Camera(BatchedModule):
         self, direction: type[Project] | type[Unproject], rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Planes (size, C, N), and valid (C, N), of rows (C, N, size); lead: the batch dims that C counts."""
+        if is_constant(self) and all(isinstance(side, int) for side in lead):
+            with with_values(self):
+                intrinsics, distortion = (per_row(t, lead, rows) for t in self._tensors)
+                cameras = self._cameras(intrinsics, distortion)
+                cameras = cameras._replace(domain=cameras.domain.at_hand())
+            order = 1 if keeps_graph(rows) else 0
+            return direction.traced(type(self), rows, intrinsics, distortion, cameras, order)
         intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
         return evaluated(direction, type(self), (rows, intrinsics, distortion), self._cameras)
 
@@ -951,6 +959,8 @@ def evaluated(
     # what is compiled has no derivatives of derivatives
     order = 1 if torch.compiler.is_compiling() else 2
     known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
+    if for_elsewhere() and not keeps_graph(*inputs):
+        inputs = inputs[0], inputs[1].detach(), inputs[2].detach()
     return direction.traced(model, *inputs, cameras_of(*inputs[1:]) if known else None, order)
 
 

@@ -98,6 +98,7 @@ def folder(tmp_path, monkeypatch, request):
     ct.MODELS.update(known)
 
 
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # torch's own, in torch.onnx.export
 # Python 3.12 and later warn of forks beside threads, ray of itself; webdataset leaves its files to the collector
 @pytest.mark.filterwarnings(
     "ignore:.*fork.*:DeprecationWarning", "ignore::DeprecationWarning:ray", "ignore:unclosed file:ResourceWarning"

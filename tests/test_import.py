@@ -99,10 +99,14 @@ def test_exported_programs_load(tmp_path, imports):
     camera = ct.KannalaBrandt([300.0, 300, 320, 240], [0.02, -0.01, 0.003, -0.001]).requires_grad_(False)
 
     class Rays(torch.nn.Module):
-        def forward(self, pixels):
-            return camera.unproject(pixels)
+        def __init__(self):
+            super().__init__()
+            self.camera = camera
 
-    program = torch.export.export(Rays(), (torch.rand(10, 2),))
+        def forward(self, pixels):
+            return self.camera.unproject(pixels)
+
+    program = torch.export.export(Rays(), (torch.rand(10, 2),), strict=True)
     assert any("camtorch" in str(node.target) for node in program.graph.nodes)
     torch.export.save(program, tmp_path / "rays.pt2")
     code = "\nimport sys\nprint(torch.export.load(sys.argv[1]).module()(torch.full((10, 2), 9.0))[1].all())"

@@ -1,9 +1,14 @@
 """Exported programs run elsewhere: in ONNX Runtime, and in a process without camtorch, with the same results."""
 
 import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
+from cameras import KEYS, make, one
 from torch import nn
 
 import camtorch as ct
@@ -93,3 +98,213 @@ def test_a_dewarp_with_options(options):
     warp, images = ct.Dewarp(fisheye(), **options), smooth(2)
     _, run = to_onnx(warp, images)
     torch.testing.assert_close(run(images)[0], warp(images).detach(), atol=1e-5, rtol=0)
+
+
+# -- cameras, as constants and as inputs
+
+
+class Both(nn.Module):
+    """Pixels of points, and rays of pixels, by a camera of its own or by one that is made of inputs."""
+
+    def __init__(self, camera, is_own):
+        super().__init__()
+        self.camera, self.key = camera if is_own else None, camera.key
+
+    def forward(self, points, pixels, intrinsics=None, distortion=None):
+        camera = self.camera or make(self.key, intrinsics, distortion)
+        return *camera.project(points), *camera.unproject(pixels)
+
+
+def inputs_of(camera, dtype, count=600):
+    """Points all around, and pixels on the image and beside it, with some that are none."""
+    generator = torch.Generator().manual_seed(5)
+    points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    points[::2, 2] = points[::2, 2].abs() + 0.3
+    points[:7] = torch.tensor(
+        [[0, 0, 0], [0, 0, -1], [0, 0, 1], [1e-8, 0, 1], [torch.nan, 0, 1], [0, torch.inf, 1], [3e8, 1e8, 5e8]]
+    )
+    sides = torch.tensor((camera.image_size or (480, 640))[::-1], dtype=torch.float64)
+    pixels = (torch.rand(count, 2, generator=generator, dtype=torch.float64) * 1.4 - 0.2) * sides
+    pixels[0], pixels[1] = camera.intrinsics[2:].detach(), torch.nan
+    pixels[2, 0], pixels[3] = torch.inf, 1e9
+    return points.to(dtype), pixels.to(dtype)
+
+
+def undecided(method, values):
+    """Which values lie so near to a limit of what is valid that rounding decides; with what is valid."""
+    valid = method(values)[1]
+    near = torch.zeros_like(valid)
+    steps = 8 * torch.finfo(values.dtype).eps * torch.tensor([-1.0, 1.0], dtype=values.dtype)
+    for step in steps:
+        for axis in range(values.shape[-1]):
+            moved = values.clone()
+            moved[..., axis] += step * values.abs().amax(-1)
+            near |= method(moved)[1] != valid
+    return near
+
+
+def assert_agrees(camera, results, points, pixels):
+    """Pixels to 1e-5 of the image or of themselves, rays to 1e-5, and valid where rounding does not decide."""
+    extent = max(camera.image_size or (640,))
+    for method, values, found, valid in (
+        (camera.project, points, *results[:2]),
+        (camera.unproject, pixels, *results[2:]),
+    ):
+        expected, is_valid = method(values)
+        near = undecided(method, values)
+        assert near.double().mean() < 0.02
+        assert torch.equal(valid | near, is_valid | near)
+        assert found.isfinite().all()
+        assert found.dtype == expected.dtype
+        both = valid & is_valid
+        assert both.any()
+        size = expected[both].abs().amax(-1).clamp(min=extent if values is points else 1)
+        assert ((found[both] - expected[both]).abs().amax(-1) / size).max() < 1e-5
+        assert torch.equal(found[~valid & ~is_valid], expected[~valid & ~is_valid])
+
+
+COUNT = {"points": {0: "count"}, "pixels": {0: "pixel_count"}}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=SLOW)])
+@pytest.mark.parametrize("key", [key if key == "pinhole" else pytest.param(key, marks=SLOW) for key in KEYS])
+def test_a_camera_is_a_constant(key, dtype):
+    camera = one(key).to(dtype).requires_grad_(False)
+    points, pixels = inputs_of(camera, dtype)
+    model, run = to_onnx(Both(camera, True), points, pixels, dynamic_shapes=COUNT)
+    assert not any(node.domain for node in model.graph)
+    for few in (points, pixels), (points[:50], pixels[:1]):
+        assert_agrees(camera, run(*few), *few)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", KEYS)
+def test_a_camera_is_made_of_inputs(key):
+    camera = one(key).float().requires_grad_(False)
+    points, pixels = inputs_of(camera, torch.float32)
+    given = [t.detach().clone() for t in (camera.intrinsics, camera.distortion) if t.numel()]
+    shapes = {**COUNT, **dict.fromkeys(("intrinsics", "distortion")[: len(given)])}
+    _, run = to_onnx(Both(camera, False), points, pixels, *given, dynamic_shapes=shapes)
+    assert_agrees(camera, run(points, pixels, *given), points, pixels)
+    # another camera, by the same program
+    other = make(key, given[0] * 1.1, *given[1:], image_size=camera.image_size).requires_grad_(False)
+    assert_agrees(other, run(points, pixels, given[0] * 1.1, *given[1:]), points, pixels)
+
+
+@pytest.mark.slow
+def test_a_batch_of_cameras_of_any_size():
+    values = torch.tensor([[60.0, 60, 64, 48], [70, 72, 60, 50], [90, 90, 62, 47]])
+    k = torch.tensor([[0.02, -0.01, 0.003, -0.001], [0.1, 0.0, 0.0, 0.0], [-0.05, 0.01, 0.0, 0.0]])
+
+    class Rays(nn.Module):
+        def forward(self, pixels, intrinsics, distortion):
+            return ct.KannalaBrandt(intrinsics, distortion).unproject(pixels)
+
+    pixels = 128 * torch.rand(3, 40, 2)
+    batch = {0: "batch"}
+    shapes = {"pixels": {0: "batch", 1: "count"}, "intrinsics": batch, "distortion": batch}
+    _, run = to_onnx(Rays(), pixels, values, k, dynamic_shapes=shapes)
+    for n in (3, 2):
+        rays, valid = run(pixels[:n, 3:], values[:n], k[:n])
+        expected, is_valid = ct.KannalaBrandt(values[:n], k[:n]).unproject(pixels[:n, 3:])
+        assert torch.equal(valid, is_valid)
+        torch.testing.assert_close(rays, expected.detach(), atol=1e-5, rtol=0)
+
+
+# -- networks
+
+
+class Network(nn.Module):
+    """Features of an undistorted image and the rays of all its pixels: both from learning cameras."""
+
+    def __init__(self):
+        super().__init__()
+        self.dewarp = ct.Dewarp(fisheye())
+        self.layer = nn.Conv2d(6, 4, 3, padding=1)
+
+    def forward(self, images):
+        images = self.dewarp(images)
+        rays, _ = self.dewarp.target.rays()
+        rays = rays.movedim(-1, 0).expand(len(images), -1, -1, -1)
+        return self.layer(torch.cat((images, rays), 1))
+
+
+@pytest.mark.slow
+def test_a_network_that_learns_its_camera():
+    network, images = Network(), smooth(2)
+    _, run = to_onnx(network, images, dynamic_shapes={"images": {0: "batch"}})
+    torch.testing.assert_close(run(images)[0], network(images).detach(), atol=1e-5, rtol=1e-5)
+    with torch.no_grad():
+        network.dewarp.source.intrinsics[:2] *= 1.2
+    _, run = to_onnx(network, images[:1])
+    torch.testing.assert_close(run(images[:1])[0], network(images[:1]).detach(), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_warp_between_cameras_that_are_inputs():
+    source, images = fisheye(), smooth(2)
+    target = ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64))
+
+    class Undistort(nn.Module):
+        def forward(self, images, intrinsics, distortion):
+            camera = ct.KannalaBrandt(intrinsics, distortion, image_size=source.image_size)
+            return ct.Warp(camera, target, tolerance=0.0)(images)
+
+    given = torch.stack((source.intrinsics, source.intrinsics * 0.9)).detach(), source.distortion.detach().repeat(2, 1)
+    _, run = to_onnx(Undistort(), images, *given)
+    torch.testing.assert_close(run(images, *given)[0], Undistort()(images, *given).detach(), atol=1e-5, rtol=0)
+
+
+def test_what_functional_call_puts_in_a_camera_is_no_constant():
+    class Replaced(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.camera = ct.Pinhole([60.0, 60.0, 63.5, 47.5]).requires_grad_(False)
+
+        def forward(self, points, focal):
+            values = {"intrinsics": self.camera.intrinsics * focal}
+            return torch.func.functional_call(self.camera, values, (points,))[0]
+
+    points, focal = torch.rand(5, 3) + 0.1, torch.ones(1)
+    program = torch.export.export(Replaced(), (points, focal)).module()
+    torch.testing.assert_close(program(points, 2 * focal), Replaced()(points, 2 * focal))
+
+
+# -- torch.export
+
+ELSEWHERE = """
+import sys, torch
+program = torch.export.load(sys.argv[1]).module()
+given, expected = torch.load(sys.argv[2])
+for result, known in zip(program(*given), expected, strict=True):
+    torch.testing.assert_close(result, known)
+assert "camtorch" not in sys.modules
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", ["kannala_brandt", "brown_conrady", "f_theta_backward"])
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_saved_program_runs_without_camtorch(key, is_own, tmp_path):
+    camera = one(key).float().requires_grad_(False)
+    given = inputs_of(camera, torch.float32)
+    given = given if is_own else (*given, camera.intrinsics.detach().clone(), camera.distortion.detach().clone())
+    count = [{0: torch.export.Dim(name, min=2)} for name in ("count", "pixel_count")]
+    module = Both(camera, is_own)
+    program = torch.export.export(module, given, dynamic_shapes=(*count, None, None)[: len(given)])
+    torch.export.save(program, tmp_path / "camera.pt2")
+    torch.save((given, module(*given)), tmp_path / "values.pt")
+    # not from the folder of the sources
+    arguments = [sys.executable, "-c", ELSEWHERE, tmp_path / "camera.pt2", tmp_path / "values.pt"]
+    subprocess.run(arguments, check=True, cwd=tmp_path, timeout=120, env={**os.environ, "PYTHONPATH": ""})
+
+
+# -- what the guide says
+
+
+def test_the_guide_has_a_line_for_every_model():
+    guide = (Path(__file__).parents[1] / "docs/guides/deploy.md").read_text()
+    rows = [line.split("|")[1:-1] for line in guide.splitlines() if line.startswith("| `")]
+    assert sorted(name.strip(" `") for name, *_ in rows) == sorted(cls.__name__ for cls in ct.MODELS.values())
+    # as the tests above have it
+    assert {cell.strip() for _, *cells in rows for cell in cells} == {"yes"}

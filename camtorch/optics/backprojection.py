@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
 
-from camtorch._tracing import has_tangent, may_look
+from camtorch._portable import for_elsewhere, times
+from camtorch._tracing import has_tangent, is_fake, may_look, set_aside
 from camtorch.optics.charts import Chart, Equidistant, even_steps_and_ratios
 from camtorch.optics.lens import Planar
 from camtorch.optics.radial import RadialFactor
@@ -35,17 +37,19 @@ class Inverted(Chart):
 
     @property
     def _inverse(self) -> RadialInverse:
-        """Graph-free, with its tables, made when first asked for; traced code may keep nothing."""
-        if torch.compiler.is_compiling():
+        """Graph-free, with its tables, made when first asked for; compiled code may keep nothing."""
+        if torch.compiler.is_compiling() and not for_elsewhere():
             return RadialInverse(self.factor, self.parameters, FURTHEST)
         if self._known is None:
-            self._known = RadialInverse(self.factor, self.parameters, FURTHEST)
+            known = for_elsewhere() and not any(map(is_fake, self.parameters))  # a constant of an exported program
+            with set_aside() if known else nullcontext():
+                self._known = RadialInverse(self.factor, self.parameters, FURTHEST)
         return self._known
 
     def margin(self, x, y, z):
         theta2 = torch.addcmul(x * x, y, y) * Equidistant().scale(x, y, z, 1) ** 2
         # away from the fold, where the ray's own rounding would carry it across
-        before = self._inverse.most2 * (1 - 32 * torch.finfo(z.dtype).eps) - theta2
+        before = times(self._inverse.most2, 1 - 32 * torch.finfo(z.dtype).eps) - theta2
         return torch.minimum(Equidistant().margin(x, y, z), before)
 
     def covers_all(self, nearest, extent, dtype):
@@ -85,11 +89,11 @@ class Inverted(Chart):
 
     def on_plane(self, a, b):
         t = torch.addcmul(a * a, b, b)
-        inside = self._inverse.inner2 * (1 - 64 * torch.finfo(a.dtype).eps) - t
+        inside = times(self._inverse.inner2, 1 - 64 * torch.finfo(a.dtype).eps) - t
         t = torch.minimum(t, self._inverse.inner2)
         theta2 = t * self._inverse.radial(t) ** 2
         # where theta ceases to ascend its rounding is that of many radii; further from there than `margin` is
-        before = self._inverse.most2 * (1 - 128 * torch.finfo(a.dtype).eps)
+        before = times(self._inverse.most2, 1 - 128 * torch.finfo(a.dtype).eps)
         return torch.minimum(inside, before.clamp(max=math.pi**2) - theta2)
 
     def to_ray(self, a, b, order=2):

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from camtorch._portable import plus
 from camtorch.optics.derivatives import vjp_of
 from camtorch.optics.special import angle_per_radius, atan2, cos_root, sinc_root, tanc_root
 
@@ -175,7 +176,7 @@ class Equidistant(Chart):
     def margin(self, x, y, z):
         # closer to the backward direction the derivative pi / rho leaves the floating-point range
         floor = floor_of(z.dtype) / torch.finfo(z.dtype).eps
-        return torch.maximum(z, torch.addcmul(x * x - floor, y, y))
+        return torch.maximum(z, torch.addcmul(plus(x * x, -floor), y, y))
 
     def covers_all(self, nearest, extent, dtype):
         return True
@@ -184,7 +185,7 @@ class Equidistant(Chart):
         rho2 = torch.addcmul(x * x, y, y)
         if order > 1:
             return angle_per_radius(rho2, z)
-        rho = (rho2 + floor_of(z.dtype)).sqrt()
+        rho = plus(rho2, floor_of(z.dtype)).sqrt()
         return atan2(rho, z) / rho
 
     def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
@@ -214,7 +215,7 @@ class Equidistant(Chart):
         """sin(theta) / theta and cos(theta)."""
         if order > 1:
             return sinc_root(theta2), cos_root(theta2)
-        theta = (theta2 + floor_of(theta2.dtype)).sqrt()
+        theta = plus(theta2, floor_of(theta2.dtype)).sqrt()
         return torch.sin(theta) / theta, torch.cos(theta)
 
     def end(self, dtype):
@@ -266,7 +267,7 @@ class SphereChart(Chart):
     has_scale = False
 
     def margin(self, x, y, z):
-        return x * x + z * z - floor_of(y.dtype)
+        return plus(x * x + z * z, -floor_of(y.dtype))
 
     def covers_all(self, nearest, extent, dtype):
         return True
@@ -367,7 +368,7 @@ class Fov(Chart):
         (omega,), (_, tan2) = self.parameters, self._slope()
         most = Perspective().end(z.dtype)
         ahead = most * z - torch.maximum(x.abs(), y.abs())
-        around = tan2 * torch.addcmul(x * x, y, y) - floor_of(z.dtype) / torch.finfo(z.dtype).eps
+        around = plus(tan2 * torch.addcmul(x * x, y, y), -floor_of(z.dtype) / torch.finfo(z.dtype).eps)
         # behind the plane of the camera r is up to pi / omega
         return torch.maximum(ahead, torch.minimum(around, omega * omega * most**2 - math.pi**2))
 

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from camtorch._portable import hypot, running_max
 from camtorch.optics.derivatives import jacobian_of, vjp_of
 from camtorch.optics.radial import RadialFactor, total
 
@@ -76,7 +77,7 @@ class Stage:
         a, b = ((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn)))
         at = self.at(a, b)
         shape = (radius.shape[-1], _DIRECTIONS)
-        orientation, distance = at.orientation.unflatten(-1, shape), torch.hypot(*at.value).unflatten(-1, shape)
+        orientation, distance = at.orientation.unflatten(-1, shape), hypot(*at.value).unflatten(-1, shape)
         least, furthest = orientation.amin(-1), distance.amax(-1)
         missed = (orientation - orientation.roll(1, -1)).abs().amax(-1)
         return least - missed / 2, furthest + (distance - distance.roll(1, -1)).abs().amax(-1) / 2
@@ -167,12 +168,12 @@ class Planar(Stage):
         if self.radial:
             least, furthest = self.radial.orientation(radius), radius * self.radial(t).abs()
         if self.tangential:
-            p = torch.hypot(*self.tangential)
+            p = hypot(*self.tangential)
             least, furthest = least - 6 * p * radius, furthest + 3 * p * t
         if self.prism:
             s0, s1, s2, s3 = self.prism
-            least = least - 2 * radius * torch.hypot(s0 + 2 * t * s1, s2 + 2 * t * s3)
-            furthest = furthest + t * torch.hypot(s0 + t * s1, s2 + t * s3)
+            least = least - 2 * radius * hypot(s0 + 2 * t * s1, s2 + 2 * t * s3)
+            furthest = furthest + t * hypot(s0 + t * s1, s2 + t * s3)
         return least, furthest
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
@@ -289,10 +290,10 @@ class Tilt(Stage):
     def lower_bound(self, radius: Tensor) -> Planes2:
         """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = self.parameters
-        slope = torch.hypot(r20, r21)
+        slope = hypot(r20, r21)
         nearest = r22 - slope * radius
-        size = torch.maximum(torch.hypot(r00, r10), torch.hypot(r01, r11)) * math.sqrt(2)
-        shift = torch.hypot(r02, r12)
+        size = torch.maximum(hypot(r00, r10), hypot(r01, r11)) * math.sqrt(2)
+        shift = hypot(r02, r12)
         # past the horizon nothing is certain
         seen = r22 * (size * radius + shift) / torch.where(nearest > 0, nearest, torch.nan)
         return torch.minimum(nearest, r22 * (r00 + r11) - slope * seen), seen + shift
@@ -382,7 +383,7 @@ class Lens:
             least, radius = stage.lower_bound(radius)
             bounds.append(least)
             # the next stage sees what any smaller circle becomes as well
-            radius = torch.cummax(radius, -1).values
+            radius = running_max(radius)
         return torch.stack(torch.broadcast_tensors(*bounds)).amin(0), radius
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:

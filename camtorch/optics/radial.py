@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
+from camtorch._portable import leading, plus
 from camtorch._threads import ALONE, undivided
-from camtorch._tracing import register
+from camtorch._tracing import is_exporting, register
 from camtorch.optics.derivatives import derivatives_of, vjp_of
 from camtorch.optics.special import angle_per_radius, root
 
@@ -186,7 +188,7 @@ class AnglePerRadius(RadialFactor):
         factor = angle_per_radius(t, ahead, 1)
         if not order:
             return (factor,)
-        square, twice = torch.addcmul(t, ahead, ahead), 2 * t + torch.finfo(t.dtype).tiny ** 0.5
+        square, twice = torch.addcmul(t, ahead, ahead), plus(2 * t, torch.finfo(t.dtype).tiny ** 0.5)
         by_radius = torch.addcmul(ahead, t, bends[0], value=-2) / square
         slope = (by_radius - factor) / twice
         if order == 1:
@@ -232,7 +234,7 @@ class RadiusTable(RadialFactor):
         """The first node that r does not ascend from, or the last one."""
         # the filter sees to it that r ascends wherever the table does
         nodes, secants = self._table
-        return nodes.gather(-1, (secants > 0).long().cumprod(-1).sum(-1, keepdim=True)).squeeze(-1)
+        return nodes.gather(-1, leading(secants > 0)).squeeze(-1)
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
@@ -276,6 +278,9 @@ class RadiusTable(RadialFactor):
 
 def _piece(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
     """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
+    if is_exporting():  # one by one: few, or the memory of all comparisons
+        passed = [(node <= place).long() for node in nodes]
+        return reduce(torch.add, passed)
     table = torch.stack(nodes, -1).contiguous()
     if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own
         return torch.searchsorted(table, place.unsqueeze(-1).contiguous(), right=True).squeeze(-1)
@@ -290,6 +295,23 @@ def _pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
     return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
 
 
+def _solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor) -> Tensor:
+    """The solution (*B, N) of equations with diagonals (*B, N - 1), (*B, N), (*B, N - 1)."""
+    if not is_exporting():
+        matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
+        return torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
+    # by Gauss's elimination from the first to the last, and back
+    lower, upper, pivots, values = below.unbind(-1), above.unbind(-1), [main[..., 0]], [right[..., 0]]
+    for i, factor in enumerate(lower):
+        share = factor / pivots[i]
+        pivots.append(main[..., i + 1] - share * upper[i])
+        values.append(right[..., i + 1] - share * values[i])
+    solution = [values[-1] / pivots[-1]]
+    for i in reversed(range(len(upper))):
+        solution.append((values[i] - upper[i] * solution[-1]) / pivots[i])
+    return torch.stack(solution[::-1], -1)
+
+
 def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
     """(*B, N) of the pieces -> (*B, N + 1): the slopes of the cubic spline at the nodes, made to ascend where it does.
 
@@ -301,12 +323,11 @@ def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
     one, zero = torch.ones_like(both), torch.zeros_like(both)
     main = torch.cat((2 * one, 2 * (before + after), before[..., -1:]), -1)
     above, below = torch.cat((one, before), -1), torch.cat((after, both), -1)
-    matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
     last, last_but_one = after[..., -1:], before[..., -1:]
     end = (last * last * secants[..., -2:-1] + (2 * both + last) * last_but_one * secants[..., -1:]) / both
     middle = 3 * (after * secants[..., :-1] + before * secants[..., 1:])
     right = torch.cat((3 * secants[..., :1], middle, end), -1)
-    slopes = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
+    slopes = _solve_tridiagonal(below, main, above, right)
     # between pieces of different orientation there is no slope
     turns = torch.cat((zero > 1, secants[..., :-1] * secants[..., 1:] <= 0, zero > 1), -1)
     neighbours = torch.stack((torch.cat((secants[..., :1], secants), -1), torch.cat((secants, secants[..., -1:]), -1)))

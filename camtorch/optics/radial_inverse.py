@@ -11,6 +11,17 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._module import same
+from camtorch._portable import (
+    as_index,
+    choose,
+    count_not_above,
+    for_elsewhere,
+    leading,
+    of_points,
+    repeat,
+    running_max,
+    times,
+)
 from camtorch._tracing import may_look
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.optics.radial import FACTORS
@@ -42,7 +53,7 @@ def short(dtype: torch.dtype) -> float:
 
 def within(fold: Tensor) -> Tensor:
     """The squared radius up to which a lens that folds there is certainly regular."""
-    return (fold * (1 - 4 * torch.finfo(fold.dtype).eps)) ** 2
+    return times(fold, 1 - 4 * torch.finfo(fold.dtype).eps) ** 2
 
 
 # -- the fold
@@ -94,7 +105,7 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
     for _ in range(2):
         inner = low + (high - low) * steps
         # the upper end counts as lost, whatever rounding says of it
-        first = (orientation(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
+        first = leading(orientation(inner) > 0).clamp(1, _PARTS)
         low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
     before, after = orientation(low), orientation(high)
     crossing = (before > 0) & (after < 0)
@@ -111,11 +122,11 @@ def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> T
     u = torch.linspace(0, 1, _NODES + 1, dtype=fold.dtype, device=fold.device)
     square = _square(u, end * end)
     factor = radial(square)
-    r2 = torch.cummax(square * factor * factor, -1).values
+    r2 = running_max(square * factor * factor)
     reach2 = r2[..., -1:]
     # where the nodes' images lie, and what lies at nodes that are even there
-    at = _variable(r2, reach2).contiguous()
-    cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, _NODES - 1)
+    at = _variable(r2, reach2)
+    cell = (count_not_above(at, u.expand_as(at)) - 1).clamp(0, _NODES - 1)
     low, high = at.gather(-1, cell), at.gather(-1, cell + 1)
     scale = factor.reciprocal()
     before, step = scale.gather(-1, cell), scale.diff(dim=-1).gather(-1, cell)
@@ -155,18 +166,21 @@ class InverseTable:
     at the fold out of the inverse, and is as analytic in r2 as that.
     """
 
-    def __init__(self, table: Tensor):
-        """table: (C, 2 + 2 nodes): its last squared radius, the largest one that has a point, factors and steps."""
-        self.reach2, self.most2 = table[..., :1], table[..., 1:2]
-        self.values, self.steps = table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
+    def __init__(self, table: Tensor, *, is_constant: bool = False):
+        """table: (C, 2 + 2 nodes): its last squared radius, the largest one that has a point, factors and steps.
+
+        is_constant: whether its parts are to be no views.
+        """
+        parts = table[..., :1], table[..., 1:2], table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
+        self.reach2, self.most2, self.values, self.steps = (p.clone() for p in parts) if is_constant else parts
 
     def __call__(self, r2: Tensor) -> Tensor:
         """The factor for (C, N), to about 1e-6."""
         position = _variable(r2, self.reach2) * _NODES
-        node = position.to(torch.int32).clamp(0, _NODES - 1)  # NaN becomes some integer
+        node = as_index(position).clamp(0, _NODES - 1)
         fraction = position - node
         if len(self.values) > 1:
-            node = node + torch.arange(len(self.values), device=r2.device, dtype=torch.int32).unsqueeze(-1) * _NODES
+            node = node + torch.arange(len(self.values), device=r2.device, dtype=node.dtype).unsqueeze(-1) * _NODES
         node = node.flatten()
         value, step = self.values.flatten().index_select(0, node), self.steps.flatten().index_select(0, node)
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
@@ -222,10 +236,9 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
     method crawls. They stay in a bracket that every other step halves, so that no kink holds them up.
     """
     eps = torch.finfo(r2.dtype).eps
-    wanted, low, high = r2.sqrt(), torch.zeros_like(r2), inner2.sqrt().expand_as(r2)
-    rho = torch.minimum(wanted, high)
-    width, moves = high, torch.ones_like(rho, dtype=torch.bool)
-    for count in range(-4 * int(math.log2(eps))):
+    wanted, high = r2.sqrt(), inner2.sqrt().expand_as(r2)
+
+    def step(count: int | Tensor, moves: Tensor, rho: Tensor, low: Tensor, high: Tensor, width: Tensor):
         t = rho * rho
         value, first, second = radial.derivatives(t, 2)
         slope, bend = value + 2 * t * first, rho * (6 * first + 4 * t * second)
@@ -235,12 +248,13 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
         ahead = rho + 2 * error / torch.where(denominator > 0, denominator, 1.0)
         ahead = torch.minimum(torch.maximum(ahead, low), high)
         moves = moves & ((ahead - rho).abs() > 2 * eps * rho)
-        if not bool(moves.any()):
-            break
-        if count % 2:
-            ahead = torch.where(high - low > width / 2, (low + high) / 2, ahead)
-            width = high - low
-        rho = torch.where(moves, ahead, rho)
+        odd = count % 2 == 1
+        ahead = choose(odd, torch.where(high - low > width / 2, (low + high) / 2, ahead), ahead)
+        return moves, torch.where(moves, ahead, rho), low, high, choose(odd, high - low, width)
+
+    rho = torch.minimum(wanted, high)
+    state = rho, torch.zeros_like(r2), high, high
+    _, rho, *_ = repeat(step, torch.ones_like(rho, dtype=torch.bool), state, -4 * int(math.log2(eps)))
     return radial(rho * rho).reciprocal()
 
 
@@ -264,17 +278,25 @@ class RadialInverse:
         self.of_points = parameters[0].ndim < 2
         self.k = torch.stack(parameters, -1).reshape(-1, len(parameters))
         k, rows = self.k, None
-        if self.of_points and len(k) > 1:
-            k, rows = k.unique(dim=0, return_inverse=True)
-        inner2, table = _radial_tables(factor.name, k, end)
+        if for_elsewhere():
+            inner2, table = _made_tables(factor.name, k, end)
+        else:
+            if self.of_points and len(k) > 1:
+                k, rows = k.unique(dim=0, return_inverse=True)
+            inner2, table = _radial_tables(factor.name, k, end)
+        self._table = table
         of_each = [w if rows is None else w[rows] for w in (inner2, InverseTable(table).most2)]
-        self.inner2, self.most2 = (w.reshape(parameters[0].shape) for w in of_each)
+        self.inner2, self.most2 = (w.reshape(parameters[0].shape).clone() for w in of_each)
 
     def __call__(self, r2: Tensor) -> Tensor:
         """The factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
         if self.of_points:
             return bracketed(self.radial, r2, self.inner2)
-        return _radial_scale(self.factor.name, self.k, self.end, r2.reshape(len(self.k), -1)).view_as(r2)
+        rows = r2.reshape(len(self.k), -1)
+        if for_elsewhere():
+            inner2 = self.inner2.reshape(-1, 1)
+            return _scale(self.factor.name, self.k, inner2, InverseTable(self._table), rows).view_as(r2)
+        return _radial_scale(self.factor.name, self.k, self.end, rows).view_as(r2)
 
 
 _KEPT = 8
@@ -295,14 +317,18 @@ def _kept_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
             return inner2, table
     with torch.inference_mode(False), torch.no_grad():
         values = k.detach().clone()
-        wide = precise(values)
-        radial = FACTORS[name](columns(wide))
-        radii = even_steps_and_ratios(RADII, end, end, wide, torch.positive)
-        fold = fold_of(radial, radii, end, torch.finfo(k.dtype).max ** 0.25)
-        inner2, table = within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
+        inner2, table = _made_tables(name, values, end)
     _tables.insert(0, (name, end, values, inner2, table))
     del _tables[_KEPT:]
     return inner2, table
+
+
+def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
+    wide = k if for_elsewhere() else precise(k)  # ONNX Runtime has no arc tangent in float64
+    radial = FACTORS[name](columns(wide))
+    radii = even_steps_and_ratios(RADII, end, end, wide, torch.positive)
+    fold = fold_of(radial, radii, end, torch.finfo(k.dtype).max ** 0.25)
+    return within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
 
 
 @_radial_tables.register_fake
@@ -320,12 +346,16 @@ def _(info, in_dims, name, k, end):
 def _radial_scale(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
     inner2, table = _kept_tables(name, k, end)
-    scale, settled = solve(FACTORS[name](columns(k)), InverseTable(table), r2, may_look(r2))
+    return _scale(name, k, inner2, InverseTable(table), r2)
+
+
+def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
+    scale, settled = solve(FACTORS[name](columns(k)), table, r2, may_look(r2))
     camera, point = (~(settled > 0)).nonzero(as_tuple=True)
-    if len(camera):
-        # a single camera serves all points
-        radial = FACTORS[name]((k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT).unbind())
-        scale[camera, point] = bracketed(radial, r2[camera, point], inner2[camera, 0])
+    if for_elsewhere() or len(camera):
+        radial = FACTORS[name](of_points(k, camera))
+        found = bracketed(radial, r2[camera, point], inner2[camera, 0])
+        scale = scale.index_put((camera, point), found)
     return scale
 
 

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._module import same
+from camtorch._portable import for_elsewhere, of_points, plus
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
-from camtorch.projection.fold import AZIMUTHS, Azimuths, azimuth
+from camtorch.projection.fold import AZIMUTHS, Azimuths, Outline, azimuth, limits_and_outline
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
@@ -33,6 +34,8 @@ def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property:
     def table(self: Domain) -> Tensor:
         if self.whole is not None:
             return getattr(self.whole, make.__name__)[self.cameras]
+        if for_elsewhere():
+            return make(self)
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
             return make(self)
@@ -67,9 +70,7 @@ class Domain:
 
     def optics_of(self, camera: Tensor) -> tuple[Chart, Lens]:
         """Of single points (M,), each seen by the camera of that index."""
-        # a single camera serves all points
-        k = self.k[0].unsqueeze(-1) if len(self.k) == 1 else self.k[camera].mT
-        return self.optics(k.unbind(0))
+        return self.optics(of_points(self.k, camera))
 
     def replaced(self, rows: Tensor, other: Domain, index: Tensor) -> Domain:
         """The domain in which the cameras `rows` are those of another at `index`; what both know of folds is kept."""
@@ -92,6 +93,34 @@ class Domain:
         self.__dict__.update(inner2=inner2, usual2=usual2, limits2=limits2, inverse=inverse)
         self.__dict__.update(staged=None, all_staged=False)  # which takes a look
         return self
+
+    def at_hand(self) -> Domain:
+        """The same, with all tables that a graph may ask for: those of values that are known, or recorded with it."""
+        if for_elsewhere():
+            if self.lens.stages and not self.lens.is_radial:
+                staged = torch.isfinite(self.circle2) if self.lens.rest is not None else None
+                limits2, outline = limits_and_outline(self.optics, self.k)
+                limits2 = limits2 if staged is None else torch.where(staged, 0.0, limits2)
+                self.__dict__.update(staged=staged, all_staged=False, limits2=limits2, outline=outline)
+            return self
+        # constants: none is a view of another
+        made = Domain(self.optics, self.k.clone())
+        made.chart, made.lens = self.optics([c.clone() for c in columns(self.k)])
+        if not self.lens.stages:
+            return made
+        tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]
+        tables += [] if self.lens.is_radial else ["limits2"]
+        made.__dict__.update({name: getattr(self, name).clone() for name in tables})
+        made.__dict__.update(staged=self.staged, all_staged=self.all_staged, inverse=None, outline=None)
+        if self.inverse is not None:
+            made.__dict__["inverse"] = InverseTable(self.table, is_constant=True)
+        if not (self.lens.is_radial or self.all_staged):
+            with torch.inference_mode(False):
+                made.outline = self.azimuths.outline(torch.arange(len(self.k), device=self.k.device))
+        return made
+
+    outline: Outline | None
+    """Of all cameras, where tables are at hand and the inverse of some does not go stage by stage."""
 
     @cached_property
     def azimuths(self) -> Azimuths:
@@ -227,8 +256,8 @@ class Domain:
             limits2 = self.azimuths.limits2(camera + first, azimuth(a, b))
             inside[camera, point] = torch.minimum(limits2 - t, regular(self.optics_of(camera)[1], a, b))
             return inside
-        row = torch.arange(len(self.k), device=t.device, dtype=torch.int32).unsqueeze(-1) * AZIMUTHS
-        index = row + azimuth(a, b)
+        index = azimuth(a, b)
+        index = index + torch.arange(len(self.k), device=t.device, dtype=index.dtype).unsqueeze(-1) * AZIMUTHS
         limits2 = self.limits2.flatten().index_select(0, index.flatten()).view(index.shape)
         return torch.maximum(inside, torch.minimum(limits2 - t, regular(self.lens, a, b)))
 
@@ -236,7 +265,7 @@ class Domain:
 def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
     """Positive where the lens is regular at the point itself, and its inverse has a derivative."""
     # nearer to zero the reciprocal could leave the floating-point range
-    return torch.nan_to_num(lens.at(a, b).orientation, nan=-1.0) - torch.finfo(a.dtype).tiny ** 0.25
+    return plus(torch.nan_to_num(lens.at(a, b).orientation, nan=-1.0), -(torch.finfo(a.dtype).tiny ** 0.25))
 
 
 _KEPT = 24  # of a batch of eight models before, while and after it changes

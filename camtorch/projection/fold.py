@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._portable import as_index, for_elsewhere, hypot, repeat, running_max
 from camtorch.optics.radial_inverse import first_loss
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # to find the fold of the radial factor
 _SMOOTH, _BULGE = 0.02, 0.001
 _DIP = 65  # radii at which a dip between two nodes is looked at
+_RECORDED_LOOKS = 2  # at such dips, one after the other, in an exported program
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 _FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
 _ROWS = 2048  # azimuths that are followed at a time
@@ -68,14 +70,8 @@ class Azimuths:
 
     def _limit(self, camera: Tensor, index: Tensor) -> Tensor:
         lost = torch.stack((self._lost[camera, index], self._lost[camera, (index + 1).remainder(AZIMUTHS)]), -1)
-        limits = _radius_at(self._radii[camera], lost)
-        nearer, further = limits.amin(-1), limits.amax(-1)
-        # Between two azimuths the fold moves smoothly, and may bulge: the orientation tells where it lies.
-        # Or it ends there: then the nearer one is on the safe side.
-        smooth = (lost.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
-        limit = torch.where(smooth, further * (1 + _BULGE), nearer).unsqueeze(-1)
         chart, _ = self.optics(columns(self.k if len(self.k) == 1 else self.k[camera]))
-        return limit.clamp(max=chart.end(limit.dtype)).squeeze(-1)
+        return _limit(chart, self._radii[camera], lost)
 
     def outline(self, camera: Tensor) -> Outline:
         """Of several cameras (G,), each given once."""
@@ -95,9 +91,7 @@ class Azimuths:
         index = torch.arange(AZIMUTHS, device=camera.device).repeat(len(camera))
         rows = camera.repeat_interleave(AZIMUTHS)
         parts = [self._follow(*some) for some in zip(rows.split(_ROWS), index.split(_ROWS), strict=True)]
-        reach, furthest, x, y = (torch.cat(w).unflatten(0, (len(camera), AZIMUTHS)) for w in zip(*parts, strict=True))
-        envelope = _envelope(furthest, x, y)
-        return Outline(self._radii[camera], reach, torch.where(envelope < _FAR, envelope, torch.inf))
+        return _outline(self._radii[camera], *(torch.cat(w) for w in zip(*parts, strict=True)))
 
     def _radii_of(self, camera: Tensor) -> Tensor:
         """(M, radii), those of cameras that are asked for the first time made now."""
@@ -117,21 +111,60 @@ class Azimuths:
         radii = self._radii_of(camera)
         # a single camera serves all rows
         chart, lens = self.optics(columns(self.k if len(self.k) == 1 else self.k[camera]))
-        a, b = (c[index].unsqueeze(-1) for c in _directions(radii))
-        at = lens.at(a * radii, b * radii)
-        lost = self._lost[camera, index] = _lost(lens, a, b, radii, at.orientation)
-        (x, y), end = at.value, chart.end(radii.dtype)
-        reach = _ascending((x * x + y * y).sqrt(), lost)
-        nodes = lost.clamp(max=radii.shape[-1] - 1).unsqueeze(-1)
-        last = _radius_at(radii, nodes).clamp(max=end)
-        x, y = lens.at(a * last, b * last, order=0).value
-        before = torch.where((radii < last) & (reach < torch.inf), reach, 0.0).amax(-1, keepdim=True)
-        furthest = torch.maximum((x * x + y * y).sqrt(), before)
-        # before a pole there is no end to it
-        beyond = radii.gather(-1, nodes.ceil().long()).clamp(max=end)
-        margin = lens.at(a * beyond, b * beyond).margin
-        open_ended = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)
-        return reach, torch.where(open_ended, torch.inf, furthest).squeeze(-1), x.squeeze(-1), y.squeeze(-1)
+        self._lost[camera, index], *rest = _followed(chart, lens, radii, *(c[index] for c in _directions(radii)))
+        return tuple(rest)
+
+
+def limits_and_outline(optics: Optics, k: Tensor) -> tuple[Tensor, Outline]:
+    """`Azimuths.limits2` of all azimuths, (C, azimuths), and the outlines, of all cameras: without a look at values."""
+    chart, lens = optics(columns(k))
+    radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(len(k), -1)
+    # each camera's azimuths are rows
+    rows = radii.repeat_interleave(AZIMUTHS, 0)
+    chart, lens = optics(columns(k.repeat_interleave(AZIMUTHS, 0)))
+    directions = (c.repeat(len(k)) for c in _directions(radii))
+    lost, *rest = _followed(chart, lens, rows, *directions)
+    of_each = lost.unflatten(0, (-1, AZIMUTHS))
+    pairs = torch.stack((of_each, of_each.roll(-1, -1)), -1).flatten(0, 1)
+    limits = _limit(chart, rows, pairs).unflatten(0, (-1, AZIMUTHS))
+    return limits * limits, _outline(radii, *rest)
+
+
+def _limit(chart: Chart, radii: Tensor, lost: Tensor) -> Tensor:
+    """(M,): the radius between two azimuths before which the orientation decides; radii (M, S), lost (M, 2) on both."""
+    limits = _radius_at(radii, lost)
+    nearer, further = limits.amin(-1), limits.amax(-1)
+    # Between two azimuths the fold moves smoothly, and may bulge: the orientation tells where it lies.
+    # Or it ends there: then the nearer one is on the safe side.
+    smooth = (lost.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
+    limit = torch.where(smooth, further * (1 + _BULGE), nearer).unsqueeze(-1)
+    return limit.clamp(max=chart.end(limit.dtype)).squeeze(-1)
+
+
+def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
+    """At which node the lens is lost on the azimuths of directions (M,), and what `Azimuths._follow` returns."""
+    a, b = a.unsqueeze(-1), b.unsqueeze(-1)
+    at = lens.at(a * radii, b * radii)
+    lost = _lost(lens, a, b, radii, at.orientation)
+    (x, y), end = at.value, chart.end(radii.dtype)
+    reach = _ascending((x * x + y * y).sqrt(), lost)
+    nodes = lost.clamp(max=radii.shape[-1] - 1).unsqueeze(-1)
+    last = _radius_at(radii, nodes).clamp(max=end)
+    x, y = lens.at(a * last, b * last, order=0).value
+    before = torch.where((radii < last) & (reach < torch.inf), reach, 0.0).amax(-1, keepdim=True)
+    furthest = torch.maximum((x * x + y * y).sqrt(), before)
+    # before a pole there is no end to it
+    beyond = radii.gather(-1, nodes.ceil().long()).clamp(max=end)
+    margin = lens.at(a * beyond, b * beyond).margin
+    open_ended = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)
+    return lost, reach, torch.where(open_ended, torch.inf, furthest).squeeze(-1), x.squeeze(-1), y.squeeze(-1)
+
+
+def _outline(radii: Tensor, reach: Tensor, furthest: Tensor, x: Tensor, y: Tensor) -> Outline:
+    """Of cameras (G,), whose azimuths are rows (G azimuths, ...)."""
+    reach, furthest, x, y = (w.unflatten(0, (-1, AZIMUTHS)) for w in (reach, furthest, x, y))
+    envelope = _envelope(furthest, x, y)
+    return Outline(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
 
 
 class Outline(NamedTuple):
@@ -183,27 +216,37 @@ def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) 
 
     a, b: (M, 1) directions. radii, orientation: (M, S).
     """
-    spared = torch.zeros_like(orientation, dtype=torch.bool)
     last = orientation.shape[-1] - 1
     steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
-    while True:
-        lost = first_loss(orientation, spared)
+
+    def look(count: int | Tensor, dips: Tensor, spared: Tensor, lost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         node = lost.round().long().clamp(max=last).unsqueeze(-1)
-        assumed = (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
-        if not bool(assumed.any()):
-            return lost
         radius = _radius_at(radii, (node + steps).clamp(0, last))
-        spared_now = assumed & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
-        if not bool(spared_now.any()):
-            return lost
+        spared_now = dips & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
         spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
+        lost = first_loss(orientation, spared)
+        # of those rows that are not done
+        return assumed(lost) & spared_now, spared, lost
+
+    def assumed(lost: Tensor) -> Tensor:
+        node = lost.round().long().clamp(max=last).unsqueeze(-1)
+        return (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
+
+    spared = torch.zeros_like(orientation, dtype=torch.bool)
+    lost = first_loss(orientation, spared)
+    dips = assumed(lost)
+    if for_elsewhere():  # few are spared at all
+        for count in range(_RECORDED_LOOKS):
+            dips, spared, lost = look(count, dips, spared, lost)
+        return lost
+    return repeat(look, dips, (spared, lost), orientation.shape[-1])[-1]
 
 
 def _directions(like: Tensor) -> tuple[Tensor, Tensor]:
     """The unit vectors of the azimuths, in even steps along the rim of the diamond |a| + |b| = 1."""
     turn = torch.arange(AZIMUTHS, dtype=like.dtype, device=like.device) * (4 / AZIMUTHS)
     a, b = (turn - 2).abs() - 1, 1 - ((turn + 1).remainder(4) - 2).abs()
-    length = torch.hypot(a, b)
+    length = hypot(a, b)
     return a / length, b / length
 
 
@@ -212,7 +255,7 @@ def azimuth(a: Tensor, b: Tensor, offset: float = 0.0) -> Tensor:
     size = a.abs() + b.abs()
     across = b / torch.where(size > 0, size, 1.0)
     turn = torch.where(a < 0, 2 - across, across)
-    return (turn * (AZIMUTHS / 4) + offset).floor().to(torch.int32).remainder(AZIMUTHS)
+    return as_index((turn * (AZIMUTHS / 4) + offset).floor()).remainder(AZIMUTHS)
 
 
 def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> Tensor:
@@ -251,4 +294,4 @@ def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
     """How far from the centre the lens sends each node, ascending; infinite past the fold."""
     nodes = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
     before = (nodes < lost.unsqueeze(-1)) & (reach < torch.inf)
-    return torch.cummax(torch.where(before, reach, torch.inf), -1).values
+    return running_max(torch.where(before, reach, torch.inf))

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from camtorch._arguments import columns
-from camtorch._tracing import in_transform, register
+from camtorch._tracing import in_transform, is_for_here, register
 from camtorch.optics.radial_inverse import table_width
 from camtorch.projection.domain import Optics, domain_of
 from camtorch.projection.fold import AZIMUTHS
@@ -145,7 +145,7 @@ _to_rows.register_autograd(lambda ctx, cotangent: _to_planes(cotangent))
 
 def to_planes(rows: Tensor) -> tuple[Tensor, ...]:
     """(C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
-    interleaved = torch.compiler.is_compiling() and rows.device.type == "cpu" and rows.stride(-2) != 1
+    interleaved = is_for_here() and rows.device.type == "cpu" and rows.stride(-2) != 1
     interleaved = interleaved and not in_transform()  # the operator has no forward mode
     return (_to_planes(rows) if interleaved else rows.movedim(-1, 0)).unbind(0)
 
@@ -162,7 +162,7 @@ def _(mask):
 
 def positive(mask: Tensor) -> Tensor:
     """The mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
-    compiled = torch.compiler.is_compiling() and mask.device.type == "cpu"
+    compiled = is_for_here() and mask.device.type == "cpu"
     return _positive(mask.detach()) if compiled else mask > 0
 
 

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._portable import for_elsewhere
 from camtorch._threads import ALONE, EVEN, split
-from camtorch._tracing import may_look
+from camtorch._tracing import is_for_here, may_look
 from camtorch.optics.radial import total
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
@@ -103,7 +104,9 @@ class Traced(NamedTuple):
             usable = able.to(intrinsics.dtype)
             k = torch.where(able, distortion.detach(), _ideal(model, intrinsics, distortion)[1])
             domain = Domain(model.optics, k)
-            if domain.lens.stages:
+            if for_elsewhere():
+                domain.at_hand()
+            elif domain.lens.stages:
                 domain.with_tables(*tables(model._model, k))
         if usable is not None:
             ideal = _ideal(model, intrinsics, distortion)
@@ -201,7 +204,7 @@ def as_kept(plane: Tensor) -> Tensor:
 
     That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
     """
-    return torch.as_strided(plane, plane.shape, plane.stride()) if torch.compiler.is_compiling() else plane
+    return torch.as_strided(plane, plane.shape, plane.stride()) if is_for_here() else plane
 
 
 # -- derivatives

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from camtorch._portable import for_elsewhere, hypot, repeat, times
+from camtorch._tracing import is_exporting
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
@@ -34,6 +36,8 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     """
     if domain.lens.is_radial:
         return _Search(domain, camera)(u, v)
+    if for_elsewhere():
+        return _search_recorded(domain, camera, u, v)
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
     staged = torch.zeros_like(found) if domain.staged is None else domain.staged[camera, 0]
     for ways, way in ((staged, _by_stages), (~staged, _within_outlines)):
@@ -43,9 +47,41 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     return a, b, found
 
 
+def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of lenses that are not radial, without a look at values."""
+    by_stages = None
+    if domain.staged is not None:
+        sent, within = _sent(domain, camera, u, v)
+        a, b, there = _Search(domain, camera, is_circle=True)(u, v, sent)
+        by_stages = a, b, there & within
+        if domain.all_staged:
+            return by_stages
+    outline = domain.outline
+    assert outline is not None  # of a domain whose tables are at hand
+    within = hypot(u, v) <= outline.furthest[camera, azimuth(u, v)]
+    a, b, there = _Search(domain, camera, outline, camera, within=within)(u, v)
+    found = a, b, there & within
+    if by_stages is None:
+        return found
+    assert domain.staged is not None  # as above
+    staged = domain.staged[camera, 0]
+    a, b, there = (torch.where(staged, *pair) for pair in zip(by_stages, found, strict=True))
+    return a, b, there
+
+
 def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`search` where only the first stage, which is radial, has a limit: what it would have to reach tells at once."""
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
+    (p, q), within = _sent(domain, camera, u, v)
+    (some,) = within.nonzero(as_tuple=True)
+    if len(some):
+        alone = _Search(domain, camera[some], is_circle=True)
+        a[some], b[some], found[some] = alone(u[some], v[some], (p[some], q[some]))
+    return a, b, found
+
+
+def _sent(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
+    """Where the first stage has to send what later ones send to (u, v), and whether it can."""
     rest, table = domain.optics_of(camera)[1].rest, domain.inverse
     assert rest is not None  # or there would be no stages to go by
     assert table is not None
@@ -55,12 +91,8 @@ def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Te
         x, y = at.value
         dp, dq, _ = newton_step(at.jacobian, u - x, v - y)
         p, q = p + dp, q + dq
-    most2 = table.most2[camera, 0] * (1 + 64 * torch.finfo(u.dtype).eps)
-    (some,) = ((u * u + v * v <= domain.circle2[camera, 0]) & (p * p + q * q <= most2)).nonzero(as_tuple=True)
-    if len(some):
-        alone = _Search(domain, camera[some], is_circle=True)
-        a[some], b[some], found[some] = alone(u[some], v[some], (p[some], q[some]))
-    return a, b, found
+    most2 = times(table.most2[camera, 0], 1 + 64 * torch.finfo(u.dtype).eps)
+    return (p, q), (u * u + v * v <= domain.circle2[camera, 0]) & (p * p + q * q <= most2)
 
 
 def _within_outlines(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -70,7 +102,7 @@ def _within_outlines(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tu
     for first in range(0, len(cameras), _CAMERAS):
         outline = domain.azimuths.outline(cameras[first : first + _CAMERAS])
         (some,) = ((row >= first) & (row < first + _CAMERAS)).nonzero(as_tuple=True)
-        within = torch.hypot(u[some], v[some]) <= outline.furthest[row[some] - first, azimuth(u[some], v[some])]
+        within = hypot(u[some], v[some]) <= outline.furthest[row[some] - first, azimuth(u[some], v[some])]
         some = some[within]
         if len(some):
             alone = _Search(domain, camera[some], outline, row[some] - first)
@@ -89,13 +121,17 @@ class _Search:
         row: Tensor | None = None,
         *,
         is_circle: bool = False,
+        within: Tensor | None = None,
     ):
         """outline: of some of the cameras, unless the fold is a circle. row: (M,) which of them.
 
         is_circle: whether the fold is one, as it is for every radial lens.
+        within: (M,) bool: of a recorded search, the points that it is for.
         """
         self.domain, self.camera, self.outline, self.row = domain, camera, outline, row
+        self.within = within
         self.chart, self.lens = domain.optics_of(camera)
+        self.limits2 = domain.limits2 if is_exporting() and not (is_circle or self.lens.is_radial) else None
         self.is_circle = is_circle or self.lens.is_radial
 
     def __call__(self, u: Tensor, v: Tensor, sent: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,19 +162,26 @@ class _Search:
         inside = t < self.domain.inner2[self.camera, 0]
         if self.is_circle:
             return inside
-        before = t < self.domain.azimuths.limits2(self.camera, azimuth(a, b))
+        index = azimuth(a, b)
+        limits2 = self.limits2
+        if limits2 is None:
+            before = t < self.domain.azimuths.limits2(self.camera, index)
+        else:
+            before = t < limits2[self.camera, index]
         return inside | (before & (regular(self.lens, a, b) > 0))
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
         """In a bracket up to the fold, by the radial factor alone."""
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit
-        fold2 = self.domain.inner2[self.camera, 0] * (1 - 64 * torch.finfo(u.dtype).eps)
+        fold2 = times(self.domain.inner2[self.camera, 0], 1 - 64 * torch.finfo(u.dtype).eps)
         assert self.lens.radial is not None
         scale = bracketed(self.lens.radial, torch.addcmul(u * u, v, v), fold2)
         return u * scale, v * scale
 
     def planar(self, u: Tensor, v: Tensor) -> Planes2:
         """Newton's method; the few that need many steps go on by themselves."""
+        if for_elsewhere():
+            return self._newton(u, v, *self._start(u, v), _FIRST_STEPS + _LATE_STEPS)[:2]
         a, b, active = self._newton(u, v, *self._start(u, v), _FIRST_STEPS)
         (late,) = active.nonzero(as_tuple=True)
         if len(late):
@@ -154,26 +197,29 @@ class _Search:
 
         Returns the points, and which of them would still move.
         """
-        at = self.lens.at(a, b)
-        value, jacobian = at.value, at.jacobian
         enough = rounding(u, v) / 8
-        length = torch.ones_like(u)
-        for step_number in range(steps + 1):
-            miss = u - value[0], v - value[1]
-            active = (torch.maximum(miss[0].abs(), miss[1].abs()) > enough) & (length > _GIVE_UP)
-            if step_number == steps or not bool(active.any()):
-                break
-            step = newton_step(jacobian, *miss)[:2]
-            trial = a + length * step[0], b + length * step[1]
+
+        def moves(x: Tensor, y: Tensor, length: Tensor) -> Tensor:
+            active = (torch.maximum((u - x).abs(), (v - y).abs()) > enough) & (length > _GIVE_UP)
+            return active if self.within is None else active & self.within
+
+        def step(count: int | Tensor, active: Tensor, length: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+            a, b, x, y, ua, ub, va, vb = state
+            jacobian = ua, ub, va, vb
+            da, db, _ = newton_step(jacobian, u - x, v - y)
+            trial = a + length * da, b + length * db
             at = self.lens.at(*trial)
-            trial_value, trial_jacobian = at.value, at.jacobian
-            ahead = newton_step(jacobian, u - trial_value[0], v - trial_value[1])
-            nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < step[0] * step[0] + step[1] * step[1]
+            ahead = newton_step(jacobian, u - at.value[0], v - at.value[1])
+            nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < da * da + db * db
             good = active & nearer & self.contains(*trial)
-            old, new = (a, b, *value, *jacobian), (*trial, *trial_value, *trial_jacobian)
-            a, b, x, y, xa, xb, ya, yb = (torch.where(good, n, o) for n, o in zip(new, old, strict=True))
-            value, jacobian = (x, y), (xa, xb, ya, yb)
+            new = *trial, *at.value, *at.jacobian
+            state = tuple(torch.where(good, n, o) for n, o in zip(new, state, strict=True))
             length = torch.where(good, (length * 4).clamp(max=1), length / 4)
+            return moves(state[2], state[3], length), length, *state
+
+        at, length = self.lens.at(a, b), torch.ones_like(u)
+        state = length, *torch.broadcast_tensors(a, b, *at.value, *at.jacobian)
+        active, _, a, b, *_ = repeat(step, moves(*at.value, length), state, steps)
         return a, b, active
 
     def _start(self, u: Tensor, v: Tensor) -> Planes2:
@@ -184,23 +230,25 @@ class _Search:
         assert self.outline is not None  # a lens that is not radial has one
         assert self.row is not None
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
-        a, b, best = torch.zeros_like(u), torch.zeros_like(v), target * target
-        close = torch.zeros_like(u, dtype=torch.bool)
-        angle, step, last_off = wanted, torch.zeros_like(u), torch.zeros_like(u)
-        for _ in range(_START_ROUNDS):
+        outline, row = self.outline, self.row
+
+        def look(count: int | Tensor, far: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+            a, b, best, angle, step, last_off = state
             c, s = torch.cos(angle), torch.sin(angle)
-            rho = self.outline.start(self.row, target, c, s)
+            rho = outline.start(row, target, c, s)
             x, y = self.lens(rho * c, rho * s)
             error = (u - x) ** 2 + (v - y) ** 2
-            better = (error < best) & ~close  # what is close stays, whatever else is in its batch
+            better = (error < best) & far  # what is close stays, whatever else is in its batch
             a, b, best = (torch.where(better, n, o) for n, o in ((rho * c, a), (rho * s, b), (error, best)))
-            close = best <= _CLOSE**2 * target * target
-            if bool(close.all()):
-                break
+            far = far & (best > _CLOSE**2 * target * target)
             off = torch.atan2(x * v - y * u, x * u + y * v)
             slope = torch.where(step != 0, (last_off - off) / torch.where(step != 0, step, 1.0), 1.0)
-            step, last_off = (off / slope.clamp(_SLOWEST_TURN, 2.0)).clamp(-1.0, 1.0), off
-            angle = angle + step
+            step = (off / slope.clamp(_SLOWEST_TURN, 2.0)).clamp(-1.0, 1.0)
+            return far, a, b, best, angle + step, step, off
+
+        far = torch.ones_like(u, dtype=torch.bool) if self.within is None else self.within
+        zero = torch.zeros_like(u)
+        _, a, b, *_ = repeat(look, far, (zero, zero, target * target, wanted, zero, zero), _START_ROUNDS)
         return a, b
 
 

@@ -10,8 +10,9 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch._arguments import columns
+from camtorch._portable import for_elsewhere, times
 from camtorch._threads import as_cores_are_free
-from camtorch._tracing import in_transform
+from camtorch._tracing import in_transform, keeps_graph
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, BriefTable, short, solve
 from camtorch.projection.ops import positive, search_in_place, search_open, to_planes, without_keeping
@@ -110,12 +111,12 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     eps, radial, table = torch.finfo(u.dtype).eps, domain.lens.radial, domain.inverse
     assert radial is not None  # a radial lens has both
     assert table is not None
-    possible = table.most2 * (1 + 8 * eps) - r2
+    possible = times(table.most2, 1 + 8 * eps) - r2
     # what is beyond the fold would never settle
     r2 = torch.minimum(replace(to_mask(possible, looks), r2, 0.0, looks), table.most2)
     scale, settled = solve(radial, table, r2, looks)
     # a ray's rounding must not carry it across the fold
-    inside = domain.inner2 * (1 - 32 * eps) - r2 * scale * scale
+    inside = times(domain.inner2, 1 - 32 * eps) - r2 * scale * scale
     return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
 
 
@@ -295,6 +296,8 @@ class Unproject(Function):
         u, v = to_planes(pixels)
 
         def finish(target: Planes2, found: Found) -> Found:
+            if for_elsewhere():
+                return _search_recorded(usual.domain, target, found)
             if torch.compiler.is_compiling():
                 search_in_place(model._model, usual.domain.k, *target, *found)
                 return found
@@ -312,7 +315,7 @@ class Unproject(Function):
             rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
             return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
-        learns = any(t.requires_grad for t in (pixels, intrinsics, distortion))
+        learns = keeps_graph(pixels, intrinsics, distortion)
         if torch.compiler.is_compiling() and not learns and not in_transform():
             order = 0
         rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
@@ -384,6 +387,17 @@ class Unproject(Function):
             if by_pixels is not None:
                 by_pixels[here][..., 0], by_pixels[here][..., 1] = ga, gb
         return by_pixels, *sums.result(), None, None, None
+
+
+def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:
+    """`search` for what is left open, as a part of an exported program."""
+    if domain.lens.radial is None:  # an affine map, of which nothing is
+        return found
+    camera, point = (~(found.solved > 0) & (found.possible > 0)).nonzero(as_tuple=True)
+    a, b, there = search(domain, camera, *(w[camera, point] for w in target))
+    places, solved = (camera, point), torch.where(there, 1.0, -1.0).to(a.dtype)
+    a, b, solved = (plane.index_put(places, w) for plane, w in ((found.a, a), (found.b, b), (found.solved, solved)))
+    return Found(a, b, solved, found.possible)
 
 
 def _places(block: Block, target: Target, left: Tensor) -> Iterable[tuple[Tensor, ...]]:

@@ -1,0 +1,127 @@
+"""What is recorded for other runtimes: of torch's operators only those that they have too, and loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from camtorch._tracing import is_exporting
+
+
+def for_elsewhere() -> bool:
+    """Whether a program is exported that runs without operators of our own.
+
+    Not where dynamo reads the code itself (`strict=True`), which does not follow all of it.
+    """
+    return is_exporting() and not torch.compiler.is_dynamo_compiling()
+
+
+# the optimiser of ONNX programs leaves out terms that are nearly 0 and factors that are nearly 1, to 1e-8 and 1e-5
+
+
+def plus(a: Tensor, least: float) -> Tensor:
+    """The sum of a tensor and of a number that is nearly nothing, and yet is to be there."""
+    if not is_exporting():
+        return a + least
+    scale = 2.0 ** -math.floor(math.log2(abs(least)))  # powers of two cost no bit
+    return (a * scale + least * scale) * (1 / scale)
+
+
+def times(a: Tensor, nearly_one: float) -> Tensor:
+    """The product of a tensor and of a number beside 1."""
+    return a * nearly_one if not is_exporting() else a * 0.5 * (2 * nearly_one)
+
+
+def hypot(a: Tensor, b: Tensor) -> Tensor:
+    """The length of (a, b), elsewhere of what has a square that is a number."""
+    return (a * a + b * b).sqrt() if is_exporting() else torch.hypot(a, b)
+
+
+def as_index(position: Tensor) -> Tensor:
+    """The integer below a position, in as few bits as serve; NaN becomes some integer."""
+    return position.to(torch.int64 if is_exporting() else torch.int32)
+
+
+def leading(flags: Tensor) -> Tensor:
+    """(..., S) -> (..., 1): how many of the flags are set before the first that is not."""
+    if is_exporting():
+        return (flags.logical_not().long().cumsum(-1) == 0).long().sum(-1, keepdim=True)
+    return flags.long().cumprod(-1).sum(-1, keepdim=True)
+
+
+def running_max(values: Tensor) -> Tensor:
+    """(..., S): the largest up to each."""
+    if not is_exporting():
+        return torch.cummax(values, -1).values
+    step = 1
+    while step < values.shape[-1]:
+        values = torch.cat((values[..., :step], torch.maximum(values[..., step:], values[..., :-step])), -1)
+        step *= 2
+    return values
+
+
+def count_not_above(table: Tensor, values: Tensor) -> Tensor:
+    """(..., M): how many entries of the ascending table (..., S) are not above each of the values (..., M)."""
+    if not is_exporting():
+        return torch.searchsorted(table.contiguous(), values.contiguous(), right=True)
+    size = table.shape[-1]
+    low, high = (torch.full_like(values, end, dtype=torch.int64) for end in (0, size))
+    for _ in range(size.bit_length()):
+        middle = (low + high) // 2
+        above = table.gather(-1, middle.clamp(max=size - 1)) > values
+        settled = low >= high
+        low = torch.where(above | settled, low, middle + 1)
+        high = torch.where(above & ~settled, middle, high)
+    return low
+
+
+def of_points(k: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
+    """The columns (M,) of coefficients (C, n), of points seen by the cameras of these indices, for `repeat` as well."""
+    if for_elsewhere():  # a recorded loop takes no views of one tensor, and no tensor of size one
+        return tuple(c[camera] for c in k.unbind(-1))
+    # a single camera serves all points
+    return (k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT).unbind(0)
+
+
+def choose(flag: bool | Tensor, chosen: Tensor, other: Tensor) -> Tensor:
+    """One of two tensors, by a flag that `repeat` counts."""
+    if isinstance(flag, Tensor):
+        return torch.where(flag, chosen, other)
+    return chosen if flag else other
+
+
+def repeat(
+    step: Callable[..., tuple[Tensor, ...]], moves: Tensor, state: Sequence[Tensor], most: int
+) -> tuple[Tensor, ...]:
+    """A loop that is recorded as one.
+
+    Args:
+        step: of how many were made, moves and the state to new moves and a new state, of the same shapes and dtypes.
+        moves: bool, any of which keeps the loop going.
+        state: tensors.
+        most: steps.
+
+    Returns:
+        moves and the state at last.
+    """
+    if not for_elsewhere():
+        for count in range(most):
+            if not bool(moves.any()):
+                break
+            moves, *state = step(count, moves, *state)
+        return (moves, *state)
+    # private, and not imported with torch
+    from torch._higher_order_ops.while_loop import while_loop
+
+    def goes_on(count: Tensor, moves: Tensor, *state: Tensor) -> Tensor:
+        return (count < most) & moves.any()
+
+    def body(count: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        return (count + 1, *step(count, *state))
+
+    start = (torch.zeros((), dtype=torch.int64, device=moves.device), moves, *(w.clone() for w in state))
+    result: tuple[Tensor, ...] = while_loop(goes_on, body, start)
+    return result[1:]
