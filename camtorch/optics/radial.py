@@ -290,6 +290,11 @@ def _piece(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
 
 def _pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
     """From each plane's own columns the one of that index."""
+    if is_exporting():  # no sizes are compared, which may be unknown
+        found = columns[0] + torch.zeros_like(index, dtype=columns[0].dtype)
+        for i, column in enumerate(columns[1:], 1):
+            found = torch.where(index == i, column, found)
+        return found
     table = torch.stack(torch.broadcast_tensors(*columns), -1)
     shape = broadcast_shapes(table.shape[:-1], index.shape)
     return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
