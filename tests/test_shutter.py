@@ -49,9 +49,10 @@ def psnr(a, b, where):
     return float(-10 * torch.log10(((a - b)[where.expand_as(a)] ** 2).mean()))
 
 
-@pytest.mark.parametrize(
-    "direction", [d if d == "down" else pytest.param(d, marks=pytest.mark.slow) for d in DIRECTIONS]
-)
+ONE_IS_QUICK = slow_unless("down".__eq__, DIRECTIONS)
+
+
+@pytest.mark.parametrize("direction", ONE_IS_QUICK)
 def test_a_room_rendered_row_by_row(direction):
     camera, rates = fisheye(fov=40), (0.4, 1.5, 0.8)
     matrix = torch.from_numpy(turns(moments(camera.image_size, direction), rates)).float()
@@ -69,7 +70,7 @@ def test_a_room_rendered_row_by_row(direction):
         assert psnr(first, wanted, where) < 25
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("direction", slow_unless({"down", "left"}.__contains__, DIRECTIONS))
 def test_points_are_where_their_own_row_sees_them(direction):
     """By NumPy: each line of the image sees every point somewhere; where that is on the line itself, the point is."""
     camera = fisheye(fov=90)
@@ -97,9 +98,7 @@ def test_points_are_where_their_own_row_sees_them(direction):
     assert (back - still)[use & valid].abs().max() < 1e-3
 
 
-@pytest.mark.parametrize(
-    "key", slow_unless({"pinhole", "kannala_brandt", "fisheye624", "cylindrical"}.__contains__, KEYS)
-)
+@pytest.mark.parametrize("key", slow_unless({"pinhole", "fisheye624"}.__contains__, KEYS))
 def test_there_and_back_through_any_lens(key):
     camera = one(key).requires_grad_(False)
     camera.image_size = camera.image_size or (480, 640)
@@ -146,7 +145,7 @@ def test_the_lattice_keeps_its_tolerance(name):
     assert (((exact.grid()[0] + 1) * half - 0.5) - back)[seen].abs().max() < 1e-9
 
 
-@pytest.mark.parametrize("name", ["shutter", "target_shutter"])
+@pytest.mark.parametrize("name", [pytest.param("shutter", marks=pytest.mark.slow), "target_shutter"])
 def test_gradients_go_to_rates_readout_and_camera(name):
     camera, straight = fisheye(), ct.Pinhole.from_fov(80, image_size=(240, 320)).double()
     pixels = torch.tensor([[100.0, 60.0], [160.0, 200.0], [220.0, 130.0]], dtype=torch.float64)
@@ -164,6 +163,7 @@ def test_gradients_go_to_rates_readout_and_camera(name):
     assert torch.autograd.gradcheck(moved, (rates, readout, intrinsics, pixels.requires_grad_()))
 
 
+@pytest.mark.slow
 def test_rates_are_learned_from_images():
     camera = fisheye((60, 80), dtype=torch.float32)
     v, u = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
@@ -235,7 +235,7 @@ def test_an_exposure_blurs_by_the_turn_meanwhile():
     camera = fisheye((120, 160), dtype=torch.float32)
     image = torch.zeros(1, 1, 120, 160)
     image[..., 40, 60] = 1.0
-    options = {"exposure": 0.02, "samples": 64}
+    options = {"exposure": 0.02, "samples": 16}
     warp = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.0, (0.0, 3.0, 0.0), **options))
     blurred = warp(image)
     # turned to the right, the scene passes to the left: by f w t, about, along the row
@@ -279,6 +279,7 @@ def test_times_are_those_of_rows():
     assert torch.equal(shutter(readout=-READOUT).times(rows, (240, 320)), -down.times(rows, (240, 320)))
 
 
+@pytest.mark.slow
 def test_transforms_of_functions_and_a_batch_of_several_models():
     camera = fisheye()
     pixels = torch.tensor([[100.0, 60.0], [160.0, 200.0]], dtype=torch.float64)
@@ -320,8 +321,8 @@ def test_it_is_copied_pickled_and_moved():
 
 @pytest.mark.slow
 def test_it_compiles_as_one_graph():
-    camera = fisheye((120, 160), dtype=torch.float32)
-    image = torch.rand(2, 3, 120, 160)
+    camera = fisheye((40, 60), dtype=torch.float32)
+    image = torch.rand(2, 3, 40, 60)
 
     def rolled(image, rates):
         return ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.03, rates))(image)
