@@ -221,7 +221,7 @@ class Augmentation(SampleTransform):
         return (
             f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
             if close
-            else f"; known are {', '.join(known)}"
+            else f"; known are {', '.join(dict.fromkeys(known))}"
         )
 
     # -- what a subclass writes

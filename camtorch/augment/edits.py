@@ -307,7 +307,9 @@ class Rotate90(Edit):
     def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Any):
         name = type(self).__name__
         ends = tuple(times) if isinstance(times, Sequence) else (times, times)
-        low, high = (as_whole(end, "times", name) for end in (ends if len(ends) == 2 else (None, None)))
+        if len(ends) != 2:
+            raise ValueError(f"{name}: times must be one number or (least, most); got {times!r}")
+        low, high = (as_whole(end, "times", name) for end in ends)
         if low > high or as_whole(step, "step", name) < 1:
             raise ValueError(f"{name}: times must be (least, most), and step positive; got {times!r} and {step!r}")
         self.times = low, high, step
@@ -346,8 +348,8 @@ class _Flip(Edit):
 
     def __init__(
         self,
-        *,
         p: float = 0.5,
+        *,
         landmarks: TableLike | Mapping[str, TableLike | None] | None = None,
         lateral_axis: str = "x",
         swap_sides: bool = True,
@@ -392,6 +394,10 @@ class VerticalFlip(_Flip):
 
 def _as_size(size: Size, owner: str) -> tuple[int, int]:
     """(height, width), of which one number makes a square."""
-    made = as_image_size(tuple(size) if isinstance(size, Sequence) else (size, size), owner)
-    assert made is not None
+    try:
+        made = as_image_size(tuple(size) if isinstance(size, Sequence) else (size, size), owner)
+    except TypeError:
+        made = None
+    if made is None:
+        raise TypeError(f"{owner}: size must be whole numbers (height, width), or one for a square; got {size!r}")
     return made
