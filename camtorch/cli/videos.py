@@ -8,7 +8,6 @@ import importlib
 import os
 import queue
 import re
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -299,7 +298,7 @@ def remake(
     """
     av = _av()
     target.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(target, synced=False) as (file,), _opened(source) as (container, stream):
+    with replacing(target) as (file,), _opened(source) as (container, stream):
         read = _Read(source, container, stream, encoder.of(FORMATS[target.suffix.lower()]), listener)
         # exact: no random identifiers
         output = av.open(file, "w", format=FORMATS[target.suffix.lower()], options={"fflags": "+bitexact"})
@@ -589,5 +588,5 @@ def _behind() -> Iterator[Callable[[Callable[[T], object], T], None]]:
     finally:
         waiting.put(None)
         thread.join()
-        if errors and sys.exc_info()[1] is None:
-            raise errors[0]
+    if errors:
+        raise errors[0]
