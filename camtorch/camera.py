@@ -455,14 +455,27 @@ class Camera(BatchedModule):
             values, lead = as_points(values, name, size, batch, tensors, type(self).__name__)
         shape = values.shape[:-1]
         rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
-        planes, valid = self._seen_by_rows(direction, rows, lead, tensors)
+        planes, valid = self._evaluated(direction, rows, lead, tensors)
         return planes.reshape((len(planes), *shape)).movedim(0, -1), valid.reshape(shape)
 
-    def _seen_by_rows(
-        self, direction: type[Project] | type[Unproject], rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
+    def _evaluated(
+        self,
+        direction: type[Project] | type[Unproject],
+        rows: Tensor,
+        lead: torch.Size,
+        tensors: Sequence[Tensor],
+        cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Planes (size, C, N), and valid (C, N), of rows (C, N, size); lead: the batch dims that C counts."""
-        if is_constant(self) and all(isinstance(side, int) for side in lead):
+        """Planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
+
+        Args:
+            direction: the way.
+            rows: points or pixels.
+            lead: the batch dims that C counts.
+            tensors: the cameras' intrinsics and distortion.
+            cameras_of: what is kept of those, if others than this module are meant.
+        """
+        if cameras_of is None and is_constant(self) and all(isinstance(side, int) for side in lead):
             with with_values(self):
                 intrinsics, distortion = (per_row(t, lead, rows) for t in self._tensors)
                 cameras = self._cameras(intrinsics, distortion)
@@ -470,11 +483,25 @@ class Camera(BatchedModule):
             order = 1 if keeps_graph(rows) else 0
             return direction.traced(type(self), rows, intrinsics, distortion, cameras, order)
         intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
-        return evaluated(direction, type(self), (rows, intrinsics, distortion), self._cameras)
+        inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or self._cameras
+        if _is_plain(inputs):
+            learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
+            keeps = learns and torch.is_grad_enabled()
+            cameras = cameras_of(intrinsics, distortion)
+            planes, valid = direction.apply(*inputs, cameras, type(self), keeps)  # type: ignore[no-untyped-call]
+            return planes, valid
+        # what is compiled has no derivatives of derivatives
+        order = 1 if torch.compiler.is_compiling() else 2
+        known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
+        if for_elsewhere() and not keeps_graph(*inputs):
+            inputs = rows, intrinsics.detach(), distortion.detach()
+        return direction.traced(type(self), *inputs, cameras_of(*inputs[1:]) if known else None, order)
 
     def _cameras(self, intrinsics: Tensor, distortion: Tensor) -> Cameras:
         """The rows' cameras, kept until a value changes."""
-        cameras = kept_cameras(self._memo, type(self), intrinsics, distortion)
+        cameras: Cameras | None = self._memo.result
+        if cameras is None or not cameras.are(intrinsics, distortion):
+            cameras = new_cameras(self._memo, type(self), intrinsics, distortion)
         if cameras.usable is not None and not self._warned:
             self._warn_of_unusable(cameras, cameras.usable)
         return cameras
@@ -938,40 +965,10 @@ def _is_given(values: Tensor) -> bool:
     return is_concrete(values) and not is_predicted(values)
 
 
-def evaluated(
-    direction: type[Project] | type[Unproject],
-    model: type[Camera],
-    inputs: tuple[Tensor, Tensor, Tensor],
-    cameras_of: Callable[[Tensor, Tensor], Cameras],
-) -> tuple[Tensor, Tensor]:
-    """Planes and valid of one model's rows: by blocks, or traced by a compiler or a transform of torch.func.
-
-    Args:
-        direction: the way.
-        model: the class of the cameras.
-        inputs: rows (C, N, size), intrinsics (C, 4) and distortion (C, n) of one dtype.
-        cameras_of: the rows' cameras, of intrinsics and distortion whose values may be looked at.
-    """
-    if _is_plain(inputs):
-        keeps = any(t.requires_grad for t in inputs) and torch.is_grad_enabled()
-        planes, valid = direction.apply(*inputs, cameras_of(*inputs[1:]), model, keeps)  # type: ignore[no-untyped-call]
-        return planes, valid
-    # what is compiled has no derivatives of derivatives
-    order = 1 if torch.compiler.is_compiling() else 2
-    known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
-    if for_elsewhere() and not keeps_graph(*inputs):
-        inputs = inputs[0], inputs[1].detach(), inputs[2].detach()
-    return direction.traced(model, *inputs, cameras_of(*inputs[1:]) if known else None, order)
-
-
-def kept_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
-    """The cameras (C,) of one model, kept in a memo until a value changes."""
-    known: Cameras | None = memo.result
-    if known is not None and known.are(intrinsics, distortion):
-        return known
+def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
+    """The cameras (C,) of one model, kept in a memo."""
     inputs = intrinsics, distortion
-    options = intrinsics.dtype, intrinsics.device
-    cameras: Cameras = memo(inputs, options, lambda: Cameras.of(model, *inputs))
+    cameras: Cameras = memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras.of(model, *inputs))
     return cameras
 
 

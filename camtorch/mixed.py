@@ -15,12 +15,14 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch._arguments import working_dtype
 from camtorch._module import Memo
 from camtorch._tracing import in_graph
-from camtorch.camera import Camera, evaluated, kept_cameras, per_row
+from camtorch.camera import Camera, new_cameras, per_row
 from camtorch.projection.project import Project
 from camtorch.projection.unproject import Unproject
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from camtorch.projection.rows import Cameras
 
 
 class _Group(NamedTuple):
@@ -173,8 +175,13 @@ class Mixed(Camera):
 
     # -- both directions
 
-    def _seen_by_rows(
-        self, direction: type[Project] | type[Unproject], rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
+    def _evaluated(
+        self,
+        direction: type[Project] | type[Unproject],
+        rows: Tensor,
+        lead: torch.Size,
+        tensors: Sequence[Tensor],
+        cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
     ) -> tuple[Tensor, Tensor]:
         results = []
         for n, (group, pair) in enumerate(zip(self._groups, self._pairs(tensors), strict=True)):
@@ -184,19 +191,21 @@ class Mixed(Camera):
                 contiguous = stop - start == len(group.rows)
                 index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
                 here, count = rows[index], torch.Size((len(group.rows),))
-            intrinsics, distortion = (per_row(t, count, here) for t in pair)
-            results.append(evaluated(direction, group.model, (here, intrinsics, distortion), self._watch(n)))
+            of_model = self._member(group.members[0])
+            results.append(of_model._evaluated(direction, here, count, pair, self._watch(n)))
         if len(results) == 1:
             return results[0]
         planes, valid = zip(*results, strict=True)
         return self._in_order(torch.cat(planes, 1), 1), self._in_order(torch.cat(valid))
 
-    def _watch(self, n: int) -> Callable[[Tensor, Tensor], Any]:
+    def _watch(self, n: int) -> Callable[[Tensor, Tensor], Cameras]:
         """The cameras of a group, kept until a value changes; its members say what is wrong with them."""
         group = self._groups[n]
 
-        def cameras(intrinsics: Tensor, distortion: Tensor) -> Any:
-            found = kept_cameras(group.memo, group.model, intrinsics, distortion)
+        def cameras(intrinsics: Tensor, distortion: Tensor) -> Cameras:
+            found: Cameras | None = group.memo.result
+            if found is None or not found.are(intrinsics, distortion):
+                found = new_cameras(group.memo, group.model, intrinsics, distortion)
             if found.usable is not None:
                 for member in map(self._member, group.members):
                     if not member._warned:
