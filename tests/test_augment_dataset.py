@@ -307,12 +307,14 @@ def test_wrong_words_and_files_are_told(folder, capsys):
         assert message in refused()
     content["annotations"][0]["bbox"] = [1]
     content["images"][1]["file_name"] = "lost.png"
+    content["images"][2]["width"] = 640
     Path("labels.json").write_text(json.dumps(content))
     augment("-o", "new", expect=1)
     told = capsys.readouterr()
     assert "error: images/0.jpg: annotation 100: bbox must be" in told.err
     assert "error: images/lost.png: No such file or directory" in told.err
-    assert "new/labels.json: 1 images, 2 annotations, of 1 of the 3 images so far" in told.out
+    assert "error: images/2.jpg: it is 96x72, and its labels are for 640x72" in told.err
+    assert "new/labels.json: 0 images, 0 annotations, of 0 of the 3 images so far" in told.out
 
 
 @pytest.mark.slow

@@ -67,6 +67,11 @@ class Augmenting:
         image, orientation = images.read(item.inputs[0], tell=listener.note)
         entry, annotations = json.loads(item.labels) if item.labels else (_read(item.inputs[1]), [])
         rows, columns = image.shape[-2:]
+        if item.labels and (entry.get("height", rows), entry.get("width", columns)) != (rows, columns):
+            stated = f"{entry.get('width')}x{entry.get('height')}"
+            raise ValueError(f"it is {columns}x{rows}, and its labels are for {stated}")
+        if orientation not in (None, 1):
+            listener.note(f"{item.name} is taken as stored, not turned by its Exif orientation, and so are its labels")
         camera = self._camera(item.inputs[0], (rows, columns), entry.get("camera"))
         augmentation, move = self._augmentation(camera)
         result: Json = {"images": [], "annotations": []}

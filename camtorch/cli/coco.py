@@ -292,20 +292,28 @@ def _along(corners: Tensor) -> Tensor:
 
 def _thinned(corners: Tensor, places: Tensor, there: Tensor) -> list[tuple[float, float]]:
     """What became of a polygon: its corners, and as many points between them as its edges are curved."""
+    everywhere: list[tuple[float, float]] = list(zip(*places.T.tolist(), strict=True))
+    is_there: list[bool] = there.tolist()
     points: list[tuple[float, float]] = []
-    counts = _samples(corners)
     first = 0
-    for i, count in enumerate(counts):
-        last = first + count if i + 1 < len(counts) else 0
-        kept = range(count)
-        if count > 1 and bool(there[first : first + count].all() & there[last]):
-            edge, chord = places[first : first + count] - places[first], places[last] - places[first]
-            across = (edge[:, 0] * chord[1] - edge[:, 1] * chord[0]).abs() / chord.norm().clamp(min=1e-9)
-            wanted = min(count, math.ceil(math.sqrt(float(across.max()) / _SAG)) or 1)
-            kept = sorted({round(j * count / wanted) for j in range(wanted)})  # type: ignore[assignment]
-        points += [tuple(places[first + j].tolist()) for j in kept if there[first + j]]
+    for count in _samples(corners):
+        edge = everywhere[first : first + count + 1]
+        if len(edge) == count:  # the last one, which closes it
+            edge.append(everywhere[0])
+        wanted = count
+        if count > 1 and all(is_there[first : first + count]) and is_there[(first + count) % len(is_there)]:
+            wanted = min(count, max(1, math.ceil(math.sqrt(_sag(edge) / _SAG))))
+        kept = sorted({round(j * count / wanted) for j in range(wanted)})
+        points += [edge[j] for j in kept if is_there[first + j]]
         first += count
     return points
+
+
+def _sag(edge: list[tuple[float, float]]) -> float:
+    """How far points are from the line between the first one and the last."""
+    (x, y), (x1, y1) = edge[0], edge[-1]
+    across, down = x1 - x, y1 - y
+    return max(abs((u - x) * down - (v - y) * across) for u, v in edge) / max(math.hypot(across, down), 1e-9)
 
 
 def _clipped(polygon: list[tuple[float, float]], width: int, height: int) -> list[tuple[float, float]]:
