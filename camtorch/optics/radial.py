@@ -227,6 +227,8 @@ class RadiusTable(RadialFactor):
         cubes = (before + after - 2 * secants) / (steps * steps)
         # by powers of the distance from the node: those of the radius itself would cancel, the more the finer the table
         self.cubics = tuple(power.unbind(-1) for power in (heights[..., :-1], before, squares, cubes))
+        if is_exporting():  # a recorded loop takes no views of one tensor
+            self.cubics = tuple(tuple(c.clone() for c in power) for power in self.cubics)
         self.parameters = tuple(c for power in self.cubics for c in power)
 
     @property
