@@ -28,7 +28,7 @@ from camtorch._arguments import (
 )
 from camtorch._module import BatchedModule, Memo, is_constant, with_values
 from camtorch._portable import for_elsewhere
-from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, is_concrete, keeps_graph
+from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, is_concrete, is_exporting, keeps_graph
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
@@ -475,7 +475,7 @@ class Camera(BatchedModule):
             tensors: the cameras' intrinsics and distortion.
             cameras_of: what is kept of those, if others than this module are meant.
         """
-        if cameras_of is None and is_constant(self) and all(isinstance(side, int) for side in lead):
+        if is_exporting() and cameras_of is None and is_constant(self) and all(isinstance(side, int) for side in lead):
             with with_values(self):
                 intrinsics, distortion = (per_row(t, lead, rows) for t in self._tensors)
                 cameras = self._cameras(intrinsics, distortion)
