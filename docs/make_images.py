@@ -193,38 +193,6 @@ def edits() -> Image.Image:
     return in_rows(panels, 3)
 
 
-def case_study(seeds: int = 3) -> None:
-    """What networks find, how they come to it, and the medians over some seeds."""
-    runs = [training.run(lambda text: print(text, flush=True), seed=seed) for seed in range(seeds)]
-    training.drawing(runs[0]).save(HERE / "case-study.jpg", quality=85)
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for i, title in enumerate(training_data.TRAINING_SETS.values()):
-        curves = torch.tensor([run[i].curves["mounts"] for run in runs])  # (seeds, looks, 3)
-        for j, ax in enumerate(axes):
-            values = curves[..., 1 + j] * (100 if j == 0 else 1)
-            ax.plot(curves[0, :, 0], values.median(0).values, color=COLOURS[i], label=title)
-            ax.fill_between(curves[0, :, 0], values.amin(0), values.amax(0), color=COLOURS[i], alpha=0.15, linewidth=0)
-    axes[0].set_title("landmarks, % of the distance between the eyes", fontsize="medium")
-    axes[1].set_title("gaze, degrees", fontsize="medium")
-    axes[1].legend(frameon=False, fontsize="small")
-    for ax, top in zip(axes, (16, 30), strict=True):
-        ax.set_xlabel("steps")
-        ax.set_ylim(0, top)
-        ax.spines[["top", "right"]].set_visible(False)
-    figure.savefig(HERE / "case-study-curves.png", dpi=110)
-    for results in zip(*runs, strict=True):
-        medians = torch.tensor([[e.medians() for e in result.errors.values()] for result in results])
-        print(f"{training_data.TRAINING_SETS[results[0].training_set]:<28}{medians.median(0).values.tolist()}")
-
-
-if __name__ == "__main__":
-    if sys.argv[1:] == ["case-study"]:  # which takes a quarter of an hour
-        sys.exit(case_study())
-    lenses().save(HERE / "lenses.jpg", quality=85)
-    shutters().save(HERE / "shutter.jpg", quality=85)
-    fields().save(HERE / "fields.jpg", quality=85)
-
-
 def maps() -> Image.Image:
     """What meshes of a fisheye are off by: on the source, and over the target."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
@@ -292,6 +260,9 @@ def case_study(seeds: int = 3) -> None:
 if __name__ == "__main__":
     if sys.argv[1:] == ["case-study"]:  # which takes a quarter of an hour
         sys.exit(case_study())
+    lenses().save(HERE / "lenses.jpg", quality=85)
+    shutters().save(HERE / "shutter.jpg", quality=85)
+    fields().save(HERE / "fields.jpg", quality=85)
     maps().save(HERE / "maps.jpg", quality=85)
     overview().save(HERE / "overview.jpg", quality=88)
     edits().save(HERE / "edits.jpg", quality=85)
