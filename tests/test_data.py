@@ -224,6 +224,19 @@ def test_a_warp_of_one_camera_for_all_rows():
     assert (moved["camera_model"] == "pinhole").all()
 
 
+def test_a_warp_with_a_shutter_undoes_it_for_all_rows():
+    shutter = ct.RollingShutter(0.03, torch.tensor([0.5, 6.0, 1.0], requires_grad=True) * 1)
+    target = ct.Pinhole([18.0, 18.0, 15.5, 11.5], image_size=SIZE)
+    warp = ct.Warp(camera(), target, shutter=shutter)
+    some = batch(rows())
+    moved = pickle.loads(pickle.dumps(ct.data.MapBatches(warp)))(some)
+    expected, _ = warp.transform_points(torch.from_numpy(some["keypoints"]))
+    np.testing.assert_array_equal(moved["keypoints"], expected.detach().numpy().astype(np.float32))
+    images = torch.from_numpy(some["image"]).permute(0, 3, 1, 2)
+    assert np.array_equal(moved["image"], warp(images).permute(0, 2, 3, 1).detach().numpy())
+    assert not np.array_equal(moved["image"], ct.data.MapBatches(ct.Warp(camera(), target))(some)["image"])
+
+
 def test_columns_as_engines_hand_them_over():
     some = rows(3)
     whole = batch(some)

@@ -18,6 +18,7 @@ from camtorch.augment.sample import Sample, kind_of
 from camtorch.camera import Camera
 from camtorch.data.columns import camera_of
 from camtorch.data.seeded import Key, Seeded
+from camtorch.warp.shutter import Shutters
 from camtorch.warp.surface import SurfaceWarp
 from camtorch.warp.warp import Warp
 
@@ -37,7 +38,9 @@ class Always(Augmentation):
         source, target = (frozen(camera, camera.image_size) for camera in (warp.source, warp.target))
         super().__init__(camera=source, fields=fields, min_filled=0)
         rotation = None if warp.rotation is None else warp.rotation.detach()
-        self.warp = Warp(source, target, rotation, **warp.options)
+        first, last = warp.shutter, warp.target_shutter
+        shutters: Shutters = {"shutter": first and first.detached(), "target_shutter": last and last.detached()}
+        self.warp = Warp(source, target, rotation, **warp.options, **shutters)
 
     def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         return Part(rows, self.warp, self.warp.source)

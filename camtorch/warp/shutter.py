@@ -10,7 +10,7 @@ from typing import Any, Literal, TypedDict, cast, get_args
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_batch, as_points, as_real, as_values, as_vectors, broadcast_shapes
+from camtorch._arguments import Numbers, as_batch, as_points, as_real, as_values, as_vectors, as_whole, broadcast_shapes
 from camtorch._module import GeometryModule
 from camtorch._tracing import in_graph, in_transform, is_concrete, keeps_graph
 from camtorch.camera import Camera
@@ -90,6 +90,7 @@ class RollingShutter(GeometryModule):
             )
         if is_concrete(times["exposure"]) and not bool((times["exposure"].detach() >= 0).all()):
             raise ValueError(f"{owner}: exposure must not be negative; got {times['exposure'].tolist()}")
+        samples = as_whole(samples, "samples", owner)
         if samples < 1 or not (math.isfinite(gamma) and gamma > 0):
             raise ValueError(f"{owner}: samples and gamma must be positive; got {samples!r} and {gamma!r}")
         shapes = {name: (*value.shape, 1) for name, value in times.items()}
@@ -101,7 +102,7 @@ class RollingShutter(GeometryModule):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, value if in_graph(value) else value.detach().clone())
-        self.direction, self.samples, self.gamma = direction, int(samples), float(gamma)
+        self.direction, self.samples, self.gamma = direction, samples, float(gamma)
         self._moment: float | None = None
         self._blurs = not is_concrete(self.exposure) or bool((self.exposure.detach() > 0).any())
 
@@ -131,6 +132,10 @@ class RollingShutter(GeometryModule):
             return value[index] if value.ndim > ndim else value
 
         return self._with(of(self.readout, 0), of(self.rates, 1), of(self.exposure, 0))
+
+    def detached(self) -> RollingShutter:
+        """The shutter of the same numbers, which do not learn."""
+        return self._with(*(t.detach() for t in self.tensors), self._moment)
 
     def _with(self, readout: Tensor, rates: Tensor, exposure: Tensor, moment: float | None = None) -> RollingShutter:
         options: dict[str, Any] = {"direction": self.direction, "samples": self.samples, "gamma": self.gamma}
