@@ -54,7 +54,7 @@ class Lens:
     @property
     def is_optical(self) -> bool:
         """Whether a lens makes such images: not stretched, not reprojected, no focal length negative, as 31 are."""
-        return not self.digital and all(factor in (None, 1.0) for factor in self.stretch) and self._exists
+        return is_as_seen(self.digital, self.stretch) and self._exists
 
     @property
     def _exists(self) -> bool:
@@ -88,7 +88,13 @@ class Lens:
         return f"<{self.name}: {', '.join(parts)}>"
 
 
-def _number(text: str) -> float | None:
+def is_as_seen(digital: str, stretch: tuple[float | None, float | None]) -> bool:
+    """Whether images are as the lens makes them: not reprojected and not stretched. See `Lens`."""
+    return not digital and all(factor in (None, 1.0) for factor in stretch)
+
+
+def as_number(text: str) -> float | None:
+    """A number that may be missing in the collection."""
     return float(text) if text else None
 
 
@@ -106,7 +112,7 @@ def entries() -> tuple[Lens, ...]:
     return tuple(
         Lens(
             *(brand, body, lens, setting, (int(height), int(width)), tuple(values[:4]), tuple(values[4:8]), values[8]),
-            *(_number(readout), (_number(across), _number(down)), digital),
+            *(as_number(readout), (as_number(across), as_number(down)), digital),
         )
         for brand, body, lens, setting, width, height, readout, across, down, digital, values in rows
     )

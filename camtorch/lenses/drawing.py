@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.lenses.collection import columns
+from camtorch.lenses.collection import as_number, columns, is_as_seen
 from camtorch.models import KannalaBrandt
 from camtorch.projection.domain import Domain
 
@@ -49,7 +49,7 @@ def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
     table = torch.from_numpy(numbers)
     size = torch.tensor([[float(side) for side in texts[name]] for name in ("height", "width")], dtype=torch.float64)
     plain = [
-        not digital and across in ("", "1", "1.0") and down in ("", "1", "1.0")
+        is_as_seen(digital, (as_number(across), as_number(down)))
         for digital, across, down in zip(*(texts[n] for n in ("digital_lens", "h_stretch", "v_stretch")), strict=True)
     ]
     off = (table[[3, 2]] / size - 0.5).abs().amax(0)
