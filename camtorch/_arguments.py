@@ -99,7 +99,7 @@ def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
     return flat
 
 
-def as_image_size(value: Any, owner: str) -> tuple[int, int] | None:
+def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int, int] | None:
     """(height, width) as two positive ints, or None.
 
     Raises:
@@ -112,9 +112,9 @@ def as_image_size(value: Any, owner: str) -> tuple[int, int] | None:
             raise TypeError
         height, width = (operator.index(side) for side in value)
     except (TypeError, ValueError):
-        raise TypeError(f"{owner}: image_size must be two integers (height, width); got {value!r}") from None
+        raise TypeError(f"{owner}: {name} must be two integers (height, width); got {value!r}") from None
     if height <= 0 or width <= 0:
-        raise ValueError(f"{owner}: image_size must be positive (height, width); got {(height, width)}")
+        raise ValueError(f"{owner}: {name} must be positive (height, width); got {(height, width)}")
     return height, width
 
 

@@ -731,7 +731,7 @@ def test_wrong_arguments_are_told():
         (lambda: A.Pad(), "give either padding or size"),
         (lambda: A.Pad(-1), "none negative"),
         (lambda: A.Pad((1, 2, 3)), "padding must be one number"),
-        (lambda: A.Resize((0, 3)), "image_size must be positive"),
+        (lambda: A.Resize((0, 3)), "Resize: size must be positive"),
         (lambda: A.Rotate90(0.5), "times must be a whole number"),
         (lambda: A.RandomResizedCrop(20, scale=(0.5, 2.0)), "scale must lie within"),
         (lambda: A.HorizontalFlip(prob=0.3), "unknown keyword 'prob'"),

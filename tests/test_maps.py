@@ -422,7 +422,7 @@ def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
     assert all(format in str(raised.value) for format in FORMATS)
     with pytest.raises(ValueError, match="unknown format 'nvidia'"):
         warp.save(tmp_path / "map.yml", "nvidia")
-    with pytest.raises(ValueError, match=r"maps of OpenCV are called \.yml"):
+    with pytest.raises(ValueError, match=r"files of opencv are called \.yml"):
         warp.save(tmp_path / "map.png", "opencv")
 
 

@@ -395,7 +395,7 @@ class VerticalFlip(_Flip):
 def _as_size(size: Size, owner: str) -> tuple[int, int]:
     """(height, width), of which one number makes a square."""
     try:
-        made = as_image_size(tuple(size) if isinstance(size, Sequence) else (size, size), owner)
+        made = as_image_size(tuple(size) if isinstance(size, Sequence) else (size, size), owner, "size")
     except TypeError:
         made = None
     if made is None:

@@ -12,13 +12,11 @@ import numpy as np
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.mesh import mesh_of, nodes_every
+from camtorch.maps.mesh import as_step, mesh_of, nodes_every
 from camtorch.maps.protocol import Encoded, Given, Options
 from camtorch.maps.tables import lookup, sizes, table
 
-_STEP = 16
 _ORDERS = ("yx", "xy")
-_LONGEST_STEP = 256
 
 
 class DepthAI:
@@ -31,11 +29,9 @@ class DepthAI:
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
         """Raises ValueError: an option that is none."""
-        step, order = _STEP if options.step is None else options.step, options.order or "yx"
+        step, order = as_step(options.step, "Warp.save"), options.order or "yx"
         if order not in _ORDERS:
             raise ValueError(f"Warp.save: order must be 'yx' (loadMeshFiles) or 'xy' (setWarpMesh); got {order!r}")
-        if not 1 <= step <= _LONGEST_STEP:
-            raise ValueError(f"Warp.save: step must be 1 to {_LONGEST_STEP} pixels; got {step}")
         height, width = exact.target_size
         mesh = mesh_of(path, exact, nodes_every(step, width), nodes_every(step, height))
         nodes = mesh.nodes if order == "xy" else mesh.nodes[..., ::-1]
@@ -46,11 +42,15 @@ class DepthAI:
         return False
 
     def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
-        """Raises CameraFileError: another length, no such order, nobody says the sizes."""
+        """Raises CameraFileError: another length, no such order or step, nobody says the sizes."""
         source, target = sizes(path, given)
-        step, order = _STEP if given.step is None else given.step, given.order or "yx"
-        if order not in _ORDERS or not 1 <= step <= _LONGEST_STEP:
-            raise CameraFileError(path, "order", f"{order!r} every {step} pixels; known are {_ORDERS}")
+        order = given.order or "yx"
+        if order not in _ORDERS:
+            raise CameraFileError(path, "order", f"must be 'yx' or 'xy'; got {order!r}")
+        try:
+            step = as_step(given.step, "load_map")
+        except ValueError as error:
+            raise CameraFileError(path, "step", str(error)) from None
         shape = len(nodes_every(step, target[0])), len(nodes_every(step, target[1])), 2
         nodes = table(path, content, "<f4", shape).astype(np.float64)
         return lookup(

@@ -23,26 +23,27 @@ class Exact:
 
     Args:
         warp: a single one; what of it learns is taken as it is.
+        owner: the function that needs it, for errors.
 
     Raises:
         ValueError: a batch of warps, or one that blurs.
     """
 
-    def __init__(self, warp: Warp):
+    def __init__(self, warp: Warp, owner: str):
         count = warp.batch_shape.numel()
         if count != 1:
             raise ValueError(
-                f"Warp.save: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
-                "cameras, so save each of ct.Warp(source[i], target[i], rotation[i])"
+                f"{owner}: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
+                "cameras, so take each ct.Warp(source[i], target[i], rotation[i])"
             )
         if warp._moments():
             raise ValueError(
-                "Warp.save: the blur of an exposure takes each pixel from many positions, and a map holds one; a "
+                f"{owner}: the blur of an exposure takes each pixel from many positions, and a map holds one; a "
                 "target_shutter with exposure=0 has one"
             )
         self.warp = warp
-        self.source_size: tuple[int, int] = warp.source._size("Warp.save")
-        self.target_size: tuple[int, int] = warp.target._size("Warp.save")
+        self.source_size: tuple[int, int] = warp.source._size(owner)
+        self.target_size: tuple[int, int] = warp.target._size(owner)
         self._batch, self._device = warp.batch_shape, warp.target.intrinsics.device
         with torch.no_grad():
             self._back = warp.inverse()

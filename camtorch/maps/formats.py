@@ -20,7 +20,7 @@ from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.onnx import ONNX
 from camtorch.maps.opencv import OpenCV
-from camtorch.maps.protocol import Given, MapFormat, Options
+from camtorch.maps.protocol import SIZES, Given, MapFormat, Options, named_sizes, sizes_in
 from camtorch.maps.report import MapReport, measure
 from camtorch.maps.stmap import STMap
 from camtorch.maps.texture_mesh import TextureMesh
@@ -54,12 +54,12 @@ def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, optio
     if options.step is not None:
         options = replace(options, step=as_whole(options.step, "step", "Warp.save"))
     if options.block is not None:
-        options = replace(options, block=_as_size(options.block, "block", "Warp.save"))
+        options = replace(options, block=as_image_size(options.block, "Warp.save", "block"))
     for option in fields(options):
         if getattr(options, option.name) is not None and option.name not in chosen.options:
             takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
             raise ValueError(f"Warp.save: {chosen.name} has no {option.name}{takes}")
-    exact = Exact(warp)
+    exact = Exact(warp, "Warp.save")
     if not exact.shown.any():
         raise ValueError(f"Warp.save: {name}: no pixel of the target shows anything of the source's image")
     encoded = chosen.encode(name, exact, options)
@@ -110,7 +110,7 @@ def load_map(
         "order": order,
     }
     for key, size in (("source_size", source_size), ("target_size", target_size)):
-        given[key] = None if size is None else _as_size(size, key, "load_map")
+        given[key] = as_image_size(size, "load_map", key)
     content = _content(name)
     if format is not None:
         chosen = _named(format)
@@ -121,9 +121,8 @@ def load_map(
         raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
     facts = {key: _as_fact(value) for key, value in described.items() if key not in _SIZES_AND_ERRORS}
     stated: dict[str, Any] = {key: facts[key] for key in ("step", "order") if key in facts}
-    if all(key in described for key in _SIZES):
-        stated["source_size"] = described["source_height"], described["source_width"]
-        stated["target_size"] = described["target_height"], described["target_width"]
+    if sizes := sizes_in(described):
+        stated["source_size"], stated["target_size"] = sizes
     given |= stated
     if given["step"] is not None and not isinstance(given["step"], int):
         raise CameraFileError(name, "step", f"{given['step']!r:.60} is no number of pixels")
@@ -163,14 +162,13 @@ def check_map(
     Raises:
         ValueError: it is between images of other sizes, and as `load_map`.
     """
-    exact = Exact(warp)
+    exact = Exact(warp, "check_map")
     sizes: dict[str, Any] = {"source_size": exact.source_size, "target_size": exact.target_size}
     read = load_map(path, format, step=step, v=v, order=order, **sizes)
     return measure(_path(path, "check_map"), read, exact, (), read.facts)
 
 
-_SIZES = ("source_height", "source_width", "target_height", "target_width")
-_SIZES_AND_ERRORS = ("format", *_SIZES, "max_error", "rms_error")
+_SIZES_AND_ERRORS = ("format", *SIZES, "max_error", "rms_error")
 
 
 def _description(path: str) -> str:
@@ -179,7 +177,7 @@ def _description(path: str) -> str:
 
 
 def _described(report: MapReport) -> dict[str, Any]:
-    sizes = dict(zip(_SIZES, (*report.source_size, *report.target_size), strict=True))
+    sizes = named_sizes(report.source_size, report.target_size)
     errors = {"max_error": round(report.max_error, 6), "rms_error": round(report.rms_error, 6)}
     return {"format": report.format, **sizes, **report.facts, **errors}
 
@@ -224,14 +222,6 @@ def _content(path: str) -> bytes:
     if not content:
         raise CameraFileError(path, "content", "the file is empty")
     return content
-
-
-def _as_size(size: Any, name: str, owner: str) -> tuple[int, int] | None:
-    """(height, width), with errors that name the argument."""
-    try:
-        return as_image_size(size, owner)
-    except (TypeError, ValueError) as error:
-        raise type(error)(str(error).replace("image_size", name)) from None
 
 
 def _path(path: Any, owner: str) -> str:

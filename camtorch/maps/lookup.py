@@ -95,7 +95,7 @@ class LookupMap:
         Raises:
             ValueError: the warp is between images of other sizes.
         """
-        return self._off(Exact(warp))
+        return self._off(Exact(warp, "LookupMap.error"))
 
     def _off(self, exact: Exact) -> Tensor:
         mine, wanted = (self.source_size, self.target_size), (exact.source_size, exact.target_size)

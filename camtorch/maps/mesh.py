@@ -10,6 +10,7 @@ import numpy as np
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Bools, Exact, Floats
 
+_STEP, _LONGEST_STEP = 16, 256  # pixels of the target
 _SLACK = 0.5  # pixels: as far as a pixel that shows the image may lie beyond the outermost pixel centres
 _OUTWARDS = 1 / 32  # of the second differences by which nodes round outwards
 _MOST_STEPS = 200
@@ -63,6 +64,19 @@ def _cells(nodes: Floats, count: int) -> tuple[np.ndarray, Floats]:
     pixels = np.arange(count, dtype=np.float64)
     cell = np.clip(np.searchsorted(nodes, pixels, "right") - 1, 0, len(nodes) - 2)
     return cell, (pixels - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+
+
+def as_step(step: int | None, owner: str) -> int:
+    """Pixels of the target between nodes; 16 if nobody says.
+
+    Raises:
+        ValueError: less than 1, or more than 256.
+    """
+    if step is None:
+        return _STEP
+    if not 1 <= step <= _LONGEST_STEP:
+        raise ValueError(f"{owner}: step must be 1 to {_LONGEST_STEP} pixels; got {step}")
+    return step
 
 
 def nodes_every(step: int, size: int) -> Floats:

@@ -9,8 +9,6 @@ Pixels without a position get -32768, which `cv2.remap` fills by BORDER_CONSTANT
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import torch
 
@@ -18,12 +16,11 @@ from camtorch.io._errors import CameraFileError
 from camtorch.maps.arrays import Arrays, as_archive, as_storage, from_archive, from_storage
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.protocol import MOST_PIXELS, Encoded, Given, Options, checked
+from camtorch.maps.protocol import MOST_PIXELS, SIZES, Encoded, Given, Options, checked, suffix_of
 
 _NOWHERE = -32768
 _LONGEST = 32766  # pixels: cv2.remap wants sides below SHRT_MAX
 _PARTS = 32  # of a pixel
-_SIZES = ("source_height", "source_width")
 _PAIRS = (("map1", "map2"), ("map_x", "map_y"), ("mapx", "mapy"), ("mapX", "mapY"), ("map1x", "map1y"), ("x", "y"))
 
 
@@ -44,9 +41,7 @@ class OpenCV:
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
         """Raises CameraFileError for sides that cv2.remap does not take. ValueError: another suffix."""
-        suffix = os.path.splitext(path)[1].lower()
-        if suffix not in self.suffixes:
-            raise ValueError(f"{path}: maps of OpenCV are called {', '.join(self.suffixes)}")
+        suffix = suffix_of(path, self)
         sides = (*exact.source_size, *exact.target_size)
         if max(sides) > _LONGEST:
             raise CameraFileError(path, "size", f"a side of {max(sides)} px; cv2.remap takes at most {_LONGEST}")
@@ -58,7 +53,7 @@ class OpenCV:
             maps = {"map1": whole.astype("<i2"), "map2": (rest[..., 1] * _PARTS + rest[..., 0]).astype("<u2")}
         else:
             maps = {name: positions[..., i].astype("<f4") for i, name in enumerate(("map1", "map2"))}
-        keys = {**maps, **dict(zip(_SIZES, exact.source_size, strict=True))}
+        keys = {**maps, **dict(zip(SIZES[:2], exact.source_size, strict=True))}
         return Encoded(as_archive(keys) if suffix == ".npz" else as_storage(keys, xml=suffix == ".xml"))
 
     def matches(self, path: str, content: bytes) -> bool:
@@ -71,7 +66,7 @@ class OpenCV:
         arrays = from_archive(path, content) if content.startswith(b"PK") else from_storage(path, content)
         positions, fixed = _positions(path, arrays)
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan
-        stated = [arrays[key].item() for key in _SIZES if key in arrays and arrays[key].size == 1]
+        stated = [arrays[key].item() for key in SIZES[:2] if key in arrays and arrays[key].size == 1]
         size = checked(path, "source_size", stated if len(stated) == 2 else given.source_size)
         return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if fixed else "opencv", {})
 

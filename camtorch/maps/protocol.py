@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -11,6 +13,8 @@ from camtorch.maps.lookup import LookupMap
 
 MOST_PIXELS = 1 << 26
 """Of a map that is read: 8192 x 8192."""
+SIZES = "source_height", "source_width", "target_height", "target_width"
+"""What files and descriptions call them."""
 _LONGEST = 1 << 16  # pixels along a side
 
 
@@ -73,6 +77,31 @@ class MapFormat(Protocol):
 
     def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
         """Read a file. Raises CameraFileError."""
+
+
+def suffix_of(path: str, format: MapFormat) -> str:
+    """The suffix of a file that is to be written, in small letters.
+
+    Raises:
+        ValueError: one that files of the format do not have.
+    """
+    suffix = os.path.splitext(path)[1].lower()
+    if suffix not in format.suffixes:
+        raise ValueError(f"{path}: files of {format.name} are called {', '.join(format.suffixes)}")
+    return suffix
+
+
+def named_sizes(source: tuple[int, int], target: tuple[int, int]) -> dict[str, int]:
+    """`SIZES` of images (height, width)."""
+    return dict(zip(SIZES, (*source, *target), strict=True))
+
+
+def sizes_in(stated: Mapping[str, Any]) -> tuple[tuple[Any, Any], tuple[Any, Any]] | None:
+    """(height, width) of source and target as they are stated, unchecked; None unless all are."""
+    if not all(name in stated for name in SIZES):
+        return None
+    rows, columns, height, width = (stated[name] for name in SIZES)
+    return (rows, columns), (height, width)
 
 
 def checked(path: str, name: str, size: Any) -> tuple[int, int]:

@@ -21,10 +21,10 @@ import torch
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.protocol import MOST_PIXELS, Encoded, Given, Options, checked
+from camtorch.maps.protocol import MOST_PIXELS, SIZES, Encoded, Given, Options, checked, suffix_of
 
 _WAYS = ("up", "down")
-_KEYS = ("v", "source_height", "source_width")
+_KEYS = ("v", *SIZES[:2])
 _PREFIX = "camtorch_"  # of attributes of an EXR
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MOST_CHANNELS = 4  # of the largest map
@@ -41,9 +41,7 @@ class STMap:
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
         """Raises ValueError: a way that v does not run, or another suffix. ImportError: the extra is missing."""
-        suffix = os.path.splitext(path)[1].lower()
-        if suffix not in self.suffixes:
-            raise ValueError(f"{path}: STMaps are called {', '.join(self.suffixes)}")
+        suffix = suffix_of(path, self)
         way = _way(options.v or "up")
         height, width = exact.source_size
         parts = (exact.positions + 0.5) / (width, height)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-import os
 import struct
 from typing import Any, NoReturn
 
@@ -23,12 +22,9 @@ import torch
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Bools, Exact, Floats
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.mesh import Mesh, mesh_of
-from camtorch.maps.protocol import Encoded, Given, Options, checked
+from camtorch.maps.mesh import Mesh, as_step, mesh_of
+from camtorch.maps.protocol import SIZES, Encoded, Given, Options, checked, named_sizes, sizes_in, suffix_of
 
-_STEP = 16
-_LONGEST_STEP = 256
-_SIZES = ("source_height", "source_width", "target_height", "target_width")
 _GLB = b"glTF"
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # kinds of chunks
 _URI = "data:application/octet-stream;base64,"
@@ -52,12 +48,7 @@ class TextureMesh:
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
         """Raises ValueError: a step that is none, or another suffix."""
-        suffix = os.path.splitext(path)[1].lower()
-        if suffix not in self.suffixes:
-            raise ValueError(f"{path}: files of {self.name} are called {' or '.join(self.suffixes)}")
-        step = _STEP if options.step is None else options.step
-        if not 1 <= step <= _LONGEST_STEP:
-            raise ValueError(f"Warp.save: step must be 1 to {_LONGEST_STEP} pixels; got {step}")
+        suffix, step = suffix_of(path, self), as_step(options.step, "Warp.save")
         height, width = exact.target_size
         mesh = mesh_of(path, exact, _edges(step, width), _edges(step, height), triangles=True)
         columns, rows = mesh.columns + 0.5, height - (mesh.rows + 0.5)
@@ -65,7 +56,7 @@ class TextureMesh:
         parts = ((mesh.nodes + 0.5) / exact.source_size[::-1]).reshape(-1, 2)
         assert mesh.drawn is not None
         triangles = _triangles(mesh.drawn)
-        sizes = dict(zip(_SIZES, (*exact.source_size, *exact.target_size), strict=True))
+        sizes = named_sizes(exact.source_size, exact.target_size)
         if self.name == "obj":
             content = _as_obj(places, parts, triangles, sizes)
         else:
@@ -85,9 +76,7 @@ class TextureMesh:
             places, parts, triangles, stated = read(content)
         except _FAILURES as error:
             raise CameraFileError(path, "content", f"no mesh in {self.name}: {error}") from None
-        sizes = given.source_size, given.target_size
-        if all(name in stated for name in _SIZES):
-            sizes = (stated[_SIZES[0]], stated[_SIZES[1]]), (stated[_SIZES[2]], stated[_SIZES[3]])
+        sizes = sizes_in(stated) or (given.source_size, given.target_size)
         source, target = (checked(path, *pair) for pair in zip(("source_size", "target_size"), sizes, strict=True))
         mesh = _lattice(path, places, parts, triangles, source, target[0])
         facts = {"nodes": (len(mesh.rows), len(mesh.columns)), "triangles": len(triangles)}
@@ -170,7 +159,7 @@ def _from_obj(content: bytes) -> tuple[Floats, Floats, np.ndarray, dict[str, int
             if len(corners) != 3 or any(len(set(corner)) != 1 for corner in corners):
                 raise ValueError(f"{line:.60}: no triangle of vertices with texture coordinates of their own")
             triangles.append([int(corner[0]) - 1 for corner in corners])
-        elif words[0] == "#" and len(words) == 3 and words[1] in _SIZES and words[2].isdigit() and len(words[2]) < 9:
+        elif words[0] == "#" and len(words) == 3 and words[1] in SIZES and words[2].isdigit() and len(words[2]) < 9:
             sizes[words[1]] = int(words[2])
     if len(parts) != len(places):
         raise ValueError(f"{len(places)} vertices and {len(parts)} texture coordinates")
