@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from cameras import KEYS, real
+from cameras import DISTINCT, KEYS, real
 from test_mixed import one_of_each
 
 import camtorch as ct
@@ -201,8 +201,9 @@ def test_latitude_and_up_are_those_of_points_that_rise(level):
         assert up[13, 7, 1] < -0.9  # and v goes down
 
 
-def test_fields_of_a_mixed_batch_are_those_of_each():
-    cameras = one_of_each()
+@pytest.mark.parametrize("keys", [DISTINCT, pytest.param(set(KEYS), marks=pytest.mark.slow)], ids=["distinct", "all"])
+def test_fields_of_a_mixed_batch_are_those_of_each(keys):
+    cameras = [camera for camera in one_of_each() if camera.key in keys]
     mixed = ct.Mixed(cameras)
     down = torch.randn(len(cameras), 3, dtype=torch.float64)
     fields = mixed.perspective_field(down, stride=8)

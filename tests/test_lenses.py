@@ -154,13 +154,14 @@ def rim(height, width):
 @pytest.mark.parametrize(
     ("augmentation", "size", "fov", "count"),
     [
-        (ct.augment.RandomLens, (480, 640), (100, 150), 1000),
+        (ct.augment.RandomLens, (480, 640), (100, 150), 200),
+        pytest.param(ct.augment.RandomLens, (480, 640), (100, 150), 1000, marks=pytest.mark.slow),
         pytest.param(ct.augment.RandomCamera, (480, 640), (100, 150), 1000, marks=pytest.mark.slow),
         pytest.param(ct.augment.RandomLens, (1080, 1920), (150, 190), 1000, marks=pytest.mark.slow),
         pytest.param(ct.augment.RandomLens, (640, 480), None, 1000, marks=pytest.mark.slow),
     ],
 )
-def test_a_thousand_draws_of_real_lenses_see_with_every_pixel_in_the_range(augmentation, size, fov, count):
+def test_real_lenses_see_with_every_pixel_in_the_range(augmentation, size, fov, count):
     augment = augmentation("real", fov=fov, camera=source(size))
     target = augment.change(None, augment.draw(count, torch.Generator().manual_seed(1))).target
     edge = rim(*size)
@@ -169,7 +170,7 @@ def test_a_thousand_draws_of_real_lenses_see_with_every_pixel_in_the_range(augme
     low, high = fov or (0, 360)
     assert wide.min() >= math.radians(low)
     assert wide.max() <= math.radians(high)
-    assert len(target.intrinsics[:, 0].unique()) > (300 if fov == (100, 150) else 10)
+    assert len(target.intrinsics[:, 0].unique()) > (0.3 * count if fov == (100, 150) else 10)
 
 
 def test_a_jittered_real_lens_is_whole_too():

@@ -43,7 +43,7 @@ def tensors(camera):
     return [t for t in (camera.intrinsics, camera.distortion) if t.numel()]
 
 
-@pytest.mark.parametrize("bad", [True, False])
+@pytest.mark.parametrize("bad", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_one_by_one_to_the_bit_with_gradients(direction, bad):
     cameras = one_of_each()
