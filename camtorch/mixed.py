@@ -83,11 +83,8 @@ class Mixed(Camera):
 
     def _group(self, members: Sequence[Camera], rows: Sequence[int]) -> _Group:
         places = [self._places[row] for row in rows]
-        used = tuple(dict.fromkeys(i for i, _ in places))
-        *starts, end = accumulate((_count(members[i]) for i in used), initial=0)
-        first = dict(zip(used, starts, strict=True))
-        index = tuple(first[i] + row for i, row in places)
-        whole = index == tuple(range(end))
+        used, index = _among_used(members, places)
+        whole = index == tuple(range(sum(_count(members[i]) for i in used)))
         model: type[Camera] = type_before_parametrizations(members[used[0]])
         counts = tuple(len(members[i]) if members[i].batch_shape else None for i in used)
         return _Group(model, used, counts, None if whole else index, tuple(rows), Memo())
@@ -247,10 +244,9 @@ class Mixed(Camera):
         places = [self._places[row] for row in taken.tolist()]
         if not places:
             raise IndexError(f"Mixed: {index!r} leaves no camera of a batch ({len(self._places)},)")
-        used = list(dict.fromkeys(i for i, _ in places))
-        *starts, _ = accumulate((_count(self._member(i)) for i in used), initial=0)
-        first = dict(zip(used, starts, strict=True))
-        return type(self)([self._member(i) for i in used], order=[first[i] + row for i, row in places])
+        members = cast("list[Camera]", list(self.cameras))
+        used, order = _among_used(members, places)
+        return type(self)([members[i] for i in used], order=order)
 
     def with_tensors(self, **tensors: Tensor) -> NoReturn:
         """There are none to give."""
@@ -282,6 +278,16 @@ class Mixed(Camera):
 
 def _count(camera: Camera) -> int:
     return len(camera) if camera.batch_shape else 1
+
+
+def _among_used(
+    members: Sequence[Camera], places: Sequence[tuple[int, int]]
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Which members hold the cameras at (member, row), and where each camera is if all of those stand in a row."""
+    used = tuple(dict.fromkeys(i for i, _ in places))
+    starts = accumulate((_count(members[i]) for i in used), initial=0)
+    first = dict(zip(used, starts, strict=False))
+    return used, tuple(first[i] + row for i, row in places)
 
 
 def _members(cameras: Any) -> list[Camera]:

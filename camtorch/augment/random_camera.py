@@ -126,6 +126,7 @@ class RandomCamera(Augmentation):
         self._is_real = isinstance(like, str) and like == _REAL
         self.like = None if self._is_real else _as_like(like, self._name)
         if self._is_real:
+            # the default itself: equal numbers may have been given
             focal, centre, distortion, crop = (
                 None if any(given is usual for usual in _USUAL) else given
                 for given in (focal, centre, distortion, crop)

@@ -98,14 +98,12 @@ def _of_each_model(camera: Mixed, object_points: Numbers, pixels: Numbers, weigh
     leads = [tuple(field.shape[:-2]) for field in fields]
     if any(lead not in ((), (1,), (count,)) for lead in leads):
         raise ValueError(f"{owner}: a Mixed of {count} cameras takes batch dims () or ({count},); got {leads}")
-    poses, order = [], []
+    poses = []
     for rows, group in camera.groups:
         mine = [field[rows] if field.shape[:-2] == (count,) else field for field in fields]
         poses.append(solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0]))
-        order += rows
-    place = torch.tensor(order, device=device).argsort()
     rotation, translation, rms, valid = (
-        torch.cat(parts)[place]
+        camera._in_order(torch.cat(parts))
         for parts in zip(
             *((p.extrinsics.rotation, p.extrinsics.translation, p.rms, p.valid) for p in poses), strict=True
         )

@@ -90,9 +90,7 @@ class CanonicalCamera(SampleTransform):
     def scale(self, camera: Camera) -> Tensor:
         """(*B,): s of cameras (*B), `focal` by their focal length. Its gradients go to fx and fy."""
         if isinstance(camera, Mixed):
-            rows = [row for rows, _ in camera.groups for row in rows]
-            order = torch.tensor(rows, device=camera.intrinsics.device).argsort()
-            return torch.cat([self.scale(group).to(camera.intrinsics.dtype) for _, group in camera.groups])[order]
+            return camera._in_order(torch.cat([self.scale(group) for _, group in camera.groups]))
         k = camera.distortion.detach()
         batch, count = k.shape[:-1], k.shape[-1]
         slopes = slopes_at_axis(camera.optics, k.reshape(batch.numel(), count)).view(*batch, 2)

@@ -135,7 +135,7 @@ class RollingShutter(GeometryModule):
 
     def detached(self) -> RollingShutter:
         """The shutter of the same numbers, which do not learn."""
-        return self._with(*(t.detach() for t in self.tensors), self._moment)
+        return self._with(self.readout.detach(), self.rates.detach(), self.exposure.detach(), self._moment)
 
     def _with(self, readout: Tensor, rates: Tensor, exposure: Tensor, moment: float | None = None) -> RollingShutter:
         options: dict[str, Any] = {"direction": self.direction, "samples": self.samples, "gamma": self.gamma}
