@@ -140,9 +140,12 @@ def test_wrong_annotations_are_told():
     change = fixed_change(CAMERAS["pinhole"], CAMERAS["pinhole"], (0, 0, 0))
     for entry, message in (
         ({"bbox": [1, 2, 3]}, "annotation 7: bbox must be a list of numbers, 4 for each"),
+        ({"bbox": [1, 2, 3, 4, 5, 6, 7, 8]}, r"bbox must be \[x, y, width, height\]"),
         ({"bbox": [1, 2, -3, 4]}, r"bbox must be \[x, y, width, height\]"),
         ({"keypoints": [1, 2]}, "keypoints must be a list of numbers, 3 for each"),
-        ({"keypoints": [1, 2, float("nan")]}, "keypoints must be finite"),
+        ({"keypoints": [1, 2, float("nan")]}, "keypoints must lie between"),
+        ({"keypoints": [1, 10**400, 2]}, "keypoints must lie between"),
+        ({"segmentation": 5}, "segmentation must be a list of polygons"),
         ({"segmentation": [[1, 2, 3, 4]]}, "a polygon must have three corners"),
         ({"segmentation": {"counts": [], "size": [1, 2]}}, r"size \[1, 2\], the image \[72, 96\]"),
         ({"gaze": [1, 2]}, r"annotation 7: gaze must be \(\*N, 3\) directions"),
@@ -302,6 +305,9 @@ def test_wrong_words_and_files_are_told(folder, capsys):
         ({"images": [*content["images"], content["images"][0]]}, "another one has the id 10"),
         ({"annotations": [{"image_id": 99}]}, "no image has the id 99"),
         ({"images": []}, "no image has the id 10"),
+        ({"images": [{"id": 1, "file_name": "0.jpg", "width": "96"}]}, "width must be a number; got '96'"),
+        ({"info": {"year": float("inf")}}, "NaN and infinity are no JSON"),
+        ({"annotations": [{"image_id": 10, "score": float("nan")}]}, "images[0] and its annotations: NaN and infinity"),
     ):
         Path("labels.json").write_text(json.dumps(content | change))
         assert message in refused()

@@ -122,7 +122,9 @@ def test_outputs_that_would_be_lost(folder):
         ({"WORLD_SIZE": "1"}, Shard()),
         ({"RANK": "1", "WORLD_SIZE": "3", "LOCAL_WORLD_SIZE": "2"}, Shard(1, 3, 2)),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard(0, 4)),
-        ({"SLURM_NTASKS": "4"}, Shard()),  # a script that sbatch runs, and no step of it
+        ({"SLURM_NTASKS": "4"}, Shard()),
+        ({"SLURM_JOB_ID": "7", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard()),  # a script that sbatch runs
+        ({"SLURM_JOB_ID": "7", "SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard(0, 4)),
         ({"RANK": "0", "WORLD_SIZE": "2", "SLURM_PROCID": "3", "SLURM_NTASKS": "4"}, Shard(0, 2)),
     ],
 )
@@ -255,6 +257,17 @@ def test_nobody_does_the_same_at_the_same_time(empty):
 
 
 @pytest.mark.slow
+def test_accounts_are_whole_where_less_is_written_than_asked_for(empty, monkeypatch):
+    write = os.write
+    monkeypatch.setattr(os, "write", lambda file, data: write(file, data[:7]))
+    with Manifest(Path("out"), "test", {}) as manifest:
+        manifest.begin(Item((Path("a"),), (Path("out/a"),)))
+    assert [list(json.loads(line)) for line in manifest.path.read_bytes().splitlines()] == [
+        ["settings", "is"],
+        ["begun"],
+    ]
+
+
 def test_what_a_crash_left_is_removed(empty):
     todo = jobs_of({"a" * 30 + "1": "1", "a" * 30 + "2": "wait"})
     code = (

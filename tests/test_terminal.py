@@ -92,3 +92,8 @@ def test_a_bar_in_a_file_is_a_line_now_and_then(monkeypatch, clock):
 def test_a_bar_fits_its_terminal(monkeypatch, clock):
     monkeypatch.setenv("COLUMNS", "40")
     assert max(map(len, bar(monkeypatch, clock, tty=True, seconds=9999).split("\r"))) == 39
+
+
+def test_names_do_not_steer_the_terminal(capsys):
+    terminal.say("error: \x1b[2J\u202egone\n.jpg: späce 日本")
+    assert capsys.readouterr().err == r"camtorch: error: \x1b[2J\u202egone .jpg: späce 日本" + "\n"

@@ -26,6 +26,7 @@ Json = dict[str, Any]
 _STEP = 8.0  # pixels: between points of a polygon's edge that are moved
 _SAG = 0.1  # pixels by which a straight edge may miss the curve that it stands for
 _LEAST = 0.01  # square pixels
+_FARTHEST = 1e6  # pixels
 _3D = ("gaze", "directions", "pitch_yaw", "points", "head_pose", "pose", "rvec", "tvec")
 _OWN = ("id", "image_id", "category_id", "iscrowd", "area", "bbox", "segmentation", "keypoints", "num_keypoints")
 
@@ -72,6 +73,9 @@ def read(path: Path) -> DataSet:
             raise LabelsError(f"{path}: images[{i}]: file_name must be the name of a file; got {name!r:.60}")
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise LabelsError(f"{path}: images[{i}]: file_name must lie within the folder of images; got {name!r:.60}")
+        for side in ("width", "height"):
+            if type(image.get(side, 0)) not in (int, float):
+                raise LabelsError(f"{path}: images[{i}]: {side} must be a number; got {image[side]!r:.60}")
         if image["id"] in known:
             raise LabelsError(f"{path}: images[{i}]: another one has the id {image['id']!r:.60}")
         known.add(image["id"])
@@ -168,9 +172,10 @@ def _read_parts(one: Json, size: tuple[int, int]) -> _Parts:
     if one.get("keypoints"):
         keypoints = _numbers(one["keypoints"], "keypoints", 3).reshape(-1, 3)
     if one.get("bbox"):
-        x, y, width, height = _numbers(one["bbox"], "bbox", 4).tolist()
-        if len(one["bbox"]) != 4 or width < 0 or height < 0:
-            raise ValueError(f"bbox must be [x, y, width, height]; got {one['bbox']}")
+        numbers = _numbers(one["bbox"], "bbox", 4).tolist()
+        if len(numbers) != 4 or min(numbers[2:]) < 0:
+            raise ValueError(f"bbox must be [x, y, width, height]; got {one['bbox']!r:.80}")
+        x, y, width, height = numbers
         box = torch.tensor([x, y, x + width, y + height], dtype=torch.float64) - 0.5
     segmentation = one.get("segmentation")
     if isinstance(segmentation, Mapping):
@@ -179,6 +184,8 @@ def _read_parts(one: Json, size: tuple[int, int]) -> _Parts:
             raise ValueError(f"segmentation has the size {stated}, the image {list(size)}, height and width")
         mask = torch.from_numpy(rle.decode(segmentation.get("counts"), size).astype("uint8"))
     elif segmentation:
+        if not isinstance(segmentation, list):
+            raise ValueError(f"segmentation must be a list of polygons, or an object of runs; got {segmentation!r:.80}")
         for polygon in segmentation:
             corners = _numbers(polygon, "segmentation", 2).reshape(-1, 2) - 0.5
             if len(corners) < 3:
@@ -190,10 +197,9 @@ def _read_parts(one: Json, size: tuple[int, int]) -> _Parts:
 def _numbers(values: Any, name: str, step: int) -> Tensor:
     if not isinstance(values, list) or len(values) % step or not all(type(v) in (int, float) for v in values):
         raise ValueError(f"{name} must be a list of numbers, {step} for each; got {values!r:.80}")
-    tensor = torch.tensor(values, dtype=torch.float64)
-    if not bool((tensor.abs() < 1e6).all()):
-        raise ValueError(f"{name} must be finite; got {values!r:.80}")
-    return tensor
+    if not all(abs(value) < _FARTHEST for value in values):  # NaN, too, and integers too large for a float
+        raise ValueError(f"{name} must lie between -1e6 and 1e6; got {values!r:.80}")
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _put(one: Json, part: _Parts, size: tuple[int, int], moved: tuple[Any, ...]) -> Json | None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from camtorch.cli import cameras, coco, images, labelled_image, many
 from camtorch.cli.augmenting import Augmenting, Json, Labelled
+from camtorch.cli.labels import LabelsError
 from camtorch.cli.options import checked_ranges
 from camtorch.io.writing import replacing
 from camtorch.jobs import inputs, items
@@ -118,11 +119,16 @@ def _by_files(folder: Path, labels: Path, output: Path, copies: int) -> tuple[li
 
 
 def _by_entries(folder: Path, data: coco.DataSet, output: Path, copies: int) -> list[Labelled]:
-    """The images of a file of annotations."""
+    """The images of a file of annotations.
+
+    Raises:
+        LabelsError: numbers that JSON does not know, which could not be written again.
+    """
+    _text_of(data.rest, f'{data.path}: what is beside "images" and "annotations"')
     result = []
-    for image in data.images:
+    for i, image in enumerate(data.images):
         place = Path(image["file_name"])
-        labels = json.dumps([image, [one for _, one in data.of(image)]], sort_keys=True)
+        labels = _text_of([image, [one for _, one in data.of(image)]], f"{data.path}: images[{i}] and its annotations")
         result.append(
             Labelled(
                 (folder / place,),
@@ -133,6 +139,13 @@ def _by_entries(folder: Path, data: coco.DataSet, output: Path, copies: int) -> 
             )
         )
     return result
+
+
+def _text_of(content: Any, what: str) -> str:
+    try:
+        return json.dumps(content, sort_keys=True, allow_nan=False)
+    except ValueError:
+        raise LabelsError(f"{what}: NaN and infinity are no JSON; null is, or leave them out") from None
 
 
 @contextlib.contextmanager

@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 
 def say(text: str) -> None:
-    """One line, whatever the text."""
-    print("camtorch:", " ".join(text.split()), file=sys.stderr, flush=True)
+    """One line, whatever the text: what would steer a terminal, as names of files may, is spelt out."""
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(text.split()))
+    print("camtorch:", line, file=sys.stderr, flush=True)
 
 
 def note(text: object) -> None:

@@ -100,7 +100,8 @@ class Shard:
             ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"),
             ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NTASKS_PER_NODE"),
         ):
-            # outside of a step SLURM_NTASKS is what was asked for, and nobody else works
+            if rank == "SLURM_PROCID" and known.get("SLURM_JOB_ID", "") and not known.get("SLURM_STEP_ID", ""):
+                continue  # a script that sbatch runs: SLURM_NTASKS is what was asked for, and nobody else works
             if known.get(rank, "") == "":
                 if rank == "RANK" and known.get(count, "") not in ("", "1"):
                     raise ValueError(f"{count} is {known[count]!r}, but {rank} is not set: which shard is this?")

@@ -172,4 +172,6 @@ class Manifest:
         self._append({"failed": list(map(self.terms.name, item.outputs)), "reason": reason})
 
     def _append(self, line: dict[str, Any]) -> None:
-        os.write(self._file, json.dumps(line, allow_nan=False).encode() + b"\n")
+        rest = json.dumps(line, allow_nan=False).encode() + b"\n"
+        while rest:  # less is written than asked for where a disk gets full, and then nothing, which is an error
+            rest = rest[os.write(self._file, rest) :]
