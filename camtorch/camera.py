@@ -979,4 +979,4 @@ def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
     if not lead:
         return parameters.unsqueeze(0)
     count = parameters.shape[-1]
-    return parameters.expand(*lead, count).reshape(len(rows), count)
+    return parameters.expand(*lead, count).reshape(rows.shape[0], count)

@@ -200,8 +200,8 @@ def test_a_batch_of_cameras_of_any_size():
             return ct.KannalaBrandt(intrinsics, distortion).unproject(pixels)
 
     pixels = 128 * torch.rand(3, 40, 2)
-    batch = {0: "batch"}
-    shapes = {"pixels": {0: "batch", 1: "count"}, "intrinsics": batch, "distortion": batch}
+    batch, count = (torch.export.Dim(name, min=2) for name in ("batch", "count"))
+    shapes = {"pixels": {0: batch, 1: count}, "intrinsics": {0: batch}, "distortion": {0: batch}}
     _, run = to_onnx(Rays(), pixels, values, k, dynamic_shapes=shapes)
     for n in (3, 2):
         rays, valid = run(pixels[:n, 3:], values[:n], k[:n])
@@ -224,7 +224,7 @@ class Network(nn.Module):
     def forward(self, images):
         images = self.dewarp(images)
         rays, _ = self.dewarp.target.rays()
-        rays = rays.movedim(-1, 0).expand(len(images), -1, -1, -1)
+        rays = rays.movedim(-1, 0).expand(images.shape[0], -1, -1, -1)
         return self.layer(torch.cat((images, rays), 1))
 
 
@@ -242,7 +242,7 @@ def test_a_network_that_learns_its_camera():
 @pytest.mark.slow
 def test_a_warp_between_cameras_that_are_inputs():
     source, images = fisheye(), smooth(2)
-    target = ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64))
+    target = ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64)).requires_grad_(False)
 
     class Undistort(nn.Module):
         def forward(self, images, intrinsics, distortion):
@@ -276,7 +276,7 @@ import sys, torch
 program = torch.export.load(sys.argv[1]).module()
 given, expected = torch.load(sys.argv[2])
 for result, known in zip(program(*given), expected, strict=True):
-    torch.testing.assert_close(result, known)
+    torch.testing.assert_close(result, known, rtol=1e-5, atol=1e-3)
 assert "camtorch" not in sys.modules
 """
 

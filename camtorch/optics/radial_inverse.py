@@ -179,8 +179,8 @@ class InverseTable:
         position = _variable(r2, self.reach2) * _NODES
         node = as_index(position).clamp(0, _NODES - 1)
         fraction = position - node
-        if len(self.values) > 1:
-            node = node + torch.arange(len(self.values), device=r2.device, dtype=node.dtype).unsqueeze(-1) * _NODES
+        if self.values.shape[0] > 1:
+            node = node + torch.arange(self.values.shape[0], device=r2.device, dtype=node.dtype).unsqueeze(-1) * _NODES
         node = node.flatten()
         value, step = self.values.flatten().index_select(0, node), self.steps.flatten().index_select(0, node)
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
@@ -292,7 +292,7 @@ class RadialInverse:
         """The factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
         if self.of_points:
             return bracketed(self.radial, r2, self.inner2)
-        rows = r2.reshape(len(self.k), -1)
+        rows = r2.reshape(self.k.shape[0], -1)
         if for_elsewhere():
             inner2 = self.inner2.reshape(-1, 1)
             return _scale(self.factor.name, self.k, inner2, InverseTable(self._table), rows).view_as(r2)

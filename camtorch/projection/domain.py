@@ -144,7 +144,7 @@ class Domain:
         it sends to them. There the image has a limit that is found once, and the inverse goes stage by stage.
         """
         if self.lens.rest is None:
-            return self.k.new_full((len(self.k), 1), torch.inf)
+            return self.k.new_full((self.k.shape[0], 1), torch.inf)
         k = precise(self.k)
         _, lens = self.optics(columns(k))
         assert lens.rest is not None
@@ -177,7 +177,7 @@ class Domain:
             inner = self._fold.to(self.k.dtype)
         else:
             radii = self.chart.radii(_RADII, self.k)
-            lost = first_loss(self.lens.lower_bound(radii.expand(len(self.k), -1))[0])
+            lost = first_loss(self.lens.lower_bound(radii.expand(self.k.shape[0], -1))[0])
             inner = radii[(lost - 1).floor().clamp(0, _RADII - 1).long()].unsqueeze(-1)
             inner = inner if self.staged is None else torch.where(self.staged, self._fold.to(inner.dtype), inner)
         return within(inner.clamp(max=self.chart.end(inner.dtype)))
@@ -188,7 +188,7 @@ class Domain:
 
         Zero where that is known of every radius.
         """
-        limits2 = self.k.new_zeros(len(self.k), AZIMUTHS)
+        limits2 = self.k.new_zeros(self.k.shape[0], AZIMUTHS)
         wanted = limits2.new_ones(len(limits2), 1, dtype=torch.bool) if self.staged is None else ~self.staged
         camera, index = wanted.expand_as(limits2).nonzero(as_tuple=True)
         if len(camera):
@@ -257,7 +257,7 @@ class Domain:
             inside[camera, point] = torch.minimum(limits2 - t, regular(self.optics_of(camera)[1], a, b))
             return inside
         index = azimuth(a, b)
-        index = index + torch.arange(len(self.k), device=t.device, dtype=index.dtype).unsqueeze(-1) * AZIMUTHS
+        index = index + torch.arange(self.k.shape[0], device=t.device, dtype=index.dtype).unsqueeze(-1) * AZIMUTHS
         limits2 = self.limits2.flatten().index_select(0, index.flatten()).view(index.shape)
         return torch.maximum(inside, torch.minimum(limits2 - t, regular(self.lens, a, b)))
 

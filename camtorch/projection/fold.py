@@ -118,11 +118,11 @@ class Azimuths:
 def limits_and_outline(optics: Optics, k: Tensor) -> tuple[Tensor, Outline]:
     """`Azimuths.limits2` of all azimuths, (C, azimuths), and the outlines, of all cameras: without a look at values."""
     chart, lens = optics(columns(k))
-    radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(len(k), -1)
+    radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(k.shape[0], -1)
     # each camera's azimuths are rows
     rows = radii.repeat_interleave(AZIMUTHS, 0)
     chart, lens = optics(columns(k.repeat_interleave(AZIMUTHS, 0)))
-    directions = (c.repeat(len(k)) for c in _directions(radii))
+    directions = (c.repeat(k.shape[0]) for c in _directions(radii))
     lost, *rest = _followed(chart, lens, rows, *directions)
     of_each = lost.unflatten(0, (-1, AZIMUTHS))
     pairs = torch.stack((of_each, of_each.roll(-1, -1)), -1).flatten(0, 1)
