@@ -13,7 +13,7 @@ from PIL import Image
 import camtorch as ct
 from camtorch.cli.main import main
 from camtorch.lenses.collection import columns
-from camtorch.lenses.drawing import lenses_for
+from camtorch.lenses.drawing import _good, lenses_for
 from camtorch.warp.warp import along_edges
 
 SAMPLE = Path(__file__).parent / "files" / "lenses.csv"
@@ -197,6 +197,31 @@ def test_fields_of_view_that_no_lens_has_are_refused():
         ct.augment.RandomLens("real", fov=(300, 310), camera=source()).change(None, {"apply": [True], "lens": [0.5]})
     with pytest.raises(ValueError, match="'real', a preset"):
         ct.augment.RandomLens("reel")
+
+
+@pytest.mark.slow
+def test_lenses_are_the_same_whatever_the_default_device_is():
+    expected = lenses_for((48, 64), (60.0, 100.0))
+    lenses_for.cache_clear()
+    _good.cache_clear()
+    with torch.device("meta"):
+        found = lenses_for((48, 64), (60.0, 100.0))
+    assert all(map(torch.equal, found, expected))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fov", [None, (60, 100)])
+def test_draws_are_compiled(fov):
+    augment = ct.augment.RandomLens("real", fov=fov, camera=source((48, 64)), min_filled=0)
+    draw, image = augment.draw(2, torch.Generator().manual_seed(0)), torch.rand(2, 3, 48, 64)
+
+    def step(image):
+        sample = augment(image=image, draw=draw)
+        return sample["image"], sample["camera"].distortion
+
+    compiled = torch.compile(step, fullgraph=True, backend="aot_eager")(image)
+    for now, then in zip(compiled, step(image), strict=True):
+        torch.testing.assert_close(now, then, atol=1e-3, rtol=0)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from camtorch.augment.change import frozen, numbers_by, remade, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera, from_values
-from camtorch.lenses.drawing import covering, lenses_for
+from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.domain import Domain, domain_of, keep
 from camtorch.projection.rays import field_of_view, image_lattice
@@ -202,7 +202,7 @@ class RandomCamera(Augmentation):
         size = self.image_size or size_of(source)
         base = source if self.like is None else self.like
         if self._is_real:
-            intrinsics, k, reach = lenses_for(size, self._among).at(values["lens"])
+            intrinsics, k, reach = drawn(values["lens"], size, self._among)
             base = remade(_ANY, intrinsics, k, size)
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if any(t.dtype != dtype or t.device != device for t in (base.intrinsics, base.distortion)):

@@ -67,7 +67,10 @@ class Lens:
             ValueError: its focal lengths are negative.
         """
         if not self._exists:
-            raise ValueError(f"{self.name}: this calibration has gone astray: fx, fy = {self.intrinsics[:2]}")
+            raise ValueError(
+                f"{self.name}: this calibration has gone astray: fx, fy = {self.intrinsics[:2]}; take another one of "
+                "lenses.search, is_optical says which"
+            )
         made = KannalaBrandt(
             torch.tensor(self.intrinsics, dtype=torch.float64),
             torch.tensor(self.distortion, dtype=torch.float64),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache, lru_cache
 from typing import NamedTuple
 
@@ -47,13 +48,14 @@ def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """
     texts, numbers = columns()
     table = torch.from_numpy(numbers)
-    size = torch.tensor([[float(side) for side in texts[name]] for name in ("height", "width")], dtype=torch.float64)
+    sides = [[float(side) for side in texts[name]] for name in ("height", "width")]
+    size = torch.tensor(sides, dtype=torch.float64, device=table.device)  # whatever the default device is
     plain = [
         is_as_seen(digital, (as_number(across), as_number(down)))
         for digital, across, down in zip(*(texts[n] for n in ("digital_lens", "h_stretch", "v_stretch")), strict=True)
     ]
     off = (table[[3, 2]] / size - 0.5).abs().amax(0)
-    is_good = torch.tensor(plain) & (table[8] < _RMS) & (off < _CENTRE) & (table[0] > 0)
+    is_good = torch.tensor(plain, device=table.device) & (table[8] < _RMS) & (off < _CENTRE) & (table[0] > 0)
     is_good = is_good & ((table[0] / table[1] - 1).abs() < _ASPECT)
     intrinsics, distortion = table[:4, is_good].mT, table[4:8, is_good].mT.contiguous()
     parts = [Domain(KannalaBrandt.optics, part).edge2 for part in distortion.split(_PART)]
@@ -91,7 +93,7 @@ def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses
         ValueError: there are none.
     """
     sizes, intrinsics, distortion, reach = _good()
-    new = torch.tensor(size, dtype=torch.float64)
+    new = sizes.new_tensor(size)
     scale = (new / sizes).amax(-1, keepdim=True)
     # pixels' centres are half a pixel from the edges
     centre = (intrinsics[:, 2:] - (sizes.flip(-1) - 1) / 2) * scale + (new.flip(-1) - 1) / 2
@@ -114,3 +116,23 @@ def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses
             f"shows {widest}. fov=(low, high) is a range of degrees"
         )
     return Lenses(found[chosen], distortion[chosen], reach[chosen])
+
+
+def drawn(share: Tensor, size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses:
+    """The lenses at shares (*B,) of the way through those of `lenses_for`, from 0 to 1, compiled or not."""
+    if torch.compiler.is_compiling():
+        return Lenses(*_opaque_drawn(share, size, fov or ()))
+    return lenses_for(size, fov).at(share)
+
+
+@torch.library.custom_op("camtorch::real_lenses", mutates_args=())
+def _opaque_drawn(share: Tensor, size: Sequence[int], fov: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
+    (height, width), (low, high) = size, fov or (0.0, 0.0)
+    found = lenses_for((height, width), (low, high) if fov else None).at(share)
+    return found.intrinsics, found.distortion, found.reach
+
+
+@_opaque_drawn.register_fake
+def _(share: Tensor, size: Sequence[int], fov: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
+    four = share.new_empty(*share.shape, 4)
+    return four, four.clone(), share.new_empty(share.shape)
