@@ -13,7 +13,7 @@ try:
     import cv2
     import torch
 
-    from benchmarks import augment, calibration, cameras, images, load, machine, points, scaling, stereo
+    from benchmarks import augment, calibration, cameras, folders, images, load, machine, points, scaling, stereo
     from benchmarks.options import Options, progress
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
@@ -24,6 +24,7 @@ SUBJECTS = {
     "augment": augment,
     "calibration": calibration,
     "stereo": stereo,
+    "folders": folders,
     "load": load,
     "scaling": scaling,
 }

@@ -6,7 +6,7 @@ import gc
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import cv2
@@ -79,9 +79,14 @@ def measure(
     finally:
         gc.enable()
     for name, taken in samples.items():
-        records.append(Record(case, name, operation, "seconds", statistics.median(taken)))
-        records.append(Record(case, name, operation, "fastest", min(taken)))
+        records += summary(case, name, operation, taken)
     return records
+
+
+def summary(case: str, contestant: str, operation: str, taken: Sequence[float]) -> list[Record]:
+    """Of the seconds that the rounds took: "seconds", the median, and "fastest", the minimum."""
+    found = (("seconds", statistics.median(taken)), ("fastest", min(taken)))
+    return [Record(case, contestant, operation, quantity, value) for quantity, value in found]
 
 
 @contextmanager
