@@ -6,13 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 
 import pytest
 from copying import Doubling
 
 from camtorch.io.writing import all_left_over
-from camtorch.jobs import inputs, items
+from camtorch.jobs import inputs, items, pool
 from camtorch.jobs.items import Item, Shard
 from camtorch.jobs.manifest import Manifest
 from camtorch.jobs.run import pending, run
@@ -308,6 +309,19 @@ def test_a_process_that_dies_takes_its_item_along(empty):
     lines = [json.loads(line) for line in Path("out/.camtorch-doubling.jsonl").read_text().splitlines()]
     failed = sorted(line["failed"] for line in lines if "failed" in line)
     assert failed == [[name, f"more/{name}"] for name in ("03", "04", "19")]
+
+
+def test_an_interrupt_does_not_find_processes_that_import(monkeypatch):
+    masks = []
+
+    def ensure_running():
+        resource_tracker.ensure_running()
+        masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+    monkeypatch.setattr(forkserver, "ensure_running", ensure_running)
+    pool.prepare([])
+    assert signal.SIGINT in masks[0]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 @pytest.mark.slow

@@ -110,6 +110,14 @@ def test_formats(folder, suffix, codec, sound):
     assert Path(f"again{suffix}").read_bytes() == Path(f"out{suffix}").read_bytes()
 
 
+def test_gray_keeps_its_range(folder):
+    Path("level.yml").write_text("K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]")
+    write_video("in.mkv", [0], codec="ffv1", pixels="gray")
+    command("dewarp", "in.mkv", "--camera", "level.yml", "-o", "out.mkv", "--crf", "1")
+    before, after = (read_video(name)["frames"][0].to_ndarray(format="gray") for name in ("in.mkv", "out.mkv"))
+    assert np.abs(before.astype(int) - after).max() <= 4  # to the ends of the range, where it was cut off
+
+
 @pytest.mark.parametrize(
     "pixels", ["bgr0", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gray", "yuv422p", "yuv420p10le"))]
 )

@@ -418,6 +418,8 @@ class _Read:
         return "yuv420p" if "yuv420p" in known or not known else next(filter(_PLANAR.fullmatch, known), known[0])
 
     def _converted(self, frame: Any, format: str | None) -> Any:
+        if frame.format.name.startswith("gray") and not frame.color_range:
+            frame.color_range = 2  # as ffmpeg takes it, but not what reads it as brightness without colours
         if frame.format.name == format:
             return frame
         # of RGB nothing else is known, and this is what players take for granted; all else keeps its range

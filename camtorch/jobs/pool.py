@@ -14,7 +14,7 @@ import types
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from multiprocessing import connection, forkserver
+from multiprocessing import connection, forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, NoReturn, TypeVar
@@ -34,8 +34,14 @@ def prepare(modules: Sequence[str]) -> None:
     """Have these modules imported, once for all processes of pools to come, while this one does something else."""
     if _HOW == "forkserver":
         multiprocessing.set_forkserver_preload([__name__, *modules])
-        with _without_main():
-            forkserver.ensure_running()
+        resource_tracker.ensure_running()  # which as it starts lets signals through again
+        # what imports them would say where an interrupt found it
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            with _without_main():
+                forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager
@@ -229,7 +235,7 @@ def _serve(pipe: Connection, pickled: bytes, folder: str) -> None:
     def send(kind: str, what: Any) -> None:
         pipe.send_bytes(pickle.dumps((kind, what)))
 
-    with contextlib.suppress(EOFError, BrokenPipeError):  # who started it wants no more
+    with contextlib.suppress(EOFError, ConnectionError):  # who started it wants no more
         try:
             os.chdir(folder)
             torch.set_num_threads(1)
