@@ -80,6 +80,8 @@ def as_range(
         raise ValueError(f"{owner}: {name} must be finite; got {value!r}")
     if low > high:
         raise ValueError(f"{owner}: {name} must be (low, high) with low <= high; got {value!r}")
+    if around == 0 and least > 0 and not isinstance(value, Iterable):
+        raise TypeError(f"{owner}: {name} must be a range (low, high); got {value!r}")
     if low < least or high > most:
         raise ValueError(f"{owner}: {name} must lie within [{least:g}, {most:g}]; got {value!r}")
     return Range(low, high, size)

@@ -241,7 +241,8 @@ class Resize(Edit):
 
     def __init__(self, size: Size, **options: Any):
         super().__init__(**options)
-        self.shorter = None if isinstance(size, Sequence) else as_whole(size, "size", self._name)
+        alone = size[0] if isinstance(size, Sequence) and len(size) == 1 else size  # torchvision's (256,) is 256
+        self.shorter = None if isinstance(alone, Sequence) else as_whole(alone, "size", self._name)
         self.image_size = _as_size(size, self._name) if self.shorter is None else None
         if self.shorter is not None and self.shorter < 1:
             raise ValueError(f"{self._name}: size must be positive; got {size!r}")
@@ -312,6 +313,8 @@ class Rotate90(Edit):
         low, high = (as_whole(end, "times", name) for end in ends)
         if low > high or as_whole(step, "step", name) < 1:
             raise ValueError(f"{name}: times must be (least, most), and step positive; got {times!r} and {step!r}")
+        if low <= -90 or high >= 90:
+            raise ValueError(f"{name}: times counts quarter turns; got {times!r}, which would be degrees: / 90")
         self.times = low, high, step
         super().__init__({"times": Range(0, 1)}, **options)
 
@@ -370,7 +373,8 @@ class HorizontalFlip(_Flip):
         p: how likely.
         landmarks: which landmarks change places: one of `LANDMARKS` ("ibug68", "wflw98", "lapa106", "coco17"), or for
             each landmark the other one's index, or pairs (left, right); for all of keypoints, landmarks and points, or
-            a dict by field. None: all keep their order.
+            a dict by field, which may name what does not move, as the visibility of each, too. None: all keep their
+            order.
         lateral_axis: "x", "y" or "z", of the head's own frame, from one side of the head to the other.
         swap_sides: whether fields named `..._left` and `..._right` change places.
         options: see `Edit`.
@@ -395,7 +399,8 @@ class VerticalFlip(_Flip):
 def _as_size(size: Size, owner: str) -> tuple[int, int]:
     """(height, width), of which one number makes a square."""
     try:
-        made = as_image_size(tuple(size) if isinstance(size, Sequence) else (size, size), owner, "size")
+        sides = tuple(size) if isinstance(size, Sequence) else (size,)
+        made = as_image_size(sides * 2 if len(sides) == 1 else sides, owner, "size")
     except TypeError:
         made = None
     if made is None:

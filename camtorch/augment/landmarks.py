@@ -136,11 +136,16 @@ class Mirroring:
         return self._named, self._one, self.lateral_axis, self.swap_sides
 
     @property
+    def by_name(self) -> tuple[str, ...]:
+        """The fields that tables are given for by name."""
+        return () if self._named is None else tuple(self._named)
+
+    @property
     def lateral(self) -> int:
         """The number of the lateral axis."""
         return "xyz".index(self.lateral_axis)
 
-    def order(self, name: str, kind: str, count: int) -> tuple[int, ...] | None:
+    def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
         """The order of `count` landmarks of a field in a mirror, or None if they keep theirs.
 
         Raises:
@@ -152,19 +157,27 @@ class Mirroring:
         order = table.of(count)
         # 3D points may be others
         if order is None and (kind != "points" or self._named is not None):
+            others = [known for known, its in LANDMARKS.items() if len(its) == count]
             raise ValueError(
                 f"{self.owner}: {name} holds {count} points, the table of landmarks {len(table.order)}. "
-                f"landmarks={{'keypoints': 'ibug68', {name!r}: None}} says it by field"
+                f"landmarks={{{name!r}: {others[0] if others else None!r}}} says it by field"
             )
         return order
 
-    def swapped(self, name: str, kind: str, value: Tensor, mirrored: Tensor, flags: bool = False) -> Tensor:
-        """Landmarks (B, N, ...) with those of mirrored rows, (B,) bool, in their order in a mirror."""
-        if kind not in _HOLD or value.ndim < (2 if flags else 3):
+    def swapped(self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool = False) -> Tensor:
+        """Landmarks (B, N, ...) with those of mirrored rows, (B,) bool, in their order in a mirror.
+
+        Kind None is of what does not move itself and has a table by its name, as the visibility of each landmark.
+        """
+        if kind is None and value.ndim < 2:
+            raise ValueError(f"{self.owner}: {name} has a table of landmarks, and must be (B, N, ...)")
+        if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3):
             return value
         order = self.order(name, kind, value.shape[1])
         if order is None:
             return value
+        if len(mirrored) != len(value):  # of what nobody else has looked at
+            raise ValueError(f"{self.owner}: {name} is of {len(value)} samples, other fields are of {len(mirrored)}")
         other = value.index_select(1, torch.tensor(order, device=value.device))
         return torch.where(_lifted(mirrored, value), other, value)
 

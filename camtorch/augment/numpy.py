@@ -159,7 +159,10 @@ class Transform:
             return {name: valid[None]}, lambda moved, size: moved[0].cpu().numpy()
         kind = kind_of(name, value, self.augmentation.fields, _OWNER)
         if kind is None:
-            return {}, None
+            mirroring = self.augmentation.mirroring
+            if mirroring is None or name not in mirroring.by_name:
+                return {}, None
+            return {name: _tensor(_checked(name, np.asarray(value)))[None]}, lambda moved, size: moved[0].cpu().numpy()
         if kind not in IMAGES:
             value = _checked(name, _numbers(value, kind))
             tensor = _tensor(value)

@@ -160,7 +160,8 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
         return None
     base = name if name in KINDS else _ALIASES.get(name)
     if base is None:
-        base = max((k for k in KINDS if name.startswith(k + "_")), key=len, default=None)
+        begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers know no max by a key
+        base = begins[-1] if begins else None
         if base is not None and not isinstance(value, (Tensor, np.ndarray, list, tuple)):
             return None  # image_path, mask_id
     if base is None and _holds_reals(value):
@@ -218,7 +219,10 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
         most -= 1
     if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
-        raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{_hint(name)}")
+        hint = _hint(name)
+        if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
+            hint = f". Of x, y and visibility, [..., 2] goes in as {name}_valid=..., a flag for each"
+        raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
     if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
         raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
 
@@ -445,8 +449,13 @@ class SampleTransform(nn.Module):
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
         mirroring = cast("Mirroring", self.mirroring)
         mirroring.sides(named)  # that none lacks the other, whatever was drawn
-        for name, (found, value) in named.items():
-            for key, flags in ((name, False), (f"{name}_valid", True)):
+        kept: dict[str, tuple[str | None, Any]] = {}
+        for name in mirroring.by_name:
+            if name in moved and name not in named:
+                moved[name] = self._of_landmarks(moved[name], name)
+                kept[name] = None, moved[name]
+        for name, (found, value) in {**named, **kept}.items():
+            for key, flags in ((name, found is None), (f"{name}_valid", True)):
                 if isinstance(value, list):
                     rows = torch.zeros(len(value), dtype=torch.bool) if mirrored is None else mirrored
                     pairs = zip(moved.get(key, ()), rows, strict=False)
@@ -466,6 +475,16 @@ class SampleTransform(nn.Module):
                 pair = [moved[key].unsqueeze(0) if single else moved[key] for key in (one, other)]
                 for key, new in zip((one, other), exchanged(pair[0], pair[1], rows), strict=True):
                     moved[key] = new.squeeze(0) if single else new
+
+    def _of_landmarks(self, value: Any, name: str) -> Tensor | list[Tensor]:
+        """What a field that does not move says of each landmark, which changes places with it."""
+        several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
+        if not several and not isinstance(value, (Tensor, np.ndarray)):
+            raise TypeError(
+                f"{self._name}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
+                f"{type(value).__name__}"
+            )
+        return [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
