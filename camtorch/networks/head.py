@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import torch
@@ -142,7 +143,8 @@ class CameraHead(GeometryModule):
             raise ValueError(
                 f"{owner}: features must be (*B, {self.linear.in_features}); got shape {tuple(features.shape)}"
             )
-        with torch.autocast(features.device.type, enabled=False):
+        device = features.device.type
+        with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
             return self.camera(self.linear(features.to(self.linear.weight.dtype)))
 
     if TYPE_CHECKING:
@@ -180,7 +182,7 @@ class CameraHead(GeometryModule):
             centre = centre + (moved if len(self._centres) == 2 else _placed(moved, self._centres[0]))
         intrinsics = torch.cat((focal * (-half).exp(), focal * half.exp(), centre), -1).to(dtype)
         lead = numbers.shape[:-1]
-        parts = [intrinsics.reshape(*lead, 4), k.to(dtype).reshape(*lead, -1)][: 2 if len(lens) else 1]
+        parts = [intrinsics.reshape(*lead, 4), k.to(dtype).reshape(*lead, len(lens))][: 2 if len(lens) else 1]
         camera = self.model(*parts, image_size=self.image_size)
         return camera if in_graph(parts[0]) else camera.requires_grad_(False)
 

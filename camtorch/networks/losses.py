@@ -162,9 +162,16 @@ def reprojection(
         seen = torch.isfinite(pixels).all(-1)
         pixels = torch.where(seen.unsqueeze(-1), pixels, 0.0)
     found, valid = predicted.project(points)
+    try:
+        off = found - pixels
+    except RuntimeError:
+        raise ValueError(
+            f"{owner}: pixels {tuple(pixels.shape)} of target and {tuple(found.shape)} of the points do not fit "
+            "together"
+        ) from None
     valid = valid & seen
     # of a point without a pixel the distance has no gradient
-    distance = torch.linalg.vector_norm(found - pixels, dim=-1)
+    distance = torch.linalg.vector_norm(off, dim=-1)
     return _reduced(distance, valid, weights, reduction, owner)
 
 

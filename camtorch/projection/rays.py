@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._tracing import is_concrete
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -68,14 +69,22 @@ def slopes_at_axis(optics: Optics, k: Tensor) -> Tensor:
 
     One where the coefficients make no lens. Graph-free.
     """
-    with torch.inference_mode(False), torch.enable_grad():
-        x, y = (k.new_zeros(len(k), 1).requires_grad_() for _ in range(2))
+
+    def to_sensor(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         chart, lens = optics(columns(k.detach().clone()))
         a, b = chart.to_plane(x, y, torch.ones_like(x), order=1)
-        if lens.stages:
-            a, b = lens(a, b)
-        pairs = ((a, x), (b, y))
-        slopes = torch.cat([torch.autograd.grad(to.sum(), of, retain_graph=True)[0] for to, of in pairs], -1)
+        return lens(a, b) if lens.stages else (a, b)
+
+    if is_concrete(k):
+        with torch.inference_mode(False), torch.enable_grad():
+            x, y = (k.new_zeros(len(k), 1).requires_grad_() for _ in range(2))
+            pairs = zip(to_sensor(x, y), (x, y), strict=True)
+            slopes = torch.cat([torch.autograd.grad(to.sum(), of, retain_graph=True)[0] for to, of in pairs], -1)
+    else:  # a compiler has no gradients, but derivatives ahead
+        zero, one = k.new_zeros(len(k), 1), k.new_ones(len(k), 1)
+        across: Any = torch.func.jvp(to_sensor, (zero, zero), (one, zero))[1]
+        down: Any = torch.func.jvp(to_sensor, (zero, zero), (zero, one))[1]
+        slopes = torch.cat((across[0], down[1]), -1)
     return torch.where(torch.isfinite(slopes) & (slopes > 0), slopes, 1.0)
 
 

@@ -22,6 +22,7 @@ SHRINKS = 1.5
 """From this many pixels of the image to one of the result on, edits antialias by themselves."""
 _MOST = 8  # times that an image is halved
 _PLAIN = (torch.uint8, torch.float32, torch.float64)  # that torch interpolates as they are
+_SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
 _WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
 _NEARLY = 1e-6  # and those of the way back
 
@@ -202,7 +203,9 @@ class AffineWarp(MirrorWarp):
             if b:
                 view = view.mT
             dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
-            view = view.flip(dims) if dims else view
+            if dims:  # torch flips none of those without a sign
+                signed = _SIGNED.get(view.dtype, view.dtype)
+                view = view.view(signed).flip(dims).view(view.dtype)
             # of the first pixel of the view
             left -= (view.shape[-1] - 1) * (a + b < 0)
             top -= (view.shape[-2] - 1) * (c + d < 0)

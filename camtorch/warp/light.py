@@ -12,6 +12,8 @@ from camtorch.camera import Camera
 from camtorch.warp.grid import STEP, interpolated
 from camtorch.warp.warp import as_sized
 
+_CUBIC = 3 / 128  # of the fourth difference of its nodes is what a cubic misses in the middle between them
+_OFF = 1e-4  # of a cosine
 _LEAST = 0.1  # of a cosine: from 84 degrees on the light stays as it is there
 
 
@@ -36,16 +38,29 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
             cosine = torch.where(valid, rays[..., 2], _LEAST)
         cosine = cosine.reshape(-1, 1, height, width).clamp(_LEAST, 1.0)
     power = torch.as_tensor(power, dtype=cosine.dtype, device=cosine.device)
+    if power.ndim > 1 or (power.ndim and len(cosine) > 1 and len(power) not in (1, len(cosine))):
+        raise ValueError(
+            f"vignetting: power must be a number, or one for each of {len(cosine)} cameras; got shape "
+            f"{tuple(power.shape)}"
+        )
     made: Tensor = cosine ** (4 * power.reshape(-1, 1, 1, 1))
     return made
 
 
 def _between_nodes(camera: Camera, height: int, width: int) -> Tensor | None:
-    """(B or 1, 1, H, W): the cosines, by cubics through those of every eighth pixel, if all these have rays."""
+    """(B or 1, 1, H, W): the cosines, by cubics through those of every eighth pixel, if all these have rays.
+
+    None as well where the images are so small for their field of view that cubics would miss by more than 0.0001.
+    """
+    if min(height, width) <= 2 * STEP:
+        return None
     v, u = (torch.arange(math.ceil(side / STEP) + 3).to(camera.intrinsics) * STEP - STEP for side in (height, width))
     nodes = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
     rays, valid = camera.unproject(nodes.expand(*camera.batch_shape, *nodes.shape))
     if not bool(valid.all()):
         return None
     planes = rays[..., 2].reshape(-1, 1, *nodes.shape[:2])
+    fourth = max(float(planes.diff(n=4, dim=dim).abs().max()) for dim in (-1, -2))
+    if fourth * _CUBIC > _OFF:
+        return None
     return interpolated(planes, len(v) - 3, len(u) - 3)[:, :, :height, :width]

@@ -1,0 +1,114 @@
+"""What people try first of edits, heads, losses and shutters: it works, or an error says what to do."""
+
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+import camtorch.augment.numpy
+from camtorch.augment.landmarks import LANDMARKS
+
+A = ct.augment
+SIZE = (48, 64)
+LENS = ct.KannalaBrandt.from_fov(120, image_size=SIZE).requires_grad_(False)
+COCO = list(LANDMARKS["coco17"])
+TABLES = {"keypoints": "coco17", "visibility": "coco17"}
+
+
+def test_sizes_of_one_number_in_a_list_are_torchvisions():
+    image = torch.rand(3, *SIZE)
+    assert A.Resize([24])(image=image)["image"].shape == A.Resize(24)(image=image)["image"].shape == (3, 24, 32)
+    assert A.CenterCrop((24,))(image=image)["image"].shape == (3, 24, 24)
+    with pytest.raises(TypeError, match="size must be whole numbers"):
+        A.Resize([])
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "says"),
+    [
+        (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90, which would be degrees"),
+        (lambda: A.Rotate90((-90, 90)), ValueError, "degrees"),
+        (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
+        (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples=2.5), TypeError, "samples must be a whole number"),
+        (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples="8"), TypeError, "samples must be a whole number"),
+        (lambda: ct.vignetting(ct.Mixed([LENS, LENS]), torch.ones(3)), ValueError, "one for each of 2 cameras"),
+        (
+            lambda: ct.losses.reprojection(LENS, torch.rand(8, 2), torch.rand(9, 3)),
+            ValueError,
+            r"pixels \(8, 2\) of target and \(9, 2\)",
+        ),
+        (
+            lambda: A.HorizontalFlip(1.0)(image=torch.rand(3, *SIZE), keypoints=torch.rand(17, 3)),
+            ValueError,
+            r"\[..., 2\] goes in as keypoints_valid",
+        ),
+        (
+            lambda: A.HorizontalFlip(landmarks="coco17")(image=torch.rand(3, *SIZE), keypoints=torch.rand(68, 2)),
+            ValueError,
+            r"landmarks=\{'keypoints': 'ibug68'\}",
+        ),
+    ],
+)
+def test_errors_say_what_to_do(make, error, says):
+    with pytest.raises(error, match=says):
+        make()
+
+
+def test_what_is_told_of_each_landmark_changes_places_with_it():
+    flip = A.HorizontalFlip(1.0, landmarks=TABLES)
+    image, keypoints, flags = torch.rand(2, 3, *SIZE), torch.rand(2, 17, 2) * 40, torch.arange(34).view(2, 17)
+    swapped = flags[:, COCO]
+    assert torch.equal(flip(image=image, keypoints=keypoints, visibility=flags)["visibility"], swapped)
+    lists = flip(image=image, keypoints=list(keypoints), visibility=list(flags))["visibility"]
+    assert torch.equal(torch.stack(lists), swapped)
+    one = flip(image=image[0], keypoints=keypoints[0], visibility=flags[0])
+    assert torch.equal(one["visibility"], swapped[0])
+    arrays = camtorch.augment.numpy.Transform(flip)(
+        image=np.zeros((*SIZE, 3), np.uint8), keypoints=keypoints[0].numpy(), visibility=flags[0].numpy()
+    )
+    np.testing.assert_array_equal(arrays["visibility"], swapped[0].numpy())
+    still = A.HorizontalFlip(0.0, landmarks=TABLES)(image=image, keypoints=keypoints, visibility=flags)
+    assert torch.equal(still["visibility"], flags)
+    for wrong, error in ((flags[0], "must be"), (flags[:1], "is of 1 samples")):
+        with pytest.raises(ValueError, match=error):
+            flip(image=image, keypoints=keypoints, visibility=wrong)
+    with pytest.raises(TypeError, match="visibility has a table"):
+        flip(image=image[0], keypoints=keypoints[0], visibility=[2] * 17)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.uint32, torch.uint64])
+def test_all_whole_numbers_are_mirrored(dtype):
+    image = torch.arange(12).view(1, 1, 3, 4) * 4000
+    assert torch.equal(A.HorizontalFlip(1.0)(image=image.to(dtype))["image"].long(), image.flip(-1))
+
+
+@pytest.mark.parametrize("model", ["pinhole", "kannala_brandt"])
+def test_heads_of_no_features_and_on_the_meta_device(model):
+    head = ct.CameraHead(8, model, image_size=SIZE)
+    assert head(torch.randn(0, 8)).batch_shape == (0,)
+    assert head.to("meta")(torch.randn(2, 8, device="meta")).batch_shape == (2,)
+
+
+@pytest.mark.parametrize("size", [SIZE, (5, 9)])
+def test_vignetting_of_small_images(size):
+    camera = ct.Pinhole.from_fov(80, image_size=size).requires_grad_(False)
+    exact = camera.rays()[0][..., 2] ** 4
+    assert (ct.vignetting(camera)[0, 0] - exact).abs().max() < 1e-3
+
+
+@pytest.mark.slow
+def test_depth_of_canonical_cameras_is_compiled():
+    canonical = ct.CanonicalCamera(100)
+    camera = ct.WoodScape.from_fov(90, image_size=SIZE).requires_grad_(False)
+    depth = torch.ones(2, 1, *SIZE)
+    step = torch.compile(lambda d: canonical(depth=d, camera=camera)["depth"], backend="eager", fullgraph=True)
+    torch.testing.assert_close(step(depth), canonical(depth=depth, camera=camera)["depth"])
+
+
+@pytest.mark.slow
+def test_fields_with_longer_names_are_compiled():
+    flip = A.HorizontalFlip(1.0, camera=LENS)
+    fields = {"gaze_left": torch.randn(2, 3), "gaze_right": torch.randn(2, 3)}
+    draw = flip.draw(2)
+    step = torch.compile(lambda f: flip(**f, draw=draw)["gaze_left"], backend="eager", fullgraph=True)
+    torch.testing.assert_close(step(fields), flip(**fields, draw=draw)["gaze_left"])
