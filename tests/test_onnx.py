@@ -191,6 +191,7 @@ def test_a_camera_is_made_of_inputs(key):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:# The axis name")  # of one batch dim, which torch names once
 def test_a_batch_of_cameras_of_any_size():
     values = torch.tensor([[60.0, 60, 64, 48], [70, 72, 60, 50], [90, 90, 62, 47]])
     k = torch.tensor([[0.02, -0.01, 0.003, -0.001], [0.1, 0.0, 0.0, 0.0], [-0.05, 0.01, 0.0, 0.0]])
