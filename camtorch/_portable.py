@@ -19,6 +19,9 @@ def for_elsewhere() -> bool:
     return is_exporting() and not torch.compiler.is_dynamo_compiling()
 
 
+_MOST_BITS = 100
+"""ONNX gets numbers of float64 programs by way of float32, and beyond its range as 0 or as infinite."""
+
 # the optimiser of ONNX programs leaves out terms that are nearly 0 and factors that are nearly 1, to 1e-8 and 1e-5
 
 
@@ -26,8 +29,14 @@ def plus(a: Tensor, least: float) -> Tensor:
     """The sum of a tensor and of a number that is nearly nothing, and yet is to be there."""
     if not is_exporting():
         return a + least
-    scale = 2.0 ** -math.floor(math.log2(abs(least)))  # powers of two cost no bit
-    return (a * scale + least * scale) * (1 / scale)
+    bits = -math.floor(math.log2(abs(least)))
+    steps = [_MOST_BITS] * (bits // _MOST_BITS) + [bits % _MOST_BITS]
+    for step in steps:  # powers of two cost no bit
+        a = a * 2.0**step
+    a = a + least * 2.0**bits
+    for step in steps:
+        a = a * 2.0**-step
+    return a
 
 
 def times(a: Tensor, nearly_one: float) -> Tensor:
