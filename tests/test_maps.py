@@ -9,8 +9,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
+import tifffile
 import torch
 
 import camtorch as ct
@@ -536,6 +538,41 @@ def test_maps_of_opencv_that_others_wrote_are_read(tmp_path):
     np.savez(tmp_path / "d.npz", K=np.eye(3))
     with pytest.raises(ct.CameraFileError, match="no map of that name; it has K"):
         ct.load_map(tmp_path / "d.npz", source_size=(200, 320))
+
+
+def test_matrices_of_integers_hold_integers(tmp_path):
+    text = '%YAML:1.0\n---\nmap1: !!opencv-matrix\n   rows: 1\n   cols: 2\n   dt: "2s"\n   data: [ 1, 2, 3, {} ]\n'
+    path = tmp_path / "map.yml"
+    path.write_text(text.format(-4))
+    assert ct.load_map(path, source_size=(9, 9)).positions.tolist() == [[[1, 2], [3, -4]]]
+    for value in ("1e30", "40000", "0.5", ".Nan"):
+        path.write_text(text.format(value))
+        with pytest.raises(ct.CameraFileError, match="not whole numbers of that type"):
+            ct.load_map(path, source_size=(9, 9))
+
+
+def test_stmaps_may_hold_plane_after_plane_and_any_text(tmp_path):
+    u, v = np.meshgrid((np.arange(30) + 0.5) / 30, (np.arange(20) + 0.5) / 20)
+    planes = np.stack((u, v, 0 * u)).astype(np.float32)
+    path = tmp_path / "map.tif"
+    tifffile.imwrite(path, planes, photometric="rgb", planarconfig="separate", description="[" * 100_000, metadata=None)
+    read = ct.load_map(path, v="down", source_size=(20, 30))
+    assert read.target_size == (20, 30)
+    assert read.positions[3, 4].tolist() == pytest.approx([4, 3], abs=1e-4)
+
+
+def test_models_of_images_of_any_size_are_read_if_somebody_says_the_size(tmp_path):
+    path = tmp_path / "map.onnx"
+    small().save(path)
+    model = onnx.load(path)
+    for axis in (2, 3):
+        model.graph.input[0].type.tensor_type.shape.dim[axis].dim_param = "any"
+    onnx.save(model, path)
+    assert float(ct.load_map(path, source_size=(200, 320)).error(small()).max()) < 1e-3
+    with pytest.raises(ct.CameraFileError, match="say source_size="):
+        ct.load_map(path)
+    with pytest.raises(ValueError, match=r"models of ONNX are called \.onnx"):  # as load_map would not find it
+        small().save(tmp_path / "map.bin", "onnx")
 
 
 def test_bare_tables_are_read_without_their_description_if_somebody_says_the_sizes(tmp_path):

@@ -166,6 +166,8 @@ def _from_words(data: bytes, dtype: np.dtype) -> np.ndarray:
             values = np.fromstring(text, np.float64, sep=" ")
         except DeprecationWarning as error:
             raise ValueError(str(error)) from None
-    if dtype.kind != "f" and not np.isfinite(values).all():
-        raise ValueError("not whole numbers")
+    if dtype.kind != "f":
+        limits = np.iinfo(dtype)
+        if not ((values >= limits.min) & (values <= limits.max) & (values == np.rint(values))).all():
+            raise ValueError("not whole numbers of that type")
     return values.astype(dtype)

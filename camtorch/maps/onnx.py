@@ -33,7 +33,9 @@ class ONNX:
     described = False
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
-        """Raises ValueError: an antialiased warp, a bicubic one with an edge that runtimes make in different ways."""
+        """Raises ValueError: an antialiased warp, a bicubic one with an edge that runtimes differ in; a suffix."""
+        if not path.lower().endswith(self.suffixes):
+            raise ValueError(f"{path}: models of ONNX are called {self.suffixes[0]}")
         warp, dtype = exact.warp, options.dtype or "float32"
         if dtype not in _DTYPES:
             raise ValueError(f"Warp.save: dtype must be one of {_DTYPES}; got {dtype!r}")
@@ -48,7 +50,7 @@ class ONNX:
         return Encoded(model.SerializeToString(), {"dtype": dtype, "opset": _OPSET})
 
     def matches(self, path: str, content: bytes) -> bool:
-        return path.lower().endswith(".onnx")
+        return path.lower().endswith(self.suffixes)
 
     def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
         """Raises CameraFileError: no model of one GridSample with a constant grid."""
@@ -72,7 +74,7 @@ class ONNX:
             kind = onnx.helper.tensor_dtype_to_np_dtype(images.elem_type).name
         except Exception as error:  # whatever protobuf raises
             raise CameraFileError(path, "content", f"no ONNX model of a warp: {error}") from None
-        size = checked(path, "source_size", sides)
+        size = checked(path, "source_size", sides if all(sides) else given.source_size)
         positions = ((grid[0] + 1) * (size[1], size[0]) - 1) / 2
         positions[(grid[0] == _OUTSIDE).all(-1) | ~np.isfinite(positions).all(-1)] = np.nan
         return LookupMap(torch.from_numpy(positions), size, self.name, {"dtype": kind})

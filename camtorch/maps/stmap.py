@@ -111,6 +111,8 @@ def _from_exr(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
             if pixels * len(header["channels"]) > _MOST_CHANNELS * MOST_PIXELS:
                 raise ValueError(f"{len(header['channels'])} channels of {pixels} pixels")
             with openexr.File(file, separate_channels=True) as image:
+                if not image.parts:
+                    raise ValueError("cut off, or its pixels are damaged")
                 channels = image.parts[0].channels
                 planes = [np.array(channels[name].pixels) for name in "RG"]
             found = {key: header[_PREFIX + key] for key in _KEYS if _PREFIX + key in header}
@@ -137,12 +139,14 @@ def _from_tiff(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
             if len(page.shape) != 3 or np.prod(page.shape, dtype=object) > _MOST_CHANNELS * MOST_PIXELS:
                 raise ValueError(f"{page.dtype} of shape {page.shape}")
             pixels, text = page.asarray(), page.description
+            if page.axes.startswith("S"):  # planes one after the other
+                pixels = np.moveaxis(pixels, 0, -1)
             if pixels.ndim != 3 or pixels.shape[2] < 2 or not pixels.size or pixels.dtype.kind != "f":
                 raise ValueError(f"{pixels.dtype} of shape {pixels.shape}")
     except Exception as error:  # whatever a damaged file makes of its tags
         raise CameraFileError(path, "content", f"no TIFF of float with red and green: {error}") from None
     try:
         stated = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         stated = None
     return pixels, stated if isinstance(stated, dict) else {}
