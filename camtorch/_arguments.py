@@ -130,6 +130,20 @@ def as_whole(value: Any, name: str, owner: str) -> int:
         raise TypeError(f"{owner}: {name} must be a whole number; got {value!r}") from None
 
 
+def as_number(value: Any, name: str, owner: str) -> float:
+    """A number, NaN and infinity among them.
+
+    Raises:
+        TypeError: it is none.
+    """
+    try:
+        if isinstance(value, str):
+            raise TypeError
+        return float(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{owner}: {name} must be a number; got {value!r:.60}") from None
+
+
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     """The shape that all shapes broadcast to. torch.broadcast_shapes imports sympy, for a third of a second.
 

@@ -315,7 +315,7 @@ def _as_order(order: Sequence[int], count: int) -> list[int]:
 
 def _checked(members: list[Camera]) -> list[Camera]:
     if not any(map(_count, members)):
-        raise ValueError("Mixed: an empty list of cameras")
+        raise ValueError("Mixed: an empty list of cameras; it must hold at least one")
     for i, camera in enumerate(members):
         if len(camera.batch_shape) > 1:
             shape = tuple(camera.batch_shape)

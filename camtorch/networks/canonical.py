@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size
+from camtorch._arguments import as_image_size, as_number
 from camtorch._threads import as_cores_are_free
 from camtorch.augment.change import Change, Part, alone, by_kinds, copied, edited, size_of
 from camtorch.augment.sample import Named, Sample, SampleTransform, without_graph_in_workers
@@ -76,13 +76,14 @@ class CanonicalCamera(SampleTransform):
         valid_mask: bool = False,
     ):
         super().__init__(camera, fields, mask_fill, valid_mask)
+        focal = as_number(focal, "focal", self._name)
         if not 0 < focal < math.inf:
             raise ValueError(f"{self._name}: focal must be positive pixels; got {focal!r}")
         if scales not in ("depth", "image"):
             raise ValueError(f'{self._name}: scales must be "depth" or "image"; got {scales!r}')
         if image_size is not None and scales == "depth":
             raise ValueError(f"{self._name}: images keep their size where depth is scaled; got image_size={image_size}")
-        self.focal, self.scales = float(focal), scales
+        self.focal, self.scales = focal, scales
         self.image_size = as_image_size(image_size, self._name)
         self.options = as_options(self._name, mode, padding_mode, fill, bool(antialias), tolerance)
         self.antialias = antialias

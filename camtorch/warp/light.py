@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from camtorch._arguments import as_values
 from camtorch._tracing import may_look
 from camtorch.camera import Camera
 from camtorch.warp.grid import STEP, interpolated
@@ -29,6 +30,9 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
             rim evenly, as fisheyes are, have less than 1.
 
     The angle is that of the lens, not that of a pinhole. Derivatives go to `power` alone.
+
+    Raises:
+        ValueError: a camera without image_size, powers of another number than cameras. TypeError: powers that are none.
     """
     height, width = as_sized(camera, "camera", "vignetting")._size("vignetting")
     with torch.no_grad():
@@ -37,7 +41,9 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
             rays, valid = camera.rays()
             cosine = torch.where(valid, rays[..., 2], _LEAST)
         cosine = cosine.reshape(-1, 1, height, width).clamp(_LEAST, 1.0)
-    power = torch.as_tensor(power, dtype=cosine.dtype, device=cosine.device)
+    if isinstance(power, (int, float)):
+        power = cosine.new_tensor(power)
+    power = as_values(power, "power", "vignetting").to(cosine)
     if power.ndim > 1 or (power.ndim and len(cosine) > 1 and len(power) not in (1, len(cosine))):
         raise ValueError(
             f"vignetting: power must be a number, or one for each of {len(cosine)} cameras; got shape "

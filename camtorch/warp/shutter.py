@@ -10,7 +10,17 @@ from typing import Any, Literal, TypedDict, cast, get_args
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_batch, as_points, as_real, as_values, as_vectors, as_whole, broadcast_shapes
+from camtorch._arguments import (
+    Numbers,
+    as_batch,
+    as_number,
+    as_points,
+    as_real,
+    as_values,
+    as_vectors,
+    as_whole,
+    broadcast_shapes,
+)
 from camtorch._module import GeometryModule
 from camtorch._tracing import in_graph, in_transform, is_concrete, keeps_graph
 from camtorch.camera import Camera
@@ -90,7 +100,7 @@ class RollingShutter(GeometryModule):
             )
         if is_concrete(times["exposure"]) and not bool((times["exposure"].detach() >= 0).all()):
             raise ValueError(f"{owner}: exposure must not be negative; got {times['exposure'].tolist()}")
-        samples = as_whole(samples, "samples", owner)
+        samples, gamma = as_whole(samples, "samples", owner), as_number(gamma, "gamma", owner)
         if samples < 1 or not (math.isfinite(gamma) and gamma > 0):
             raise ValueError(f"{owner}: samples and gamma must be positive; got {samples!r} and {gamma!r}")
         shapes = {name: (*value.shape, 1) for name, value in times.items()}
@@ -102,7 +112,7 @@ class RollingShutter(GeometryModule):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, value if in_graph(value) else value.detach().clone())
-        self.direction, self.samples, self.gamma = direction, samples, float(gamma)
+        self.direction, self.samples, self.gamma = direction, samples, gamma
         self._moment: float | None = None
         self._blurs = not is_concrete(self.exposure) or bool((self.exposure.detach() > 0).any())
 
