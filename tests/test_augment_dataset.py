@@ -280,11 +280,13 @@ def test_labels_in_files_of_their_own(folder, capsys):
     assert set(files("again")) == set(files("new"))
     Path("images/2.json").unlink()
     Path("images/0.json").write_text("{")
+    Path("images/b/1.json").write_text('{"score": NaN}')
     augment("-o", "broken", start=words, expect=1)
     told = capsys.readouterr()
     assert "images/2.json: No such file or directory" in told.err
     assert "error: images/0.jpg: images/0.json: no JSON" in told.err
-    assert "broken: 1 of 3 files made; 2 failed" in told.out
+    assert "error: images/b/1.png: its labels hold NaN or infinity" in told.err
+    assert "broken: 0 of 3 files made; 3 failed" in told.out
 
 
 def test_wrong_words_and_files_are_told(folder, capsys):

@@ -367,6 +367,7 @@ def test_wrong_samples_are_told():
         ({"left.png": sample["jpg"]}, "whether left.png moves is not known; fields={'left.png': KIND}"),
         ({"png": sample["jpg"]}, "png and jpg both hold image"),
         ({"json": {"keypoints": [[1, 2], [3]]}}, "keypoints must be numbers in lists of one length"),
+        ({"json": {"keypoints": [[10**400, 2]]}}, "keypoints must be numbers in lists of one length"),
         ({"json": {"scores": [0.5]}}, "'scores' holds real numbers"),
         ({"json": {"camera": {"model": "pinhole"}}}, "the camera has no intrinsics"),
     ):

@@ -68,6 +68,14 @@ def test_a_folder_is_dewarped_as_its_images_one_by_one(folder, capsys):
     assert opened("out/deep/er/3.tif").mode == "I;16"
 
 
+def test_nobody_hears_of_it(folder, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stderr", None)
+    command(*WORDS, "--jobs", 1)
+    assert len(outputs()) == 5
+    assert sys.stderr is None
+    assert capsys.readouterr().out.startswith("out: 5 of 5 files made")
+
+
 def test_what_there_is_already(folder, capsys):
     assert refused(capsys, *WORDS[:-1], "new.png").endswith("-o OUT/ names a folder\n")
     command(*WORDS, "--dry-run")

@@ -168,5 +168,9 @@ def _read(path: Path) -> Json:
 
 
 def _write(path: Path, labels: Json) -> None:
+    try:
+        text = json.dumps(labels, allow_nan=False)
+    except ValueError:
+        raise ValueError("its labels hold NaN or infinity, which are no JSON; null is, or leave them out") from None
     with replacing(path, synced=False) as (file,):
-        file.write(json.dumps(labels, allow_nan=False).encode() + b"\n")
+        file.write(text.encode() + b"\n")

@@ -48,6 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status: 0; 1 where some of many files failed; 2 after an error, which is one line on stderr; 130 after
         an interrupt; 141 where nobody reads what is printed.
     """
+    if sys.stderr is None:  # closed by whoever called
+        with open(os.devnull, "w") as nobody, contextlib.redirect_stderr(nobody):
+            return main(argv)
     try:
         arguments = _parser().parse_args(argv)
         arguments.prepare(arguments)

@@ -152,7 +152,7 @@ def _array(name: str, value: list[Any], kind: str | None) -> np.ndarray[Any, Any
     """A label as an array: of float64, or of bool for validity."""
     try:
         array = np.asarray(value, bool if kind is None else np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise ValueError(f"{_OWNER}: {name} must be numbers in lists of one length; got {value!r:.80}") from None
     if array.size or kind is None:
         return array
