@@ -32,6 +32,7 @@ def test_sizes_of_one_number_in_a_list_are_torchvisions():
         (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples=2.5), TypeError, "samples must be a whole number"),
         (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples="8"), TypeError, "samples must be a whole number"),
         (lambda: ct.vignetting(ct.Mixed([LENS, LENS]), torch.ones(3)), ValueError, "one for each of 2 cameras"),
+        (lambda: LENS.rays(stride=64), ValueError, r"larger than images of \(48, 64\).*: .resize\(64, 64\), or"),
         (
             lambda: ct.losses.reprojection(LENS, torch.rand(8, 2), torch.rand(9, 3)),
             ValueError,

@@ -34,6 +34,12 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
             [side // step * step for side in sides] for sides in (size, (height + step - 1, width + step - 1))
         )
         pads = more[1] - width, more[0] - height
+        if not all(fewer):
+            raise ValueError(
+                f"{owner}: patches of stride {step} are larger than images of {size} (height, width). What is done to "
+                f"the image first is done to the camera: .resize({more[0]}, {more[1]}), or "
+                f".pad(0, {pads[0]}, 0, {pads[1]}) where it is padded at the right and at the bottom"
+            )
         raise ValueError(
             f"{owner}: patches of stride {step} do not fill images of {size} (height, width). What is done to the "
             f"image first is done to the camera: .crop(0, 0, {fewer[0]}, {fewer[1]}) where a convolution drops the "
