@@ -10,7 +10,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 import camtorch as ct
 
 every_model = pytest.mark.parametrize("key", KEYS)
-QUICK = ("pinhole", "kannala_brandt", "fisheye624")
+QUICK = ("pinhole", "fisheye624")
 some_models = pytest.mark.parametrize(
     "key", [key if key in QUICK else pytest.param(key, marks=pytest.mark.slow) for key in KEYS]
 )

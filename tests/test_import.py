@@ -92,9 +92,8 @@ def test_a_pickled_camera_needs_no_import(tmp_path):
     assert python(code, str(tmp_path / "camera.pickle")) == "Pinhole(fx=1, fy=2, cx=3, cy=4)\n"
 
 
-@pytest.mark.parametrize(
-    "imports", ["import camtorch\nimport torch", pytest.param("import torch\nimport camtorch", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("imports", ["import camtorch\nimport torch", "import torch\nimport camtorch"])
 def test_exported_programs_load(tmp_path, imports):
     camera = ct.KannalaBrandt([300.0, 300, 320, 240], [0.02, -0.01, 0.003, -0.001]).requires_grad_(False)
 

@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, RARE_ARE_SLOW, constants, fan, make, one, pixel_lattice, spread
+from cameras import DISTINCT, KEYS, constants, fan, make, one, pixel_lattice, slow_unless, spread
 from torch import nn
 from torch.func import functional_call, jacfwd, jacrev, vmap
 
@@ -46,10 +46,11 @@ def parameters_of(module):
 # -- compile, export, transforms
 
 
-distinct_models = pytest.mark.parametrize("key", RARE_ARE_SLOW)
+# tracing takes seconds: one lens that is radial, and one that is not
+few_models = pytest.mark.parametrize("key", slow_unless({"kannala_brandt", "fisheye624"}.__contains__, KEYS))
 
 
-@distinct_models
+@few_models
 @both_directions
 def test_compile_without_graph_breaks(key, method):
     module, values = module_and_input(key, method)
@@ -72,7 +73,7 @@ def test_compile_to_machine_code():
     assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
 
 
-@distinct_models
+@pytest.mark.parametrize("key", slow_unless("kannala_brandt".__eq__, KEYS))
 @both_directions
 def test_export(key, method):
     module, values = module_and_input(key, method)
