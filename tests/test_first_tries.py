@@ -28,6 +28,8 @@ def test_sizes_of_one_number_in_a_list_are_torchvisions():
     [
         (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90, which would be degrees"),
         (lambda: A.Rotate90((-90, 90)), ValueError, "degrees"),
+        (lambda: A.RandomLens("kannala_brandt", fov=(1.0, 2.0)), ValueError, "seems to be radians"),
+        (lambda: A.RandomCamera("real", fov=(1.0, 2.0)), ValueError, "seems to be radians"),
         (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
         (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples=2.5), TypeError, "samples must be a whole number"),
         (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples="8"), TypeError, "samples must be a whole number"),

@@ -154,6 +154,10 @@ class RandomCamera(Augmentation):
             "exposure": (_pair(exposure), {"least": 0, "most": 1}),
         }
         self.ranges = {n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None}
+        if "fov" in self.ranges and self.ranges["fov"].high <= 2 * math.pi:
+            raise ValueError(
+                f"{self._name}: fov is in degrees; {fov!r} seems to be radians, which math.degrees() converts"
+            )
         if ("rates" in self.ranges) != bool({"readout", "exposure"} & set(self.ranges)):
             raise ValueError(
                 f"{self._name}: rates, in degrees per second, show by a readout or an exposure, in seconds, and those "
