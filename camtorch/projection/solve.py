@@ -65,8 +65,8 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tu
         return found
     assert domain.staged is not None  # as above
     staged = domain.staged[camera, 0]
-    a, b, there = (torch.where(staged, *pair) for pair in zip(by_stages, found, strict=True))
-    return a, b, there
+    a, b = (torch.where(staged, *pair) for pair in zip(by_stages[:2], found[:2], strict=True))
+    return a, b, (staged & by_stages[2]) | (~staged & found[2])  # ONNX Runtime selects no bool
 
 
 def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
