@@ -763,7 +763,7 @@ class Camera(BatchedModule):
         return self._edited(matrix, (width, height) if turns % 2 else (height, width))
 
     def _edited(self, matrix: Sequence[Sequence[float]], size: tuple[int, int]) -> Self:
-        intrinsics, distortion = self._edited_numbers(self.intrinsics.new_tensor(matrix))
+        intrinsics, distortion = self._edited_numbers(self.intrinsics.new_tensor(matrix), turns=matrix[0][1] != 0)
         edited = self.with_tensors(intrinsics=intrinsics, distortion=distortion)
         edited.image_size = as_image_size(size, type(self).__name__)
         for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
@@ -771,12 +771,13 @@ class Camera(BatchedModule):
                 its.requires_grad = False
         return edited
 
-    def _edited_numbers(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
+    def _edited_numbers(self, matrix: Tensor, turns: bool | None = None) -> tuple[Tensor, Tensor]:
         """Intrinsics (*B, 4) and distortion (*B, n) of the camera of an edited image.
 
         Args:
             matrix: (*B, 2, 3), from pixels (u, v, 1) to those of the edited image: a quarter turn clockwise or none,
                 flips, scales, and a shift.
+            turns: whether it is a quarter turn, where that is known without a look at values.
 
         Raises:
             ValueError: a quarter turn of a model that is not the same on its side.
@@ -789,12 +790,14 @@ class Camera(BatchedModule):
             *(a * cx + b * cy + left, c * cx + d * cy + top),
         )
         intrinsics = torch.stack(torch.broadcast_tensors(*numbers), -1).to(self.intrinsics.dtype)
-        return intrinsics, self._edited_distortion(a - b, c + d, b != 0)
+        if turns is None:
+            turns = not is_concrete(b) or bool((b != 0).any())
+        return intrinsics, self._edited_distortion(a - b, c + d, b != 0 if turns else None)
 
-    def _edited_distortion(self, across: Tensor, down: Tensor, on_side: Tensor) -> Tensor:
+    def _edited_distortion(self, across: Tensor, down: Tensor, on_side: Tensor | None) -> Tensor:
         """Coefficients after a quarter turn clockwise where it is on its side, (*B,) bool, and flips by signs (*B,)."""
         k, names = self.distortion, self.distortion_names
-        if not is_concrete(on_side) or bool(on_side.any()):
+        if on_side is not None:
             k = torch.where(on_side.unsqueeze(-1), self._on_side(), k)
         for sign, odd in ((across, self.odd_in_x), (down, self.odd_in_y)):
             if not odd.isdisjoint(names):
