@@ -195,8 +195,12 @@ def test_a_camera_is_a_constant(key):
         assert_agrees(camera, run(*few), *few)
 
 
+# to export what finds the folds of these takes minutes
+DEAR = {"brown_conrady", "fisheye62", "fisheye624", "mei", "ocamcalib", "thin_prism_fisheye"}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("key", [key for key in KEYS if key not in DEAR])
 def test_a_camera_is_made_of_inputs(key):
     camera = one(key).float().requires_grad_(False)
     points, pixels = inputs_of(camera)
@@ -324,6 +328,6 @@ def test_a_saved_program_runs_without_camtorch(key, is_own, tmp_path):
 def test_the_guide_has_a_line_for_every_model():
     guide = (Path(__file__).parents[1] / "docs/guides/deploy.md").read_text()
     rows = [line.split("|")[1:-1] for line in guide.splitlines() if line.startswith("| `")]
-    assert sorted(name.strip(" `") for name, *_ in rows) == sorted(cls.__name__ for cls in ct.MODELS.values())
+    said = {name.strip(" `"): tuple(cell.strip() for cell in cells) for name, *cells in rows}
     # as the tests above have it
-    assert {cell.strip() for _, *cells in rows for cell in cells} == {"yes"}
+    assert said == {cls.__name__: ("yes", "not tested" if key in DEAR else "yes") for key, cls in ct.MODELS.items()}
