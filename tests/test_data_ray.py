@@ -30,7 +30,7 @@ def cluster():
         # workers find this file
         environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}
         ray.init(
-            num_cpus=2,
+            num_cpus=4,  # two workers, and what feeds them
             include_dashboard=False,
             log_to_driver=False,
             configure_logging=False,
@@ -94,7 +94,7 @@ class Where:
 
     def __call__(self, batch):
         (self.folder / str(os.getpid())).touch()
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 120
         while len(list(self.folder.iterdir())) < 2 and time.monotonic() < deadline:
             time.sleep(0.01)
         return batch | {"process": np.full(len(batch["path"]), os.getpid())}

@@ -197,10 +197,14 @@ def test_a_camera_is_a_constant(key):
 
 # to export what finds the folds of these takes minutes
 DEAR = {"brown_conrady", "fisheye62", "fisheye624", "mei", "ocamcalib", "thin_prism_fisheye"}
+USUAL = {"pinhole", "kannala_brandt", "double_sphere"}
+ON_DEMAND = pytest.mark.skipif(not os.environ.get("CAMTORCH_ONNX"), reason="takes minutes; CAMTORCH_ONNX=1 runs it")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", [key for key in KEYS if key not in DEAR])
+@pytest.mark.parametrize(
+    "key", [key if key in USUAL else pytest.param(key, marks=ON_DEMAND) for key in KEYS if key not in DEAR]
+)
 def test_a_camera_is_made_of_inputs(key):
     camera = one(key).float().requires_grad_(False)
     points, pixels = inputs_of(camera)
