@@ -753,14 +753,8 @@ class Camera(BatchedModule):
         Raises:
             ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
         """
-        (height, width), turns = self._size("rot90"), as_whole(k, "k", "rot90") % 4
-        matrix = (
-            ((1, 0, 0), (0, 1, 0)),
-            ((0, 1, 0), (-1, 0, width - 1)),
-            ((-1, 0, width - 1), (0, -1, height - 1)),
-            ((0, -1, height - 1), (1, 0, 0)),
-        )[turns]
-        return self._edited(matrix, (width, height) if turns % 2 else (height, width))
+        size, turns = self._size("rot90"), as_whole(k, "k", "rot90") % 4
+        return self._edited(quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
 
     def _edited(self, matrix: Sequence[Sequence[float]], size: tuple[int, int]) -> Self:
         intrinsics, distortion = self._edited_numbers(self.intrinsics.new_tensor(matrix), turns=matrix[0][1] != 0)
@@ -966,6 +960,17 @@ def _is_plain(inputs: Sequence[Tensor]) -> bool:
 def _is_given(values: Tensor) -> bool:
     """Whether the values may be looked at, and bad ones are refused."""
     return is_concrete(values) and not is_predicted(values)
+
+
+def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, int], tuple[int, int, int]], ...]:
+    """From pixels (u, v, 1) to those of the image turned counterclockwise by 0, 1, 2 and 3 quarters: (2, 3) each."""
+    bottom, right = (side - 1 for side in image_size)
+    return (
+        ((1, 0, 0), (0, 1, 0)),
+        ((0, 1, 0), (-1, 0, right)),
+        ((-1, 0, right), (0, -1, bottom)),
+        ((0, -1, bottom), (1, 0, 0)),
+    )
 
 
 def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:

@@ -62,8 +62,7 @@ def _rows_of_warp(warp: Warp, camera: Camera, index: Tensor) -> Warp:
         return AffineWarp(camera, target, matrix, rotation, **warp.options)
     first, last = warp.shutter, warp.target_shutter
     shutters: Shutters = {"shutter": first and first.rows_of(index), "target_shutter": last and last.rows_of(index)}
-    kind_of_warp = MirrorWarp if isinstance(warp, MirrorWarp) else Warp
-    return kind_of_warp(camera, target, rotation, **warp.options, **shutters)
+    return warp.between(camera, target, rotation, **warp.options, **shutters)
 
 
 def _joined(a: Part, b: Part) -> Part:

@@ -15,7 +15,7 @@ from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import Change, Part, by_kinds, edited, size_of
 from camtorch.augment.landmarks import Mirroring, TableLike
-from camtorch.camera import Camera
+from camtorch.camera import Camera, quarter_turns
 from camtorch.warp.affine import AffineWarp, after, on_rays
 
 Size = int | Sequence[int]
@@ -327,15 +327,7 @@ class Rotate90(Edit):
         (low, high, step), (height, width) = self.times, size
         count = (high - low) // step + 1
         turns = (low + step * (values["times"] * count).floor().clamp(max=count - 1)).long() % 4
-        maps = turns.new_tensor(
-            [
-                [[1, 0, 0], [0, 1, 0]],
-                [[0, 1, 0], [-1, 0, width - 1]],
-                [[-1, 0, width - 1], [0, -1, height - 1]],
-                [[0, -1, height - 1], [1, 0, 0]],
-            ],
-            dtype=torch.float64,
-        )
+        maps = turns.new_tensor(quarter_turns(size), dtype=torch.float64)
         on_side = turns % 2
         if height != width and is_concrete(on_side) and on_side.numel() and int(on_side.min()) != int(on_side.max()):
             raise ValueError(

@@ -15,7 +15,6 @@ from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
 from camtorch.warp.sampling import Fill, Mode, PaddingMode, narrow, render, widen
-from camtorch.warp.shutter import RollingShutter, Shutters
 from camtorch.warp.warp import Warp
 
 SHRINKS = 1.5
@@ -110,14 +109,9 @@ class MirrorWarp(Warp):
             return images.new_empty(count, images.shape[1], *size)
         return sampler.empty(images, count, size)
 
-    def inverse(self) -> Warp:
-        """The warp from target to source."""
-        rotation = None if self.rotation is None else self.rotation.mT
-        return MirrorWarp(self.target, self.source, rotation, **self.options, **self._shutters_back)
-
-    def _at(self, shutter: RollingShutter) -> Warp:
-        shutters: Shutters = {"shutter": self.shutter, "target_shutter": shutter}
-        return MirrorWarp(self.source, self.target, self.rotation, **self.options, **shutters)
+    def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
+        """See `Warp.between`."""
+        return MirrorWarp(source, target, rotation, **options)
 
 
 class AffineWarp(MirrorWarp):
@@ -241,10 +235,10 @@ class AffineWarp(MirrorWarp):
         def made(part: slice, box: list[int], flip: list[int]) -> Tensor:
             left, top, right, bottom = box
             view = images[part, :, top:bottom, left:right]
-            view = F.interpolate(
-                view if plain else widen(view), (height, width), mode=mode, align_corners=False, antialias=True
-            )
-            return (view if plain else narrow(view, images.dtype)).flip(flip) if flip else narrow(view, images.dtype)
+            view = view if plain else widen(view)
+            view = F.interpolate(view, (height, width), mode=mode, align_corners=False, antialias=True)
+            view = view if plain else narrow(view, images.dtype)
+            return view.flip(flip) if flip else view
 
         results = [made(part, box, flip) for part, box, flip in zip(parts, boxes, flips, strict=False)]
         return results[0] if together else torch.cat(results)

@@ -380,9 +380,8 @@ class Warp(GeometryModule):
 
     def _at(self, shutter: RollingShutter) -> Warp:
         """This warp at a moment of the exposure."""
-        return Warp(
-            self.source, self.target, self.rotation, shutter=self.shutter, target_shutter=shutter, **self.options
-        )
+        shutters: Shutters = {"shutter": self.shutter, "target_shutter": shutter}
+        return self.between(self.source, self.target, self.rotation, **self.options, **shutters)
 
     def _rows(self, count: int | None) -> Iterator[range]:
         height, width = self.target._size("Warp")
@@ -470,16 +469,17 @@ class Warp(GeometryModule):
     def inverse(self) -> Warp:
         """The warp from target to source. What lay outside the image, or between its pixels, stays lost."""
         rotation = None if self.rotation is None else self.rotation.mT
-        return Warp(self.target, self.source, rotation, **self.options, **self._shutters_back)
+        shutters: Shutters = {"shutter": self.target_shutter, "target_shutter": self.shutter}
+        return self.between(self.target, self.source, rotation, **self.options, **shutters)
+
+    def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
+        """A warp as this one is, mirrored or not, between other cameras."""
+        return Warp(source, target, rotation, **options)
 
     @property
     def shutters(self) -> Shutters:
         """Of source and target, as another Warp takes them."""
         return {"shutter": self.shutter, "target_shutter": self.target_shutter}
-
-    @property
-    def _shutters_back(self) -> Shutters:
-        return {"shutter": self.target_shutter, "target_shutter": self.shutter}
 
     @property
     def options(self) -> Options:
