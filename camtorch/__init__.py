@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from camtorch._public import *  # noqa: F403 (the list is there)
     from camtorch._public import __all__ as __all__
+    from camtorch.models import *  # noqa: F403
 
 __version__ = "0.1.0"
 

@@ -1,13 +1,13 @@
 """The names that `camtorch` shows: this file imports what `camtorch/__init__.py` hands out at first use."""
 
-from camtorch import augment, data, io, lenses
+from camtorch import augment, data, io, lenses, models
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
 from camtorch.calibration.pnp import solve_pnp
 from camtorch.calibration.report import write_report
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.calibration.triangulate import triangulate
-from camtorch.camera import MODELS, Camera
+from camtorch.camera import Camera
 from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, save
@@ -15,33 +15,7 @@ from camtorch.maps.formats import load_map
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.report import MapReport
 from camtorch.mixed import Mixed
-from camtorch.models import (
-    EUCM,
-    FOV,
-    UCM,
-    BrownConrady,
-    Cylindrical,
-    Division,
-    DoubleSphere,
-    Equirectangular,
-    Equisolid,
-    Fisheye62,
-    Fisheye624,
-    FisheyeRadTanThinPrism,
-    FTheta,
-    FThetaBackward,
-    KannalaBrandt,
-    LatLon,
-    Mei,
-    OCamCalib,
-    OrthographicFisheye,
-    Pinhole,
-    Stereographic,
-    Tabulated,
-    ThinPrismFisheye,
-    TransverseCylindrical,
-    WoodScape,
-)
+from camtorch.models import *  # noqa: F403 (the list is there)
 from camtorch.native.library import native_available
 from camtorch.networks import losses
 from camtorch.networks.canonical import CanonicalCamera
@@ -59,39 +33,18 @@ from camtorch.warp.surround import Surround, surround
 from camtorch.warp.warp import Warp
 
 __all__ = [
-    "EUCM",
-    "FOV",
-    "MODELS",
-    "UCM",
     "BirdsEye",
-    "BrownConrady",
     "Calibration",
     "Camera",
     "CameraFileError",
     "CameraHead",
     "CanonicalCamera",
     "Conversion",
-    "Cylindrical",
     "Dewarp",
-    "Division",
-    "DoubleSphere",
-    "Equirectangular",
-    "Equisolid",
     "Extrinsics",
-    "FTheta",
-    "FThetaBackward",
-    "Fisheye62",
-    "Fisheye624",
-    "FisheyeRadTanThinPrism",
-    "KannalaBrandt",
-    "LatLon",
     "LookupMap",
     "MapReport",
-    "Mei",
     "Mixed",
-    "OCamCalib",
-    "OrthographicFisheye",
-    "Pinhole",
     "PlaneWarp",
     "PositiveFocal",
     "Rectification",
@@ -99,14 +52,9 @@ __all__ = [
     "Rig",
     "RigCalibration",
     "RollingShutter",
-    "Stereographic",
     "Surround",
-    "Tabulated",
-    "ThinPrismFisheye",
     "TiedFocal",
-    "TransverseCylindrical",
     "Warp",
-    "WoodScape",
     "augment",
     "calibrate",
     "calibrate_rig",
@@ -127,3 +75,4 @@ __all__ = [
     "vignetting",
     "write_report",
 ]
+__all__ += models.__all__
