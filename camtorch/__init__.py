@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from camtorch._public import __all__ as __all__
     from camtorch.models import *  # noqa: F403
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # What is public needs torch, which takes a second to import; `camtorch --help` does not. So names come at first use.
 

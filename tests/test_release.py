@@ -1,0 +1,51 @@
+"""What the repository says of its releases, and asks of those who report: one version everywhere, forms that are forms."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+import camtorch as ct
+
+ROOT = Path(__file__).parent.parent
+FORMS = ROOT / ".github" / "ISSUE_TEMPLATE"
+RELEASE = r"^## \[?(\d+\.\d+\.\d+)\]? - (\d{4}-\d\d-\d\d)$"
+
+
+def test_version_and_date_are_the_same_everywhere():
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    (version, date), *older = re.findall(RELEASE, changes, re.M)
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert version == ct.__version__ == citation["version"]
+    assert date == citation["date-released"].isoformat()
+    assert f'placeholder: "camtorch {version}, torch ' in (FORMS / "defect.yml").read_text()
+    order = [tuple(map(int, number.split("."))) for number, _ in ((version, date), *older)]
+    assert order == sorted(order, reverse=True)
+
+
+def test_the_changelog_has_the_sections_of_its_form():
+    text = (ROOT / "CHANGELOG.md").read_text()
+    headings = re.findall(r"^## (.+)$", text, re.M)
+    assert headings[0] == "[Unreleased]"
+    assert all(re.match(RELEASE, f"## {heading}") for heading in headings[1:])
+    kinds = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+    assert set(re.findall(r"^### (.+)$", text, re.M)) <= kinds
+    for name in re.findall(r"^## \[(.+)\]", text, re.M):
+        assert re.search(rf"^\[{re.escape(name)}\]: https://", text, re.M), f"{name} has no link"
+
+
+@pytest.mark.parametrize("path", sorted(set(FORMS.glob("*.yml")) - {FORMS / "config.yml"}), ids=lambda path: path.stem)
+def test_a_form_is_as_github_wants_it(path):
+    form = yaml.safe_load(path.read_text())
+    assert set(form) == {"name", "description", "labels", "body"}
+    ids = [field["id"] for field in form["body"]]
+    assert len(set(ids)) == len(ids)
+    for field in form["body"]:
+        assert field["type"] in ("textarea", "input")
+        assert set(field) <= {"type", "id", "attributes", "validations"}
+        assert set(field["attributes"]) <= {"label", "description", "placeholder", "render"}
+        assert field["attributes"]["label"]
+        assert field["type"] == "textarea" or "render" not in field["attributes"]
+        assert field.get("validations", {"required": True}) == {"required": True}
+    assert any("validations" in field for field in form["body"])
