@@ -1,4 +1,4 @@
-"""What the repository says of its releases, and asks of those who report: one version everywhere, forms that are forms."""
+"""What the repository says of a release and asks of those who report: one version everywhere, forms that are forms."""
 
 import re
 from pathlib import Path
