@@ -136,5 +136,26 @@ def test_every_page_is_in_the_navigation():
     assert [page for page in pages if f" {page}\n" not in navigation] == []
 
 
+def test_links_of_the_root_lead_somewhere():
+    """The strict build of the site checks those of docs/."""
+    links = [
+        (page.name, target)
+        for page in ROOT.glob("*.md")
+        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text())
+        if "://" not in target
+    ]
+    assert links
+    broken = []
+    for page, target in links:
+        path, _, anchor = target.partition("#")
+        text = (ROOT / path).read_text() if path.endswith(".md") and (ROOT / path).exists() else ""
+        anchors = [
+            re.sub(r"[^\w\s-]", "", title).lower().replace(" ", "-") for title in re.findall(r"^#+ (.*)", text, re.M)
+        ]
+        if not (ROOT / path).exists() or (anchor and anchor not in anchors):
+            broken.append((page, target))
+    assert not broken
+
+
 def test_the_readme_is_short():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 200
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
