@@ -86,7 +86,7 @@ class GeometryModule(nn.Module):
                 return tensor.to(moved.device)
             return moved
 
-        super()._apply(at_least_float32, recurse)
+        super()._apply(at_least_float32, recurse)  # type: ignore[no-untyped-call]
         for name in (*self._parameters, *self._buffers):
             self._note(name)
         return self

@@ -20,6 +20,11 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+def is_tracing() -> bool:
+    """Whether torch.compile or torch.jit.trace is at work."""
+    return torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+
+
 def spread(work: Callable[[], object], threads: int) -> None:
     """Run the same function on several threads at once: on this one, and on workers of the pool.
 
@@ -155,7 +160,7 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or torch.jit.is_tracing():  # a trace's sizes are tensors
+        if is_tracing():  # its sizes are tensors
             return function(*args, **kwargs)
         if _mine.threads:  # of a function that called this one, and goes on as before
             was_alone = _mine.is_alone
@@ -181,7 +186,7 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or torch.jit.is_tracing() or _limits is None or _mine.stays_alone:
+        if is_tracing() or _limits is None or _mine.stays_alone:
             return function(*args, **kwargs)
         threads, was_alone = _mine.threads, _mine.is_alone
         _mine.threads, _mine.stays_alone = threads or torch.get_num_threads(), True

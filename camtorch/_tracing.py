@@ -64,7 +64,8 @@ def in_memory(tensor: Tensor) -> bool:
 
 def is_recorded() -> bool:
     """Whether torch's operators are recorded, or a mode changes what they do: what goes past them would be lost."""
-    return torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack() > 0
+    tracing: bool = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+    return tracing or torch._C._len_torch_dispatch_stack() > 0
 
 
 is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)

@@ -97,7 +97,8 @@ def _rotation(rays: Tensor, others: tuple[Tensor, Tensor], seen: Tensor) -> Tens
     u, _, vh = torch.linalg.svd(others[0][use].double().mT @ rays[use].double())
     sign = torch.ones(3, dtype=torch.float64, device=u.device)
     sign[2] = torch.linalg.det(u @ vh)
-    return u @ torch.diag(sign) @ vh
+    rotation: Tensor = u @ torch.diag(sign) @ vh
+    return rotation
 
 
 def angle(rotation: Tensor) -> float:

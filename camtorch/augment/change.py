@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -17,6 +17,8 @@ from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.sampling import Mode, Options, narrow, widen
 from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
+
+Moved = TypeVar("Moved", Tensor, tuple[Tensor, Tensor])
 
 
 def _same(value: Tensor) -> Tensor:
@@ -270,14 +272,14 @@ class Change:
         return self._inverse
 
     def each(
-        self, value: Tensor, move: Callable[[Part, Warp, Tensor], Any], stay: Callable[[Camera, Tensor], Any]
-    ) -> Any:
+        self, value: Tensor, move: Callable[[Part, Warp, Tensor], Moved], stay: Callable[[Camera, Tensor], Moved]
+    ) -> Moved:
         """`move(part, warp, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves.
 
         Both give a tensor, or a pair of tensors.
         """
 
-        def of(part: Part) -> Any:
+        def of(part: Part) -> Moved:
             if part.rows is not None:
                 rows = value[part.rows.to(value.device)]
             else:  # what comes out is never what went in, but a copy
@@ -396,7 +398,8 @@ class Change:
 def _handedness(rotation: Tensor) -> Tensor:
     """(*B,): the determinant of orthogonal matrices, 1 or -1."""
     x, y, z = rotation.unbind(-2)
-    return (torch.linalg.cross(x, y) * z).sum(-1)
+    triple: Tensor = (torch.linalg.cross(x, y) * z).sum(-1)
+    return triple
 
 
 def by_kinds(count: int, camera: Camera | Sequence[Camera], part: Callable[[Tensor | None, Camera], Part]) -> Change:
@@ -443,10 +446,11 @@ def _chosen(gate: Tensor, target: Camera, source: Camera) -> Camera:
     return remade(target, intrinsics, distortion, target.image_size)
 
 
-def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Any) -> Any:
+def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Moved) -> Moved:
     """`function` of the results, or of the first and of the second ones where each is a pair."""
     if isinstance(results[0], tuple):
-        return tuple(function(pieces) for pieces in zip(*results, strict=True))
+        first, second = (function(pieces) for pieces in zip(*results, strict=True))
+        return first, second
     return function(results)
 
 

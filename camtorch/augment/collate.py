@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,17 +30,18 @@ def collate(samples: Sequence[object]) -> object:
     return collate_by(samples, collate_fn_map={**default_collate_fn_map, Tensor: _tensors, np.ndarray: _arrays})
 
 
-def _tensors(batch: Sequence[Tensor], *, collate_fn_map=None) -> Tensor | list[Tensor]:
+def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)
-    return default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map)
+    stacked: Tensor = default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map)
+    return stacked
 
 
-def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map=None) -> Tensor | list[Tensor]:
+def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
     return _tensors([torch.as_tensor(array) for array in batch], collate_fn_map=collate_fn_map)
 
 
-def collate_cameras(batch: Sequence[Camera], *, collate_fn_map=None) -> Camera | list[Camera]:
+def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:
     """Single cameras as one batch, of several models if need be, or as a list where they are of several sizes."""
     if any(camera.batch_shape for camera in batch) or len({camera.image_size for camera in batch}) > 1:
         return list(batch)

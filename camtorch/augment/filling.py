@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
-from camtorch.augment.change import frozen, remade, size_of
+from camtorch.augment.change import frozen, size_of
 from camtorch.camera import Camera, from_values
+from camtorch.mixed import remade
 from camtorch.rotations import rotation_matrix, rotation_vector, turn
 from camtorch.warp.warp import along_edges
 

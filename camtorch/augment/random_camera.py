@@ -14,11 +14,12 @@ from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._module import Memo, same
 from camtorch._tracing import in_graph, is_concrete
 from camtorch.augment.augmentation import Augmentation, as_range
-from camtorch.augment.change import frozen, numbers_by, remade, size_of
+from camtorch.augment.change import frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera, from_values
 from camtorch.lenses.drawing import covering, drawn
+from camtorch.mixed import remade
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.domain import Domain, domain_of, keep
 from camtorch.projection.rays import field_of_view, image_lattice

@@ -240,7 +240,7 @@ def is_batch(named: Named, camera: object) -> bool:
         if isinstance(value, (list, tuple)):
             return True
         if KINDS[kind].decides:
-            return value.ndim > KINDS[kind].dims
+            return bool(value.ndim > KINDS[kind].dims)
     if isinstance(camera, Camera) and camera.batch_shape:
         return True
     return any(value.ndim > KINDS[kind].dims for kind, value in named.values())

@@ -119,7 +119,8 @@ def _grid_points(xs: NDArray[Any], ys: NDArray[Any]) -> NDArray[np.float64]:
 
 def _chessboard(columns: int, rows: int) -> NDArray[np.bool_]:
     """(rows, columns) squares, black at the top left."""
-    return (np.arange(rows)[:, None] + np.arange(columns)) % 2 == 0
+    dark: np.ndarray = (np.arange(rows)[:, None] + np.arange(columns)) % 2 == 0
+    return dark
 
 
 @dataclass(frozen=True)

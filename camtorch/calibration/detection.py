@@ -81,7 +81,8 @@ def _as_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
         return np.ascontiguousarray(image)
     low, high = np.percentile(image, (0.1, 99.9))
     scaled = (image.astype(np.float32) - low) * (255 / max(high - low, 1))
-    return np.clip(scaled, 0, 255).astype(np.uint8)
+    stretched: np.ndarray = np.clip(scaled, 0, 255).astype(np.uint8)
+    return stretched
 
 
 # -- chessboards
@@ -157,7 +158,8 @@ def _refined(cv2: Any, grey: NDArray[np.uint8], pixels: Pixels, radius: float) -
     half = int(np.clip(round(radius), 2, 20))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     corners = pixels.astype(np.float32).reshape(-1, 1, 2)
-    return cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop).reshape(-1, 2).astype(np.float64)
+    refined: np.ndarray = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
+    return refined.reshape(-1, 2).astype(np.float64)
 
 
 def _ordered(board: Chessboard, grey: NDArray[np.uint8], pixels: Pixels) -> Pixels:

@@ -331,7 +331,8 @@ def _as_float64(value: Any, name: str, owner: str) -> Tensor:
         raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
     if value.is_meta:
         raise ValueError(f"{owner}: {name} is on the device meta, and has no values")
-    return value.detach().to(torch.float64)
+    values: Tensor = value.detach().to(torch.float64)
+    return values
 
 
 def _as_size(value: Any, name: str, owner: str) -> tuple[int, int]:

@@ -411,7 +411,8 @@ def _warnings(texts: Sequence[str]) -> str:
 def _ranked(shots: _Shots) -> list[int]:
     """Rows of the views, the worst first."""
     squares = np.nan_to_num(shots.seen.lengths**2).sum(-1) / np.maximum(shots.seen.seen.sum(-1), 1)
-    return np.argsort(-squares, kind="stable").tolist()
+    order: list[int] = np.argsort(-squares, kind="stable").tolist()
+    return order
 
 
 def _views(shots: _Shots) -> str:
@@ -559,7 +560,7 @@ def _reduced(image: Any, size: tuple[int, int], name: str) -> Image.Image:
     if image.mode.startswith(("I", "F")):  # deep grey
         values = np.asarray(image, np.float64)
         image = Image.fromarray((255 * values / max(values.max(), 1e-9)).clip(0, 255).astype(np.uint8))
-    reduced = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
+    reduced: Image.Image = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
     reduced.thumbnail((_PHOTOGRAPH, _PHOTOGRAPH), reducing_gap=2.0)
     return reduced
 

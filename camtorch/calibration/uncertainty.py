@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values
-from camtorch.calibration.bundle import Adjusted, Equations, robust
+from camtorch.calibration.bundle import Adjusted, robust
 from camtorch.camera import Camera, from_values
+from camtorch.least_squares.equations import Equations
 from camtorch.least_squares.jacobians import sensor_jacobians
 
 _PIXELS = 1 << 15  # that are looked at together
@@ -42,7 +43,8 @@ class Spread(NamedTuple):
     @property
     def std(self) -> Tensor:
         """(B, P)."""
-        return torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
+        deviations: Tensor = torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
+        return deviations
 
     def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
         """(B, M, 2, 2) covariances, in px^2, of where points are seen that lie at pixels; NaN where one has no ray.
@@ -142,7 +144,7 @@ def shared_factor(equations: Equations) -> Tensor:
 
     A combination of the unknowns that the data leave open has a variance that is huge, but no infinity.
     """
-    triangle = equations.shared[:, :-1, :-1]
+    triangle: Tensor = equations.shared[:, :-1, :-1]
     if not triangle.shape[-1]:
         return triangle
     # the columns differ by many orders of magnitude, also before what poses make up for is taken out of them
@@ -151,7 +153,8 @@ def shared_factor(equations: Equations) -> Tensor:
     scale = torch.where(scale > 0, scale, 1.0)
     _, sizes, axes = torch.linalg.svd(triangle / scale[:, None])
     least = _LEAST * sizes[:, :1].clamp(min=torch.finfo(sizes.dtype).tiny)
-    return axes.mT / torch.maximum(sizes, least)[:, None] / scale[..., None]
+    factor: Tensor = axes.mT / torch.maximum(sizes, least)[:, None] / scale[..., None]
+    return factor
 
 
 def _frame_factor(equations: Equations, translations: Tensor, shared: Tensor) -> Tensor:
@@ -190,7 +193,8 @@ def _cross_matrix(vectors: Tensor) -> Tensor:
     """(..., 3, 3): that of the product v x."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    matrix: Tensor = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    return matrix
 
 
 def worst(covariances: Tensor) -> Tensor:

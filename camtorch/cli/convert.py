@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from camtorch.cli.options import add_calibration, add_force, parse_path
 from camtorch.cli.terminal import note
@@ -75,7 +75,7 @@ def _read(path: Path) -> tuple[Path, ...]:
     return (path, *path.parent.glob("images.*")) if path.stem == "cameras" else (path,)
 
 
-def _quality(result: Conversion) -> str:
+def _quality(result: Conversion[Any]) -> str:
     """How good a conversion is; of a batch, the worst of it."""
     error = f"rms {float(result.rms.max()):.3g} px, at most {float(result.max_error.max()):.3g} px"
     degrees, covered = math.degrees(float(result.max_angle.min())), 100 * float(result.valid_fraction.min())

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -40,7 +41,7 @@ class Labels:
     """(K, 3) unit directions."""
 
 
-def read(path, camera: Camera) -> Labels:
+def read(path: str | Path, camera: Camera) -> Labels:
     """The labels of an image of `camera`: an object of keypoints, boxes, gaze and gaze_from, each optional.
 
     Raises:
@@ -79,7 +80,7 @@ def read(path, camera: Camera) -> Labels:
     return Labels(_tensor(values.get("keypoints", []), 2), _tensor(values.get("boxes", []), 4), eyes, gaze)
 
 
-def _numbers(where: str, name: str, entry) -> list:
+def _numbers(where: str, name: str, entry: Any) -> list[Any]:
     size, shape = _SHAPES[name]
     many = shape.startswith("[[")
     if not isinstance(entry, list):
@@ -99,7 +100,7 @@ def _numbers(where: str, name: str, entry) -> list:
     return entry
 
 
-def _tensor(rows: list, size: int) -> Tensor:
+def _tensor(rows: list[Any], size: int) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64).reshape(-1, size)
 
 
@@ -107,12 +108,12 @@ def _known() -> str:
     return ", ".join(f'"{name}": {shape}' for name, (_, shape) in _SHAPES.items())
 
 
-def _kind(value) -> str:
+def _kind(value: object) -> str:
     names = {dict: "an object", list: "a list", str: "a text", bool: "true or false", type(None): "null"}
     return names.get(type(value), "a number")
 
 
-def _short(value) -> str:
+def _short(value: object) -> str:
     try:
         text = json.dumps(value)
     except ValueError:  # Python refuses to print integers of thousands of digits

@@ -28,7 +28,8 @@ def decode(counts: Any, size: tuple[int, int]) -> NDArray[np.bool_]:
     if sum(runs) != height * width:
         raise ValueError(f"counts are of {sum(runs)} pixels, and the size says {width}x{height}")
     values = np.arange(len(runs)) % 2 == 1
-    return np.repeat(values, runs).reshape(width, height).T
+    mask: np.ndarray = np.repeat(values, runs).reshape(width, height).T
+    return mask
 
 
 def encode(mask: NDArray[np.bool_], *, as_text: bool) -> list[int] | str:

@@ -148,7 +148,8 @@ def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     if len(pixels) < 3:
         return np.ascontiguousarray(pixels[0])
     red, green, blue = pixels[:3].astype(np.float32)
-    return np.rint(0.299 * red + 0.587 * green + 0.114 * blue).astype(np.uint8)
+    grey: np.ndarray = np.rint(0.299 * red + 0.587 * green + 0.114 * blue).astype(np.uint8)
+    return grey
 
 
 def usable_views(corners: Corners) -> tuple[dict[str, dict[str, ImageCorners]], dict[str, tuple[int, int]]]:

@@ -161,7 +161,8 @@ def _rate(stream: Any) -> Fraction:
 def _length(container: Any, stream: Any) -> Fraction:
     """Seconds; 0 where that is not said."""
     if stream.duration is not None and stream.time_base is not None:
-        return stream.duration * stream.time_base
+        duration: Fraction = stream.duration * stream.time_base
+        return duration
     return Fraction(container.duration or 0, 1_000_000)
 
 

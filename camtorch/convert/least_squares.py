@@ -107,9 +107,9 @@ def refine_minimax(camera: Camera, observations: Observations, parameters: Tenso
 
 def _distances(observations: Observations, camera: Camera, parameters: Tensor) -> Tensor:
     """(C, N) pixels."""
-    return torch.linalg.vector_norm(
-        _residuals(observations, parameters, to_sensor(camera, parameters[:, 4:], observations.rays)), dim=1
-    )
+    residuals = _residuals(observations, parameters, to_sensor(camera, parameters[:, 4:], observations.rays))
+    distances: Tensor = torch.linalg.vector_norm(residuals, dim=1)
+    return distances
 
 
 def bounds(camera: Camera, parameters: Tensor, held: Collection[str] = ()) -> tuple[Tensor, Tensor]:

@@ -114,7 +114,8 @@ def _climbed(source: Reference, errors: Tensor, error_at: Callable[[views.Sample
         found, best = error_at(lattice.sampled(source.camera, near)).unflatten(1, (_PEAKS, -1)).max(-1)
         places = near.unflatten(1, (_PEAKS, -1)).gather(2, best[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
         step = step / 3
-    return found.amax(-1)
+    largest: Tensor = found.amax(-1)
+    return largest
 
 
 def _rim(source: Reference, angle: Tensor) -> views.SampledRays:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -153,6 +153,6 @@ def radii(camera: Camera, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor
     return angles, torch.where(seen > 0, radii, end + slope * (index - at))
 
 
-def _like(camera: Camera) -> dict:
+def _like(camera: Camera) -> dict[str, Any]:
     # steps of float32 would go past half a circle
     return {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}

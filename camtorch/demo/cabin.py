@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,7 +45,7 @@ class Drivers:
     def __len__(self) -> int:
         return len(self.pose)
 
-    def __getitem__(self, index) -> Drivers:
+    def __getitem__(self, index: Any) -> Drivers:
         index = slice(index, index + 1 or None) if isinstance(index, int) else index
         return Drivers(self.pose[index], self.gaze[index], self.looks[index])
 
@@ -113,7 +114,8 @@ def _rays(corners: Tensor, across: float, down: float, turn: Tensor | None) -> T
     rows = torch.lerp(corners[..., :-1, :], corners[..., 1:, :], across)
     rays = torch.lerp(rows[:, :-1], rows[:, 1:], down)
     rays = (rays if turn is None else rays @ turn).flatten(1, 2)
-    return rays / rays.norm(dim=-1, keepdim=True)
+    unit: Tensor = rays / rays.norm(dim=-1, keepdim=True)
+    return unit
 
 
 def _by_rows(rotation: Tensor | None, rays: Tensor) -> Tensor | None:

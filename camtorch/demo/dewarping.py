@@ -63,7 +63,13 @@ class DemoCamera:
 def lenses(height: int = 640) -> list[DemoCamera]:
     """The five lenses, with images of about that height in pixels."""
 
-    def camera(model, size, intrinsics, *distortion, rows=height):
+    def camera(
+        model: type[Camera],
+        size: tuple[int, int],
+        intrinsics: list[float],
+        *distortion: list[float],
+        rows: int = height,
+    ) -> Camera:
         values = [torch.tensor(v, dtype=torch.float64) for v in (intrinsics, *distortion)]
         whole = model(*values, image_size=size)
         return whole.requires_grad_(False).resize(rows, round(rows * size[1] / size[0]))

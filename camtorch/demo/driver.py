@@ -7,8 +7,8 @@ frame has the camera's axes and its origin at the base of the neck. Positions ar
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -64,7 +64,7 @@ def shape_of(looks: Tensor) -> Shape:
 # -- distances
 
 
-def _egg(x: Tensor, y: Tensor, z: Tensor, centre, radii) -> Tensor:
+def _egg(x: Tensor, y: Tensor, z: Tensor, centre: Sequence[Any], radii: Sequence[Any]) -> Tensor:
     """The distance to an ellipsoid, exact on its surface and to first order."""
     square = steep = torch.full((), 1e-12)
     for place, middle, radius in zip((x, y, z), centre, radii, strict=True):
@@ -76,13 +76,16 @@ def _egg(x: Tensor, y: Tensor, z: Tensor, centre, radii) -> Tensor:
     return (square - square.sqrt()) * steep.rsqrt()
 
 
-def _limb(x: Tensor, y: Tensor, z: Tensor, start, end, thick: tuple[float, float]) -> Tensor:
+def _limb(
+    x: Tensor, y: Tensor, z: Tensor, start: Sequence[Any], end: Sequence[Any], thick: tuple[float, float]
+) -> Tensor:
     """The distance to a round limb between two points, of its own thickness at each."""
     axis = [b - a for a, b in zip(start, end, strict=True)]
     to = [p - a for p, a in zip((x, y, z), start, strict=True)]
     along = (sum(t * a for t, a in zip(to, axis, strict=True)) / sum(a * a for a in axis)).clamp(0, 1)
     gap = sum((t - along * a) ** 2 for t, a in zip(to, axis, strict=True)).sqrt()
-    return gap - (thick[0] + (thick[1] - thick[0]) * along)
+    distance: Tensor = gap - (thick[0] + (thick[1] - thick[0]) * along)
+    return distance
 
 
 def _join(a: Tensor, b: Tensor, width: float) -> Tensor:
@@ -201,7 +204,9 @@ def belt(x: Tensor, y: Tensor) -> Tensor:
     return soft(0.78 * x + 0.62 * y - 0.155, -0.023, 0.023, 0.0012)
 
 
-def march(distance: Callable, origin: Planes, ray: Planes, near: Tensor, far: Tensor, shape) -> Tensor:
+def march(
+    distance: Callable[[Planes, Any], Tensor], origin: Planes, ray: Planes, near: Tensor, far: Tensor, shape: Any
+) -> Tensor:
     """Where rays first meet a surface between near and far, infinite where they do not; `shape` is a NamedTuple."""
     found = torch.full_like(near, torch.inf)
     left, t = torch.arange(len(near)), near
@@ -224,13 +229,14 @@ def march(distance: Callable, origin: Planes, ray: Planes, near: Tensor, far: Te
     return found
 
 
-def normals(distance: Callable, p: Planes, shape, step: float = 4e-4) -> Tensor:
+def normals(distance: Callable[[Planes, Any], Tensor], p: Planes, shape: Any, step: float = 4e-4) -> Tensor:
     """(3, N): the outward unit normals at points on a surface."""
     total = torch.zeros_like(torch.stack(p))
     for signs in ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1)):
         value = distance(tuple(c + step * e for c, e in zip(p, signs, strict=True)), shape)
         total += value * torch.tensor(signs)[:, None]
-    return total / (total.norm(dim=0) + 1e-12)
+    unit: Tensor = total / (total.norm(dim=0) + 1e-12)
+    return unit
 
 
 # -- lines on the face

@@ -34,7 +34,8 @@ def _on_skin(places: Sequence[Place], s: Shape) -> Tensor:
     shape = Shape._make(c.repeat(len(places)) for c in s)
     # half steps: along a fixed line the surface is to be met, not just come near to
     way = driver.march(lambda p, s: 0.6 * driver.skin(p, s), tuple(origin), tuple(ray), near, near + 1, shape)
-    return (origin + way * ray).unflatten(1, (len(places), -1)).permute(2, 1, 0)
+    points: Tensor = (origin + way * ray).unflatten(1, (len(places), -1)).permute(2, 1, 0)
+    return points
 
 
 def face_points(s: Shape, gaze: Tensor) -> tuple[Tensor, Tensor]:

@@ -133,7 +133,7 @@ def trace(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tens
     return (1 - torch.exp(-1.3 * light)).pow(1 / 2.2).T, classes
 
 
-def _trace_head(ray: Planes, turned: Planes, t: Tensor, here: Tensor, k: Tensor, scene: Scene):
+def _trace_head(ray: Planes, turned: Planes, t: Tensor, here: Tensor, k: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
     """Light (3, N) and classes (N) of rays `here` that meet the head at distances t."""
     o, r, shape = _columns(scene.origin[k]), tuple(c[here] for c in turned), Shape._make(c[k] for c in scene.shape)
     p = tuple(a + t * b for a, b in zip(o, r, strict=True))
@@ -177,7 +177,16 @@ def _under_head(p: Planes, normal: Tensor, scene: Scene, k: Tensor) -> Tensor:
     return 1 - (0.95 * (0.55 + 0.45 * facing) * 0.115**2 / square).clamp(0, 0.8)
 
 
-def _lit(albedo, normal, shade, p: Planes, ray: Planes, scene: Scene, k: Tensor, gloss) -> Tensor:
+def _lit(
+    albedo: Tensor,
+    normal: Tensor,
+    shade: Tensor,
+    p: Planes,
+    ray: Planes,
+    scene: Scene,
+    k: Tensor,
+    gloss: Tensor | float,
+) -> Tensor:
     """(3, N): light from points: the sun through the windscreen, sky through the side windows, soft light around."""
     n = normal
     view = torch.stack(ray)
@@ -186,7 +195,7 @@ def _lit(albedo, normal, shade, p: Planes, ray: Planes, scene: Scene, k: Tensor,
         fall = 0.42 / sum(c * c for c in p)
         shine = torch.as_tensor(gloss)
         shine = torch.where(shine > 0.5, 3 * facing**3000, 3 * shine * facing**60)
-        return albedo.mean(0, keepdim=True) ** 0.7 * shade * (0.04 + 1.3 * fall * facing) + fall * shine
+        return albedo.mean(0, keepdim=True).pow(0.7) * shade * (0.04 + 1.3 * fall * facing) + fall * shine
     sun, day = scene.sun[k].T, scene.day[k]
     facing = (n * sun).sum(0)
     key = ((facing + 0.2) / 1.2).clamp(min=0)
@@ -197,4 +206,5 @@ def _lit(albedo, normal, shade, p: Planes, ray: Planes, scene: Scene, k: Tensor,
     half = sun - view
     glint = ((n * half).sum(0) / half.norm(dim=0)).clamp(0, 1)
     shine = torch.as_tensor(gloss) * torch.where(torch.as_tensor(gloss) > 0.5, glint**400 * 3, 2 * glint**18)
-    return day * (1.15 * albedo * light + shine * shade)
+    lit: Tensor = day * (1.15 * albedo * light + shine * shade)
+    return lit

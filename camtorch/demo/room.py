@@ -6,7 +6,8 @@ otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ _CHUNK = 1 << 17
 # -- where the rays go
 
 
-def _slabs(origin: Planes, ray: Planes, box) -> tuple[Tensor, Tensor, Tensor]:
+def _slabs(origin: Planes, ray: Planes, box: Sequence[Sequence[float]]) -> tuple[Tensor, Tensor, Tensor]:
     """Distances at which rays enter and leave a box, and the axis of the face they enter through."""
     first = torch.zeros_like(ray[0])
     near, far, axis = first - torch.inf, first + torch.inf, first.long()
@@ -33,7 +34,7 @@ def _slabs(origin: Planes, ray: Planes, box) -> tuple[Tensor, Tensor, Tensor]:
     return near, far, axis
 
 
-def _ball(origin: Planes, ray: Planes, centre, radius: float) -> Tensor:
+def _ball(origin: Planes, ray: Planes, centre: Sequence[Any], radius: float) -> Tensor:
     """The distance to a ball, infinite where it is missed."""
     to = [c - o for c, o in zip(centre, origin, strict=True)]
     along = sum(a * b for a, b in zip(to, ray, strict=True))
@@ -131,7 +132,8 @@ def _irradiance(point: Planes, normal: Tensor) -> Tensor:
         near, far, _ = _slabs(start, direction, box)
         shaded = shaded | ((near < far) & (near > 0))
     sun[lit] = torch.where(shaded, 0.0, sun[lit])
-    return light + 4.2 * sun * torch.tensor([[1.0], [0.76], [0.46]])
+    sky: Tensor = light + 4.2 * sun * torch.tensor([[1.0], [0.76], [0.46]])
+    return sky
 
 
 # -- what the outside sees
@@ -174,7 +176,8 @@ def distances(rays: Tensor, place: Place = _MIDDLE) -> Tensor:
 def visible(points: Tensor) -> Tensor:
     """(...) bool: nothing stands between the origin and a point (..., 3) on a surface."""
     length = points.norm(dim=-1).to(torch.float32)
-    return distances(points.to(torch.float32) / length[..., None]) > length - 2e-3
+    visible: Tensor = distances(points.to(torch.float32) / length[..., None]) > length - 2e-3
+    return visible
 
 
 def render(

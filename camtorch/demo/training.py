@@ -107,7 +107,8 @@ def loss_of(found: tuple[Tensor, Tensor], p: Samples) -> Tensor:
     keypoints, gaze = found
     off = F.smooth_l1_loss(keypoints, p.keypoints, reduction="none", beta=2.0).sum(-1).mean(-1)
     off = off + _RADIAN * (gaze - p.gaze).norm(dim=-1)
-    return (off * p.weight).sum() / p.weight.sum().clamp(min=1)
+    mean: Tensor = (off * p.weight).sum() / p.weight.sum().clamp(min=1)
+    return mean
 
 
 def train(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -75,7 +75,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.image)
 
-    def __getitem__(self, index) -> Samples:
+    def __getitem__(self, index: Any) -> Samples:
         return Samples(*(value[index] for value in vars(self).values()))
 
     @staticmethod

@@ -6,6 +6,7 @@ Convention: x right, y down, z forward, in metres. Colours are linear light, (3,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -92,7 +93,7 @@ def _between(a: Tensor, low: float, high: float) -> Tensor:
     return (a > low) & (a < high)
 
 
-def _inside(a: Tensor, b: Tensor, box, margin: float = 0.0) -> Tensor:
+def _inside(a: Tensor, b: Tensor, box: Sequence[float], margin: float = 0.0) -> Tensor:
     return _between(a, box[0] + margin, box[1] - margin) & _between(b, box[2] + margin, box[3] - margin)
 
 
@@ -127,7 +128,7 @@ def _wall(along: Tensor, y: Tensor) -> Tensor:
     return torch.where(_between(y, RAIL, RAIL + 0.1) | (y > 1.13), _CREAM, albedo)
 
 
-def _framed(albedo: Tensor, a: Tensor, b: Tensor, box, image: Tensor) -> Tensor:
+def _framed(albedo: Tensor, a: Tensor, b: Tensor, box: Sequence[float], image: Tensor) -> Tensor:
     albedo = torch.where(_inside(a, b, box, -FRAME), _INK, albedo)
     return torch.where(_inside(a, b, box), image, albedo)
 
@@ -199,7 +200,7 @@ def _outside(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return torch.where(up < 0, torch.lerp(colour("e8c39a"), colour("3f7f93"), (-up / 0.09).clamp(0, 1)), sky) * 1.15
 
 
-def panes(x: Tensor, y: Tensor, blur) -> Tensor:
+def panes(x: Tensor, y: Tensor, blur: Tensor | float) -> Tensor:
     """How much of the window's 4 x 2 panes is open at (x, y), softened by `blur` metres."""
     width, height = (WINDOW[1] - WINDOW[0] - 2 * FRAME) / 4, (WINDOW[3] - WINDOW[2] - 2 * FRAME) / 2
     u, v = x - WINDOW[0] - FRAME, y - WINDOW[2] - FRAME

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from camtorch.io import poses
 from camtorch.io.protocol import Names
@@ -22,7 +23,7 @@ _MODELS = {
 }
 
 
-def matches(keys: dict) -> bool:
+def matches(keys: dict[str, Any]) -> bool:
     """Whether these are the keys of such a file."""
     return "CameraCalibrations" in keys
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ _VERSION = 1
 _DEEPEST_BATCH = 8
 
 
-def matches(keys: dict) -> bool:
+def matches(keys: dict[str, Any]) -> bool:
     """Whether these are the keys of such a file."""
     return "camtorch" in keys
 
@@ -134,7 +135,7 @@ def _rows(*tensors: Tensor) -> list[Tensor]:
     return [t if t.ndim == 1 else t.expand(*batch, -1) for t in tensors]
 
 
-def _values(lossy: Lossy, name: str, tensor: Tensor) -> Sequence:
+def _values(lossy: Lossy, name: str, tensor: Tensor) -> Sequence[Any]:
     if not bool(torch.isfinite(tensor).all()):
         lossy.fail(name, "numbers that are not finite")
     return tensor.detach().double().tolist()

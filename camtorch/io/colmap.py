@@ -9,6 +9,7 @@ import math
 import os
 import re
 import struct
+from typing import Any
 
 from camtorch.camera import Camera
 from camtorch.io import colmap_images, poses
@@ -109,7 +110,7 @@ def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
     record, position = Record(path, None, "byte 0"), 0
 
-    def take(layout: str) -> tuple:
+    def take(layout: str) -> tuple[Any, ...]:
         nonlocal position
         record.place, position = f"byte {position}", position + struct.calcsize(layout)
         if position > len(content):
@@ -223,7 +224,7 @@ def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]
     return model, [*(fx, fy)[: _MODELS[model][2]], cx + 0.5, cy + 0.5, *values]
 
 
-def _as_text(entries: list[tuple]) -> bytes:
+def _as_text(entries: list[tuple[Any, ...]]) -> bytes:
     lines = [
         "# Camera list with one line of data per camera:",
         "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
@@ -234,7 +235,7 @@ def _as_text(entries: list[tuple]) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _as_bytes(entries: list[tuple]) -> bytes:
+def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
     parts = [struct.pack("<Q", len(entries))]
     for identity, model, values, width, height in entries:
         parts.append(struct.pack("<IiQQ", identity, _MODELS[model][0], width, height))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from array import array
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -177,7 +177,7 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
     return _as_bytes(entries) if binary else _as_text(entries)
 
 
-def _as_text(entries: list[tuple]) -> bytes:
+def _as_text(entries: list[tuple[Any, ...]]) -> bytes:
     lines = [
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
@@ -189,7 +189,7 @@ def _as_text(entries: list[tuple]) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _as_bytes(entries: list[tuple]) -> bytes:
+def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
     parts = [struct.pack("<Q", len(entries))]
     for i, (name, camera, values) in enumerate(entries, 1):
         parts += [_HEAD.pack(i, *values, camera), name.encode(), b"\0", struct.pack("<Q", 0)]

@@ -115,7 +115,8 @@ def parse_storage(path: str | os.PathLike[str], content: bytes) -> dict[str, Any
         parser.Parse(content, True)
     except expat.ExpatError as error:
         raise CameraFileError(path, f"line {error.lineno}", f"not XML: {expat.ErrorString(error.code)}") from None
-    return elements.root
+    root: dict[str, Any] = elements.root
+    return root
 
 
 class _Elements:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from typing import Any
 
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -29,7 +30,7 @@ _MODELS = {
 _NAME = re.compile(r"cam(\d{1,4})")
 
 
-def matches(keys: dict) -> bool:
+def matches(keys: dict[str, Any]) -> bool:
     """Whether these are the keys of such a file."""
     return any(_NAME.fullmatch(key) and isinstance(value, dict) for key, value in keys.items())
 
@@ -97,7 +98,7 @@ def render(rig: Rig, path: str) -> str:
 
 
 def _step(this: Extrinsics, previous: Extrinsics) -> list[list[float]]:
-    kept = poses.written(this, "step", previous)
+    kept: list[list[float]] | None = poses.written(this, "step", previous)
     if kept is not None:
         return kept
     if poses.is_identity(previous):

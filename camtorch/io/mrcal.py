@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.protocol import Names
@@ -21,7 +23,7 @@ _MODELS = {
 }
 
 
-def matches(keys: dict) -> bool:
+def matches(keys: dict[str, Any]) -> bool:
     """Whether these are the keys of such a file."""
     return any(key in keys for key in ("lensmodel", "lens_model")) and "imagersize" in keys
 

@@ -48,7 +48,7 @@ _CORE = (
 _OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL)
 
 
-def matches(keys: dict) -> bool:
+def matches(keys: dict[str, Any]) -> bool:
     """Whether these are the keys of such a file."""
     return (isinstance(keys.get("frames"), list) and "camtorch" not in keys) or any(
         key in keys for key in ("fl_x", "camera_angle_x", "x_fov")
@@ -178,7 +178,7 @@ def render(rig: Rig, path: str) -> str:
         if len(rig.cameras) > 1 and name not in rig.extrinsics and name not in rig.images.values():
             lossy.fail(name, "no extrinsics; several cameras are told apart by their frames")
     shared = len(rig.cameras) == 1 and next(iter(rig.cameras)) not in rig.extrinsics
-    whole: dict = {"camera_model": next(iter(models.values()))}
+    whole: dict[str, Any] = {"camera_model": next(iter(models.values()))}
     if shared:
         whole.update(next(iter(written.values())))
     whole["frames"] = []
@@ -190,7 +190,7 @@ def render(rig: Rig, path: str) -> str:
     return as_json(whole)
 
 
-def _entries(lossy: Lossy, name: str, camera: Camera) -> dict:
+def _entries(lossy: Lossy, name: str, camera: Camera) -> dict[str, Any]:
     (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
     key = lossy.model(name, camera, set(_MODELS.values()))
     entries: dict[str, Any] = {"camera_model": next(model for model, k in _MODELS.items() if k == key)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -46,7 +47,7 @@ class AmbiguousModelWarning(UserWarning):
     """A file leaves open of which model its coefficients are."""
 
 
-def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
+def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | None = None) -> Camera:
     """The camera of an OpenCV YAML, JSON or XML file, in float64 and frozen.
 
     Args:
@@ -64,7 +65,7 @@ def read(path, model: str | None = None, *, name: str | None = None) -> Camera:
     return _File(Record(path, read_mapping(path))).camera(_known(model), name).requires_grad_(False)
 
 
-def read_rig(path, model: str | None = None) -> Rig:
+def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
     """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
     rig = parse(Record(path, read_mapping(path)), _known(model))
     for layer in (*rig.cameras.values(), *rig.extrinsics.values()):
@@ -78,7 +79,7 @@ def _known(model: str | None) -> str | None:
     return model
 
 
-def matches(keys: dict) -> bool:
+def matches(keys: dict[str, Any]) -> bool:
     """Whether these may be the keys of such a file."""
     return any(len(key) <= _LONGEST_KEY and _MATRIX.fullmatch(key) for key in keys)
 
@@ -154,7 +155,8 @@ class _File:
 
     def by_name(self, pattern: re.Pattern[str]) -> dict[str, str]:
         if pattern in self.found:
-            return self.found[pattern]
+            known: dict[str, str] = self.found[pattern]
+            return known
         named: dict[str, str] = {}
         for key in self.keys:
             if match := pattern.fullmatch(key):
@@ -223,7 +225,8 @@ class _File:
     def find(self, pattern: re.Pattern[str]) -> str | None:
         if pattern not in self.found:
             self.found[pattern] = next(filter(pattern.fullmatch, self.keys), None)
-        return self.found[pattern]
+        key: str | None = self.found[pattern]
+        return key
 
     def numbers(self, key: str) -> list[float]:
         """An OpenCV matrix, a list, or a list of rows as one list."""
@@ -272,7 +275,7 @@ def render(rig: Rig, path: str) -> str:
     return text_for(path, values)
 
 
-def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str) -> None:
+def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera, end: str) -> None:
     key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt", "mei"))
     (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
     if camera.image_size is not None:
@@ -299,7 +302,7 @@ def _add_camera(lossy: Lossy, values: dict, name: str, camera: Camera, end: str)
         values[distortion_key] = [[value] for value in distortion]
 
 
-def _add_pose(lossy: Lossy, values: dict, rig: Rig, ends_and_names: list[tuple[str, str]]) -> None:
+def _add_pose(lossy: Lossy, values: dict[str, Any], rig: Rig, ends_and_names: list[tuple[str, str]]) -> None:
     ends, names = zip(*ends_and_names, strict=True)
     if len(names) == 2 and list(ends) in _PAIRS and names[1] in rig.extrinsics:
         lossy.all_posed(rig)

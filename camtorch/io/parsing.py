@@ -229,7 +229,7 @@ def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
     return tree.root
 
 
-def _take(yaml, tree: Tree, event) -> None:
+def _take(yaml: Any, tree: Tree, event: Any) -> None:
     if tree.documents > 1 and isinstance(event, yaml.NodeEvent):
         # rostopic ends a message with ---, which begins an empty document
         if not isinstance(event, yaml.ScalarEvent) or event.value:
@@ -253,7 +253,7 @@ def _take(yaml, tree: Tree, event) -> None:
             tree.fail("a third document in the file")
 
 
-def _check_tag(tree: Tree, event, names: tuple[str, ...]) -> None:
+def _check_tag(tree: Tree, event: Any, names: tuple[str, ...]) -> None:
     if event.tag is None or event.tag == "!" or event.tag in [f"tag:yaml.org,2002:{name}" for name in names]:
         return
     if event.tag == "tag:yaml.org,2002:opencv-matrix":
@@ -285,7 +285,7 @@ class Tree:
         """Whether a key of the innermost mapping has no value yet."""
         return self._open[-1][1] is not None
 
-    def open(self, container: list | dict, anchor: str | None = None) -> None:
+    def open(self, container: list[Any] | dict[Any, Any], anchor: str | None = None) -> None:
         """Begin a list or a mapping."""
         if len(self._open) >= _DEEPEST:
             raise CameraFileError(self.path, "content", "nested too deeply")

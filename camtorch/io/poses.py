@@ -253,7 +253,7 @@ def from_rows(record: Record, undo: bool = False) -> Extrinsics:
 
 def to_rows(extrinsics: Extrinsics, undo: bool = False) -> list[list[float]]:
     """The 4 x 4 matrix of a pose, or of what undoes it."""
-    rows = written(extrinsics, "undone rows" if undo else "rows")
+    rows: list[list[float]] | None = written(extrinsics, "undone rows" if undo else "rows")
     if rows is None:
         rotation, translation = inverse(*numbers(extrinsics)) if undo else numbers(extrinsics)
         rows = as_rows(matrix_of_vector(rotation), translation)
@@ -278,7 +278,7 @@ def from_quaternion(record: Record, quaternion: Vector, translation: Vector, und
 
 def to_quaternion(extrinsics: Extrinsics, undo: bool = False) -> tuple[list[float], list[float]]:
     """Quaternion w, x, y, z and translation of a pose, or of what undoes it."""
-    kept = written(extrinsics, "undone quaternion" if undo else "quaternion")
+    kept: tuple[list[float], list[float]] | None = written(extrinsics, "undone quaternion" if undo else "quaternion")
     if kept is not None:
         return kept
     rotation, translation = inverse(*numbers(extrinsics)) if undo else numbers(extrinsics)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, listed, quoted
@@ -19,7 +21,7 @@ _MODELS = {
 }
 
 
-def matches(keys: dict) -> bool:
+def matches(keys: dict[str, Any]) -> bool:
     """Whether these are the keys of such a file."""
     return "distortion_model" in keys and any(key in keys for key in ("camera_matrix", "K", "k"))
 

@@ -125,7 +125,8 @@ def _solved(triangle: Tensor, right: Tensor) -> Tensor:
     diagonal = triangle.diagonal(dim1=-2, dim2=-1)
     empty = diagonal == 0
     triangle = triangle + torch.diag_embed(empty.to(triangle.dtype))
-    return torch.linalg.solve_triangular(triangle, torch.where(empty[..., None], 0.0, right), upper=True)
+    solution: Tensor = torch.linalg.solve_triangular(triangle, torch.where(empty[..., None], 0.0, right), upper=True)
+    return solution
 
 
 def padded(rows: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch._portable import for_elsewhere, times
 from camtorch._tracing import has_tangent, is_fake, may_look, set_aside
-from camtorch.optics.charts import Chart, Equidistant, even_steps_and_ratios
+from camtorch.optics.charts import Chart, Equidistant, Planes2, Planes3, even_steps_and_ratios
 from camtorch.optics.lens import Planar
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse
@@ -46,17 +46,17 @@ class Inverted(Chart):
                 self._known = RadialInverse(self.factor, self.parameters, FURTHEST)
         return self._known
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         theta2 = torch.addcmul(x * x, y, y) * Equidistant().scale(x, y, z, 1) ** 2
         # away from the fold, where the ray's own rounding would carry it across
         before = times(self._inverse.most2, 1 - 32 * torch.finfo(z.dtype).eps) - theta2
         return torch.minimum(Equidistant().margin(x, y, z), before)
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         most2 = self._inverse.most2
         return may_look(most2) and bool(most2.amin() > (math.pi / 2) ** 2)
 
-    def scale(self, x, y, z, order=2):
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         angle = Equidistant().scale(x, y, z, order)
         theta2 = torch.minimum(torch.addcmul(x * x, y, y) * angle * angle, self._inverse.most2)
         found = self._inverse(theta2.detach())
@@ -75,7 +75,10 @@ class Inverted(Chart):
             scale = scale + (1 - scale * radial(theta2 * scale * scale)) * step
         return scale
 
-    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(
+        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
+    ) -> tuple[Planes3, list[Tensor]]:
+        assert scale is not None  # this chart has one
         rho2 = torch.addcmul(x * x, y, y)
         t = rho2 * scale * scale
         factor, slope = self._radial.derivatives(t, 1)
@@ -87,7 +90,7 @@ class Inverted(Chart):
         ray = torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz
         return ray, self._radial.vjp(t, -along * scale * by_angle) if want_parameters else []
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         t = torch.addcmul(a * a, b, b)
         inside = times(self._inverse.inner2, 1 - 64 * torch.finfo(a.dtype).eps) - t
         t = torch.minimum(t, self._inverse.inner2)
@@ -96,16 +99,18 @@ class Inverted(Chart):
         before = times(self._inverse.most2, 1 - 128 * torch.finfo(a.dtype).eps)
         return torch.minimum(inside, before.clamp(max=math.pi**2) - theta2)
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         factor = self._radial(torch.addcmul(a * a, b, b))
         return Equidistant().to_ray(a * factor, b * factor, order)
 
-    def to_ray_vjp(self, a, b, gx, gy, gz, want_parameters):
+    def to_ray_vjp(
+        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
+    ) -> tuple[Planes2, list[Tensor]]:
         at = Planar(self._radial).at(a, b)
         (ga, gb), _ = Equidistant().to_ray_vjp(*at.value, gx, gy, gz, False)
         return at.vjp(ga, gb, want_parameters)
 
-    def end(self, dtype):
+    def end(self, dtype: torch.dtype) -> float | Tensor:
         inverse = self._inverse
         last = inverse.inner2.sqrt()
         # beyond half a turn a ray is seen from the other side
@@ -113,5 +118,5 @@ class Inverted(Chart):
         turned = math.pi * inverse(inverse.most2.clamp(max=most2))
         return torch.where(inverse.inner2 * inverse.radial(inverse.inner2) ** 2 > most2, turned, last).to(dtype)
 
-    def radii(self, count, like):
+    def radii(self, count: int, like: Tensor) -> Tensor:
         return even_steps_and_ratios(count, FURTHEST, FURTHEST, like, torch.positive)

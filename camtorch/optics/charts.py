@@ -30,7 +30,7 @@ def unit(x: Tensor, y: Tensor, z: Tensor) -> Planes3:
 
 def floor_of(dtype: torch.dtype) -> float:
     """A square that is nothing beside 1, and whose reciprocal's square is still a number."""
-    return torch.finfo(dtype).tiny ** 0.5
+    return math.sqrt(torch.finfo(dtype).tiny)
 
 
 class Chart:
@@ -135,60 +135,68 @@ class Perspective(Chart):
     distortion polynomials reach, leaves the floating-point range.
     """
 
-    def end(self, dtype):
-        return min(1e9, torch.finfo(dtype).max ** (1 / 9))
+    def end(self, dtype: torch.dtype) -> float:
+        return min(1e9, math.pow(torch.finfo(dtype).max, 1 / 9))
 
-    def usual_end(self, dtype):
+    def usual_end(self, dtype: torch.dtype) -> float:
         return math.tan(math.radians(87))
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return self.end(z.dtype) * z - torch.maximum(x.abs(), y.abs())
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return self.end(dtype) * nearest > extent
 
-    def scale(self, x, y, z, order=2):
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         return z.reciprocal()
 
-    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(
+        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
+    ) -> tuple[Planes3, list[Tensor]]:
+        assert scale is not None  # this chart has one
         gx, gy = ga * scale, gb * scale
         return (gx, gy, torch.addcmul(gx * x, gy, y) * -scale), []
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return self.end(a.dtype) - torch.maximum(a.abs(), b.abs())
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         z = torch.addcmul(a * a + 1, b, b).rsqrt()
         return a * z, b * z, z
 
-    def to_ray_vjp(self, a, b, gx, gy, gz, want_parameters):
+    def to_ray_vjp(
+        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
+    ) -> tuple[Planes2, list[Tensor]]:
         z = torch.addcmul(a * a + 1, b, b).rsqrt()
         along = z * z * torch.addcmul(torch.addcmul(gz, gx, a), gy, b)
         return (z * (gx - along * a), z * (gy - along * b)), []
 
-    def radii(self, count, like):
+    def radii(self, count: int, like: Tensor) -> Tensor:
         return even_steps_and_ratios(count, math.radians(88), self.end(like.dtype), like, torch.tan)
 
 
 class Equidistant(Chart):
     """theta (cos phi, sin phi), theta = atan2(hypot(x, y), z): every ray but the exact backward one."""
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         # closer to the backward direction the derivative pi / rho leaves the floating-point range
         floor = floor_of(z.dtype) / torch.finfo(z.dtype).eps
         return torch.maximum(z, torch.addcmul(plus(x * x, -floor), y, y))
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return True
 
-    def scale(self, x, y, z, order=2):
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         rho2 = torch.addcmul(x * x, y, y)
         if order > 1:
             return angle_per_radius(rho2, z)
         rho = plus(rho2, floor_of(z.dtype)).sqrt()
         return atan2(rho, z) / rho
 
-    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(
+        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
+    ) -> tuple[Planes3, list[Tensor]]:
+        assert scale is not None  # this chart has one
         rho2 = torch.addcmul(x * x, y, y)
         along = torch.addcmul(ga * x, gb, y)
         gz = -along / torch.addcmul(rho2, z, z)
@@ -196,15 +204,17 @@ class Equidistant(Chart):
         outwards = torch.addcmul(gz * z, along, scale) / -(rho2 + floor_of(z.dtype))
         return (torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz), []
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return math.pi**2 - torch.addcmul(a * a, b, b)
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         theta2 = torch.addcmul(a * a, b, b)
         sinc, cos = self._turned(theta2, order)
         return a * sinc, b * sinc, cos
 
-    def to_ray_vjp(self, a, b, gx, gy, gz, want_parameters):
+    def to_ray_vjp(
+        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
+    ) -> tuple[Planes2, list[Tensor]]:
         theta2 = torch.addcmul(a * a, b, b)
         sinc, cos = self._turned(theta2, 1)
         along = torch.addcmul(gx * a, gy, b) * (cos - sinc) / (theta2 + floor_of(a.dtype)) - gz * sinc
@@ -218,10 +228,10 @@ class Equidistant(Chart):
         theta = plus(theta2, floor_of(theta2.dtype)).sqrt()
         return torch.sin(theta) / theta, torch.cos(theta)
 
-    def end(self, dtype):
+    def end(self, dtype: torch.dtype) -> float | Tensor:
         return math.pi
 
-    def radii(self, count, like):
+    def radii(self, count: int, like: Tensor) -> Tensor:
         return even_steps_and_ratios(count, math.pi, math.pi, like, torch.positive)
 
 
@@ -231,7 +241,7 @@ class EquidistantUpTo(Equidistant):
     def __init__(self, last: Tensor):
         self.last = last.detach()
 
-    def end(self, dtype):
+    def end(self, dtype: torch.dtype) -> float | Tensor:
         return self.last.clamp(max=math.pi)
 
 
@@ -245,19 +255,19 @@ class CylinderChart(Chart):
 
     has_scale = False
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return Perspective().end(y.dtype) * torch.maximum(x.abs(), z.abs()) - y.abs()
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return Perspective().end(dtype) * nearest > extent
 
-    def to_plane(self, x, y, z, order=2, scale=None):
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
         return atan2(x, z), y * (x * x + z * z).rsqrt()
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return torch.minimum(_half_turn(a.dtype) - a.abs(), Perspective().end(b.dtype) - b.abs())
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         return unit(torch.sin(a), b, torch.cos(a))
 
 
@@ -266,19 +276,19 @@ class SphereChart(Chart):
 
     has_scale = False
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return plus(x * x + z * z, -floor_of(y.dtype))
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return True
 
-    def to_plane(self, x, y, z, order=2, scale=None):
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
         return atan2(x, z), atan2(y, (x * x + z * z).sqrt())
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return torch.minimum(_half_turn(a.dtype) - a.abs(), math.pi / 2 - b.abs())
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         across = torch.cos(b)
         return torch.sin(a) * across, torch.sin(b), torch.cos(a) * across
 
@@ -291,20 +301,20 @@ class Transverse(Chart):
     def __init__(self, chart: Chart):
         self.chart = chart
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return self.chart.margin(y, x, z)
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return self.chart.covers_all(nearest, extent, dtype)
 
-    def to_plane(self, x, y, z, order=2, scale=None):
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
         b, a = self.chart.to_plane(y, x, z, order)
         return a, b
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return self.chart.on_plane(b, a)
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         y, x, z = self.chart.to_ray(b, a, order)
         return x, y, z
 
@@ -323,29 +333,29 @@ def _sum(z: Tensor, root: Tensor, difference: Tensor) -> Tensor:
 class Equisolid(Chart):
     """2 sin(theta / 2) (cos phi, sin phi): every ray but the exact backward one."""
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return Equidistant().margin(x, y, z)
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return True
 
-    def scale(self, x, y, z, order=2):
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         rho2, distance = _length(x, y, z)
         return (2 / (distance * _sum(z, distance, rho2))).sqrt()
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return self.end(a.dtype) ** 2 - torch.addcmul(a * a, b, b)
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         r2 = torch.addcmul(a * a, b, b)
         across = (1 - r2 / 4).sqrt()
         return a * across, b * across, 1 - r2 / 2
 
-    def end(self, dtype):
+    def end(self, dtype: torch.dtype) -> float:
         # at the end itself the derivative of its ray is infinite
         return 2 * (1 - 64 * torch.finfo(dtype).eps)
 
-    def radii(self, count, like):
+    def radii(self, count: int, like: Tensor) -> Tensor:
         return even_steps_and_ratios(count, self.end(like.dtype), self.end(like.dtype), like, torch.positive)
 
 
@@ -364,7 +374,7 @@ class Fov(Chart):
         slope = tanc_root(omega * omega / 4)
         return slope, (omega * slope) ** 2
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         (omega,), (_, tan2) = self.parameters, self._slope()
         most = Perspective().end(z.dtype)
         ahead = most * z - torch.maximum(x.abs(), y.abs())
@@ -372,19 +382,19 @@ class Fov(Chart):
         # behind the plane of the camera r is up to pi / omega
         return torch.maximum(ahead, torch.minimum(around, omega * omega * most**2 - math.pi**2))
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return Perspective().end(dtype) * nearest > extent
 
-    def scale(self, x, y, z, order=2):
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         slope, tan2 = self._slope()
         return slope * angle_per_radius(tan2 * torch.addcmul(x * x, y, y), z, order)
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         (omega,) = self.parameters
         inside = math.pi**2 - omega * omega * torch.addcmul(a * a, b, b)
         return torch.minimum(inside, Perspective().end(a.dtype) / 2 - torch.maximum(a.abs(), b.abs()))
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         (omega,), (slope, _) = self.parameters, self._slope()
         angle2 = omega * omega * torch.addcmul(a * a, b, b)
         sinc = sinc_root(angle2, order) / slope
@@ -404,22 +414,22 @@ class OneDivision(Chart):
         square = torch.addcmul(difference, z, z)
         return _sum(z, square.sqrt(), difference), square
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         below, square = self._below(x, y, z)
         return torch.minimum(Perspective().end(z.dtype) / 2 * below - torch.maximum(x.abs(), y.abs()), square)
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return False
 
-    def scale(self, x, y, z, order=2):
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         return 2 / self._below(x, y, z)[0]
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         (coefficient,) = self.parameters
         # away from the fold, where the ray's own rounding would carry it across
         before = 1 - 64 * torch.finfo(a.dtype).eps - coefficient * torch.addcmul(a * a, b, b)
         return torch.minimum(before, Perspective().end(a.dtype) / 2 - torch.maximum(a.abs(), b.abs()))
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         (coefficient,) = self.parameters
         return unit(a, b, torch.addcmul(torch.ones_like(a), coefficient, torch.addcmul(a * a, b, b)))

@@ -306,7 +306,8 @@ def _solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor
     """The solution (*B, N) of equations with diagonals (*B, N - 1), (*B, N), (*B, N - 1)."""
     if not is_exporting():
         matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
-        return torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
+        found: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
+        return found
     # by Gauss's elimination from the first to the last, and back
     lower, upper, pivots, values = below.unbind(-1), above.unbind(-1), [main[..., 0]], [right[..., 0]]
     for i, factor in enumerate(lower):

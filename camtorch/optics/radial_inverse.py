@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -48,7 +48,7 @@ def precise(k: Tensor) -> Tensor:
 def short(dtype: torch.dtype) -> float:
     """The relative length of a step of Newton's method after which the next one would be nothing."""
     # that one is about its square
-    return torch.finfo(dtype).eps ** 0.5 / 8
+    return math.sqrt(torch.finfo(dtype).eps) / 8
 
 
 def within(fold: Tensor) -> Tensor:
@@ -238,7 +238,9 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
     eps = torch.finfo(r2.dtype).eps
     wanted, high = r2.sqrt(), inner2.sqrt().expand_as(r2)
 
-    def step(count: int | Tensor, moves: Tensor, rho: Tensor, low: Tensor, high: Tensor, width: Tensor):
+    def step(
+        count: int | Tensor, moves: Tensor, rho: Tensor, low: Tensor, high: Tensor, width: Tensor
+    ) -> tuple[Tensor, ...]:
         t = rho * rho
         value, first, second = radial.derivatives(t, 2)
         slope, bend = value + 2 * t * first, rho * (6 * first + 4 * t * second)
@@ -284,7 +286,7 @@ class RadialInverse:
             if self.of_points and len(k) > 1:
                 k, rows = k.unique(dim=0, return_inverse=True)
             inner2, table = _radial_tables(factor.name, k, end)
-        self._table = table
+        self._table: Tensor = table
         of_each = [w if rows is None else w[rows] for w in (inner2, InverseTable(table).most2)]
         self.inner2, self.most2 = (w.reshape(parameters[0].shape).clone() for w in of_each)
 
@@ -296,7 +298,8 @@ class RadialInverse:
         if for_elsewhere():
             inner2 = self.inner2.reshape(-1, 1)
             return _scale(self.factor.name, self.k, inner2, InverseTable(self._table), rows).view_as(r2)
-        return _radial_scale(self.factor.name, self.k, self.end, rows).view_as(r2)
+        found: Tensor = _radial_scale(self.factor.name, self.k, self.end, rows)
+        return found.view_as(r2)
 
 
 _KEPT = 8
@@ -332,12 +335,12 @@ def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
 
 
 @_radial_tables.register_fake
-def _(name, k, end):
+def _(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
     return k.new_empty(len(k), 1), k.new_empty(len(k), table_width())
 
 
 @_radial_tables.register_vmap
-def _(info, in_dims, name, k, end):
+def _(info: Any, in_dims: tuple[Any, ...], name: str, k: Tensor, end: float) -> Any:
     results = _radial_tables(name, k.movedim(in_dims[1], 0).flatten(0, 1), end)
     return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0)
 
@@ -360,12 +363,12 @@ def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor
 
 
 @_radial_scale.register_fake
-def _(name, k, end, r2):
+def _(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
     return torch.empty_like(r2)
 
 
 @_radial_scale.register_vmap
-def _(info, in_dims, name, k, end, r2):
+def _(info: Any, in_dims: tuple[Any, ...], name: str, k: Tensor, end: float, r2: Tensor) -> Any:
     _, of_k, _, of_r2 = in_dims
     r2 = r2.expand(info.batch_size, *r2.shape) if of_r2 is None else r2.movedim(of_r2, 0)
     if of_k is None:  # what is mapped joins the points

@@ -8,6 +8,7 @@ multiplied by t in the derivative by a point. With order 1 they are used as they
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -30,7 +31,7 @@ def _series(t: Tensor, coefficients: list[float]) -> Tensor:
     return result
 
 
-def _blend(t: Tensor, series: list[float], closed_form) -> Tensor:
+def _blend(t: Tensor, series: list[float], closed_form: Callable[[Tensor], Tensor]) -> Tensor:
     small = t < _SMALL_ANGLE2
     return torch.where(
         small, _series(torch.where(small, t, 0.0), series), closed_form(torch.where(small, 1.0, t).sqrt())

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch._tracing import may_look
-from camtorch.optics.charts import Chart, Perspective, even_steps_and_ratios, unit
+from camtorch.optics.charts import Chart, Perspective, Planes3, even_steps_and_ratios, unit
 from camtorch.optics.radial import total
 
 
@@ -69,22 +69,25 @@ class Unified(Chart):
         behind = behind / torch.where(ahead, 1.0, alpha * sphere - (1 - alpha) * z)
         return torch.where(ahead, z + alpha * (sphere - z), behind)
 
-    def margin(self, x, y, z):
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         xi, alpha, _ = self._parts()
         rho2, shifted, sphere, distance = self._shifted(x, y, z)
         below = self._below(rho2, shifted, sphere)
         margin = self._most(z.dtype) * below - torch.maximum(x.abs(), y.abs())
         margin = torch.minimum(margin, alpha * shifted + (1 - alpha) * sphere)
-        return margin if xi is None else torch.minimum(margin, torch.addcmul(distance, xi, z))
+        return margin if xi is None or distance is None else torch.minimum(margin, torch.addcmul(distance, xi, z))
 
-    def covers_all(self, nearest, extent, dtype):
+    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         return self._is_tame and self._most(dtype) * nearest > extent
 
-    def scale(self, x, y, z, order=2):
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         rho2, shifted, sphere, _ = self._shifted(x, y, z)
         return self._below(rho2, shifted, sphere).reciprocal()
 
-    def to_plane_vjp(self, x, y, z, ga, gb, scale, want_parameters):
+    def to_plane_vjp(
+        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
+    ) -> tuple[Planes3, list[Tensor]]:
+        assert scale is not None  # this chart has one
         xi, alpha, beta = self._parts()
         rho2, shifted, sphere, distance = self._shifted(x, y, z)
         by_below = torch.addcmul(ga * x, gb, y) * -(scale * scale)
@@ -92,18 +95,18 @@ class Unified(Chart):
         by_shifted = torch.addcmul(by_below * (1 - alpha), by_root, shifted)
         outwards = by_root if beta is None else by_root * beta
         gz = by_shifted
-        if xi is not None:
+        if xi is not None and distance is not None:
             by_distance = by_shifted * xi / distance
             outwards, gz = outwards + by_distance, torch.addcmul(by_shifted, by_distance, z)
         ray = torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz
-        sums = []
+        sums: list[Tensor] = []
         if want_parameters:
-            sums += [total(by_shifted * distance)] if self.has_xi else []
+            sums += [] if distance is None else [total(by_shifted * distance)]
             sums += [total(by_below * (sphere - shifted))] if self.fixed_alpha is None else []
             sums += [total(by_root * rho2) / 2] if self.has_beta else []
         return ray, sums
 
-    def on_plane(self, a, b):
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         xi, alpha, beta = self._parts()
         rho2 = torch.addcmul(a * a, b, b)
         around = rho2 if beta is None else rho2 * beta
@@ -120,7 +123,7 @@ class Unified(Chart):
         reach = torch.addcmul(before.clamp(min=0).sqrt(), xi, ahead)
         return torch.minimum(margin, reach - floor * ahead.abs())
 
-    def to_ray(self, a, b, order=2):
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         xi, alpha, beta = self._parts()
         rho2 = torch.addcmul(a * a, b, b)
         ahead = self._ahead(rho2 if beta is None else rho2 * beta, alpha)
@@ -154,7 +157,7 @@ class Unified(Chart):
         """A radius that no image has, and whose powers are still numbers."""
         return Perspective().end(dtype)
 
-    def end(self, dtype):
+    def end(self, dtype: torch.dtype) -> float | Tensor:
         xi, alpha, _ = self._parts()
         most, inside = self._most(dtype) / 2, 1 - 64 * torch.finfo(dtype).eps
         if xi is None:
@@ -162,13 +165,13 @@ class Unified(Chart):
         beyond = (xi - 1) * (xi + 1)
         return torch.where(beyond > 0, inside * torch.where(beyond > 0, beyond, 1.0).rsqrt(), most).clamp(max=most)
 
-    def usual_end(self, dtype):
+    def usual_end(self, dtype: torch.dtype) -> float | Tensor:
         xi, alpha, _ = self._parts()
         usual = math.tan(math.radians(87)) * (1 if xi is not None or alpha == 0 else 1 / alpha)
         end = self.end(dtype)
         return end.clamp(max=usual) if isinstance(end, Tensor) else min(end, usual)
 
-    def radii(self, count, like):
+    def radii(self, count: int, like: Tensor) -> Tensor:
         end = self.end(like.dtype)
         most = self._most(like.dtype) / 2 if isinstance(end, Tensor) else end
         if most < 2:

@@ -28,12 +28,13 @@ _BRIEF, _LOOKS = 129, 2  # radii of a brief look, one of which each direction ma
 _MILD, _WIDER = 0.75, 1.25
 
 
-def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property:
+def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
     """A table (C, ...) that is made when it is first asked for; that of some cameras is a part of the whole one."""
 
     def table(self: Domain) -> Tensor:
         if self.whole is not None:
-            return getattr(self.whole, make.__name__)[self.cameras]
+            of_all: Tensor = getattr(self.whole, make.__name__)
+            return of_all[self.cameras]
         if for_elsewhere():
             return make(self)
         # what inference mode makes could not be used in a graph later
@@ -134,7 +135,8 @@ class Domain:
         _, lens = self.optics(columns(precise(self.k)))
         assert lens.radial is not None
         edge = self._fold * lens.radial(self._fold * self._fold)
-        return (edge * edge).to(self.k.dtype)
+        edge2: Tensor = (edge * edge).to(self.k.dtype)
+        return edge2
 
     @_per_camera
     def circle2(self) -> Tensor:
@@ -221,7 +223,8 @@ class Domain:
     @cached_property
     def usual2(self) -> Tensor:
         """(C, 1): `inner2`, but no further out than images reach."""
-        return self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+        inner2: Tensor = self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+        return inner2
 
     def brief(self, furthest2: Tensor) -> Tensor | None:
         """Radii (C, K) from the centre to the given ones, (C, 1) squared, if a brief look shows no fold before them.

@@ -6,7 +6,7 @@ As operators of their own they keep compiled graphs small, and look at values in
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -51,7 +51,7 @@ def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @tables.register_fake
-def _(model, k):
+def _(model: str, k: Tensor) -> tuple[Tensor, ...]:
     lens = OPTICS[model](columns(k))[1]
     widths = 1, 0 if lens.is_radial else AZIMUTHS, table_width() if lens.radial else 0
     return tuple(k.new_empty(len(k), width) for width in widths)
@@ -82,27 +82,34 @@ def search_open(
 
 
 @search_in_place.register_fake
-def _(model, k, u, v, a, b, solved, possible):
+def _(*_: Any) -> None:
     pass
 
 
 @search_open.register_fake
-def _(model, k, u, v, a, b, solved, possible):
-    return torch.empty_like(a), torch.empty_like(b), torch.empty_like(solved)
+def _(model: str, *planes: Tensor) -> tuple[Tensor, ...]:
+    return tuple(torch.empty_like(plane) for plane in planes[3:6])
 
 
 @tables.register_vmap
-def _(info, in_dims, model, k):
+def _(info: Any, in_dims: tuple[Any, ...], model: str, k: Tensor) -> Any:
     results = tables(model, k.movedim(in_dims[1], 0).flatten(0, 1))
     return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
 
 
 @search_open.register_vmap
-def _(info, in_dims, model, k, *planes):
+def _(info: Any, in_dims: tuple[Any, ...], model: str, k: Tensor, *planes: Tensor) -> Any:
     return _mapped(search_open, info, in_dims, model, k, *planes)
 
 
-def _mapped(operator, info, in_dims, model: str, k: Tensor, *planes: Tensor):
+def _mapped(
+    operator: Callable[..., tuple[Tensor, ...]],
+    info: Any,
+    in_dims: tuple[Any, ...],
+    model: str,
+    k: Tensor,
+    *planes: Tensor,
+) -> Any:
     """An operator of planes (C, N) of cameras (C, n), with a mapped dim."""
     # it joins the cameras, or the points where the cameras are not mapped
     cameras = in_dims[1] is not None
@@ -125,7 +132,7 @@ def _to_planes(rows: Tensor) -> Tensor:
 
 
 @_to_planes.register_fake
-def _(rows):
+def _(rows: Tensor) -> Tensor:
     return rows.new_empty(rows.shape[-1], *rows.shape[:-1])
 
 
@@ -135,7 +142,7 @@ def _to_rows(planes: Tensor) -> Tensor:
 
 
 @_to_rows.register_fake
-def _(planes):
+def _(planes: Tensor) -> Tensor:
     return planes.new_empty(*planes.shape[1:], len(planes))
 
 
@@ -156,7 +163,7 @@ def _positive(mask: Tensor) -> Tensor:
 
 
 @_positive.register_fake
-def _(mask):
+def _(mask: Tensor) -> Tensor:
     return torch.empty_like(mask, dtype=torch.bool)
 
 
@@ -169,5 +176,6 @@ def positive(mask: Tensor) -> Tensor:
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
     """`function(*inputs)`; where that is compiled, backward computes it again from the inputs, which alone are kept."""
     if torch.compiler.is_compiling() and torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-        return checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
+        result: Result = checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
+        return result
     return function(*inputs)

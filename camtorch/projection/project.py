@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -172,7 +172,15 @@ class Project(Function):
 
     @staticmethod
     @as_cores_are_free
-    def forward(ctx, points, intrinsics, distortion, cameras: Cameras, model: type[Camera], keeps: bool):
+    def forward(
+        ctx: Any,
+        points: Tensor,
+        intrinsics: Tensor,
+        distortion: Tensor,
+        cameras: Cameras,
+        model: type[Camera],
+        keeps: bool,
+    ) -> tuple[Tensor, Tensor]:
         """keeps: whether there will be a backward."""
         shape = points.shape[:2]
         pixels = points.new_empty(2, *shape)
@@ -192,7 +200,7 @@ class Project(Function):
                     plane[here] = replace(mask, plane[here], INVALID_PIXEL, looks)
             if mask is not None:
                 valid[here] = mask > 0
-            if scales.numel():
+            if scale is not None and scales.numel():
                 scales[here] = scale
             ctx.plain.append(mask is None and is_plain)
         if keeps:
@@ -205,14 +213,14 @@ class Project(Function):
 
     @staticmethod
     @as_cores_are_free
-    def backward(ctx, by_pixels, _):
+    def backward(ctx: Any, by_pixels: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """The cotangents of points and parameters; with a graph if that is asked for."""
         if by_pixels is None:
             return (None,) * 6
         *inputs, valid, scales = ctx.saved_tensors
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
         if torch.is_grad_enabled():
-            again = by_formulas(lambda *t: Project.traced(ctx.model, *t, cameras), inputs, wanted, by_pixels)
+            again = by_formulas(lambda p, i, d: Project.traced(ctx.model, p, i, d, cameras), inputs, wanted, by_pixels)
             return *again, None, None, None
         points, looks = inputs[0], cameras.looks
         sums = Sums(cameras, wanted, points)
@@ -234,7 +242,8 @@ class Project(Function):
             sums.add_intrinsics(block, gu, gv, *at.value)
             wants = sums.wants_distortion
             (ga, gb), by_lens = at.vjp(gu * block.intrinsics[0], gv * block.intrinsics[1], wants)
-            by_ray, by_chart = (), []
+            by_ray: tuple[Tensor, ...] = ()
+            by_chart: list[Tensor] = []
             if by_points is not None or (wants and chart.parameters):
                 by_ray, by_chart = chart.to_plane_vjp(x, y, z, ga, gb, scale, wants)
             sums.add_optics(block, by_chart + by_lens)

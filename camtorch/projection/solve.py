@@ -168,7 +168,8 @@ class _Search:
             before = t < self.domain.azimuths.limits2(self.camera, index)
         else:
             before = t < limits2[self.camera, index]
-        return inside | (before & (regular(self.lens, a, b) > 0))
+        regular_there: Tensor = inside | (before & (regular(self.lens, a, b) > 0))
+        return regular_there
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
         """In a bracket up to the fold, by the radial factor alone."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -174,7 +174,8 @@ def shown(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
         p, q = (sent.a, sent.b) if known else (p, q)
     if domain.lens.is_radial or (domain.all_staged and known):
         most2 = domain.edge2 * (1 + 8 * torch.finfo(p.dtype).eps)
-        return (torch.addcmul(p * p, q, q) <= most2) & (within > 0)
+        possible: Tensor = (torch.addcmul(p * p, q, q) <= most2) & (within > 0)
+        return possible
     found = invert(domain, p, q, True)
     has_ray = found.solved > 0
     camera, point = (~has_ray & (found.possible > 0)).nonzero(as_tuple=True)
@@ -323,7 +324,15 @@ class Unproject(Function):
 
     @staticmethod
     @as_cores_are_free
-    def forward(ctx, pixels, intrinsics, distortion, cameras: Cameras, model: type[Camera], keeps: bool):
+    def forward(
+        ctx: Any,
+        pixels: Tensor,
+        intrinsics: Tensor,
+        distortion: Tensor,
+        cameras: Cameras,
+        model: type[Camera],
+        keeps: bool,
+    ) -> tuple[Tensor, Tensor]:
         """keeps: whether there will be a backward."""
         shape, looks = pixels.shape[:2], cameras.looks
         rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
@@ -355,14 +364,14 @@ class Unproject(Function):
 
     @staticmethod
     @as_cores_are_free
-    def backward(ctx, by_rays, _):
+    def backward(ctx: Any, by_rays: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """The cotangents of pixels and parameters; with a graph if that is asked for."""
         if by_rays is None:
             return (None,) * 6
         *inputs, valid, solution = ctx.saved_tensors
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
         if torch.is_grad_enabled():
-            again = by_formulas(lambda *t: Unproject.traced(ctx.model, *t, cameras), inputs, wanted, by_rays)
+            again = by_formulas(lambda p, i, d: Unproject.traced(ctx.model, p, i, d, cameras), inputs, wanted, by_rays)
             return *again, None, None, None
         sums = Sums(cameras, wanted, inputs[0])
         by_pixels = torch.empty_like(inputs[0]) if wanted[0] else None

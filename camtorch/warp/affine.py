@@ -313,7 +313,8 @@ def inverted(matrix: Tensor) -> Tensor:
     scale = 1 / (a * d - b * c)
     a, b, c, d = d * scale, -b * scale, -c * scale, a * scale
     rows = a, b, -(a * left + b * top), c, d, -(c * left + d * top)
-    return torch.stack(rows, -1).unflatten(-1, (2, 3))
+    back: Tensor = torch.stack(rows, -1).unflatten(-1, (2, 3))
+    return back
 
 
 def after(second: Tensor, first: Tensor) -> Tensor:

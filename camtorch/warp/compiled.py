@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from threading import local
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -55,7 +56,17 @@ def _count(rotation: Tensor | None, *numbers: Tensor) -> int:
 
 
 @_positions.register_fake
-def _(_, source, source_distortion, __, target, target_distortion, rotation, sizes, *_options):
+def _(
+    _: str,
+    source: Tensor,
+    source_distortion: Tensor,
+    __: str,
+    target: Tensor,
+    target_distortion: Tensor,
+    rotation: Tensor | None,
+    sizes: Sequence[int],
+    *_options: Any,
+) -> tuple[Tensor, Tensor]:
     count = _count(rotation, source, source_distortion, target, target_distortion)
     dtype = torch.promote_types(source.dtype, target.dtype)
     dtype = dtype if rotation is None else torch.promote_types(dtype, rotation.dtype)
@@ -95,7 +106,9 @@ def warped(
     sizes = [side for camera in (source, target) for side in camera._size("Warp")]
     last = layout(images) == torch.channels_last
     options = tolerance, antialias, padding, mode, padding_mode, list(fill), last
-    return _warp(images.detach(), *cameras, None if rotation is None else rotation.detach(), sizes, *options)
+    turned = None if rotation is None else rotation.detach()
+    result: Tensor = _warp(images.detach(), *cameras, turned, sizes, *options)
+    return result
 
 
 def _layout(channels_last: bool) -> torch.memory_format:
@@ -147,14 +160,25 @@ def _warp(
 
 
 @_warp.register_fake
-def _(images, _, source, source_distortion, __, target, target_distortion, rotation, sizes, *options):
+def _(
+    images: Tensor,
+    _: str,
+    source: Tensor,
+    source_distortion: Tensor,
+    __: str,
+    target: Tensor,
+    target_distortion: Tensor,
+    rotation: Tensor | None,
+    sizes: Sequence[int],
+    *options: Any,
+) -> Tensor:
     count = _count(rotation, source, source_distortion, target, target_distortion)
     result = images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *sizes[2:])
     return result.contiguous(memory_format=_layout(options[-1]))
 
 
 @_warp.register_vmap
-def _(info, in_dims, *arguments):
+def _(info: Any, in_dims: tuple[Any, ...], *arguments: Any) -> tuple[Tensor, int]:
     dims = (*in_dims, *[None] * (len(arguments) - len(in_dims)))
     rows = (
         [a if not isinstance(dim, int) else a.select(dim, i) for a, dim in zip(arguments, dims, strict=True)]

@@ -432,7 +432,7 @@ def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
     return d
 
 
-def _over_windows(values: Tensor, dim: int, width: int, pick: Callable) -> Tensor:
+def _over_windows(values: Tensor, dim: int, width: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """The largest, or whatever is picked of two, in every window of 2 or 4; torch's pools take longer."""
     for step in (1, 2)[: width // 2]:
         n = values.shape[dim] - step
@@ -466,7 +466,7 @@ def _sixth_difference(nodes: Tensor, dim: int) -> Tensor:
     return _over_six(_over_windows(d, dim, 2, torch.maximum), -3 - dim, torch.maximum)
 
 
-def _over_six(values: Tensor, dim: int, pick: Callable) -> Tensor:
+def _over_six(values: Tensor, dim: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """`_over_windows` of 6."""
     four = _over_windows(values, dim, 4, pick)
     n = four.shape[dim] - 2
@@ -489,7 +489,8 @@ def _quintic(nodes: Tensor, camera: Tensor, i: Tensor, j: Tensor) -> Tensor:
     weights = torch.cat(terms, 1)  # (8, 6)
     with torch.autocast(nodes.device.type, enabled=False):
         planes = windows @ torch.kron(weights, weights).T.to(windows)
-    return planes.to(nodes.dtype).unflatten(-1, (STEP, STEP))
+    cells: Tensor = planes.to(nodes.dtype).unflatten(-1, (STEP, STEP))
+    return cells
 
 
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:

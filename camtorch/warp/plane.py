@@ -159,7 +159,8 @@ def _ahead(rays: Tensor, normal: Tensor, distance: Tensor) -> Tensor:
     unit = unit.to(rays.dtype)
     if unit.ndim == 2:
         unit = unit.view(len(unit), *[1] * (rays.ndim - 2), 3)
-    return (rays.detach() * unit).sum(-1) > _GRAZING
+    meets: Tensor = (rays.detach() * unit).sum(-1) > _GRAZING
+    return meets
 
 
 class BirdsEye(PlaneWarp):

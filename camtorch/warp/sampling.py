@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import Literal, TypedDict, TypeVar, get_args
+from typing import Any, Literal, TypedDict, TypeVar, get_args
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -304,7 +304,7 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
     if images.is_cpu and not any(in_graph(t) for t in (images, grid)) and not in_transform():
         return _sample(images, grid, mode, padding_mode, finite)
-    result: Tensor = _Sample.apply(images, grid, mode, padding_mode)
+    result: Tensor = _Sample.apply(images, grid, mode, padding_mode)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -325,7 +325,9 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode,
     return result
 
 
-def _sample_tiles(result: Tensor, image: Tensor, grid: Tensor, count: int, mode: Mode, padding_mode: PaddingMode):
+def _sample_tiles(
+    result: Tensor, image: Tensor, grid: Tensor, count: int, mode: Mode, padding_mode: PaddingMode
+) -> None:
     """One image (C, H, W) by tiles of rows that share it, and what rows are left over."""
     height = len(grid) // count
     tiles = count * height
@@ -509,19 +511,19 @@ class _Sample(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(images, grid, mode, padding_mode):
+    def forward(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
         if images.is_cpu and is_concrete(images) and is_concrete(grid):
             return _sample(images, grid, mode, padding_mode)
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
 
     @staticmethod
-    def setup_context(ctx, inputs, output):
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         images, grid, ctx.mode, ctx.padding_mode = inputs
         ctx.save_for_backward(images, grid)
         ctx.save_for_forward(images, grid)
 
     @staticmethod
-    def backward(ctx, gradient):
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         images, grid = ctx.saved_tensors
         by_images, by_grid = torch.ops.aten.grid_sampler_2d_backward(
             gradient,
@@ -535,7 +537,7 @@ class _Sample(torch.autograd.Function):
         return by_images, by_grid, None, None
 
     @staticmethod
-    def jvp(ctx, images_tangent, grid_tangent, *_):
+    def jvp(ctx: Any, images_tangent: Tensor, grid_tangent: Tensor, *_: Any) -> Tensor:
         images, grid = ctx.saved_tensors
         tangent = F.grid_sample(images_tangent, grid, ctx.mode, ctx.padding_mode, align_corners=False)
         nodes = _NODES[ctx.mode]
