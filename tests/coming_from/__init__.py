@@ -1,0 +1,74 @@
+"""What the checks of the rows of the pages "Coming from" have in common; beside this is one file a library."""
+
+import importlib
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+CHECKS, TRAPS = {}, []
+SIZE = (120, 160)
+
+
+def row(*keys, slow=False):
+    """Register the check of the rows that begin with these names, module and all."""
+
+    def register(check):
+        param = pytest.param(check, id=keys[0], marks=[pytest.mark.slow] if slow else [])
+        assert not CHECKS.keys() & set(keys), keys
+        CHECKS.update(dict.fromkeys(keys, param))
+        return check
+
+    return register
+
+
+def trap(check):
+    """Register the check of what a page says under "Traps"."""
+    TRAPS.append(pytest.param(check, id=f"{check.__module__.split('.')[-1]}: {check.__name__}"))
+    return check
+
+
+def optional(name):
+    """The module, or None where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+def close(ours, theirs, atol=1e-9):
+    """The same shape, and the same numbers within atol."""
+    ours, theirs = (torch.as_tensor(value).detach().numpy() for value in (ours, theirs))
+    assert ours.shape == theirs.shape
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol)
+
+
+def points(count=50, low=(-1.5, -1.5, 1.5), high=(1.5, 1.5, 4.5), seed=0):
+    """(N, 3) float64, before a camera."""
+    return np.random.default_rng(seed).uniform(low, high, (count, 3))
+
+
+def pixels(count=50, seed=0):
+    """(N, 2) float64, on an image of SIZE."""
+    return np.random.default_rng(seed).uniform((5, 5), (SIZE[1] - 5, SIZE[0] - 5), (count, 2))
+
+
+def photograph(size=SIZE):
+    """(H, W, 3) uint8, smooth, so that how it is interpolated does not matter, and nowhere 0."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    return (127 + 100 * np.stack([np.sin(x / 12 + i) * np.cos(y / 15 - i) for i in range(3)], -1)).astype(np.uint8)
+
+
+def as_images(array):
+    """(1, C, H, W) of an array (H, W, C)."""
+    return torch.from_numpy(np.ascontiguousarray(array)).permute(2, 0, 1)[None]
+
+
+def same_images(ours, theirs, within=2):
+    """Arrays (H, W, C) that differ by so many grey values, away from the borders of what is shown."""
+    assert ours.shape == theirs.shape
+    shown = ((theirs > 0) & (ours > 0)).all(-1).astype(np.uint8)
+    inner = cv2.erode(shown, np.ones((5, 5)), borderValue=0).astype(bool)
+    assert inner.mean() > 0.2
+    assert np.abs(ours.astype(int) - theirs.astype(int))[inner].max() <= within

@@ -1,0 +1,91 @@
+"""What the pages "Coming from" say of other libraries: all names exist, theirs and ours; every row holds in numbers.
+
+A row of their tables is checked by the function that is registered for the first name in it, in `coming_from/`.
+"""
+
+import functools
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+import cv2
+import pytest
+from coming_from import CHECKS, TRAPS
+
+import camtorch as ct
+import camtorch.augment.kornia
+import camtorch.augment.numpy
+
+PAGES = sorted((Path(__file__).parent.parent / "docs" / "coming-from").glob("*.md"))
+for _library in ("opencv",):
+    importlib.import_module(f"coming_from.{_library}")  # which registers its checks
+LIBRARIES = ["cv2"]
+INSTANCES = {
+    "calibration": ct.Calibration,
+    "camera": ct.Camera,
+    "pair": ct.Rectification,
+    "pose": ct.Extrinsics,
+    "warp": ct.Warp,
+}
+
+
+def rows():
+    """(page, names of theirs) of every row of the tables whose first column is headed by a module of theirs."""
+    for page in PAGES:
+        tables = re.findall(r"^\| `([\w.]+)` \| camtorch \|.*\n\|[-| ]+\n((?:\|.*\n?)+)", page.read_text(), re.M)
+        for module, body in tables:
+            for line in body.splitlines():
+                spans = re.findall(r"`([^`]+)`", line.split(" | ")[0])
+                assert spans, f"{page.name}: no name in {line}"
+                yield page, [f"{module}.{re.match(r'[A-Za-z_][.A-Za-z0-9_]*', span)[0]}" for span in spans]
+
+
+def resolved(name):
+    """What goes by that dotted name, a module or what is in it."""
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        try:
+            module = importlib.import_module(".".join(parts[:end]))
+        except ImportError:
+            continue
+        return functools.reduce(getattr, parts[end:], module)
+    raise ImportError(name)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_their_names_exist(library):
+    pytest.importorskip(library, reason=f"{library} is not installed")
+    names = [name for _, names in rows() for name in names if name.split(".")[0] == library]
+    if not hasattr(cv2, "omnidir"):  # of opencv-contrib-python
+        names = [name for name in names if not name.startswith("cv2.omnidir")]
+    assert len(names) > 5
+    for name in names:
+        resolved(name)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_our_names_exist(page):
+    found = 0
+    for span in re.findall(r"`([^`\n]+)`", page.read_text()):
+        for name in re.findall(r"(?<![\w.])((?:ct|camtorch)(?:\.[A-Za-z_]\w*)+)", span):
+            resolved(re.sub(r"^ct\.", "camtorch.", name))
+            found += 1
+        for owner, name in re.findall(rf"(?<![\w.])({'|'.join(INSTANCES)})\.([A-Za-z_]\w*)", span):
+            known = dir(INSTANCES[owner]), getattr(INSTANCES[owner], "__annotations__", ())
+            assert any(name in names for names in known), span
+    assert found > 5
+
+
+def test_every_row_has_a_check():
+    assert sorted({names[0] for _, names in rows()}) == sorted(CHECKS)
+
+
+@pytest.mark.parametrize("check", {id(param): param for param in CHECKS.values()}.values())
+def test_a_row_holds(check, tmp_path):
+    check(*[tmp_path] * len(inspect.signature(check).parameters))
+
+
+@pytest.mark.parametrize("check", TRAPS)
+def test_a_trap_is_one(check):
+    check()
