@@ -1,4 +1,8 @@
-"""The images of the documentation, rendered: `python docs/make_images.py`; those of a page by `... case-study`."""
+"""The images of the documentation, rendered: `python docs/make_images.py`, or some of them by their names.
+
+`models kannala_brandt` makes that of one camera model, `models` those of all; `case-study` takes a quarter of an hour
+and is made by its name only.
+"""
 
 import io
 import sys
@@ -7,6 +11,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
+from drawings import models
 from PIL import Image, ImageDraw, ImageFont
 
 import camtorch as ct
@@ -257,15 +262,8 @@ def case_study(seeds: int = 3) -> None:
         print(f"{training_data.TRAINING_SETS[results[0].training_set]:<28}{medians.median(0).values.tolist()}")
 
 
-if __name__ == "__main__":
-    if sys.argv[1:] == ["case-study"]:  # which takes a quarter of an hour
-        sys.exit(case_study())
-    lenses().save(HERE / "lenses.jpg", quality=85)
-    shutters().save(HERE / "shutter.jpg", quality=85)
-    fields().save(HERE / "fields.jpg", quality=85)
-    maps().save(HERE / "maps.jpg", quality=85)
-    overview().save(HERE / "overview.jpg", quality=88)
-    edits().save(HERE / "edits.jpg", quality=85)
+def by_commands() -> None:
+    """What the demos and `camtorch augment` draw."""
     full = ["--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5"]
     for words in (["augment", *full], ["demo"], ["demo", "stereo"], ["demo", "surround"], ["demo", "camera"]):
         path = HERE / f"{words[1] if words[0] == 'demo' and words[1:] else words[0]}.jpg"
@@ -274,3 +272,42 @@ if __name__ == "__main__":
         if words[1:] == ["camera"]:
             image = image.resize((image.width * 3 // 4, image.height * 3 // 4), Image.Resampling.LANCZOS)
         image.save(path, quality=85)
+
+
+SHEETS = {
+    "lenses": (lenses, 85),
+    "shutter": (shutters, 85),
+    "fields": (fields, 85),
+    "maps": (maps, 85),
+    "overview": (overview, 88),
+    "edits": (edits, 85),
+}
+"""Name of the file -> what draws it, and its quality."""
+PARTS = {"models": models.main}
+"""Name -> what makes the images of a part, or those of it that are named."""
+
+
+def make(names: list[str]) -> None:
+    """All images, or those named: of a part the names after it."""
+    if names == ["case-study"]:
+        return case_study()
+    if names and names[0] in PARTS:
+        return PARTS[names[0]](names[1:])
+    unknown = [name for name in names if name not in (*SHEETS, "commands")]
+    if unknown:
+        known = ", ".join((*SHEETS, "commands", *PARTS, "case-study"))
+        sys.exit(f"there is no image {unknown[0]!r}; there are {known}")
+    for name in names or SHEETS:
+        if name in SHEETS:
+            draw, quality = SHEETS[name]
+            draw().save(HERE / f"{name}.jpg", quality=quality)
+    if not names or "commands" in names:
+        by_commands()
+    if not names:
+        for part in PARTS.values():
+            part([])
+    return None
+
+
+if __name__ == "__main__":
+    make(sys.argv[1:])

@@ -1,0 +1,1 @@
+"""The modules of `docs/make_images.py`."""
