@@ -194,4 +194,4 @@ def main(names: list[str]) -> None:
         if not names or camera.key in names:
             picture(camera).save(folder / f"{camera.key}.jpg", quality=80, optimize=True)
     if not names or "all" in names:
-        overview(made).save(folder / "all.jpg", quality=70, optimize=True)
+        overview(made).save(folder / "all.jpg", quality=60, optimize=True)
