@@ -1,9 +1,12 @@
 """The galleries of the documentation: everything public has its place, its picture and its code there."""
 
+import inspect
+import re
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import camtorch as ct
 
@@ -46,3 +49,38 @@ def test_the_code_of_a_model_makes_one(pages):
         exec(pages.code(section), made)
         assert type(made["camera"]).__name__ == name
         assert made["camera"].image_size is not None
+
+
+def augmentations():
+    """Those that are no base of others."""
+    bases = {ct.augment.Augmentation, ct.augment.Edit}
+    found = {name: getattr(ct.augment, name) for name in ct.augment.__all__}
+    return {name for name, value in found.items() if _moves_samples(value) and value not in bases}
+
+
+def _moves_samples(value):
+    return isinstance(value, type) and issubclass(value, torch.nn.Module)
+
+
+def test_every_augmentation_has_its_place_and_picture(pages):
+    found = pages.sections("augmentations.md")
+    assert {title.split()[0] for title in found} == augmentations()
+    for section in found.values():
+        assert "ct.augment." in pages.code(section)
+        (name,) = re.findall(r"\(\.\./images/(augment/.*?)\)", section)
+        check_picture(section, name)
+
+
+def test_every_option_of_cameras_is_shown(pages):
+    shown = " ".join(pages.code(section) for section in pages.sections("augmentations.md").values())
+    options = [
+        name for name in inspect.signature(ct.augment.RandomCamera).parameters if name not in ("like", "options")
+    ]
+    assert [name for name in options if not re.search(rf'\b{name}"?[=:]', shown)] == []
+
+
+def test_no_picture_is_left_over(pages):
+    text = "".join(page.read_text() for page in DOCS.rglob("*.md"))
+    for folder in ("models", "augment"):
+        for picture in (DOCS / "images" / folder).iterdir():
+            assert f"images/{folder}/{picture.name})" in text

@@ -34,6 +34,8 @@ class Example:
     """(2, 3) points in metres."""
     gaze: Tensor
     """(2, 3) unit directions."""
+    drivers: cabin.Drivers
+    """Who was rendered, a batch of one."""
 
 
 @torch.no_grad()
@@ -61,6 +63,7 @@ def driver(camera: Camera | None = None) -> Example:
         torch.cat([box.amin(0), box.amax(0)])[None],
         drivers.eyes()[0],
         drivers.gaze.expand(2, 3),
+        drivers,
     )
 
 
