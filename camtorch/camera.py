@@ -102,7 +102,7 @@ class Camera(BatchedModule):
     """In words, what `defined` asks for."""
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
-    tensor_names = ("intrinsics", "distortion")
+    tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
     intrinsics: Tensor
     distortion: Tensor
     distortion_names: tuple[str, ...] = ()

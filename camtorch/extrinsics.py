@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ class Extrinsics(BatchedModule):
         TypeError: values that are not numbers.
     """
 
-    tensor_names = ("rotation", "translation")
+    tensor_names: ClassVar[tuple[str, ...]] = ("rotation", "translation")
     rotation: Tensor
     translation: Tensor
 

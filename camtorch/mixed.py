@@ -71,7 +71,7 @@ class Mixed(Camera):
         given = [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))]
         super(Camera, self).__init__()  # it has no numbers of its own
         self.cameras = nn.ModuleList(members)
-        self.image_size = members[0].image_size
+        self.image_size: tuple[int, int] | None = members[0].image_size
         self._places = tuple(given if order is None else [given[i] for i in _as_order(order, len(given))])
         self._rays, self._fields = Memo(), Memo()
         kinds: dict[tuple[object, ...], list[int]] = {}

@@ -67,6 +67,8 @@ class Transform(A.DualTransform):
     """
 
     _targets = (Targets.IMAGE, Targets.MASK, Targets.BBOXES, Targets.KEYPOINTS)
+    augmentation: Augmentation
+    camera: Camera | None
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, p: float | None = None):
         if not isinstance(augmentation, Augmentation):

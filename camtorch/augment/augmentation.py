@@ -21,7 +21,7 @@ from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, kind
-from camtorch.warp.sampling import as_options
+from camtorch.warp.sampling import Options, as_options
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
 
@@ -175,6 +175,10 @@ class Augmentation(SampleTransform):
     """Of what comes out; None: that of what comes in."""
     other_words: ClassVar[Mapping[str, str]] = {}
     """Words that people try as keywords -> the keyword, for the hint of an error."""
+    p: float
+    same_on_batch: bool
+    options: Options
+    min_filled: float | None
 
     def __init__(
         self,

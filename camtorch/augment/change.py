@@ -135,6 +135,12 @@ class Change:
         gate: (count,) bool, where values may not be looked at: which rows of the only part move.
     """
 
+    count: int
+    parts: list[Part]
+    listed: bool
+    mixed: Sequence[Sequence[int]] | None
+    gate: Tensor | None
+
     def __init__(
         self,
         count: int,

@@ -47,6 +47,8 @@ class Compose(Augmentation):
             last part.
     """
 
+    augmentations: nn.ModuleList
+
     def __init__(
         self,
         augmentations: Iterable[Augmentation],
@@ -79,7 +81,7 @@ class Compose(Augmentation):
         super().__init__(ranges, camera=camera, fields=fields, antialias=bool(antialias), **options)
         self.antialias = antialias
         self.augmentations = nn.ModuleList(parts)
-        self.needs_camera = any(part.needs_camera for part in parts)
+        self.needs_camera: bool = any(part.needs_camera for part in parts)
         self._check_options(parts)
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
         if len(mirrorings) > 1:

@@ -173,7 +173,7 @@ class RandomResizedCrop(Edit):
             "place": Range(0, 1, 2),
         }
         super().__init__(ranges, **options)
-        self.image_size = _as_size(size, name)
+        self.image_size: tuple[int, int] | None = _as_size(size, name)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
         """The box, of whole pixels, to the size."""
@@ -198,7 +198,7 @@ class RandomCrop(Edit):
 
     def __init__(self, size: Size, **options: Any):
         super().__init__({"place": Range(0, 1, 2)}, **options)
-        self.image_size = _as_size(size, self._name)
+        self.image_size: tuple[int, int] | None = _as_size(size, self._name)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
         """The box at its place."""
@@ -221,7 +221,7 @@ class CenterCrop(Edit):
 
     def __init__(self, size: Size, **options: Any):
         super().__init__(**options)
-        self.image_size = _as_size(size, self._name)
+        self.image_size: tuple[int, int] | None = _as_size(size, self._name)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
         """The middle, to the whole pixel."""
@@ -239,11 +239,13 @@ class Resize(Edit):
         options: see `Edit`.
     """
 
+    shorter: int | None
+
     def __init__(self, size: Size, **options: Any):
         super().__init__(**options)
         alone = size[0] if isinstance(size, Sequence) and len(size) == 1 else size  # torchvision's (256,) is 256
         self.shorter = None if isinstance(alone, Sequence) else as_whole(alone, "size", self._name)
-        self.image_size = _as_size(size, self._name) if self.shorter is None else None
+        self.image_size: tuple[int, int] | None = _as_size(size, self._name) if self.shorter is None else None
         if self.shorter is not None and self.shorter < 1:
             raise ValueError(f"{self._name}: size must be positive; got {size!r}")
 
@@ -265,6 +267,8 @@ class Pad(Edit):
         size: instead of it (height, width) that the image is padded to, evenly on both sides.
         options: see `Edit`.
     """
+
+    least: tuple[int, int] | None
 
     def __init__(self, padding: Size | None = None, *, size: Size | None = None, **options: Any):
         super().__init__(**options)
@@ -304,6 +308,8 @@ class Rotate90(Edit):
         step: between the numbers.
         options: see `Edit`.
     """
+
+    times: tuple[int, int, int]
 
     def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Any):
         name = type(self).__name__
@@ -351,7 +357,7 @@ class _Flip(Edit):
         **options: Any,
     ):
         super().__init__(p=p, **options)
-        self.mirroring = Mirroring(landmarks, lateral_axis, swap_sides, self._name)
+        self.mirroring: Mirroring | None = Mirroring(landmarks, lateral_axis, swap_sides, self._name)
 
 
 class HorizontalFlip(_Flip):

@@ -16,7 +16,7 @@ from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_wo
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.rotations import check_rotation, rotation_matrix
-from camtorch.warp.sampling import as_options
+from camtorch.warp.sampling import Options, as_options
 from camtorch.warp.warp import Warp
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
@@ -50,6 +50,12 @@ class FaceNormalizer(SampleTransform):
     camera. The face's centre is `face_center` (B, 3) if the sample has it, else the origin of the head.
     Beside the moved fields come `scale` (B,), distance / |c|, `camera` and `rotation`.
     """
+
+    focal: float
+    distance: float
+    image_size: tuple[int, int]
+    axis: tuple[float, ...]
+    options: Options
 
     def __init__(
         self,

@@ -85,6 +85,9 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         - params are tensors, drawn on the CPU wherever the module is. A replay is bit-identical.
     """
 
+    augmentation: Augmentation
+    camera: Camera
+
     def __init__(
         self,
         augmentation: Augmentation,
@@ -112,7 +115,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         same_on_batch = augmentation.same_on_batch if same_on_batch is None else same_on_batch
         super().__init__(p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
         self.augmentation, self.camera = augmentation, camera
-        self.flags = {"resample": Resample.get(augmentation.options["mode"]), "align_corners": False}
+        self.flags: dict[str, Any] = {"resample": Resample.get(augmentation.options["mode"]), "align_corners": False}
         self.flags["padding_mode"] = SamplePadding.get(augmentation.options["padding_mode"])
         size = augmentation.size_after(camera.image_size)
         if size != camera.image_size:

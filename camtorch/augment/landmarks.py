@@ -111,6 +111,10 @@ class Mirroring:
         owner: the augmentation, for errors.
     """
 
+    given: TableLike | Mapping[str, TableLike | None] | None
+    swap_sides: bool
+    owner: str
+
     def __init__(
         self,
         landmarks: TableLike | Mapping[str, TableLike | None] | None,

@@ -13,7 +13,7 @@ from torch import Tensor
 from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._module import Memo, same
 from camtorch._tracing import in_graph, is_concrete
-from camtorch.augment.augmentation import Augmentation, as_range
+from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
@@ -97,6 +97,7 @@ class RandomCamera(Augmentation):
         **dict.fromkeys(("preset", "model", "lens"), "like"),
         **{"center": "centre", "size": "image_size"},
     }
+    like: Camera | None
 
     def __init__(
         self,
@@ -123,7 +124,7 @@ class RandomCamera(Augmentation):
         super().__init__(**options)
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
         self._memo, self._plane = Memo(), Memo()
-        self.image_size = as_image_size(image_size, self._name)
+        self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
         self._is_real = isinstance(like, str) and like == _REAL
         self.like = None if self._is_real else _as_like(like, self._name)
         if self._is_real:
@@ -154,7 +155,9 @@ class RandomCamera(Augmentation):
             "readout": (_pair(readout), {"least": -1, "most": 1}),
             "exposure": (_pair(exposure), {"least": 0, "most": 1}),
         }
-        self.ranges = {n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None}
+        self.ranges: dict[str, Range] = {
+            n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None
+        }
         if "fov" in self.ranges and self.ranges["fov"].high <= 2 * math.pi:
             raise ValueError(
                 f"{self._name}: fov is in degrees; {fov!r} seems to be radians, which math.degrees() converts"

@@ -274,6 +274,10 @@ def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
 class SampleTransform(nn.Module):
     """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
 
+    fields: dict[str, str]
+    mask_fill: float
+    valid_mask: bool
+
     def __init__(self, camera: Camera | None, fields: Mapping[str, str] | None, mask_fill: float, valid_mask: bool):
         super().__init__()
         self._name = type(self).__name__

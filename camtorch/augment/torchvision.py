@@ -73,6 +73,8 @@ class Transform(v2.Transform):
     """
 
     _transformed_types = (torch.Tensor, PIL.Image.Image, Camera)
+    camera: Camera | None
+    valid: bool
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, *, valid: bool = False):
         super().__init__()

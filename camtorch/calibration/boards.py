@@ -170,7 +170,7 @@ class Charuco(Board):
     kind = "charuco"
     counted = "squares"
     least = 3
-    sides = ("square", "marker")
+    sides: ClassVar[tuple[str, ...]] = ("square", "marker")
 
     def __post_init__(self) -> None:
         super().__post_init__()

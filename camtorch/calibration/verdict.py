@@ -58,6 +58,9 @@ class Zone(NamedTuple):
 class Survey:
     """Numbers of a calibration that sentences are made of, over a map of the image."""
 
+    shape: tuple[int, int]
+    pixels: Tensor
+
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
         height, width = calibration.image_size

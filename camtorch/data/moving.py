@@ -30,6 +30,8 @@ _MOST_WARPS = 16  # whose maps are kept
 class Always(Augmentation):
     """One warp, for every sample: the same map each time."""
 
+    warp: Warp
+
     def __init__(self, warp: Warp, owner: str, fields: Mapping[str, str] | None = None):
         if isinstance(warp, SurfaceWarp):
             raise TypeError(f"{owner}: {type(warp).__name__} moves images alone; call it on them, without their labels")
@@ -58,6 +60,9 @@ class Mover:
     Raises:
         TypeError: nothing that moves samples.
     """
+
+    owner: str
+    fields: dict[str, str]
 
     def __init__(self, transform: Moves, owner: str, seed: int, epoch: int, fields: Mapping[str, str] | None):
         self.owner, self.fields = owner, dict(fields or {})

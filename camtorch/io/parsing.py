@@ -269,6 +269,9 @@ class Tree:
         place: says where in it the parser is, for the errors.
     """
 
+    path: str | os.PathLike[str]
+    place: Callable[[], str]
+
     def __init__(self, path: str | os.PathLike[str], place: Callable[[], str]):
         self.path, self.place = path, place
         self.root: Any = None

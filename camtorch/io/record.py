@@ -28,6 +28,10 @@ class Record:
         place: where it stands.
     """
 
+    path: str | os.PathLike[str]
+    value: Any
+    place: str
+
     def __init__(self, path: str | os.PathLike[str], value: Any, place: str = ""):
         self.path, self.value, self.place = path, value, place
 

@@ -169,6 +169,9 @@ class Lossy:
         format: what the errors call the format.
     """
 
+    path: str
+    format: str
+
     def __init__(self, path: str, format: str):
         self.path, self.format = path, format
 

@@ -96,6 +96,13 @@ class Manifest:
         OSError: no such folder can be made, or written to. BlockingIOError: somebody does the same right now.
     """
 
+    folder: Path
+    job: str
+    settings: Any
+    shard: Shard
+    path: Path
+    terms: Terms
+
     def __init__(self, folder: Path, job: str, settings: Json, shard: Shard | None = None):
         shard = shard or Shard()
         of = "" if shard.count == 1 else f"-{shard.rank}-of-{shard.count}"

@@ -32,6 +32,9 @@ _FIRM = 1e-4  # of the largest singular value: what is less belongs to unknowns 
 class System:
     """Linear problems with their damped steps: what `levenberg_marquardt.minimise` asks for."""
 
+    equations: Equations
+    decrement: Tensor
+
     def __init__(self, equations: Equations, width: int, held: Tensor):
         self.width = width
         if bool(held.any()):

@@ -23,8 +23,8 @@ class DepthAI:
     """The format: see the module."""
 
     name = "depthai"
-    suffixes = ()
-    options = ("step", "order")
+    suffixes: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("step", "order")
     described = True
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:

@@ -29,8 +29,8 @@ class DW100:
     """The format: see the module."""
 
     name = "dw100"
-    suffixes = ()
-    options = ("clip",)
+    suffixes: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("clip",)
     described = True
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:

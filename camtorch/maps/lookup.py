@@ -30,6 +30,11 @@ class LookupMap:
         facts: what the file or its description says beside, such as `step`, `nodes` or `block_size`.
     """
 
+    positions: Tensor
+    source_size: tuple[int, int]
+    format: str
+    facts: dict[str, Any]
+
     def __init__(self, positions: Tensor, source_size: tuple[int, int], format: str, facts: dict[str, Any]):
         self.positions, self.source_size, self.format, self.facts = positions, source_size, format, facts
 

@@ -28,8 +28,8 @@ class ONNX:
     """The format: see the module."""
 
     name = "onnx"
-    suffixes = (".onnx",)
-    options = ("dtype",)
+    suffixes: tuple[str, ...] = (".onnx",)
+    options: tuple[str, ...] = ("dtype",)
     described = False
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:

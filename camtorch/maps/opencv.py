@@ -32,9 +32,11 @@ class OpenCV:
         fixed: whether it is in fixed point.
     """
 
-    suffixes = (".yml", ".yaml", ".xml", ".npz")
-    options = ()
+    suffixes: tuple[str, ...] = (".yml", ".yaml", ".xml", ".npz")
+    options: tuple[str, ...] = ()
     described = False
+    name: str
+    fixed: bool
 
     def __init__(self, name: str, *, fixed: bool):
         self.name, self.fixed = name, fixed

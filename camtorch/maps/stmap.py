@@ -35,8 +35,8 @@ class STMap:
     """The format: see the module."""
 
     name = "stmap"
-    suffixes = (".exr", ".tif", ".tiff")
-    options = ("v",)
+    suffixes: tuple[str, ...] = (".exr", ".tif", ".tiff")
+    options: tuple[str, ...] = ("v",)
     described = False
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:

@@ -40,8 +40,10 @@ class TextureMesh:
         suffixes: of its files.
     """
 
-    options = ("step",)
+    options: tuple[str, ...] = ("step",)
     described = False
+    name: str
+    suffixes: tuple[str, ...]
 
     def __init__(self, name: str, suffixes: tuple[str, ...]):
         self.name, self.suffixes = name, suffixes

@@ -39,8 +39,8 @@ class TILDC:
     """The format: see the module."""
 
     name = "ti_ldc"
-    suffixes = ()
-    options = ("step", "block", "clip")
+    suffixes: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("step", "block", "clip")
     described = True
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from types import MappingProxyType
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ class BrownConrady(Camera):
     key = "brown_conrady"
     distortion_names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
     default_count = 5
-    counts = (4, 5, 8, 12, 14)
+    counts: ClassVar[tuple[int, ...]] = (4, 5, 8, 12, 14)
     special_cases = (("pinhole", ()),)
     fit_counts = (5, 8)
     odd_in_x = frozenset({"p2", "s1", "s2", "tau_y"})

@@ -185,8 +185,12 @@ class _Msvc(_Gcc):
         return target
 
 
-if __name__ == "__main__":
+def _main() -> None:
     try:
         print(build())
     except (BuildError, OSError) as error:
         sys.exit(f"camtorch.native.build: {error}")
+
+
+if __name__ == "__main__":
+    _main()

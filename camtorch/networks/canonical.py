@@ -17,7 +17,7 @@ from camtorch.camera import Camera
 from camtorch.mixed import Mixed
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.warp.affine import AffineWarp
-from camtorch.warp.sampling import as_options
+from camtorch.warp.sampling import Options, as_options
 
 _LENGTHS = ("depth", "distance", "points", "tvec")
 
@@ -58,6 +58,10 @@ class CanonicalCamera(SampleTransform):
     Raises:
         ValueError: a focal length that is not positive, another word for `scales`, a size beside "depth".
     """
+
+    focal: float
+    image_size: tuple[int, int] | None
+    options: Options
 
     def __init__(
         self,

@@ -61,6 +61,13 @@ class CameraHead(GeometryModule):
         TypeError: no model, no pair of numbers.
     """
 
+    model: type[Camera]
+    image_size: tuple[int, int]
+    centre: float
+    shared_focal: bool
+    names: tuple[str, ...]
+    linear: nn.Linear
+
     def __init__(
         self,
         features: int,

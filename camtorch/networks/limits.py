@@ -54,6 +54,11 @@ class Limits:
     Coefficients are (*C, n) and radii of discs, on the plane of the chart, (*C, 1).
     """
 
+    model: type[Camera]
+    given: Tensor
+    bends: bool
+    is_radial: bool
+
     def __init__(self, model: type[Camera], given: Tensor):
         """given: (n,), the coefficients of the lens from which others are seen."""
         self.model, self.given = model, given

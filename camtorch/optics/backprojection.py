@@ -26,9 +26,12 @@ class Inverted(Chart):
     Rays are covered before theta ceases to ascend, and up to `FURTHEST`.
     """
 
+    factor: type[RadialFactor]
+
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor]):
         """factor: the class of R, whose instances are made of the parameters."""
-        self.factor, self.parameters = factor, tuple(parameters)
+        self.factor = factor
+        self.parameters: tuple[Tensor, ...] = tuple(parameters)
         self._known: RadialInverse | None = None
 
     @property

@@ -238,6 +238,8 @@ class Equidistant(Chart):
 class EquidistantUpTo(Equidistant):
     """The equidistant chart of a lens that is known up to some angle."""
 
+    last: Tensor
+
     def __init__(self, last: Tensor):
         self.last = last.detach()
 
@@ -366,7 +368,7 @@ class Fov(Chart):
     """
 
     def __init__(self, omega: Tensor):
-        self.parameters = (omega,)
+        self.parameters: tuple[Tensor, ...] = (omega,)
 
     def _slope(self) -> tuple[Tensor, Tensor]:
         """2 tan(omega / 2) / omega and the square of 2 tan(omega / 2)."""
@@ -405,7 +407,7 @@ class OneDivision(Chart):
     """The rays (a, b, 1 + coefficient r^2): all but the exact backward one for a negative coefficient."""
 
     def __init__(self, coefficient: Tensor):
-        self.parameters = (coefficient,)
+        self.parameters: tuple[Tensor, ...] = (coefficient,)
 
     def _below(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """The plane point is 2 (x, y) over the first; the second is positive before the fold."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -96,6 +96,10 @@ class Stage:
 class StageAt:
     """A stage at points (a, b)."""
 
+    stage: Stage
+    a: Tensor
+    b: Tensor
+
     def __init__(self, stage: Stage, a: Tensor, b: Tensor):
         self.stage, self.a, self.b = stage, a, b
 
@@ -150,10 +154,15 @@ class Planar(Stage):
     radial: RadialFactor | None = None
     tangential: Sequence[Tensor] = ()
     prism: Sequence[Tensor] = ()
+    is_radial: bool = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self.is_radial = len(self.tangential) == len(self.prism) == 0
-        self.parameters = *(self.radial.parameters if self.radial else ()), *self.tangential, *self.prism
+        self.parameters: tuple[Tensor, ...] = (
+            *(self.radial.parameters if self.radial else ()),
+            *self.tangential,
+            *self.prism,
+        )
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> PlanarAt:
         """The stage at points; see `PlanarAt`."""
@@ -186,6 +195,12 @@ class PlanarAt(StageAt):
     """A `Planar` stage at points m = (a, b)."""
 
     stage: Planar
+    a: Tensor
+    b: Tensor
+    t: Tensor
+    factor: Tensor
+    slope: Tensor
+    twice_dot: Tensor
 
     def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
         """order: 1 if any derivative will be asked for. t: |m|^2, if it is known."""
@@ -281,7 +296,17 @@ class Tilt(Stage):
 
     def __init__(self, tau_x: Tensor, tau_y: Tensor):
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
-        self.parameters = (cy, sy * sx, -sy * cx, torch.zeros_like(cx), cx, sx, sy, -cy * sx, cy * cx)
+        self.parameters: tuple[Tensor, ...] = (
+            cy,
+            sy * sx,
+            -sy * cx,
+            torch.zeros_like(cx),
+            cx,
+            sx,
+            sy,
+            -cy * sx,
+            cy * cx,
+        )
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> TiltAt:
         """The stage at points."""
@@ -309,6 +334,14 @@ class Tilt(Stage):
 
 class TiltAt(StageAt):
     """A `Tilt` stage at points."""
+
+    stage: Tilt
+    a: Tensor
+    b: Tensor
+    depth: Tensor
+    reciprocal: Tensor
+    u: Tensor
+    v: Tensor
 
     def __init__(self, stage: Tilt, a: Tensor, b: Tensor):
         self.stage, self.a, self.b = stage, a, b
@@ -353,6 +386,10 @@ class TiltAt(StageAt):
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
+    is_radial: bool
+    radial: RadialFactor | None
+    rest: Lens | None
+
     def __init__(self, *stages: Stage):
         self.stages = stages
         self.is_radial = len(stages) == 1 and stages[0].is_radial
@@ -395,6 +432,8 @@ class Lens:
 
 class LensAt:
     """A chain of stages at points."""
+
+    value: tuple[Tensor, Tensor]
 
     def __init__(self, stages: Sequence[Stage], a: Tensor, b: Tensor, order: int, t: Tensor | None):
         self.stages: list[StageAt] = []

@@ -42,7 +42,7 @@ class RadialFactor:
         cls.name = register(FACTORS, cls)
 
     def __init__(self, coefficients: Sequence[Tensor]):
-        self.parameters = tuple(coefficients)
+        self.parameters: tuple[Tensor, ...] = tuple(coefficients)
 
     def __call__(self, t: Tensor) -> Tensor:
         """The factor itself: all that a new one has to state."""
@@ -114,9 +114,12 @@ class Polynomial(RadialFactor):
 class Rational(RadialFactor):
     """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
 
+    numerator: Polynomial
+    denominator: Polynomial
+
     def __init__(self, numerator: Sequence[Tensor], denominator: Sequence[Tensor]):
         self.numerator, self.denominator = Polynomial(numerator), Polynomial(denominator)
-        self.parameters = *self.numerator.parameters, *self.denominator.parameters
+        self.parameters: tuple[Tensor, ...] = *self.numerator.parameters, *self.denominator.parameters
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.numerator(t) / self.denominator(t)
@@ -149,9 +152,11 @@ class RadiusPolynomial(RadialFactor):
     on the direction from which the centre is approached. The one given there is zero, their mean.
     """
 
+    of_radius: Polynomial
+
     def __init__(self, coefficients: Sequence[Tensor]):
         self.of_radius = Polynomial(coefficients)
-        self.parameters = self.of_radius.parameters
+        self.parameters: tuple[Tensor, ...] = self.of_radius.parameters
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
@@ -177,7 +182,7 @@ class AnglePerRadius(RadialFactor):
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.ahead: RadialFactor = Polynomial(coefficients)
-        self.parameters = self.ahead.parameters
+        self.parameters: tuple[Tensor, ...] = self.ahead.parameters
 
     def __call__(self, t: Tensor) -> Tensor:
         return angle_per_radius(t, self.ahead(t))
@@ -210,6 +215,10 @@ class RadiusTable(RadialFactor):
     so that the lens folds there.
     """
 
+    nodes: tuple[Tensor, ...]
+    end: Tensor
+    cubics: tuple[tuple[Tensor, ...], ...]
+
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
         """nodes: ascending radii. values: r at the nodes, as many, two at least."""
         zero = torch.zeros_like(values[0])
@@ -229,7 +238,7 @@ class RadiusTable(RadialFactor):
         self.cubics = tuple(power.unbind(-1) for power in (heights[..., :-1], before, squares, cubes))
         if is_exporting():  # a recorded loop takes no views of one tensor
             self.cubics = tuple(tuple(c.clone() for c in power) for power in self.cubics)
-        self.parameters = tuple(c for power in self.cubics for c in power)
+        self.parameters: tuple[Tensor, ...] = tuple(c for power in self.cubics for c in power)
 
     @property
     def fold(self) -> Tensor:

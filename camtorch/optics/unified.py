@@ -23,10 +23,14 @@ class Unified(Chart):
     out is 0, 0 and 1, that is the perspective chart; a number is a part that does not learn.
     """
 
+    fixed_alpha: float | None
+    has_xi: bool
+    has_beta: bool
+
     def __init__(self, xi: Tensor | None = None, alpha: Tensor | float = 0.0, beta: Tensor | None = None):
         self.fixed_alpha = alpha if isinstance(alpha, float) else None
         self.has_xi, self.has_beta = xi is not None, beta is not None
-        self.parameters = tuple(w for w in (xi, alpha, beta) if isinstance(w, Tensor))
+        self.parameters: tuple[Tensor, ...] = tuple(w for w in (xi, alpha, beta) if isinstance(w, Tensor))
 
     def _parts(self) -> tuple[Tensor | None, Tensor | float, Tensor | None]:
         parts = list(self.parameters)

@@ -66,6 +66,12 @@ class Rectification(GeometryModule):
     Where the cameras or the extrinsics learn, the warps are made anew each time, and gradients reach them.
     """
 
+    source_left: Camera
+    source_right: Camera
+    extrinsics: Extrinsics
+    camera_right: Camera
+    vertical: bool
+
     def __init__(
         self,
         source_left: Camera,

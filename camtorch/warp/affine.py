@@ -37,6 +37,8 @@ class MirrorWarp(Warp):
         options: mode and so on, as of `Warp`.
     """
 
+    batch_shape: torch.Size
+
     def __init__(
         self,
         source: Camera,
@@ -131,6 +133,7 @@ class AffineWarp(MirrorWarp):
 
     is_an_operator = False
     matrix: Tensor
+    batch_shape: torch.Size
 
     def __init__(self, source: Camera, target: Camera, matrix: Tensor, rotation: Tensor | None, **options: Any):
         super().__init__(source, target, rotation, **options)

@@ -69,6 +69,11 @@ class Lattice:
         size: (h, w) of the target.
     """
 
+    nodes: Tensor
+    cells: Tensor
+    exact: Tensor
+    size: tuple[int, int]
+
     def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]):
         self.nodes, self.cells, self.exact, self.size = nodes, cells, exact, size
 

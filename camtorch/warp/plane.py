@@ -44,6 +44,8 @@ class PlaneWarp(SurfaceWarp):
             not fit, and as `Warp`. TypeError: no cameras, no extrinsics.
     """
 
+    batch_shape: torch.Size
+
     def __init__(
         self,
         source: Camera,
@@ -181,6 +183,10 @@ class BirdsEye(PlaneWarp):
         ValueError: a camera on or below the ground, ranges that do not ascend, a resolution that is not positive, and
             as `Warp`. TypeError: no camera, no extrinsics.
     """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    resolution: float
 
     def __init__(
         self,

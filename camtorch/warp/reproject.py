@@ -43,6 +43,12 @@ class Reproject(GeometryModule):
         TypeError: no cameras, no extrinsics.
     """
 
+    source: Camera
+    target: Camera
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: tuple[float, ...]
+
     def __init__(
         self,
         source: Camera,

@@ -244,6 +244,9 @@ class Pyramid:
     filter, and between levels is interpolated.
     """
 
+    images: Tensor
+    finite: bool
+
     def __init__(self, images: Tensor, finite: bool):
         self.images, self.finite = images, finite
 

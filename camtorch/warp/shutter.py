@@ -70,6 +70,9 @@ class RollingShutter(GeometryModule):
     readout: Tensor
     rates: Tensor
     exposure: Tensor
+    batch_shape: torch.Size
+    samples: int
+    gamma: float
 
     def __init__(
         self,

@@ -56,6 +56,7 @@ class Surround(GeometryModule):
     """
 
     warps: nn.ModuleDict
+    names: tuple[str, ...]
 
     def __init__(self, warps: Mapping[str, Warp], blend: float | None, fill: float):
         super().__init__()

@@ -94,6 +94,11 @@ class Warp(GeometryModule):
     target: Camera
     rotation: Tensor | None
     _pinned: Sampling | Lattice | None
+    fill: tuple[float, ...]
+    antialias: bool
+    shutter: RollingShutter | None
+    target_shutter: RollingShutter | None
+    batch_shape: torch.Size
 
     def __init__(
         self,
