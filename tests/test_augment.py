@@ -158,6 +158,17 @@ def test_signs_of_the_angles(angle, moves):
     torch.testing.assert_close(shift, expected.float(), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("angle", ["yaw", "pitch", "roll"])
+def test_angles_may_be_left_out(angle):
+    camera, pixels = pinhole(), lattice()
+    turned = {angle: (10, 10)}
+    none, zero = (
+        RandomMount(camera=camera, **{**dict.fromkeys(("yaw", "pitch", "roll"), v), **turned}) for v in (None, (0, 0))
+    )
+    torch.testing.assert_close(none(keypoints=pixels)["keypoints"], zero(keypoints=pixels)["keypoints"], rtol=0, atol=0)
+    assert (none(keypoints=pixels)["keypoints"] - pixels).abs().max() > 10
+
+
 def sample(count=3, camera=None):
     generator = torch.Generator().manual_seed(5)
 

@@ -183,8 +183,12 @@ class RandomCamera(Augmentation):
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """The new camera and its turn; see `Augmentation.new_camera`."""
-        rotation = mount_rotation(*(values[name] for name in ("yaw", "pitch", "roll"))) if "yaw" in values else None
-        return self._target(source, values), rotation
+        names = "yaw", "pitch", "roll"
+        angle = next((values[name] for name in names if name in values), None)
+        if angle is None:
+            return self._target(source, values), None
+        zero = torch.zeros_like(angle)
+        return self._target(source, values), mount_rotation(*(values.get(name, zero) for name in names))
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         shades = light = None
