@@ -18,10 +18,11 @@ import camtorch.augment.kornia
 import camtorch.augment.numpy
 
 PAGES = sorted((Path(__file__).parent.parent / "docs" / "coming-from").glob("*.md"))
-for _library in ("opencv",):
+for _library in ("opencv", "kornia"):
     importlib.import_module(f"coming_from.{_library}")  # which registers its checks
-LIBRARIES = ["cv2"]
+LIBRARIES = ["cv2", "kornia"]
 INSTANCES = {
+    "augment": ct.augment.Augmentation,
     "calibration": ct.Calibration,
     "camera": ct.Camera,
     "pair": ct.Rectification,
@@ -31,14 +32,15 @@ INSTANCES = {
 
 
 def rows():
-    """(page, names of theirs) of every row of the tables whose first column is headed by a module of theirs."""
+    """(names of theirs, ours) of every row of the tables whose first column is headed by a module of theirs."""
     for page in PAGES:
         tables = re.findall(r"^\| `([\w.]+)` \| camtorch \|.*\n\|[-| ]+\n((?:\|.*\n?)+)", page.read_text(), re.M)
         for module, body in tables:
             for line in body.splitlines():
-                spans = re.findall(r"`([^`]+)`", line.split(" | ")[0])
+                theirs, ours, *_ = line.split(" | ")
+                spans = re.findall(r"`([^`]+)`", theirs)
                 assert spans, f"{page.name}: no name in {line}"
-                yield page, [f"{module}.{re.match(r'[A-Za-z_][.A-Za-z0-9_]*', span)[0]}" for span in spans]
+                yield [f"{module}.{re.match(r'[A-Za-z_][.A-Za-z0-9_]*', span)[0]}" for span in spans], ours.strip()
 
 
 def resolved(name):
@@ -56,7 +58,7 @@ def resolved(name):
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_their_names_exist(library):
     pytest.importorskip(library, reason=f"{library} is not installed")
-    names = [name for _, names in rows() for name in names if name.split(".")[0] == library]
+    names = [name for names, _ in rows() for name in names if name.split(".")[0] == library]
     if not hasattr(cv2, "omnidir"):  # of opencv-contrib-python
         names = [name for name in names if not name.startswith("cv2.omnidir")]
     assert len(names) > 5
@@ -78,7 +80,9 @@ def test_our_names_exist(page):
 
 
 def test_every_row_has_a_check():
-    assert sorted({names[0] for _, names in rows()}) == sorted(CHECKS)
+    """But for those that have no counterpart."""
+    assert sorted({names[0] for names, ours in rows() if ours != "none"} - set(CHECKS)) == []
+    assert sorted(set(CHECKS) - {names[0] for names, _ in rows()}) == []
 
 
 @pytest.mark.parametrize("check", {id(param): param for param in CHECKS.values()}.values())

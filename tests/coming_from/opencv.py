@@ -223,11 +223,6 @@ def rational():
     same_calibrations(cv2.CALIB_RATIONAL_MODEL, {"count": 8})
 
 
-@row("cv2.CALIB_FIX_ASPECT_RATIO")
-def aspect_ratio():
-    """Not to be had."""
-
-
 def boards(cameras, count=12):
     """A board (N, 3), and what cameras see of it in its poses: corners (V, N, 2) of each, float64, without noise.
 
