@@ -39,7 +39,7 @@ def optional(name):
 
 def close(ours, theirs, atol=1e-9):
     """The same shape, and the same numbers within atol."""
-    ours, theirs = (torch.as_tensor(value).detach().numpy() for value in (ours, theirs))
+    ours, theirs = (np.asarray(x.detach() if isinstance(x, torch.Tensor) else x) for x in (ours, theirs))
     assert ours.shape == theirs.shape
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol)
 
