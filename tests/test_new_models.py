@@ -186,6 +186,16 @@ def test_without_a_graph(model, method):
             torch.testing.assert_close(getattr(camera_of(model), method)(values)[0], expected)
 
 
+@every_camera
+def test_reverse_mode_of_torch_func(model):
+    camera = camera_of(model)
+    ray = fan(50)[100]
+    for method, value in ((camera.project, ray), (camera.unproject, camera.project(ray)[0].detach())):
+        found = torch.func.jacrev(lambda v, m=method: m(v)[0])(value)
+        expected = torch.autograd.functional.jacobian(lambda v, m=method: m(v)[0], value)
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("model", slow_unless((Waved, Backwards).__contains__, list(CAMERAS)))
 def test_traced(model):
     camera = camera_of(model)

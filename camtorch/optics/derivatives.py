@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import torch
@@ -79,11 +79,11 @@ def derivatives_of(part: Any, t: Tensor, order: int) -> tuple[Tensor, ...]:
 @contextmanager
 def _recorded() -> Iterator[None]:
     """A graph for this derivative alone, whatever is recorded around it, and however that keeps its tensors."""
-    with (
-        torch.inference_mode(False),
-        torch.enable_grad(),
-        torch.autograd.graph.saved_tensors_hooks(lambda tensor: tensor, lambda tensor: tensor),
-    ):
+    with ExitStack() as stack:
+        stack.enter_context(torch.inference_mode(False))
+        stack.enter_context(torch.enable_grad())
+        with suppress(RuntimeError):  # within torch.func's transforms there are no hooks, and torch refuses new ones
+            stack.enter_context(torch.autograd.graph.saved_tensors_hooks(lambda tensor: tensor, lambda tensor: tensor))
         yield
 
 
