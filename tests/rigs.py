@@ -6,11 +6,11 @@ from pathlib import Path
 import torch
 
 import camtorch as ct
+from camtorch.io import formats
 
 FILES = Path(__file__).parent / "files"
 MANIFEST = json.loads((FILES / "MANIFEST.json").read_text())
-SUFFIXES = {"opencv": ".yml", "ros": ".yaml", "kalibr": ".yaml", "colmap": ".txt", "nerfstudio": ".json"}
-SUFFIXES |= {"aria": ".json", "basalt": ".json", "mrcal": ".cameramodel", "camtorch": ".json"}
+SUFFIXES = {names.format: names.suffixes[0] for names in formats.NAMES_BY_FORMAT.values()}
 POINT = (0.1, -0.2, 1.0)
 
 

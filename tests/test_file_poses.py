@@ -254,11 +254,15 @@ def test_any_pose_survives(rotation, translation, tmp_path):
     camera = ct.Pinhole(float64([500, 501, 320, 240]), image_size=(480, 640))
     pose = ct.Extrinsics(float64(rotation), float64(translation))
     for format, suffix in SUFFIXES.items():
-        if format in ("opencv", "ros"):
-            continue
         path = tmp_path / f"cameras{suffix}"
-        ct.save(ct.Rig({"cam0": camera}, {"cam0": pose}), path, format)
+        try:
+            ct.save(ct.Rig({"cam0": camera}, {"cam0": pose}), path, format)
+        except ct.CameraFileError:
+            assert format not in ("kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "camtorch")
+            continue
         first = ct.load(path)
+        if not first.extrinsics and not any((*rotation, *translation)):  # which is none
+            continue
         (found,) = first.extrinsics.values()
         limit = 1e-15 * (8 + math.hypot(*translation))
         assert torch.allclose(found.matrix(), pose.matrix(), rtol=0, atol=limit)

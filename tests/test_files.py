@@ -107,6 +107,9 @@ def cases():
                     values = values[:1] + values
                 model = models.get(camera["name"], "kannala_brandt")
                 yield name, label, model, values[:4], values[4:], tuple(camera["image_size"])
+        elif "cameras" in expected:
+            for label, camera in expected["cameras"].items():
+                yield name, label, *(camera[key] for key in ("model", "intrinsics", "distortion", "image_size"))
 
 
 @pytest.mark.parametrize(("name", "camera", "model", "core", "distortion", "size"), list(cases()))

@@ -137,11 +137,15 @@ def test_poses_of_many_images_are_one_batch_in_every_format(tmp_path):
 @given(core=st.tuples(*[st.floats(1, 1e4)] * 4), distortion=st.lists(st.floats(-1, 1), min_size=4, max_size=4))
 def test_numbers_come_back_to_the_last_bit(tmp_path_factory, core, distortion):
     for format, suffix in SUFFIXES.items():
-        if format in ("aria", "basalt", "colmap", "nerfstudio"):  # another model; half a pixel
+        if format in ("basalt", "colmap", "nerfstudio"):  # another number of coefficients; half a pixel
             continue
         path = tmp_path_factory.getbasetemp() / f"exact{suffix}"
         one = camera(distortion=distortion, core=core)
-        ct.save(one, path, format)
+        try:
+            ct.save(one, path, format)
+        except ct.CameraFileError:
+            assert format not in ("opencv", "ros", "kalibr", "mrcal", "camtorch")
+            continue
         again = ct.load(path)
         assert_same(ct.Rig(again.cameras), ct.Rig({"cam0" if format == "kalibr" else "camera": one}))
 

@@ -26,8 +26,8 @@ from camtorch.rig import Rig
 _BY_CONTENT: tuple[ContentFormat, ...] = (colmap, ocamcalib)
 _BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, nerfstudio, ros, kalibr, opencv)
 
-_NAMES = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
-FORMATS = tuple(_NAMES)
+NAMES_BY_FORMAT = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
+FORMATS = tuple(NAMES_BY_FORMAT)
 
 
 def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
@@ -76,7 +76,7 @@ def _path(path: Any, owner: str) -> str:
 
 
 def _in_folder(path: str) -> str:
-    names = [name for format in _NAMES.values() for name in format.in_folder]
+    names = [name for format in NAMES_BY_FORMAT.values() for name in format.in_folder]
     found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
     if found is None:
         raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
@@ -141,7 +141,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise TypeError(f"{path}: {name} is a {type(camera).__name__}, which has no key of its own to be loaded by")
     format = _known(format) or _format_of(rig, path)
     if os.path.isdir(path):
-        inside = [os.path.join(path, name) for name in _NAMES[format].in_folder]
+        inside = [os.path.join(path, name) for name in NAMES_BY_FORMAT[format].in_folder]
         if not inside:
             raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
         path = next(filter(os.path.exists, inside), inside[-1])
@@ -165,7 +165,7 @@ def _known(format: str | None) -> str | None:
 def _format_of(rig: Rig, path: str) -> str:
     """The format to write: the rig's own if it may be, else the one that the name of the file means."""
     folder, file = os.path.isdir(path), os.path.basename(path).lower()
-    fitting = [n for n in _NAMES.values() if (n.in_folder if folder else file.endswith(n.suffixes))]
+    fitting = [n for n in NAMES_BY_FORMAT.values() if (n.in_folder if folder else file.endswith(n.suffixes))]
     formats = sorted(names.format for names in fitting)
     if rig.format is not None and rig.format in formats:
         return rig.format
