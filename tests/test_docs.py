@@ -134,6 +134,11 @@ def test_every_public_name_has_a_place_in_the_reference():
     assert not missing
 
 
+def test_every_format_has_a_row():
+    page = (ROOT / "docs" / "guides" / "files.md").read_text()
+    assert [name for name in ct.io.FORMATS if f'| `"{name}"` |' not in page] == []
+
+
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text()
     pages = [str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from cameras import fan, one, pixel_lattice, spread
+from cameras import KEYS, RANGES, fan, one, pixel_lattice, real, spread
 
 import camtorch as ct
 
@@ -280,3 +280,24 @@ def test_bad_tables_are_refused(angles, radii, text):
         ct.Tabulated.from_table([1.0, 2.0], [10.0, 90.0], [1.0, 2.0])
     with pytest.raises(ValueError, match="ascend"):
         camera(ct.Tabulated, 0.3, 0.2, 1.0, 2.0)
+
+
+# Models of which nobody published a calibration with its image size
+UNPUBLISHED = {
+    "division",
+    "equisolid",
+    "f_theta",
+    "f_theta_backward",
+    "orthographic_fisheye",
+    "stereographic",
+    "tabulated",
+}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_the_laws_have_numbers_to_try_a_model_on(key):
+    if one(key).distortion_names:
+        assert key in RANGES, "tests/cameras.py says in RANGES how far its coefficients go"
+        assert ("default" in real(key)) == (key in UNPUBLISHED), (
+            "its real numbers stand in CALIBRATIONS, tests/cameras.py"
+        )

@@ -378,3 +378,47 @@ def test_import_is_light():
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert json.loads(out.stdout.replace("'", '"')) == []
+
+
+# -- what versions before this one saved
+
+FIRST_FILE = """{
+  "camtorch": 1,
+  "cameras": {
+    "left": {
+      "model": "brown_conrady",
+      "intrinsics": [ 300.5, 301.25, 319.5, 239.5 ],
+      "distortion_names": [ "k1", "k2", "p1", "p2", "k3" ],
+      "distortion": [ -0.25, 0.125, 0.0625, -0.03125, 0.5 ],
+      "image_size": [ 480, 640 ]
+    }
+  },
+  "extrinsics": { "left": { "rotation": [ 0.5, 0.0, 0.0 ], "translation": [ 0.0, 0.25, 0.0 ] } }
+}"""
+
+
+def test_a_file_of_version_0_2_0_loads(tmp_path):
+    (tmp_path / "rig.json").write_text(FIRST_FILE)
+    rig = ct.load(tmp_path / "rig.json")
+    lens = camera(distortion=[-0.25, 0.125, 0.0625, -0.03125, 0.5], core=[300.5, 301.25, 319.5, 239.5])
+    pose = ct.Extrinsics(float64([0.5, 0, 0]), float64([0, 0.25, 0]))
+    assert_same(rig, ct.Rig({"left": lens}, {"left": pose}))
+
+
+def test_state_of_version_0_2_0_loads():
+    lens = camera("kannala_brandt", [0.1, 0.2, 0.3, 0.4])
+    pose = ct.Extrinsics([0.5, 0.0, 0.0], [0.0, 0.25, 0.0])
+    for module, names in (
+        (lens, "intrinsics distortion"),
+        (pose, "rotation translation"),
+        (
+            ct.Rig({"a": lens}, {"a": pose}),
+            "cameras.a.intrinsics cameras.a.distortion extrinsics.a.rotation extrinsics.a.translation",
+        ),
+        (
+            ct.Warp(lens, lens, torch.eye(3)),
+            "rotation source.intrinsics source.distortion target.intrinsics target.distortion",
+        ),
+    ):
+        state = module.state_dict()
+        module.load_state_dict({name: 2 * state[name] for name in names.split()})

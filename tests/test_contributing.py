@@ -1,0 +1,195 @@
+"""The pages for contributors: their walks are taken step by step, and what they say of the rooms is so."""
+
+import ast
+import itertools
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted((ROOT / "docs" / "contributing").glob("*.md"))
+every_walk = pytest.mark.parametrize("page", [page.name for page in PAGES])
+
+
+class Step(NamedTuple):
+    """A block of a page: a new file, changes of one, or commands."""
+
+    kind: str
+    file: str
+    text: str
+
+
+def steps(page):
+    """Of a page, in order."""
+    text = (ROOT / "docs" / "contributing" / page).read_text()
+    blocks = re.findall(r'^```(\w+)(?: title="(.*?)")?\n(.*?)^```$', text, re.M | re.S)
+    assert len(blocks) == len(re.findall("^```", text, re.M)) / 2
+    return [Step(*block) for block in blocks]
+
+
+def changed(text, changes):
+    """A text after the hunks of a diff, parted by @@; a line that ends in ... stands for the one that begins so."""
+    for hunk in re.split(r"^@@\n", changes, flags=re.M):
+        lines = [(line[:1], line[1:]) for line in hunk.splitlines()]
+        assert {mark for mark, _ in lines} <= {" ", "+", "-"}, hunk
+        old = [
+            re.escape(line).removesuffix(r"\.\.\.") + (".*" if line.endswith("...") else "")
+            for mark, line in lines
+            if mark != "+"
+        ]
+        (found,) = re.finditer("^" + "\n".join(old) + "$", text, re.M)
+        was = iter(found[0].split("\n"))
+        new = [line if mark == "+" else next(was) for mark, line in lines]
+        kept = [line for line, (mark, _) in zip(new, lines, strict=True) if mark != "-"]
+        text = text[: found.start()] + "\n".join(kept) + text[found.end() :]
+    return text
+
+
+def take(page, root, without=""):
+    """Write into a copy of the repository what a page says, but for one file."""
+    for kind, file, text in steps(page):
+        if not file or file == without:
+            continue
+        path = root / file
+        if kind == "diff":
+            path.write_text(changed((path if path.exists() else ROOT / file).read_text(), text))
+        else:
+            assert not (ROOT / file).exists(), f"{file} is there already"
+            path.write_text(text)
+
+
+def commands(page):
+    """Those that a test can run: nothing is installed, and what takes minutes is left to the reader."""
+    lines = [line for kind, _, text in steps(page) if kind == "bash" for line in text.splitlines()]
+    return [line for line in lines if re.match(r"(pytest|python docs|ruff) ", line) and " -n 2" not in line]
+
+
+def run(command, root):
+    """The exit status and what was printed."""
+    python = f'"{sys.executable}"'
+    command = re.sub(r"^python", python, re.sub(r"\b(pytest|ruff)\b(?= \w| -|$)", rf"{python} -m \1", command, count=1))
+    command = re.sub(r"&& ruff", f"&& {python} -m ruff", command)
+    environment = {**os.environ, "PYTHONPATH": str(root), "PYTEST_ADDOPTS": "-p no:cacheprovider -p no:xdist"}
+    done = subprocess.run(command, shell=True, cwd=root, env=environment, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory):
+    """The repository as git knows it, with the compiled sampler if there is one."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("this is no clone of the repository")
+    root = tmp_path_factory.mktemp("clone")
+    native = [str(path.relative_to(ROOT)) for path in (ROOT / "camtorch" / "native").glob("*.so")]
+    for name in [*filter(None, listed.stdout.split("\0")), *native]:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        if (ROOT / name).exists():
+            shutil.copy(ROOT / name, root / name)
+    return root
+
+
+@pytest.fixture
+def copy(clone, tmp_path):
+    return Path(shutil.copytree(clone, tmp_path / "camtorch"))
+
+
+@every_walk
+def test_the_steps_fit_the_repository(page, tmp_path):
+    files = {step.file for step in steps(page) if step.file}
+    assert files
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    take(page, tmp_path)
+    for file in (file for file in files if file.endswith(".py")):
+        for words in (["check"], ["format", "--check"]):
+            ruff = [sys.executable, "-m", "ruff", *words, "--no-cache", "--stdin-filename", ROOT / file, "-"]
+            done = subprocess.run(ruff, input=(tmp_path / file).read_text(), capture_output=True, text=True)
+            assert done.returncode == 0, file + done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@every_walk
+def test_a_walk_ends_with_green_tests(page, copy):
+    take(page, copy)
+    assert commands(page)
+    for command in commands(page):
+        status, printed = run(command, copy)
+        assert status == 0, f"{command}\n{printed}"
+        if command.startswith("pytest"):
+            assert re.search(r"\d+ passed", printed), printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("page", "file"),
+    [
+        ("model.md", "camtorch/models/__init__.py"),
+        ("model.md", "docs/models.md"),
+        ("format.md", "camtorch/io/formats.py"),
+        ("augmentation.md", "camtorch/augment/__init__.py"),
+        ("augmentation.md", "docs/api/augment.md"),
+    ],
+)
+def test_a_step_that_is_forgotten_is_found(page, file, copy):
+    take(page, copy, without=file)
+    found = [command for command in commands(page) if command.startswith("pytest") and run(command, copy)[0]]
+    assert found
+
+
+# -- the rooms
+
+
+def rooms():
+    """Of the table in CONTRIBUTING.md, in order: the names in camtorch/ that each row is about."""
+    text = (ROOT / "CONTRIBUTING.md").read_text().split("## Where things are")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?) \|", text, re.M)
+    return [re.findall(r"`camtorch/(\w+)(?:/|\.py)`", row) for row in rows]
+
+
+def arrows():
+    """(room, imported room, file): all imports but those of type checkers; a room is a folder or a file."""
+    package = ROOT / "camtorch"
+    for path in package.rglob("*.py"):
+        parts = path.relative_to(package).with_suffix("").parts
+
+        def imports(node):
+            for child in ast.iter_child_nodes(node):
+                if isinstance(child, ast.expr) or (
+                    isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test)
+                ):
+                    continue
+                if isinstance(child, ast.Import):
+                    yield from (alias.name for alias in child.names)
+                elif isinstance(child, ast.ImportFrom):
+                    inside = child.module == "camtorch"
+                    yield from (f"camtorch.{alias.name}" for alias in child.names) if inside else (child.module,)
+                yield from imports(child)
+
+        for name in imports(ast.parse(path.read_text())):
+            first, _, other = name.partition(".")
+            if first == "camtorch" and other:
+                yield parts[0], other.split(".")[0], path.relative_to(ROOT)
+
+
+def test_every_room_has_its_row():
+    there = {
+        path.stem for path in (ROOT / "camtorch").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    named = list(itertools.chain(*rooms()))
+    assert sorted(named) == sorted(there)
+
+
+def test_imports_go_down_the_table():
+    place = {name: i for i, row in enumerate(rooms()) for name in row}
+    found = set(arrows())
+    assert len(found) > 100
+    for room, other, file in found:
+        if other in place and room != other:
+            assert place[room] < place[other], f"{file} imports camtorch.{other}, which stands above"
