@@ -1,5 +1,6 @@
 """What mkdocs does beside building pages: it takes pages from the repository's root, and lets images load lazily."""
 
+import io
 import re
 from pathlib import Path
 from urllib.parse import urljoin
@@ -30,7 +31,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
         file = files.get_file_from_path(urljoin(page.url, tag[1]))
         if file is None or file.src_uri.endswith(".svg"):
             return tag[0].replace("<img ", '<img loading="lazy" ', 1)
-        with Image.open(file.abs_src_path) as image:
+        with Image.open(io.BytesIO(file.content_bytes)) as image:
             width, height = image.size
         return tag[0].replace("<img ", f'<img loading="lazy" width="{width}" height="{height}" ', 1)
 
