@@ -1,0 +1,1 @@
+"""What camtorch says where something is wrong."""
