@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -37,8 +38,7 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
         ValueError: NaN or infinite values.
     """
     if not isinstance(value, Tensor):
-        if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
-            raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
+        _check_list(value, name, owner)
         try:
             if isinstance(value, (list, tuple)) and value and all(getattr(v, "ndim", 0) for v in value):
                 value = torch.stack([torch.as_tensor(_as_plain(v)) for v in value])
@@ -48,13 +48,24 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
             raise TypeError(
                 f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
             ) from None
-    if value.is_complex() or value.dtype == torch.bool:
-        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
+    _check_real(value, name, owner)
     if not value.is_floating_point():
         value = value.to(torch.get_default_dtype())
     if is_concrete(value) and not is_predicted(value) and not bool(torch.isfinite(value).all()):
         raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
     return value
+
+
+def _check_list(value: object, name: str, owner: str) -> None:
+    if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
+        raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
+
+
+def _check_real(value: Tensor, name: str, owner: str) -> None:
+    if value.is_complex() or value.dtype == torch.bool:
+        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
+    if value.layout is not torch.strided:
+        raise TypeError(f"{owner}: {name} must be a dense tensor; got {value.layout}, of which .to_dense() makes one")
 
 
 def _as_plain(value: Numbers) -> Numbers:
@@ -118,16 +129,39 @@ def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int
     return height, width
 
 
-def as_whole(value: Any, name: str, owner: str) -> int:
+def shown(value: object) -> str:
+    """What was passed, for an error: of tensors and arrays the shape, of anything else the beginning."""
+    if isinstance(value, (Tensor, np.ndarray)) and value.ndim:
+        return f"{type(value).__name__} of shape {tuple(value.shape)}"
+    return f"{value!r:.60}"
+
+
+def as_whole(value: Any, name: str, owner: str, least: int | None = None) -> int:
     """A whole number.
 
     Raises:
-        TypeError: it is none.
+        TypeError: it is none. ValueError: it is below the least.
     """
     try:
-        return operator.index(value)
-    except TypeError:
-        raise TypeError(f"{owner}: {name} must be a whole number; got {value!r}") from None
+        whole = operator.index(value)
+    except (TypeError, RuntimeError):
+        raise TypeError(f"{owner}: {name} must be a whole number; got {shown(value)}") from None
+    if least is not None and whole < least:
+        raise ValueError(f"{owner}: {name} must be at least {least}; got {whole}")
+    return whole
+
+
+def as_flag(value: Any, name: str, owner: str) -> bool:
+    """True or False.
+
+    Raises:
+        TypeError: neither, as "False" is.
+    """
+    if value is True or value is False:
+        return value
+    if isinstance(value, (int, np.bool_)) and value in (0, 1):
+        return bool(value)
+    raise TypeError(f"{owner}: {name} must be True or False; got {shown(value)}")
 
 
 def as_number(value: Any, name: str, owner: str) -> float:
@@ -137,11 +171,50 @@ def as_number(value: Any, name: str, owner: str) -> float:
         TypeError: it is none.
     """
     try:
-        if isinstance(value, str):
+        if isinstance(value, (str, bytes)):
             raise TypeError
         return float(value)
-    except (TypeError, ValueError, RuntimeError):
-        raise TypeError(f"{owner}: {name} must be a number; got {value!r:.60}") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise TypeError(f"{owner}: {name} must be a number; got {shown(value)}") from None
+
+
+def as_part(value: Any, name: str, owner: str) -> float:
+    """A part of a whole, as a probability is one.
+
+    Raises:
+        TypeError: no number. ValueError: one that is not within [0, 1].
+    """
+    part = as_number(value, name, owner)
+    if not 0 <= part <= 1:
+        raise ValueError(f"{owner}: {name} must lie in [0, 1]; got {value!r}")
+    return part
+
+
+def as_mapping(value: Any, name: str, owner: str, form: str) -> Mapping[Any, Any]:
+    """A mapping, an empty one of None.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{owner}: {name} must be a dict, as {form}; got {shown(value)}")
+    return value
+
+
+def check_path(path: Any, owner: str) -> None:
+    """Raise a TypeError for what is no path."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"{owner}: path must name a file; got {shown(path)}")
+
+
+def check_devices(owner: str, **tensors: Tensor) -> None:
+    """Raise a ValueError unless all are on one device."""
+    devices = {name: tensor.device for name, tensor in tensors.items()}
+    if len(set(devices.values())) > 1:
+        where = ", ".join(f"{name} is on {device}" for name, device in devices.items())
+        raise ValueError(f"{owner}: {where}; .to(device) brings them together")
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
@@ -190,13 +263,27 @@ def as_values(values: Numbers, name: str, owner: str, device: torch.device | Non
         TypeError: it cannot.
     """
     if not isinstance(values, Tensor):
+        _check_list(values, name, owner)
         try:
-            values = torch.as_tensor(values, device=device)
+            values = torch.as_tensor(_as_plain(values), device=device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(f"{owner}: {name} must be a tensor; got {type(values).__name__}: {error}") from None
-    if values.is_complex() or values.dtype == torch.bool:
-        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {values.dtype}")
+    _check_real(values, name, owner)
     return values
+
+
+def as_coordinates(
+    values: Numbers, name: str, size: int, owner: str, device: torch.device | None = None, form: str = "..."
+) -> Tensor:
+    """A tensor (..., size) of real numbers; whole ones take torch's default dtype.
+
+    Raises:
+        TypeError: not real numbers. ValueError: another shape.
+    """
+    values = as_values(values, name, owner, device)
+    if values.ndim == 0 or values.shape[-1] != size:
+        raise ValueError(f"{owner}: {name} must be ({form}, {size}); got shape {tuple(values.shape)}")
+    return values if values.is_floating_point() else values.to(torch.get_default_dtype())
 
 
 def as_points(
@@ -207,7 +294,12 @@ def as_points(
     Raises:
         TypeError: not real numbers. ValueError: the shape does not fit `batch`.
     """
-    values = as_values(values, name, owner, parameters[0].device)
+    device = parameters[0].device
+    values = as_values(values, name, owner, device)
+    if values.device != device:
+        raise ValueError(
+            f"{owner}: {name} must be on {device}, as {owner}; got {values.device}. .to(device) brings them together"
+        )
     takes = f"{name} must be (*B, *N, {size}) with batch dims *B = {tuple(batch)}"
     if values.ndim == 0 or values.shape[-1] != size:
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}")

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch._arguments import shown
 from camtorch._tracing import (
     has_tangent,
     in_graph,
@@ -171,6 +172,10 @@ class BatchedModule(GeometryModule):
             except IndexError as error:
                 shape = tuple(self.batch_shape)
                 raise IndexError(f"{type(self).__name__}: {index!r} of a batch {shape}: {error}") from None
+            except (TypeError, ValueError, RuntimeError):
+                raise TypeError(
+                    f"{type(self).__name__}: a batch is indexed by whole numbers, slices and masks; got {shown(index)}"
+                ) from None
             tensors[name] = rows if in_graph(rows) else nn.Parameter(rows, requires_grad=False)
         return self.with_tensors(**tensors)
 

@@ -17,6 +17,7 @@ from torch.nn.utils import parametrize
 from camtorch._arguments import (
     Numbers,
     as_batch,
+    as_flag,
     as_image_size,
     as_points,
     as_real,
@@ -25,6 +26,7 @@ from camtorch._arguments import (
     as_whole,
     broadcast_shapes,
     is_predicted,
+    shown,
 )
 from camtorch._module import BatchedModule, Memo, is_constant, with_values
 from camtorch._portable import for_elsewhere
@@ -218,7 +220,7 @@ class Camera(BatchedModule):
             if bool((bottom != bottom.new_tensor([0, 0, 1])).any()) or bool((K[..., 1, 0] != 0).any()):
                 raise ValueError(f"{cls.__name__}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
             skew = K[..., 0, 1].detach()
-            if not ignore_skew and bool((skew != 0).any()):
+            if not as_flag(ignore_skew, "ignore_skew", cls.__name__) and bool((skew != 0).any()):
                 raise ValueError(
                     f"{cls.__name__}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
                     "ignore_skew=True drops it"
@@ -271,8 +273,8 @@ class Camera(BatchedModule):
         size = as_image_size(image_size, owner)
         if size is None:
             raise ValueError(f"{owner}: a field of view is one of an image; give its image_size=(height, width)")
-        if axis not in AXES:
-            raise ValueError(f"{owner}: axis must be one of {AXES}; got {axis!r}")
+        if not isinstance(axis, str) or axis not in AXES:
+            raise ValueError(f"{owner}: axis must be one of {AXES}; got {shown(axis)}")
         fov = torch.tensor(fov, dtype=torch.float64) if isinstance(fov, (int, float)) else fov
         degrees = as_real(fov, "fov", owner).detach().double()
         if is_concrete(degrees) and not bool(((degrees > 0) & (degrees <= 360)).all()):

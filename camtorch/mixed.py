@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import working_dtype
+from camtorch._arguments import as_points, shown, working_dtype
 from camtorch._module import Memo
 from camtorch._tracing import in_graph
 from camtorch.camera import Camera, new_cameras, per_row
@@ -96,7 +96,10 @@ class Mixed(Camera):
         Args:
             groups: the rows of the batch, and as many cameras; as of `groups`.
         """
-        rows = [int(row) for of_group, _ in groups for row in of_group]
+        try:
+            rows = [int(row) for of_group, _ in groups for row in of_group]
+        except (TypeError, ValueError):
+            raise TypeError(f"Mixed: groups must be pairs (rows, cameras); got {shown(groups)}") from None
         place = {row: i for i, row in enumerate(rows)}
         if sorted(place) != list(range(len(rows))):
             raise ValueError(f"Mixed: groups must fill every row once; got rows {rows}")
@@ -214,12 +217,15 @@ class Mixed(Camera):
 
     def explain(self, points: Tensor) -> list[str]:
         """Why points (B, *N, 3) have no pixel, in words; see `Camera.explain`."""
+        points, _ = as_points(points, "points", 3, self.batch_shape, (self.intrinsics,), "Mixed")
         return [line for camera, mine in zip(self, points, strict=True) for line in camera.explain(mine)]
 
     # -- other cameras
 
     def by_groups(self, change: Callable[[Camera], Camera]) -> Self:
         """The batch of what `change` makes of each group."""
+        if not callable(change):
+            raise TypeError(f"Mixed: change must be a function of a camera that returns a camera; got {shown(change)}")
         return type(self).of_groups([(rows, change(camera)) for rows, camera in self.groups])
 
     def _edited(self, matrix: Sequence[Sequence[float]], size: tuple[int, int]) -> Self:
@@ -233,8 +239,10 @@ class Mixed(Camera):
         """
         try:
             taken = torch.arange(len(self._places))[index]
-        except (IndexError, TypeError) as error:
+        except IndexError as error:
             raise IndexError(f"Mixed: {index!r} of a batch ({len(self._places)},): {error}") from None
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(f"Mixed: it is indexed by whole numbers, slices and masks; got {shown(index)}") from None
         if taken.ndim == 0:
             i, row = self._places[int(taken)]
             camera = self._member(i)
@@ -307,7 +315,10 @@ def _members(cameras: Any) -> list[Camera]:
 
 
 def _as_order(order: Sequence[int], count: int) -> list[int]:
-    places = [operator.index(place) for place in order]
+    try:
+        places = [operator.index(place) for place in order]
+    except TypeError:
+        raise TypeError(f"Mixed: order must be places among {count} cameras, from 0; got {shown(order)}") from None
     if not places or min(places) < 0 or max(places) >= count:
         raise ValueError(f"Mixed: order must be places among {count} cameras, from 0; got {places}")
     return places

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import ItemsView, Iterator, KeysView, Mapping, MutableMapping, Sequence, ValuesView
+from itertools import islice
 from typing import TypeVar, cast
 
 from torch import nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch._arguments import as_mapping
 from camtorch._module import BatchedModule
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
@@ -45,8 +47,9 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
             for key, module in modules._modules.items():
                 self._modules[key] = module
             self.batch = modules.batch
-        elif modules is not None:
-            for name, module in modules.items():
+        else:
+            word = "cameras" if kind.__name__ == "Camera" else kind.__name__.lower()
+            for name, module in as_mapping(modules, word, "Rig", f"{{'left': {kind.__name__}}}").items():
                 self[name] = module
         if batch is not None or names:
             self._add_rows(list(names), batch)
@@ -66,7 +69,10 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
         self.batch = batch
 
     def __getitem__(self, name: str) -> M:
-        place = self._places[name]
+        place = self._places.get(name) if isinstance(name, str) else None
+        if place is None:
+            there = ", ".join(map(repr, islice(self, _SHOWN))) or "none"
+            raise KeyError(f"no {self._kind.__name__} is called {name!r}; there are {there}")
         return cast(M, self._modules[place] if isinstance(place, str) else cast(M, self.batch)[place])
 
     def __setitem__(self, name: str, module: M) -> None:
@@ -147,11 +153,13 @@ class Rig(nn.Module):
         super().__init__()
         self.cameras = NamedModules(Camera, cameras)
         if isinstance(extrinsics, tuple):
+            if len(extrinsics) != 2:
+                raise TypeError(f"Rig: extrinsics must be a dict, or (names, a batch); got {len(extrinsics)} things")
             names, batch = extrinsics
             self.extrinsics = NamedModules(Extrinsics, names=names, batch=batch)
         else:
             self.extrinsics = NamedModules(Extrinsics, extrinsics)
-        self.images = dict(images or {})
+        self.images = dict(as_mapping(images, "images", "Rig", "{'0001.png': 'left'}"))
         self.format = format
         for image, name in self.images.items():
             if name not in self.cameras:
@@ -176,7 +184,7 @@ class Rig(nn.Module):
         Raises:
             ValueError: no such camera and no such image.
         """
-        found = self.cameras.get(self.images.get(name, name))
+        found = self.cameras.get(self.images.get(name, name)) if isinstance(name, str) else None
         if found is None:
             names = [*self.cameras, *self.images]
             more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""

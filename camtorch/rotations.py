@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_real, as_rows
+from camtorch._arguments import Numbers, as_real, as_rows, as_values, check_devices
 from camtorch._tracing import in_graph, is_concrete, may_look
 from camtorch.optics.special import cosc_root, sinc_root
 
@@ -102,7 +102,14 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
         pitch: likewise.
         roll: likewise.
     """
-    angles = torch.deg2rad(torch.stack(torch.broadcast_tensors(yaw, pitch, roll)))
+    given = {"yaw": yaw, "pitch": pitch, "roll": roll}
+    given = {name: as_values(value, name, "mount_rotation") for name, value in given.items()}
+    try:
+        angles = torch.deg2rad(torch.stack(torch.broadcast_tensors(*given.values())))
+    except RuntimeError:
+        check_devices("mount_rotation", **given)
+        shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
+        raise ValueError(f"mount_rotation: the angles must be of one shape (*B,); got {shapes}") from None
     (ca, cb, cc), (sa, sb, sc) = angles.cos().unbind(), angles.sin().unbind()
     # the turn, the look and the lean multiplied out, each about the turned camera's axes, and transposed
     right, ahead = sa * sb, ca * sb

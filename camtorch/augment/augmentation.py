@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole
+from camtorch._arguments import as_flag, as_mapping, as_number, as_part, as_whole, shown
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, rows_of, size_of
@@ -42,7 +42,8 @@ class Range:
     size: int | None = None
 
     def __post_init__(self) -> None:
-        if not -math.inf < self.low <= self.high < math.inf:
+        low, high = as_number(self.low, "low", "Range"), as_number(self.high, "high", "Range")
+        if not -math.inf < low <= high < math.inf:
             raise ValueError(f"Range: low and high must be finite, with low <= high; got {self.low!r}, {self.high!r}")
 
     @property
@@ -74,8 +75,8 @@ def as_range(
             low, high = map(float, value)
         else:
             low, high = around - float(value), around + float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise TypeError(f"{owner}: {name} must be a range (low, high) or a number; got {value!r}") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise TypeError(f"{owner}: {name} must be a range (low, high) or a number; got {shown(value)}") from None
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError(f"{owner}: {name} must be finite; got {value!r}")
     if low > high:
@@ -83,7 +84,8 @@ def as_range(
     if around == 0 and least > 0 and not isinstance(value, Iterable):
         raise TypeError(f"{owner}: {name} must be a range (low, high); got {value!r}")
     if low < least or high > most:
-        raise ValueError(f"{owner}: {name} must lie within [{least:g}, {most:g}]; got {value!r}")
+        means = "" if isinstance(value, Iterable) else f", which stands for ({low:g}, {high:g})"
+        raise ValueError(f"{owner}: {name} must lie within [{least:g}, {most:g}]; got {value!r}{means}")
     return Range(low, high, size)
 
 
@@ -94,6 +96,8 @@ def draw(
 
     The numbers come in the order in which kornia asks for them: first the gate, if there is a choice, then the ranges.
     """
+    if not (generator is None or isinstance(generator, torch.Generator)):
+        raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
     device = generator.device if generator is not None else torch.device("cpu")
     if 0 < p < 1:
@@ -201,14 +205,10 @@ class Augmentation(SampleTransform):
         super().__init__(camera, fields, mask_fill, valid_mask)
         for name in unknown:
             raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
-        if not 0 <= p <= 1:
-            raise ValueError(f"{self._name}: p must be a probability in [0, 1]; got {p!r}")
-        if min_filled is not None and not 0 <= min_filled <= 1:
-            raise ValueError(f"{self._name}: min_filled must be a part in [0, 1], or None; got {min_filled!r}")
-        self.p, self.same_on_batch = float(p), bool(same_on_batch)
+        self.p, self.same_on_batch = as_part(p, "p", self._name), as_flag(same_on_batch, "same_on_batch", self._name)
         self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         self.ranges = dict(ranges or {})
-        self.min_filled = None if min_filled is None else float(min_filled)
+        self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
         self._warned = False
         self.last: Change | None = None
         """The change of the last call: its `source`, `target` and `rotation`."""
@@ -336,9 +336,10 @@ class Augmentation(SampleTransform):
         return self._part(rows, source, {name: value[rows.to(value.device)] for name, value in draw.items()})
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        as_mapping(draw, "draw", self._name, "what draw() returns")
         missing = [name for name in ("apply", *self.ranges) if name not in draw]
         if missing:
-            has = ", ".join(draw) or "nothing"
+            has = ", ".join(map(str, draw)) or "nothing"
             raise ValueError(f"{self._name}: the draw lacks {', '.join(missing)}; it has {has}")
         values = {name: torch.as_tensor(draw[name]) for name in ("apply", *self.ranges)}
         count = len(values["apply"])

@@ -25,8 +25,12 @@ def collate(samples: Sequence[object]) -> object:
     they do by `default_collate`.
 
     Raises:
-        TypeError: what cannot be collated, as by `default_collate`.
+        TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list.
     """
+    if not isinstance(samples, (list, tuple)):
+        raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
+    if not samples:
+        raise ValueError("collate: samples must not be empty; got an empty list")
     return collate_by(samples, collate_fn_map={**default_collate_fn_map, Tensor: _tensors, np.ndarray: _arrays})
 
 

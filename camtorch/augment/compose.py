@@ -8,6 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from camtorch._arguments import as_mapping
 from camtorch.augment.augmentation import Augmentation, Range, draw
 from camtorch.augment.change import Change
 from camtorch.augment.edits import Edit, change_by
@@ -71,14 +72,16 @@ class Compose(Augmentation):
         if options.get("min_filled") is not None:
             raise TypeError(f"{name}: there is no min_filled here; the lenses in it have it")
         camera = next((part.camera for part in parts if part.camera is not None), None) if camera is None else camera
-        fields = {key: value for part in parts for key, value in part.fields.items()} | dict(fields or {})
+        fields = {key: value for part in parts for key, value in part.fields.items()} | dict(
+            as_mapping(fields, "fields", name, "{'lidar': 'points'}")
+        )
         if any(part.valid_mask for part in parts):
             options.setdefault("valid_mask", True)
         ranges: dict[str, Range] = {}
         for i, part in enumerate(parts):
             ranges[f"{i}.apply"] = Range(0, 1)
             ranges |= {f"{i}.{key}": interval for key, interval in part.ranges.items()}
-        super().__init__(ranges, camera=camera, fields=fields, antialias=bool(antialias), **options)
+        super().__init__(ranges, camera=camera, fields=fields, antialias=antialias or False, **options)
         self.antialias = antialias
         self.augmentations = nn.ModuleList(parts)
         self.needs_camera: bool = any(part.needs_camera for part in parts)

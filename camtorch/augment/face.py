@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size
+from camtorch._arguments import as_image_size, as_number, shown
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete
 from camtorch.augment.change import Change, Part, alone, camera_like, copied
@@ -75,15 +76,20 @@ class FaceNormalizer(SampleTransform):
         valid_mask: bool = False,
     ):
         super().__init__(camera, fields, mask_fill, valid_mask)
-        for name, value in (("focal", focal), ("distance", distance)):
+        self.focal, self.distance = as_number(focal, "focal", self._name), as_number(distance, "distance", self._name)
+        for name, value in (("focal", self.focal), ("distance", self.distance)):
             if not 0 < value < float("inf"):
                 raise ValueError(f"{self._name}: {name} must be positive; got {value!r}")
-        self.focal, self.distance = float(focal), float(distance)
         size = as_image_size(image_size, self._name)
         if size is None:
             raise TypeError(f"{self._name}: image_size must be two integers (height, width); got None")
         height, width = self.image_size = size
-        self.axis = (width / 2, height / 2) if axis is None else tuple(map(float, axis))
+        self.axis = (width / 2, height / 2)
+        if axis is not None:
+            given = tuple(axis) if isinstance(axis, (Sequence, Tensor, np.ndarray)) else ()
+            if len(given) != 2:
+                raise TypeError(f"{self._name}: axis must be a pixel (u, v); got {shown(axis)}")
+            self.axis = as_number(given[0], "axis", self._name), as_number(given[1], "axis", self._name)
         self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
 
     def change(self, camera: Camera, head_rotation: Tensor, face_centre: Tensor) -> Change:

@@ -19,6 +19,7 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch._arguments import as_part
 from camtorch._module import Memo
 from camtorch.augment import compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
@@ -109,9 +110,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
                 f"{name}: camera must be a single one with image_size=(height, width); got batch dims "
                 f"{tuple(camera.batch_shape)} and {camera.image_size}. with_cameras gives every sample its own"
             )
-        p = augmentation.p if p is None else p
-        if not (0 <= p <= 1 and 0 <= p_batch <= 1):
-            raise ValueError(f"{name}: p and p_batch must be probabilities in [0, 1]; got {p!r} and {p_batch!r}")
+        p, p_batch = augmentation.p if p is None else as_part(p, "p", name), as_part(p_batch, "p_batch", name)
         same_on_batch = augmentation.same_on_batch if same_on_batch is None else same_on_batch
         super().__init__(p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
         self.augmentation, self.camera = augmentation, camera

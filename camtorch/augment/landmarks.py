@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole
+from camtorch._arguments import as_flag, as_whole, shown
 
 
 def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
@@ -75,7 +75,12 @@ def as_table(value: TableLike, owner: str) -> Table:
                 f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs; got {value!r}"
             )
         return Table(LANDMARKS[value], True)
-    items: list[Any] = list(value)
+    try:
+        items: list[Any] = list(value)
+    except TypeError:
+        raise TypeError(
+            f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs; got {shown(value)}"
+        ) from None
     pairs: list[tuple[int, ...]] = []
     if items and all(isinstance(item, Iterable) for item in items):
         pairs = [tuple(as_whole(i, "landmarks", owner) for i in pair) for pair in items]
@@ -122,11 +127,12 @@ class Mirroring:
         swap_sides: bool,
         owner: str,
     ):
-        if lateral_axis not in ("x", "y", "z"):
+        if not isinstance(lateral_axis, str) or lateral_axis not in ("x", "y", "z"):
             raise ValueError(
-                f"{owner}: lateral_axis must be 'x', 'y' or 'z', of the head's frame; got {lateral_axis!r}"
+                f"{owner}: lateral_axis must be 'x', 'y' or 'z', of the head's frame; got {shown(lateral_axis)}"
             )
-        self.given, self.lateral_axis, self.swap_sides, self.owner = landmarks, lateral_axis, bool(swap_sides), owner
+        self.given, self.lateral_axis, self.owner = landmarks, lateral_axis, owner
+        self.swap_sides = as_flag(swap_sides, "swap_sides", owner)
         self._named: dict[str, Table | None] | None = None
         self._one: Table | None = None
         if isinstance(landmarks, Mapping):

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
+from camtorch._arguments import as_coordinates, as_flag, as_mapping, as_number
 from camtorch.augment.change import Change, alone, copied, on_device, singles
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
@@ -194,10 +195,10 @@ def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
     Raises:
         TypeError: it is neither a tensor nor an array of real numbers.
     """
-    if isinstance(value, np.ndarray) and value.dtype != object:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         value = torch.from_numpy(value)
     if not isinstance(value, Tensor) or value.is_complex():
-        what = f"dtype {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+        what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
         raise TypeError(
             f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{_hint(name)}"
         )
@@ -284,11 +285,12 @@ class SampleTransform(nn.Module):
         if camera is not None and not isinstance(camera, Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {type(camera).__name__}")
         self.camera = camera
-        self.fields = dict(fields or {})
+        self.fields = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
         if wrong:
             raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
-        self.mask_fill, self.valid_mask = float(mask_fill), bool(valid_mask)
+        self.mask_fill = as_number(mask_fill, "mask_fill", self._name)
+        self.valid_mask = as_flag(valid_mask, "valid_mask", self._name)
 
     mirroring: Mirroring | None = None
     """What changes places where an augmentation mirrors; None: it never does."""
@@ -519,11 +521,11 @@ def from_pitch_yaw(angles: Tensor) -> Tensor:
 
     Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
     """
-    pitch, yaw = angles.unbind(-1)
+    pitch, yaw = as_coordinates(angles, "angles", 2, "from_pitch_yaw").unbind(-1)
     return torch.stack((-pitch.cos() * yaw.sin(), -pitch.sin(), -pitch.cos() * yaw.cos()), -1)
 
 
 def to_pitch_yaw(gaze: Tensor) -> Tensor:
     """Pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
-    x, y, z = gaze.unbind(-1)
+    x, y, z = as_coordinates(gaze, "gaze", 3, "to_pitch_yaw").unbind(-1)
     return torch.stack((torch.atan2(-y, torch.hypot(x, z)), torch.atan2(-x, -z)), -1)

@@ -9,7 +9,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from importlib import resources
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 import camtorch.plot as plot
+from camtorch._arguments import check_path
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.svg import Plots, palette
 from camtorch.calibration.verdict import ROUGH, Survey
@@ -81,6 +82,9 @@ def write_report(
             an image of another size than the camera's, a name that no camera has. TypeError: images of a rig that are
             no mapping. OSError: the file cannot be written.
     """
+    if not isinstance(calibration, (Calibration, RigCalibration)):
+        raise TypeError(f"write_report: calibration must be what calibrate returns; got {type(calibration).__name__}")
+    check_path(path, "write_report")
     page = _Page()
     if isinstance(calibration, RigCalibration):
         cameras = _rig_shots(calibration, images, names)
@@ -125,6 +129,8 @@ class _Shots:
         self.calibration, self.prefix = calibration, prefix
         count = len(calibration.image_points)
         for what, given in (("images", images), ("names", names)):
+            if given is not None and not isinstance(given, Sized):
+                raise TypeError(f"write_report: {what} must be a list, one for each view; got {type(given).__name__}")
             if given is not None and len(given) != count:
                 raise ValueError(f"write_report: {len(given)} {what} for {count} views; give one of each, or None")
         self.images: list[Any] = [None] * count if images is None else list(images)

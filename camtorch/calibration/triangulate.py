@@ -143,7 +143,11 @@ def _listed(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> l
     if isinstance(modules, kind):
         listed = [modules[i] for i in range(len(modules))] if modules.batch_shape else [modules] * count
     else:
-        listed = list(cast(Sequence[M], modules))
+        try:
+            listed = list(cast(Sequence[M], modules))
+        except TypeError:
+            what = type(modules).__name__
+            raise TypeError(f"triangulate: {name} must be {kind.__name__} in a list; got a {what}") from None
     for module in listed:
         if not isinstance(module, kind):
             raise TypeError(f"triangulate: {name} must be {kind.__name__} in a list; got a {type(module).__name__}")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_image_size, as_whole
+from camtorch._arguments import as_image_size, as_number, as_whole
 from camtorch.convert import views
 from camtorch.convert.least_squares import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
@@ -78,9 +78,11 @@ def convert(
     """See `Camera.convert`; models: all that there are, by key, some of which may relate the two."""
     owner = f"{type_before_parametrizations(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
-    if max_angle is not None and not 0 < float(max_angle) <= math.pi * (1 + 1e-6):
+    max_angle = None if max_angle is None else as_number(max_angle, "max_angle", owner)
+    if max_angle is not None and not 0 < max_angle <= math.pi * (1 + 1e-6):
         raise ValueError(f"{owner}: max_angle must be positive radians, up to pi; got {max_angle}")
-    if not float(tolerance) > 0:
+    tolerance = as_number(tolerance, "tolerance", owner)
+    if not tolerance > 0:
         raise ValueError(f"{owner}: tolerance must be positive; got {tolerance}")
     if count is None:
         least = default_count(model, source, models)
@@ -96,7 +98,7 @@ def convert(
         arguments = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
         return model(*arguments, image_size=image_size, **options).double()
 
-    limit = math.pi if max_angle is None else min(math.pi, float(max_angle))
+    limit = math.pi if max_angle is None else min(math.pi, max_angle)
     batch = source.batch_shape
     tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
     parts = []

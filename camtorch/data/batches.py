@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from camtorch._arguments import shown
 from camtorch.augment.sample import IMAGES, Sample
 from camtorch.camera import Camera
 from camtorch.data.columns import PARTS, to_columns
@@ -64,7 +65,9 @@ class MapBatches:
         fields: Mapping[str, str] | None = None,
     ):
         self._move = Mover(transform, _OWNER, seed, epoch, fields)
-        self._keys = [key] if isinstance(key, str) else list(key or ())
+        self._keys = [key] if isinstance(key, str) else list(key) if isinstance(key, (list, tuple)) else []
+        if not (key is None or isinstance(key, (str, list, tuple))) or not all(isinstance(k, str) for k in self._keys):
+            raise TypeError(f"{_OWNER}: key must be the name of a column, or several in a list; got {shown(key)}")
         if self._move.draws and not self._keys:
             raise ValueError(
                 f'{_OWNER}: key must name the column whose value names a row, as in key="path" after '
@@ -86,7 +89,11 @@ class MapBatches:
             raise TypeError(
                 f'{_OWNER}: a batch must be a dict of arrays, as of batch_format="numpy"; got {type(batch).__name__}'
             )
-        counts = {name: len(column) for name, column in batch.items()}
+        try:
+            counts = {name: len(column) for name, column in batch.items()}
+        except TypeError:
+            kinds = {name: type(column).__name__ for name, column in batch.items()}
+            raise TypeError(f"{_OWNER}: columns must be arrays or lists; got {kinds}") from None
         if len(set(counts.values())) > 1:
             raise ValueError(f"{_OWNER}: all columns must have as many rows; got {counts}")
         missing = [name for name in self._keys if name not in batch]

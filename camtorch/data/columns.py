@@ -54,6 +54,8 @@ def from_columns(columns: Mapping[str, Any], name: str = "camera") -> Camera | l
     Raises:
         ValueError: columns that lack, or are not those of a camera.
     """
+    if not isinstance(columns, Mapping):
+        raise TypeError(f"from_columns: columns must be a dict of columns; got {type(columns).__name__}")
     missing = [f"{name}_{part}" for part in ("model", "intrinsics", "image_size") if f"{name}_{part}" not in columns]
     if missing:
         raise ValueError(f"from_columns: {', '.join(missing)} is missing; to_columns makes the columns of a camera")

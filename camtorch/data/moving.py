@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from camtorch._arguments import as_mapping
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part, frozen
 from camtorch.augment.face import FaceNormalizer
@@ -65,7 +66,7 @@ class Mover:
     fields: dict[str, str]
 
     def __init__(self, transform: Moves, owner: str, seed: int, epoch: int, fields: Mapping[str, str] | None):
-        self.owner, self.fields = owner, dict(fields or {})
+        self.owner, self.fields = owner, dict(as_mapping(fields, "fields", owner, "{'lidar': 'points'}"))
         self._seeded: Seeded | None = None
         self._fixed: Transform | None = None
         self._make: Callable[[Camera], Warp] | None = None

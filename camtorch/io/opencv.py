@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
+from camtorch._arguments import check_path, shown
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
@@ -62,11 +63,13 @@ def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | 
         CameraFileError: not one usable camera in the file, or one of another model than `model`.
         OSError: no such file, or it cannot be opened. ValueError: an unknown model.
     """
+    check_path(path, "io.opencv.read")
     return _File(Record(path, read_mapping(path))).camera(_known(model), name).requires_grad_(False)
 
 
 def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
     """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
+    check_path(path, "io.opencv.read_rig")
     rig = parse(Record(path, read_mapping(path)), _known(model))
     for layer in (*rig.cameras.values(), *rig.extrinsics.values()):
         layer.requires_grad_(False)
@@ -74,8 +77,8 @@ def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
 
 
 def _known(model: str | None) -> str | None:
-    if model is not None and model not in MODELS:
-        raise ValueError(f"unknown model {model!r}; known are {', '.join(sorted(MODELS))}")
+    if model is not None and (not isinstance(model, str) or model not in MODELS):
+        raise ValueError(f"io.opencv: unknown model {shown(model)}; known are {', '.join(sorted(MODELS))}")
     return model
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from camtorch._arguments import shown
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
@@ -29,9 +30,9 @@ class DepthAI:
 
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
         """Raises ValueError: an option that is none."""
-        step, order = as_step(options.step, "Warp.save"), options.order or "yx"
-        if order not in _ORDERS:
-            raise ValueError(f"Warp.save: order must be 'yx' (loadMeshFiles) or 'xy' (setWarpMesh); got {order!r}")
+        step, order = as_step(options.step, "Warp.save"), "yx" if options.order is None else options.order
+        if not isinstance(order, str) or order not in _ORDERS:
+            raise ValueError(f"Warp.save: order must be 'yx' (loadMeshFiles) or 'xy' (setWarpMesh); got {shown(order)}")
         height, width = exact.target_size
         mesh = mesh_of(path, exact, nodes_every(step, width), nodes_every(step, height))
         nodes = mesh.nodes if order == "xy" else mesh.nodes[..., ::-1]

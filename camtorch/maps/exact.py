@@ -30,6 +30,8 @@ class Exact:
     """
 
     def __init__(self, warp: Warp, owner: str):
+        if not hasattr(warp, "transform_points"):
+            raise TypeError(f"{owner}: warp must be a Warp; got {type(warp).__name__}")
         count = warp.batch_shape.numel()
         if count != 1:
             raise ValueError(

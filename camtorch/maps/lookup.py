@@ -78,10 +78,17 @@ class LookupMap:
             ValueError: another shape or size.
         """
         shape = tuple(getattr(images, "shape", ()))
-        if not isinstance(images, Tensor) or len(shape) != 4 or shape[-2:] != self.source_size:
+        if (
+            not isinstance(images, Tensor)
+            or len(shape) != 4
+            or shape[-2:] != self.source_size
+            or images.is_complex()
+            or images.is_sparse
+        ):
+            what = images.dtype if isinstance(images, Tensor) else type(images).__name__
             raise ValueError(
-                f"LookupMap: images must be a tensor (B, C, {self.source_size[0]}, {self.source_size[1]}); got "
-                f"{type(images).__name__} {shape}"
+                f"LookupMap: images must be a dense tensor (B, C, {self.source_size[0]}, {self.source_size[1]}) of "
+                f"real numbers; got {what} {shape}"
             )
         values = images if images.is_floating_point() else images.float()
         grid = self.grid().to(values).expand(shape[0], -1, -1, -1)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from camtorch._arguments import shown
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
@@ -42,7 +43,7 @@ class STMap:
     def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
         """Raises ValueError: a way that v does not run, or another suffix. ImportError: the extra is missing."""
         suffix = suffix_of(path, self)
-        way = _way(options.v or "up")
+        way = _way("up" if options.v is None else options.v)
         height, width = exact.source_size
         parts = (exact.positions + 0.5) / (width, height)
         if way == "up":
@@ -74,8 +75,8 @@ class STMap:
 
 
 def _way(v: str) -> str:
-    if v not in _WAYS:
-        raise ValueError(f"Warp.save: v must be 'up' (as Nuke has it) or 'down'; got {v!r}")
+    if not isinstance(v, str) or v not in _WAYS:
+        raise ValueError(f"Warp.save: v must be 'up' (as Nuke has it) or 'down'; got {shown(v)}")
     return v
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from camtorch._arguments import TensorLike, as_batch, as_real
+from camtorch._arguments import TensorLike, as_batch, as_number, as_real
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 
@@ -68,6 +68,7 @@ class FreePolynomial(Camera):
         Raises:
             ValueError: fewer than two coefficients, or a first one that is not positive.
         """
+        aspect_ratio = as_number(aspect_ratio, "aspect_ratio", cls.__name__)
         centre = as_real(centre, "centre", cls.__name__)
         coefficients = as_real(coefficients, "coefficients", cls.__name__)
         if centre.ndim == 0 or centre.shape[-1] != 2:

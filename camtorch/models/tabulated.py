@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import TensorLike, as_real
+from camtorch._arguments import TensorLike, as_number, as_real
 from camtorch.camera import Camera
 from camtorch.optics import Chart, EquidistantUpTo, Lens, Planar, RadiusTable
 
@@ -101,6 +101,7 @@ class Tabulated(Camera):
             ValueError: the table has another shape, does not begin to ascend from the origin, or goes beyond half a
                 turn.
         """
+        pixels_per_unit = as_number(pixels_per_unit, "pixels_per_unit", cls.__name__)
         centre = as_real(centre, "centre", cls.__name__)
         angles = as_real(angles, "angles", cls.__name__)
         radii = as_real(radii, "radii", cls.__name__)

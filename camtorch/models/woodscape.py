@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from camtorch._arguments import TensorLike
+from camtorch._arguments import TensorLike, as_image_size, as_real
 from camtorch.models.f_theta import FTheta
 
 if TYPE_CHECKING:
@@ -51,6 +51,11 @@ class WoodScape(FTheta):
             image_size: (height, width) in pixels.
             aspect_ratio: the file's, by which it scales v.
         """
-        height, width = image_size
-        centre = [offset[0] + (width - 1) / 2, offset[1] + (height - 1) / 2]
+        owner = f"{cls.__name__}.from_woodscape"
+        size, moved = as_image_size(image_size, owner), as_real(offset, "offset", owner)
+        if size is None:
+            raise ValueError(f"{owner}: offsets are from the middle of an image; give its image_size=(height, width)")
+        if moved.shape != (2,):
+            raise ValueError(f"{owner}: offset must be (2,) = cx_offset, cy_offset; got shape {tuple(moved.shape)}")
+        centre = moved + (moved.new_tensor([size[1], size[0]]) - 1) / 2
         return cls.from_polynomial(centre, coefficients, aspect_ratio=aspect_ratio, image_size=image_size)

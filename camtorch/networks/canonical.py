@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number
+from camtorch._arguments import as_image_size, as_number, shown
 from camtorch._threads import as_cores_are_free
 from camtorch.augment.change import Change, Part, alone, by_kinds, copied, edited, size_of
 from camtorch.augment.sample import Named, Sample, SampleTransform, without_graph_in_workers
@@ -83,17 +83,19 @@ class CanonicalCamera(SampleTransform):
         focal = as_number(focal, "focal", self._name)
         if not 0 < focal < math.inf:
             raise ValueError(f"{self._name}: focal must be positive pixels; got {focal!r}")
-        if scales not in ("depth", "image"):
-            raise ValueError(f'{self._name}: scales must be "depth" or "image"; got {scales!r}')
+        if not isinstance(scales, str) or scales not in ("depth", "image"):
+            raise ValueError(f'{self._name}: scales must be "depth" or "image"; got {shown(scales)}')
         if image_size is not None and scales == "depth":
             raise ValueError(f"{self._name}: images keep their size where depth is scaled; got image_size={image_size}")
         self.focal, self.scales = focal, scales
         self.image_size = as_image_size(image_size, self._name)
-        self.options = as_options(self._name, mode, padding_mode, fill, bool(antialias), tolerance)
+        self.options = as_options(self._name, mode, padding_mode, fill, antialias or False, tolerance)
         self.antialias = antialias
 
     def scale(self, camera: Camera) -> Tensor:
         """(*B,): s of cameras (*B), `focal` by their focal length. Its gradients go to fx and fy."""
+        if not isinstance(camera, Camera):
+            raise TypeError(f"{self._name}.scale: camera must be a Camera; got {type(camera).__name__}")
         if isinstance(camera, Mixed):
             return camera._in_order(torch.cat([self.scale(group) for _, group in camera.groups]))
         k = camera.distortion.detach()

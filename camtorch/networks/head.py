@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_image_size, as_values, as_whole
+from camtorch._arguments import as_flag, as_image_size, as_number, as_values, as_whole
 from camtorch._module import GeometryModule
 from camtorch._tracing import in_graph
 from camtorch.calibration.calibrate import as_model
@@ -82,8 +82,9 @@ class CameraHead(GeometryModule):
     ):
         super().__init__()
         owner = type(self).__name__
-        features = as_whole(features, "features", owner)
-        if isinstance(fixed, Collection) and {"fx", "fy", "all"} & set((fixed,) if isinstance(fixed, str) else fixed):
+        features = as_whole(features, "features", owner, least=1)
+        names = () if not isinstance(fixed, Collection) else (fixed,) if isinstance(fixed, str) else tuple(fixed)
+        if any(isinstance(name, str) and name in ("fx", "fy", "all") for name in names):
             raise ValueError(f"{owner}: a focal length is held by its field of view, fov=(90, 90); got fixed={fixed!r}")
         asked = as_model(model, count, None, fixed, owner)
         known = None if asked.start is None else asked.start.image_size
@@ -92,9 +93,10 @@ class CameraHead(GeometryModule):
             raise ValueError(f"{owner}: a camera is valid for an image; give its image_size=(height, width)")
         if known not in (None, size):
             raise ValueError(f"{owner}: the camera is of images of {known}; got image_size={size}")
+        centre, shared_focal = as_number(centre, "centre", owner), as_flag(shared_focal, "shared_focal", owner)
         if not 0 <= centre < 0.5:
             raise ValueError(f"{owner}: centre must be a part of the image, from 0 to below 0.5; got {centre!r}")
-        self.model, self.image_size, self.centre, self.shared_focal = asked.kind, size, float(centre), shared_focal
+        self.model, self.image_size, self.centre, self.shared_focal = asked.kind, size, centre, shared_focal
         prior = prior_of(asked, size, self.centre, 0.0 if shared_focal else _ASPECT, fov, owner)
         least, given, most = (math.log(disc) for disc in prior.discs)
         discs = torch.linspace(least, most, _NODES, dtype=torch.float64)

@@ -8,7 +8,7 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_values, as_whole, broadcast_shapes
+from camtorch._arguments import Numbers, as_batch, as_coordinates, as_values, as_whole, broadcast_shapes, shown
 from camtorch.camera import Camera
 
 
@@ -23,6 +23,8 @@ def angles(first: Tensor, second: Tensor) -> Tensor:
         first: of any length but zero.
         second: likewise; both broadcast.
     """
+    first, second = (as_coordinates(w, name, 3, "angles") for w, name in ((first, "first"), (second, "second")))
+    as_batch("angles", first=first.shape, second=second.shape)
     a, b = (w / torch.linalg.vector_norm(w, dim=-1, keepdim=True) for w in (first, second))
     # the norm has a gradient of zero at zero
     return 2 * torch.atan2(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
@@ -225,8 +227,8 @@ def _reduced(
             raise ValueError(
                 f"{owner}: weights must broadcast against {tuple(valid.shape)}; got {tuple(given.shape)}"
             ) from None
+    if not isinstance(reduction, str) or reduction not in ("mean", "none"):
+        raise ValueError(f'{owner}: reduction must be "mean" or "none"; got {shown(reduction)}')
     if reduction == "none":
         return values, valid
-    if reduction != "mean":
-        raise ValueError(f'{owner}: reduction must be "mean" or "none"; got {reduction!r}')
     return values.sum() / weighing.sum().clamp(min=torch.finfo(values.dtype).tiny)

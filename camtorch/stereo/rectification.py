@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_batch, as_image_size, as_values
+from camtorch._arguments import (
+    Numbers,
+    as_batch,
+    as_coordinates,
+    as_flag,
+    as_image_size,
+    as_number,
+    as_points,
+    as_values,
+    check_devices,
+    check_path,
+    shown,
+)
 from camtorch._module import GeometryModule, Memo
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
@@ -179,7 +191,10 @@ class Rectification(GeometryModule):
         batched = bool(self.extrinsics.batch_shape or camera.batch_shape)
         if batched and (d.ndim != 4 or len(d) not in (1, count, camera.batch_shape.numel())):
             raise ValueError(f"{owner}: disparity must be (B, 1, H, W) for {count} pairs; got {shape}")
-        known = None if valid is None else torch.as_tensor(valid, device=d.device)
+        try:
+            known = None if valid is None else torch.as_tensor(valid, device=d.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(f"{owner}: valid must be a mask in the shape of disparity; got {shown(valid)}") from None
         if known is not None and tuple(known.shape) != shape:
             raise ValueError(f"{owner}: valid must have the shape of disparity, {shape}; got {tuple(known.shape)}")
         rows = d.reshape(-1, *size)
@@ -222,7 +237,9 @@ class Rectification(GeometryModule):
 
     def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The disparity of points (*B, *N, 3) of the frame of the rectified left camera, and whether both see them."""
-        baseline = self.baseline.to(points.dtype)
+        baseline = self.baseline
+        points, _ = as_points(points, "points", 3, baseline.shape, (baseline,), "Rectification.disparity")
+        baseline = baseline.to(points.dtype)
         axis = 1 if self.vertical else 0
         shift = torch.nn.functional.one_hot(torch.tensor(axis, device=points.device), 3).to(points.dtype)
         shift = baseline[..., None] * shift
@@ -238,15 +255,17 @@ class Rectification(GeometryModule):
             near: the least depth: z in perspective, the distance from the baseline in the panoramas about it.
             far: the greatest.
         """
+        near, far = (as_number(v, name, "disparity_range") for v, name in ((near, "near"), (far, "far")))
         if not 0 < near < far:
-            raise ValueError(f"disparity_range: 0 < near < far, got near={near}, far={far}")
+            raise ValueError(f"disparity_range: depths must be 0 < near < far; got near={near}, far={far}")
         disparities = torch.cat([self._at(depth).flatten() for depth in (near, far)])
         return float(disparities.min()), float(disparities.max())
 
     def depth_range(self, least: float, most: float) -> tuple[float, float]:
         """The other way: the least and the greatest depth that disparities between two have; infinite for zero."""
+        least, most = (as_number(v, name, "depth_range") for v, name in ((least, "least"), (most, "most")))
         if not least < most:
-            raise ValueError(f"depth_range: least < most, got least={least}, most={most}")
+            raise ValueError(f"depth_range: disparities must be least < most; got least={least}, most={most}")
         with torch.no_grad():
             camera = self.camera_left
             depths = []
@@ -262,6 +281,7 @@ class Rectification(GeometryModule):
 
     def distance(self, points: Tensor) -> Tensor:
         """Of points (..., 3) of the frame of the rectified left camera, from the baseline: depth in a panorama."""
+        points = as_coordinates(points, "points", 3, "Rectification.distance")
         return torch.hypot(points[..., 0 if self.vertical else 1], points[..., 2])
 
     @torch.no_grad()
@@ -308,6 +328,7 @@ class Rectification(GeometryModule):
         Raises:
             ValueError: as `opencv`; another suffix. OSError: it cannot be written.
         """
+        check_path(path, "Rectification.save")
         matrices, pose = self.opencv(), self.extrinsics.matrix()
         height, width = self.camera_left._size("Rectification.save")
         values: dict[str, Value] = {"image_width": width, "image_height": height}
@@ -364,8 +385,9 @@ def rectify(
         )
     for value, name, known in ((projection, "projection", tuple(_KINDS)), (align, "align", ("mean", "opencv"))):
         if not isinstance(value, str) or value not in known:
-            raise ValueError(f"{owner}: {name} must be one of {known}; got {value!r}")
-    size = as_image_size(image_size, owner)
+            raise ValueError(f"{owner}: {name} must be one of {known}; got {shown(value)}")
+    size, vertical = as_image_size(image_size, owner), as_flag(vertical, "vertical", owner)
+    check_devices(owner, left=left.intrinsics, right=right.intrinsics, extrinsics=extrinsics.rotation)
     batch = as_batch(
         owner,
         left=(*left.batch_shape, 1),
@@ -517,7 +539,8 @@ def _half(
     for i, angle in enumerate(angles):
         is_along = (i == 1) == vertical
         most = 2 * math.pi if not is_along and projection != "perspective" else math.pi
-        if not 0 < float(angle) < most:
+        angle = as_number(angle, "fov", owner)
+        if not 0 < angle < most:
             raise ValueError(f"{owner}: fov must be radians between 0 and {most:.4g} for {projection}; got {fov!r}")
         straight = projection == "perspective" or (projection == "cylindrical" and is_along)
         half[..., i] = math.tan(angle / 2) if straight else angle / 2

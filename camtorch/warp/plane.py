@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_batch, as_real, as_values
+from camtorch._arguments import Numbers, as_batch, as_coordinates, as_number, as_real, check_devices, shown
 from camtorch._tracing import in_graph, is_concrete
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -72,6 +72,7 @@ class PlaneWarp(SurfaceWarp):
                 f"{owner}: normal must be (3,) or (B, 3) and distance a number or (B,); got {tuple(normal.shape)} and "
                 f"{tuple(distance.shape)}"
             )
+        check_devices(owner, source=source.intrinsics, target=target.intrinsics, extrinsics=extrinsics.rotation)
         shapes = {"source": source.batch_shape, "target": target.batch_shape, "extrinsics": extrinsics.batch_shape}
         shapes |= {"normal": normal.shape[:-1], "distance": distance.shape}
         self.batch_shape = as_batch(owner, **{name: (*shape, 1) for name, shape in shapes.items()})
@@ -131,9 +132,7 @@ class PlaneWarp(SurfaceWarp):
 
     def transform_rays(self, rays: Tensor) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
-        rays = as_values(rays, "rays", type(self).__name__, self.source.intrinsics.device)
-        if rays.ndim == 0 or rays.shape[-1] != 3:
-            raise ValueError(f"{type(self).__name__}: rays must be (B, *N, 3); got shape {tuple(rays.shape)}")
+        rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
         rotation = self.plane[0].mT.to(rays.dtype)
         return turned(rotation, rays)
 
@@ -201,9 +200,8 @@ class BirdsEye(PlaneWarp):
         fill: Fill = 0.0,
         antialias: bool = False,
     ):
-        for name, ends in (("x", x), ("y", y)):
-            if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
-                raise ValueError(f"BirdsEye: {name} must be (from, to), ascending; got {ends!r}")
+        x, y = _as_ends(x, "x"), _as_ends(y, "y")
+        resolution = as_number(resolution, "resolution", "BirdsEye")
         if not (math.isfinite(resolution) and resolution > 0):
             raise ValueError(f"BirdsEye: resolution must be positive units of the ground per pixel; got {resolution}")
         size = tuple(round((ends[1] - ends[0]) / resolution) for ends in (y, x))
@@ -227,7 +225,7 @@ class BirdsEye(PlaneWarp):
             fill=fill,
             antialias=antialias,
         )
-        self.x, self.y, self.resolution = (float(x[0]), float(x[1])), (float(y[0]), float(y[1])), float(resolution)
+        self.x, self.y, self.resolution = x, y, resolution
 
     def _check(self, owner: str) -> None:
         """Raise a ValueError where the camera is not above the ground."""
@@ -253,11 +251,22 @@ class BirdsEye(PlaneWarp):
 
     def to_ground(self, pixels: Tensor) -> Tensor:
         """Pixels (..., 2) of the image from above to x and y on the ground."""
-        u, v = pixels.unbind(-1)
+        u, v = as_coordinates(pixels, "pixels", 2, "BirdsEye").unbind(-1)
         step = self.resolution
         return torch.stack((self.x[0] + (u + 0.5) * step, self.y[1] - (v + 0.5) * step), -1)
 
     def from_ground(self, points: Tensor) -> Tensor:
         """The other way: x and y on the ground, (..., 2), to pixels."""
-        x, y = points.unbind(-1)
+        x, y = as_coordinates(points, "points", 2, "BirdsEye").unbind(-1)
         return torch.stack(((x - self.x[0]) / self.resolution - 0.5, (self.y[1] - y) / self.resolution - 0.5), -1)
+
+
+def _as_ends(ends: tuple[float, float], name: str) -> tuple[float, float]:
+    try:
+        low, high = ends
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"BirdsEye: {name} must be (from, to) on the ground; got {shown(ends)}") from None
+    low, high = as_number(low, name, "BirdsEye"), as_number(high, name, "BirdsEye")
+    if not -math.inf < low < high < math.inf:
+        raise ValueError(f"BirdsEye: {name} must be (from, to), ascending; got {(low, high)}")
+    return low, high

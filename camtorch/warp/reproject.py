@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_batch
+from camtorch._arguments import Numbers, as_batch, as_number, check_devices
 from camtorch._module import GeometryModule, Memo
 from camtorch._tracing import in_graph, is_concrete, may_look
 from camtorch.camera import Camera
@@ -66,6 +66,7 @@ class Reproject(GeometryModule):
             raise TypeError(
                 f"{owner}: extrinsics must be Extrinsics, source from target; got {type(extrinsics).__name__}"
             )
+        check_devices(owner, source=source.intrinsics, target=target.intrinsics, extrinsics=extrinsics.rotation)
         self.extrinsics = extrinsics
         self.mode = one_of(mode, MODES, "mode", owner)
         self.padding_mode = one_of(padding_mode, PADDINGS, "padding_mode", owner)
@@ -116,10 +117,12 @@ class Reproject(GeometryModule):
             or images.ndim != 4
             or tuple(images.shape[-2:]) != size
         ):
-            what = tuple(images.shape) if isinstance(images, Tensor) else type(images).__name__
+            what = f"{images.dtype} {tuple(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
             raise ValueError(
-                f"{owner}: images must be a tensor (B, C, H, W) of the source's image_size {size}; got {what}"
+                f"{owner}: images must be a tensor (B, C, H, W) of real numbers, of the source's image_size {size}; "
+                f"got {what}"
             )
+        check_devices(owner, images=images, source=self.source.intrinsics)
         given = as_depth(depth, kind, self.target._size(owner), owner, self.target.intrinsics.device)
         given = given if given.ndim == 4 else given[None, None]
         counts = {"images": len(images), "depth": len(given), "cameras": self.batch_shape.numel()}
@@ -128,7 +131,7 @@ class Reproject(GeometryModule):
             raise ValueError(f"{owner}: batches do not fit: {counts}")
         seen, valid, far = self._seen(given, kind)
         if source_depth is not None:
-            valid = valid & self._shows(seen, far, source_depth, kind, float(tolerance), owner)
+            valid = valid & self._shows(seen, far, source_depth, kind, as_number(tolerance, "tolerance", owner), owner)
         rows, steps = seen.shape[0], seen.shape[1]
         # an image that stays where it is, or is shifted by whole pixels, is copied to the bit
         plain = steps == 1 and may_look(seen) and not in_graph(seen)

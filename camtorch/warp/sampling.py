@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch._arguments import as_flag, as_number, shown
 from camtorch._threads import as_cores_are_free, thread_count
 from camtorch._tracing import converted, in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
@@ -453,34 +454,37 @@ def as_options(
     Raises:
         ValueError: a mode that does not exist, a fill or a tolerance that is none. TypeError: a fill that is no number.
     """
+    tolerance = None if tolerance is None else as_number(tolerance, "tolerance", owner)
     if tolerance is not None and not 0 <= tolerance < math.inf:
         raise ValueError(f"{owner}: tolerance must be a number of pixels, zero or more; got {tolerance!r}")
     return {
         "mode": one_of(mode, MODES, "mode", owner),
         "padding_mode": one_of(padding_mode, PADDINGS, "padding_mode", owner),
         "fill": as_fill(fill, owner),
-        "antialias": bool(antialias),
-        "tolerance": None if tolerance is None else float(tolerance),
+        "antialias": as_flag(antialias, "antialias", owner),
+        "tolerance": tolerance,
     }
 
 
 def one_of(value: str, allowed: tuple[Name, ...], name: str, owner: str) -> Name:
     """The value, if it is allowed."""
-    for known in allowed:
+    for known in allowed if isinstance(value, str) else ():
         if value == known:
             return known
-    raise ValueError(f"{owner}: {name} must be one of {allowed}; got {value!r}")
+    raise ValueError(f"{owner}: {name} must be one of {allowed}; got {shown(value)}")
 
 
 def as_fill(fill: Fill, owner: str) -> tuple[float, ...]:
     """One value or one for each channel, as a tuple; integers, which may be ids, stay what they are."""
     try:
+        if isinstance(fill, (str, bytes)):
+            raise TypeError
         given = tuple(fill) if isinstance(fill, Iterable) else (fill,)
         values = tuple(value if isinstance(value, int) else float(value) for value in given)
-    except (TypeError, ValueError):
-        raise TypeError(f"{owner}: fill must be a number or one for each channel; got {fill!r}") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise TypeError(f"{owner}: fill must be a number or one for each channel; got {shown(fill)}") from None
     if not values or not all(map(math.isfinite, values)):
-        raise ValueError(f"{owner}: fill must be finite; got {fill!r}")
+        raise ValueError(f"{owner}: fill must be a finite number or one for each channel; got {shown(fill)}")
     return values
 
 

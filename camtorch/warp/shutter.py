@@ -13,13 +13,15 @@ from torch import Tensor, nn
 from camtorch._arguments import (
     Numbers,
     as_batch,
+    as_coordinates,
+    as_image_size,
     as_number,
     as_points,
     as_real,
-    as_values,
     as_vectors,
     as_whole,
     broadcast_shapes,
+    shown,
 )
 from camtorch._module import GeometryModule
 from camtorch._tracing import in_graph, in_transform, is_concrete, keeps_graph
@@ -88,8 +90,8 @@ class RollingShutter(GeometryModule):
         owner = "RollingShutter"
         rates = as_vectors(rates, "rates", owner)
         times = {name: as_real(value, name, owner) for name, value in (("readout", readout), ("exposure", exposure))}
-        if direction not in DIRECTIONS:
-            raise ValueError(f"{owner}: direction must be one of {DIRECTIONS}; got {direction!r}")
+        if not isinstance(direction, str) or direction not in DIRECTIONS:
+            raise ValueError(f"{owner}: direction must be one of {DIRECTIONS}; got {shown(direction)}")
         for name, value in times.items():
             if value.ndim > 1:
                 raise ValueError(f"{owner}: {name} must be a number or (B,); got shape {tuple(value.shape)}")
@@ -121,7 +123,10 @@ class RollingShutter(GeometryModule):
 
     def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
         """(*B, *N): seconds from the middle of the readout at which pixels (*B, *N, 2) of an image are seen."""
-        values = as_values(pixels, "pixels", "RollingShutter", self.rates.device)
+        values = as_coordinates(pixels, "pixels", 2, "RollingShutter", self.rates.device)
+        size = as_image_size(image_size, "RollingShutter")
+        if size is None:
+            raise TypeError("RollingShutter: image_size must be two integers (height, width); got None")
         return self._times(self._share(values, image_size), values.ndim)
 
     # -- what a warp asks for

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
+from camtorch._arguments import as_number
 from camtorch._module import GeometryModule, Memo
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -78,6 +79,8 @@ class Surround(GeometryModule):
 
     def warp(self, name: str) -> Warp:
         """That of one camera."""
+        if name not in self.names:
+            raise ValueError(f"Surround: no camera is called {name!r}; there are {list(self.names)}")
         made: Warp = self._warps[self.names.index(name)]
         return made
 
@@ -115,6 +118,10 @@ class Surround(GeometryModule):
             if set(images) != set(self.names):
                 raise ValueError(f"Surround: images must be of the cameras {list(self.names)}; got {list(images)}")
             images = [images[name] for name in self.names]
+        listed = isinstance(images, (list, tuple))
+        if not listed or not all(isinstance(image, Tensor) for image in images):
+            given = [type(one).__name__ for one in images] if listed else type(images).__name__
+            raise TypeError(f"Surround: images must be tensors (B, C, H, W) by name, or in a list; got {given}")
         if len(images) != len(self.names):
             raise ValueError(f"Surround: {len(self.names)} cameras, {list(self.names)}; got {len(images)} images")
         weights = self._weights()
@@ -191,8 +198,13 @@ def surround(
     given = [name for name, value in ground.items() if value is not None]
     if (target is None and len(given) < 3) or (target is not None and given):
         raise ValueError(f"{owner}: give a target, or x, y and resolution of the ground; got target={target}, {ground}")
+    distance, fill = as_number(distance, "distance", owner), as_number(fill, "fill", owner)
     if not distance > 0:
         raise ValueError(f"{owner}: distance must be positive; got {distance}")
+    if blend is not None:
+        blend = as_number(blend, "blend", owner)
+        if not 0 <= blend < math.inf:
+            raise ValueError(f"{owner}: blend must be pixels, zero or more; got {blend}")
     warps: dict[str, Warp] = {}
     # what a camera does not see has no weight; the last half pixel that it sees is not darkened
     options: dict[str, Any] = {"mode": mode, "padding_mode": "border"}
@@ -212,5 +224,5 @@ def surround(
         far = float(torch.linalg.vector_norm(pose.position.detach(), dim=-1).max())
         if far >= distance:
             raise ValueError(f"{owner}: the camera {name!r} stands {far:.4g} from the origin; distance is {distance}")
-        warps[name] = _SphereWarp(camera, target, pose, float(distance), mode)
-    return Surround(warps, blend, float(fill))
+        warps[name] = _SphereWarp(camera, target, pose, distance, mode)
+    return Surround(warps, blend, fill)

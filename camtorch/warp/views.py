@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_whole
+from camtorch._arguments import as_number, as_whole, shown
 from camtorch._module import GeometryModule
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
@@ -106,9 +106,9 @@ class Views(GeometryModule):
             ValueError: another shape.
         """
         size = self.view._size("Views")
-        if views.ndim != 5 or views.shape[1] != len(self) or tuple(views.shape[-2:]) != size:
+        if not isinstance(views, Tensor) or views.ndim != 5 or views.shape[1] != len(self) or views.shape[-2:] != size:
             raise ValueError(
-                f"Views: views must be (B, {len(self)}, C, {size[0]}, {size[1]}); got {tuple(views.shape)}"
+                f"Views: views must be a tensor (B, {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"
             )
         weights = self.weights()
         result = None
@@ -163,12 +163,10 @@ def ring(
     Raises:
         ValueError: no views, or a field of view that no pinhole has.
     """
-    count = as_whole(count, "count", "ring")
-    if count < 1:
-        raise ValueError(f"ring: count must be at least 1; got {count}")
+    count, pitch = as_whole(count, "count", "ring", least=1), as_number(pitch, "pitch", "ring")
     seen = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max())
     step = seen / count
-    wide = min(_OVERLAP * step, math.radians(150)) if fov is None else float(fov)
+    wide = min(_OVERLAP * step, math.radians(150)) if fov is None else as_number(fov, "fov", "ring")
     if not 0 < wide < math.pi:
         raise ValueError(f"ring: fov must be radians between 0 and pi; got {fov}")
     yaws = torch.rad2deg((torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * step)
@@ -182,10 +180,7 @@ def _size(camera: Camera, size: int | None, fov: float, owner: str) -> int:
     if camera.batch_shape:
         raise ValueError(f"{owner}: takes one camera; got batch_shape={tuple(camera.batch_shape)}")
     if size is not None:
-        size = as_whole(size, "size", owner)
-        if size < 1:
-            raise ValueError(f"{owner}: size must be at least 1; got {size}")
-        return size
+        return as_whole(size, "size", owner, least=1)
     with torch.no_grad():
         slope = slopes_at_axis(camera.optics, camera.distortion[None])
         focal = float((camera.intrinsics[:2] * slope[0]).max())

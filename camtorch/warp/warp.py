@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_values, broadcast_shapes
+from camtorch._arguments import as_coordinates, as_values, as_whole, broadcast_shapes, check_devices
 from camtorch._module import GeometryModule, Memo, is_constant, with_values
 from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, set_aside
 from camtorch.camera import Camera
@@ -119,6 +119,8 @@ class Warp(GeometryModule):
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
         self.mode, self.padding_mode, self.fill = options["mode"], options["padding_mode"], options["fill"]
         self.antialias, self._tolerance = options["antialias"], options["tolerance"]
+        if target is not source:
+            check_devices("Warp", source=source.intrinsics, target=target.intrinsics)
         self._set_rotation(as_rotation(rotation, "Warp"))
         turned = () if self.rotation is None else self.rotation.shape[:-2]
         self.shutter, self.target_shutter = as_shutter(shutter, "shutter"), as_shutter(target_shutter, "target_shutter")
@@ -232,8 +234,7 @@ class Warp(GeometryModule):
             the rows of the target, a slice; these rows of `forward`'s result (B, C, n, W'); and of `valid_mask`
             (B or 1, 1, n, W').
         """
-        if rows is not None and rows < 1:
-            raise ValueError(f"Warp: rows must be at least 1; got {rows}")
+        rows = None if rows is None else as_whole(rows, "rows", "Warp", least=1)
         return self._strips(images, rows, *self._checked(images, mode, padding_mode, fill))
 
     def _strips(
@@ -269,6 +270,8 @@ class Warp(GeometryModule):
                 f"Warp: images are {shape[-2:]} (height, width), but the source camera's image_size is {expected}; "
                 "camera.crop makes that of a part of it, camera.resize that of another resolution"
             )
+        if images.device != self.source.intrinsics.device:
+            check_devices("Warp", images=images, source=self.source.intrinsics)
         cameras = math.prod(self.batch_shape)
         if cameras != 1 and images.shape[0] not in (1, cameras):
             raise ValueError(f"Warp: {images.shape[0]} images do not fit {cameras} cameras")
@@ -453,6 +456,7 @@ class Warp(GeometryModule):
 
     def enclose(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """As `transform_boxes`, of closed polygons (B, *N, K, 2), or (*N, K, 2)."""
+        corners = as_coordinates(corners, "corners", 2, "Warp", self.source.intrinsics.device, "B, *N, K")
         moved, mapped = self._move(along_edges(corners, EDGE_SAMPLES))
         mapped = mapped & torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
         some = mapped.any(-1, keepdim=True)
@@ -466,9 +470,7 @@ class Warp(GeometryModule):
 
         With shutters both frames are those of the middle of the readout.
         """
-        rays = as_values(rays, "rays", "Warp", self.source.intrinsics.device)
-        if rays.ndim == 0 or rays.shape[-1] != 3:
-            raise ValueError(f"Warp: rays must be (B, *N, 3); got shape {tuple(rays.shape)}")
+        rays = as_coordinates(rays, "rays", 3, "Warp", self.source.intrinsics.device, "B, *N")
         return turn(self.rotation, rays, "rays")
 
     def inverse(self) -> Warp:
@@ -619,8 +621,5 @@ def outlines(boxes: Tensor, samples: int = 16) -> Tensor:
     Returns:
         (..., 4 * samples, 2).
     """
-    if boxes.ndim == 0 or boxes.shape[-1] != 4:
-        raise ValueError(f"outlines: boxes must be (..., 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
-    if samples < 1:
-        raise ValueError(f"outlines: samples must be at least 1; got {samples}")
-    return along_edges(corners_of(boxes if boxes.is_floating_point() else boxes.float()), samples)
+    boxes = as_coordinates(boxes, "boxes x1, y1, x2, y2", 4, "outlines")
+    return along_edges(corners_of(boxes), as_whole(samples, "samples", "outlines", least=1))
