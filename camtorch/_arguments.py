@@ -178,7 +178,7 @@ def as_number(value: Any, name: str, owner: str) -> float:
         raise TypeError(f"{owner}: {name} must be a number; got {shown(value)}") from None
 
 
-def as_part(value: Any, name: str, owner: str) -> float:
+def as_part(value: Any, name: str, owner: str, kind: str = "part") -> float:
     """A part of a whole, as a probability is one.
 
     Raises:
@@ -186,7 +186,7 @@ def as_part(value: Any, name: str, owner: str) -> float:
     """
     part = as_number(value, name, owner)
     if not 0 <= part <= 1:
-        raise ValueError(f"{owner}: {name} must lie in [0, 1]; got {value!r}")
+        raise ValueError(f"{owner}: {name} must be a {kind} in [0, 1]; got {value!r}")
     return part
 
 
@@ -273,7 +273,13 @@ def as_values(values: Numbers, name: str, owner: str, device: torch.device | Non
 
 
 def as_coordinates(
-    values: Numbers, name: str, size: int, owner: str, device: torch.device | None = None, form: str = "..."
+    values: Numbers,
+    name: str,
+    size: int,
+    owner: str,
+    device: torch.device | None = None,
+    form: str = "...",
+    means: str = "",
 ) -> Tensor:
     """A tensor (..., size) of real numbers; whole ones take torch's default dtype.
 
@@ -282,7 +288,7 @@ def as_coordinates(
     """
     values = as_values(values, name, owner, device)
     if values.ndim == 0 or values.shape[-1] != size:
-        raise ValueError(f"{owner}: {name} must be ({form}, {size}); got shape {tuple(values.shape)}")
+        raise ValueError(f"{owner}: {name} must be ({form}, {size}){means}; got shape {tuple(values.shape)}")
     return values if values.is_floating_point() else values.to(torch.get_default_dtype())
 
 

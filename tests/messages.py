@@ -77,13 +77,13 @@ def everything() -> list[Statement]:
 class _Recorded(ast.NodeTransformer):
     """Statements hand what they raise or warn of to the record first."""
 
-    def visit_Raise(self, node: ast.Raise) -> ast.Raise:  # noqa: N802
+    def visit_Raise(self, node: ast.Raise) -> ast.Raise:
         self.generic_visit(node)
         if node.exc is not None:
             node.exc = self._record(node.exc)
         return node
 
-    def visit_Call(self, node: ast.Call) -> ast.Call:  # noqa: N802
+    def visit_Call(self, node: ast.Call) -> ast.Call:
         self.generic_visit(node)
         if isinstance(node.func, ast.Attribute) and node.func.attr == "warn":
             node.args[0] = self._record(node.args[0])

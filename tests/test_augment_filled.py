@@ -164,7 +164,7 @@ def test_what_cannot_be_filled_is_said():
     with pytest.warns(UserWarning, match=r"min_filled=0.9 is out of reach for . of 4 new images.* does not see along"):
         augmentation(image=torch.rand(4, 1, 120, 40))
     augmentation(image=torch.rand(4, 1, 120, 40))
-    with pytest.raises(ValueError, match=r"RandomMount: min_filled must be a part in \[0, 1\], or None; got 90"):
+    with pytest.raises(ValueError, match=r"RandomMount: min_filled must be a part in \[0, 1\]; got 90"):
         RandomMount(min_filled=90)
 
 

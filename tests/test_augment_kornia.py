@@ -552,7 +552,7 @@ def test_errors_say_what_is_wrong():
         adapter.RandomMount(ct.Pinhole([1.0, 1.0, 0.0, 0.0]))
     with pytest.raises(ValueError, match="with_cameras"):
         adapter.RandomMount(several())
-    with pytest.raises(ValueError, match=r"p must lie in \[0, 1\]; got"):
+    with pytest.raises(ValueError, match=r"p must be a probability in \[0, 1\]; got"):
         adapter.RandomMount(camera(), p=2.0)
     with pytest.raises(TypeError, match="augmentation must be"):
         adapter.CameraAugmentation(K.RandomAffine(3.0))

@@ -205,7 +205,10 @@ class Augmentation(SampleTransform):
         super().__init__(camera, fields, mask_fill, valid_mask)
         for name in unknown:
             raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
-        self.p, self.same_on_batch = as_part(p, "p", self._name), as_flag(same_on_batch, "same_on_batch", self._name)
+        self.p, self.same_on_batch = (
+            as_part(p, "p", self._name, "probability"),
+            as_flag(same_on_batch, "same_on_batch", self._name),
+        )
         self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         self.ranges = dict(ranges or {})
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)

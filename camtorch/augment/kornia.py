@@ -110,7 +110,10 @@ class CameraAugmentation(GeometricAugmentationBase2D):
                 f"{name}: camera must be a single one with image_size=(height, width); got batch dims "
                 f"{tuple(camera.batch_shape)} and {camera.image_size}. with_cameras gives every sample its own"
             )
-        p, p_batch = augmentation.p if p is None else as_part(p, "p", name), as_part(p_batch, "p_batch", name)
+        p, p_batch = (
+            augmentation.p if p is None else as_part(p, "p", name, "probability"),
+            as_part(p_batch, "p_batch", name, "probability"),
+        )
         same_on_batch = augmentation.same_on_batch if same_on_batch is None else same_on_batch
         super().__init__(p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
         self.augmentation, self.camera = augmentation, camera

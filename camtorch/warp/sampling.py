@@ -484,7 +484,7 @@ def as_fill(fill: Fill, owner: str) -> tuple[float, ...]:
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise TypeError(f"{owner}: fill must be a number or one for each channel; got {shown(fill)}") from None
     if not values or not all(map(math.isfinite, values)):
-        raise ValueError(f"{owner}: fill must be a finite number or one for each channel; got {shown(fill)}")
+        raise ValueError(f"{owner}: fill must be finite, a number or one for each channel; got {shown(fill)}")
     return values
 
 

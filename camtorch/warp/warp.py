@@ -621,5 +621,5 @@ def outlines(boxes: Tensor, samples: int = 16) -> Tensor:
     Returns:
         (..., 4 * samples, 2).
     """
-    boxes = as_coordinates(boxes, "boxes x1, y1, x2, y2", 4, "outlines")
+    boxes = as_coordinates(boxes, "boxes", 4, "outlines", means=" = x1, y1, x2, y2")
     return along_edges(corners_of(boxes), as_whole(samples, "samples", "outlines", least=1))
