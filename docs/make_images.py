@@ -11,7 +11,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
-from drawings import augmentations, concepts, models
+from drawings import augmentations, concepts, models, views
 from PIL import Image, ImageDraw, ImageFont
 
 import camtorch as ct
@@ -283,7 +283,12 @@ SHEETS = {
     "edits": (edits, 85),
 }
 """Name of the file -> what draws it, and its quality."""
-PARTS = {"models": models.main, "augmentations": augmentations.main, "concepts": concepts.main}
+PARTS = {
+    "models": models.main,
+    "augmentations": augmentations.main,
+    "views": views.main,
+    "concepts": concepts.main,
+}
 """Name -> what makes the images of a part, or those of it that are named."""
 
 

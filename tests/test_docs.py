@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -52,10 +53,14 @@ def photographs():
     return [photograph(board, fisheye(), *pose)[0] for pose in poses]
 
 
-def write_calibration_data():
-    """Corners and photographs, as the pages on calibration speak of them."""
+def write_corners():
+    """Of OpenCV's photographs."""
     left, _ = opencv_left()
     np.savez("corners.npz", object_points=left.object_points, image_points=left.image_points)
+
+
+def write_calibration_data():
+    """Corners of a stereo pair, and photographs, as the pages on calibration speak of them."""
     pair, right, *_ = stereo(12)
     np.savez("stereo.npz", object_points=pair.object_points, left=pair.image_points, right=right)
     Path("images").mkdir()
@@ -93,10 +98,14 @@ def folder(tmp_path, monkeypatch, request):
         Path("sparse/0").mkdir(parents=True)
         pose = ct.Extrinsics([0.0, 0.1, 0.0], [0.0, 0.0, 0.1]).double()
         ct.save(ct.Rig({"1": camera}, {"a.jpg": pose}, images={"a.jpg": "1"}), "sparse/0/cameras.bin", format="colmap")
+    if "corners.npz" in text:
+        write_corners()
     if "images/*.jpg" in text:
         write_calibration_data()
     known = dict(ct.MODELS)
     yield tmp_path
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
     # the models that pages define are theirs
     ct.MODELS.clear()
     ct.MODELS.update(known)

@@ -4,11 +4,13 @@ import inspect
 import re
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
 
 import camtorch as ct
+from camtorch.warp.dewarp import Projection
 
 DOCS = Path(__file__).parent.parent / "docs"
 LARGEST = 150_000  # bytes of a picture
@@ -79,8 +81,19 @@ def test_every_option_of_cameras_is_shown(pages):
     assert [name for name in options if not re.search(rf'\b{name}"?[=:]', shown)] == []
 
 
+def test_every_plot_is_shown(pages):
+    found = pages.sections("views.md")
+    for section in found.values():
+        (name,) = re.findall(r"\(\.\./images/(views/.*?)\)", section)
+        check_picture(section, name)
+    page = (DOCS / "gallery" / "views.md").read_text()
+    assert [name for name in ct.plot.__all__ if f"ct.plot.{name}(" not in page] == []
+    projections = get_args(Projection)
+    assert [name for name in projections if f"{name}.jpg" not in page] == []
+
+
 def test_no_picture_is_left_over(pages):
     text = "".join(page.read_text() for page in DOCS.rglob("*.md"))
-    for folder in ("models", "augment"):
+    for folder in ("models", "augment", "views", "concepts"):
         for picture in (DOCS / "images" / folder).iterdir():
             assert f"images/{folder}/{picture.name})" in text
