@@ -39,7 +39,7 @@ def moved(before: LabelledImage, warp: ct.Warp) -> LabelledImage:
     return LabelledImage(warp(before.image[None])[0], warp.target, new, [], keypoints_valid, boxes_valid)
 
 
-def overview() -> Image.Image:
+def overview(columns: int) -> Image.Image:
     """A fisheye image, dewarped, and as other cameras would have seen it."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
     fisheye = rendered(driver(lens.double().requires_grad_(False)))
@@ -55,7 +55,7 @@ def overview() -> Image.Image:
         (straight, "dewarped"),
         *((other, "another lens and mount") for other in others),
     ]
-    return in_rows(panels, len(panels))
+    return in_rows(panels, columns)
 
 
 def in_rows(panels: list[tuple[LabelledImage, str]], columns: int) -> Image.Image:

@@ -11,6 +11,7 @@ from mkdocs.structure.pages import Page
 from PIL import Image
 
 ROOT = Path(__file__).parent.parent
+WIDE = 700  # px: more than a phone shows
 PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 
 
@@ -25,14 +26,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Images of the site have their size, so that text stays where it is while they load, when they are scrolled to."""
+    """Images load when they are scrolled to, and text stays where it is meanwhile; wide ones open by themselves."""
 
-    def sized(tag: re.Match[str]) -> str:
-        file = files.get_file_from_path(urljoin(page.url, tag[1]))
-        if file is None or file.src_uri.endswith(".svg"):
-            return tag[0].replace("<img ", '<img loading="lazy" ', 1)
+    def shown(found: re.Match[str]) -> str:
+        link, tag = found[1] or "", found[2]
+        source = re.search(r'src="([^"]+)"', tag)
+        file = files.get_file_from_path(urljoin(page.url, source[1])) if source else None
+        if source is None or file is None or file.src_uri.endswith(".svg"):
+            return link + tag.replace("<img ", '<img loading="lazy" ', 1)
         with Image.open(io.BytesIO(file.content_bytes)) as image:
             width, height = image.size
-        return tag[0].replace("<img ", f'<img loading="lazy" width="{width}" height="{height}" ', 1)
+        tag = tag.replace("<img ", f'<img loading="lazy" width="{width}" height="{height}" ', 1)
+        return f"{link}{tag}" if link or width < WIDE else f'<a href="{source[1]}">{tag}</a>'
 
-    return re.sub(r'<img [^>]*?src="([^"]+)"[^>]*>', sized, html)
+    return re.sub(r"(<a [^>]*>\s*)?(<img [^>]*>)", shown, html)
