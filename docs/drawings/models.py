@@ -47,11 +47,23 @@ def fitted(camera: ct.Camera, height: int, width: int) -> ct.Camera:
 
 
 @torch.no_grad()
+def rendered(camera: ct.Camera, samples: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The room (3, H, W) as a camera sees it, and (H, W) bool, where it has rays.
+
+    The renderer leaves out pixels of which a corner has none, as at the ends of a panorama: those have one ray here.
+    """
+    image = room.render(camera, samples=samples)
+    whole = camera.unproject(camera.crop(0, 0, camera.height + 1, camera.width + 1).pixel_grid() - 0.5)[1]
+    rays, seen = camera.rays()
+    rest = seen & ~(whole[1:, 1:] & whole[1:, :-1] & whole[:-1, 1:] & whole[:-1, :-1])
+    image[:, rest] = room.radiance(rays[rest].float()).T
+    return image, seen
+
+
+@torch.no_grad()
 def room_image(camera: ct.Camera, samples: int = 8) -> Image.Image:
     """The room as the camera sees it, paper where it has no rays."""
-    image = room.render(camera, samples=samples)
-    seen = camera.unproject(camera.crop(0, 0, camera.height + 1, camera.width + 1).pixel_grid() - 0.5)[1]
-    seen = seen[1:, 1:] & seen[1:, :-1] & seen[:-1, 1:] & seen[:-1, :-1]  # as the room is rendered
+    image, seen = rendered(camera, samples)
     paper = torch.tensor([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)])[:, None, None]
     image = torch.where(seen, image, paper)
     return Image.fromarray((image * 255).round().byte().permute(1, 2, 0).numpy())

@@ -16,24 +16,27 @@ import matplotlib
 matplotlib.use("agg")
 
 import matplotlib.pyplot as plt
+import torch
 from PIL import Image
 
 import camtorch as ct
 from camtorch._drawing import PAPER, shown
-from camtorch.demo import room
 from drawings.augmentations import GAP, TILE, WIDTH, put
+from drawings.models import rendered
 from drawings.pages import DOCS, IMAGES, code, sections
 
 TESTS = DOCS.parent / "tests"
 
 
-def pair(warp: ct.Warp) -> Image.Image:
-    """A room before and after a warp."""
+def pair(camera: ct.Camera, made: ct.Warp | ct.views.Views) -> Image.Image:
+    """A room before and after a warp, or in several views, three in a row."""
     height, width = TILE
-    source = warp.source
-    large = room.render(source, samples=4)
+    large, _ = rendered(camera, 4)
+    after = made(large[None])[0]
+    if after.ndim == 4:
+        after = torch.cat([torch.cat(list(row), -1) for row in after.split(3)], -2)
     tiles = []
-    for image in (large, warp(large[None])[0]):
+    for image in (large, after):
         scale = min(height / image.shape[-2], width / image.shape[-1])
         tiles.append(shown(image, round(scale * image.shape[-2]), round(scale * image.shape[-1])))
     sheet = Image.new("RGB", (WIDTH, max(tile.height for tile in tiles) + 2 * GAP), PAPER)
@@ -92,5 +95,5 @@ def main(names: list[str]) -> None:
             else:
                 made: dict[str, Any] = {}
                 exec(code(text), made)
-                made["warp"].requires_grad_(False)
-                pair(made["warp"]).save(folder / name, quality=80, optimize=True)
+                moved = (made.get("warp") or made["views"]).requires_grad_(False)
+                pair(made["camera"], moved).save(folder / name, quality=80, optimize=True)
