@@ -20,6 +20,8 @@ KEYS = sorted(ct.MODELS)
 
 # One model of each kind of chart and lens: the others are put together from the same parts
 DISTINCT = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sphere", "division", "f_theta_backward"}
+# Those, what most people have, and those with a part of their own
+USUAL = DISTINCT | {"brown_conrady", "fisheye62", "fov", "equisolid", "tabulated"}
 
 
 def slow_unless(quick, cases):
