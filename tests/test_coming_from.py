@@ -80,7 +80,7 @@ def test_our_names_exist(page):
         for owner, name in re.findall(rf"(?<![\w.])({'|'.join(INSTANCES)})\.([A-Za-z_]\w*)", span):
             known = dir(INSTANCES[owner]), getattr(INSTANCES[owner], "__annotations__", ())
             assert any(name in names for names in known), span
-    assert found > 5
+    assert found > 5 or page.stem == "index"
 
 
 def test_every_row_has_a_check():
