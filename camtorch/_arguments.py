@@ -6,7 +6,7 @@ import math
 import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -14,18 +14,8 @@ from torch import Tensor, nn
 
 from camtorch._tracing import in_graph, is_concrete
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-TensorLike: TypeAlias = "Tensor | ArrayLike"
-"""What parameters and points are made of: a tensor, an array, or lists of numbers."""
-
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-Numbers: TypeAlias = "Tensor | ArrayLike"
-"""What users pass as numbers: a tensor, an array, a list."""
+Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
+"""What users pass as numbers: a tensor, an array, a number, or lists of them."""
 
 
 def as_real(value: Numbers, name: str, owner: str) -> Tensor:

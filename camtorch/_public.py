@@ -1,6 +1,6 @@
 """The names that `camtorch` shows: this file imports what `camtorch/__init__.py` hands out at first use."""
 
-from camtorch import augment, data, io, lenses, models
+from camtorch import augment, data, io, lenses, models, plot
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
 from camtorch.calibration.pnp import solve_pnp
@@ -66,6 +66,7 @@ __all__ = [
     "load_map",
     "losses",
     "native_available",
+    "plot",
     "rectify",
     "save",
     "solve_pnp",

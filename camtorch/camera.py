@@ -28,7 +28,7 @@ from camtorch._arguments import (
     is_predicted,
     shown,
 )
-from camtorch._module import BatchedModule, Memo, is_constant, with_values
+from camtorch._module import BatchedModule, Memo, is_constant, typed_as, with_values
 from camtorch._portable import for_elsewhere
 from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, is_concrete, is_exporting, keeps_graph
 from camtorch.convert.conversion import CameraT, Conversion, convert
@@ -155,7 +155,7 @@ class Camera(BatchedModule):
     _model: ClassVar[str]
 
     def __init__(
-        self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: tuple[int, int] | None = None
+        self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
         super().__init__()
         owner = type(self).__name__
@@ -197,7 +197,7 @@ class Camera(BatchedModule):
         K: Numbers,  # noqa: N803
         distortion: Numbers | None = None,
         *,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         ignore_skew: bool = False,
     ) -> Self:
         """A camera from its matrix, as OpenCV's calibrations give it.
@@ -250,7 +250,7 @@ class Camera(BatchedModule):
         cls,
         fov: Numbers,
         *,
-        image_size: tuple[int, int],
+        image_size: Sequence[int],
         axis: Literal["horizontal", "vertical", "diagonal"] = "horizontal",
         distortion: Numbers | None = None,
     ) -> Self:
@@ -412,14 +412,16 @@ class Camera(BatchedModule):
 
     # -- both directions
 
-    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, points: Numbers) -> tuple[Tensor, Tensor]:
         """The same as `project`."""
         return self.project(points)
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
 
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
+
+    def project(self, points: Numbers) -> tuple[Tensor, Tensor]:
         """Project points, or rays, of the camera frame to pixels.
 
         Args:
@@ -432,7 +434,7 @@ class Camera(BatchedModule):
         """
         return self._map(Project, points, "points", 3)
 
-    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
 
         Args:
@@ -447,13 +449,18 @@ class Camera(BatchedModule):
     # -- how both are evaluated
 
     def _map(
-        self, direction: type[Project] | type[Unproject], values: Tensor, name: str, size: int
+        self, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
     ) -> tuple[Tensor, Tensor]:
         """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
         batch, tensors = self.batch_shape, self._tensors
         lead, dims = batch, len(batch)
-        fit = isinstance(values, Tensor) and all(t.dtype == values.dtype for t in tensors)
-        if not fit or values.ndim <= dims or values.shape[-1] != size or values.shape[:dims] != batch:
+        if (
+            not isinstance(values, Tensor)
+            or any(t.dtype != values.dtype for t in tensors)
+            or values.ndim <= dims
+            or values.shape[-1] != size
+            or values.shape[:dims] != batch
+        ):
             values, lead = as_points(values, name, size, batch, tensors, type(self).__name__)
         shape = values.shape[:-1]
         rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
@@ -539,7 +546,7 @@ class Camera(BatchedModule):
 
     # -- the image
 
-    def contains(self, pixels: Tensor) -> Tensor:
+    def contains(self, pixels: Numbers) -> Tensor:
         """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
         height, width = self._size("contains")
         pixels = as_values(pixels, "pixels", type(self).__name__)
@@ -610,7 +617,7 @@ class Camera(BatchedModule):
         """
         return plucker(*self.rays(stride), extrinsics, f"{type(self).__name__}.plucker")
 
-    def local_pinhole(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def local_pinhole(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """The pinhole camera that agrees with this one to first order around each pixel.
 
         A ray near that of the pixel is seen at K (R ray) / z, up to the square of its distance. So a patch can be taken
@@ -702,7 +709,7 @@ class Camera(BatchedModule):
         """
         return field_of_view(self)
 
-    def explain(self, points: Tensor) -> list[str]:
+    def explain(self, points: Numbers) -> list[str]:
         """Why points have no pixel, in words; for a person, and slow.
 
         Args:
@@ -829,7 +836,7 @@ class Camera(BatchedModule):
         model: type[CameraT],
         *,
         count: int | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         max_angle: float | None = None,
         tolerance: float = 0.1,
         **options: Any,
@@ -841,7 +848,7 @@ class Camera(BatchedModule):
         model: str,
         *,
         count: int | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         max_angle: float | None = None,
         tolerance: float = 0.1,
         **options: Any,
@@ -852,7 +859,7 @@ class Camera(BatchedModule):
         model: type[Camera] | str,
         *,
         count: int | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         max_angle: float | None = None,
         tolerance: float = 0.1,
         **options: Any,

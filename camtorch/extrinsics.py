@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_batch, as_real, as_rows, as_vectors, broadcast_shapes, columns
-from camtorch._module import BatchedModule
+from camtorch._module import BatchedModule, typed_as
 from camtorch._tracing import is_concrete
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
@@ -56,7 +56,7 @@ class Extrinsics(BatchedModule):
         """*B, the batch dims of the pose."""
         return broadcast_shapes(self.rotation.shape, self.translation.shape)[:-1]
 
-    def forward(self, points_world: Tensor) -> Tensor:
+    def forward(self, points_world: Numbers) -> Tensor:
         """World points (*B, *N, 3) to the camera frame, same shape."""
         parameters = (self.rotation, self.translation)
         rows, lead, restore = as_rows(points_world, "points_world", 3, self.batch_shape, parameters, "Extrinsics")
@@ -65,7 +65,9 @@ class Extrinsics(BatchedModule):
         return restore(torch.stack([p + t for p, t in zip(turned, columns(translation), strict=True)]))
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def matrix(self) -> Tensor:
         """The (*B, 4, 4) matrix [[R, t], [0, 1]]."""

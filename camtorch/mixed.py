@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_points, shown, working_dtype
+from camtorch._arguments import Numbers, as_points, shown, working_dtype
 from camtorch._module import Memo
 from camtorch._tracing import in_graph
 from camtorch.camera import Camera, new_cameras, per_row
@@ -215,10 +215,10 @@ class Mixed(Camera):
 
         return cameras
 
-    def explain(self, points: Tensor) -> list[str]:
+    def explain(self, points: Numbers) -> list[str]:
         """Why points (B, *N, 3) have no pixel, in words; see `Camera.explain`."""
-        points, _ = as_points(points, "points", 3, self.batch_shape, (self.intrinsics,), "Mixed")
-        return [line for camera, mine in zip(self, points, strict=True) for line in camera.explain(mine)]
+        rows, _ = as_points(points, "points", 3, self.batch_shape, (self.intrinsics,), "Mixed")
+        return [line for camera, mine in zip(self, rows, strict=True) for line in camera.explain(mine)]
 
     # -- other cameras
 

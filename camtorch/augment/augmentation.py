@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_flag, as_mapping, as_number, as_part, as_whole, shown
+from camtorch._module import typed_as
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, rows_of, size_of
@@ -485,7 +486,9 @@ class Augmentation(SampleTransform):
         return self._moved(sample, named, batched, change)
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "last": None}

@@ -463,7 +463,7 @@ def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Moved) -> 
 # -- cameras as rows of a batch: made anew from other numbers, taken out, put together
 
 
-def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
+def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int] | None) -> Camera:
     """A camera of the same model with these numbers; nothing in it learns that is not part of a graph already."""
     numbers = held(intrinsics, distortion)
     model: type[Camera] = type_before_parametrizations(camera)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, shown
+from camtorch._module import typed_as
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete
 from camtorch.augment.change import Change, Part, alone, camera_like, copied
@@ -64,7 +65,7 @@ class FaceNormalizer(SampleTransform):
         camera: Camera | None = None,
         focal: float = 960.0,
         distance: float = 600.0,
-        image_size: tuple[int, int] = (224, 224),
+        image_size: Sequence[int] = (224, 224),
         axis: tuple[float, float] | None = None,
         mode: str = "bilinear",
         padding_mode: str = "zeros",
@@ -184,7 +185,9 @@ class FaceNormalizer(SampleTransform):
         return moved
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
         """The virtual camera, and the options."""

@@ -118,7 +118,7 @@ class RandomCamera(Augmentation):
         rates: RangeLike | None = None,
         readout: RangeLike | None = None,
         exposure: RangeLike | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         **options: Any,
     ):
         super().__init__(**options)

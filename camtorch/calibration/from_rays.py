@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -30,7 +31,7 @@ def fit(
     rays: Numbers,
     *,
     weights: Numbers | None = None,
-    image_size: tuple[int, int] | None = None,
+    image_size: Sequence[int] | None = None,
     count: int | None = None,
 ) -> Conversion[Camera]:
     """The camera of a model that sees rays at pixels, as nearly as it can: by least squares of the distances in px.

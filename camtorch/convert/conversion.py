@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
@@ -70,7 +70,7 @@ def convert(
     models: Mapping[str, type[Camera]],
     *,
     count: int | None,
-    image_size: tuple[int, int] | None,
+    image_size: Sequence[int] | None,
     max_angle: float | None,
     tolerance: float,
     **options: Any,

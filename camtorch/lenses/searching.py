@@ -6,6 +6,7 @@ import difflib
 import itertools
 import re
 import unicodedata
+from collections.abc import Sequence
 from functools import cache
 
 from camtorch._arguments import as_image_size
@@ -18,7 +19,7 @@ _ASPECT = 0.01  # the part by which aspect ratios may differ, as sizes are round
 _SHOWN = 8
 
 
-def search(words: str = "", *, image_size: tuple[int, int] | None = None) -> list[Lens]:
+def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[Lens]:
     """The lenses whose names have all of these words, best first; all lenses if there are none.
 
     Case, spaces and signs do not count, nor does the order of words. The last letters of a word may be missing, and
@@ -40,7 +41,7 @@ def search(words: str = "", *, image_size: tuple[int, int] | None = None) -> lis
     return sorted(alike, key=lambda lens: lens.image_size != size)
 
 
-def find(words: str, *, image_size: tuple[int, int] | None = None) -> KannalaBrandt:
+def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrandt:
     """The camera of the best match of `search`, in float64, with nothing to learn.
 
     Args:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from camtorch._arguments import TensorLike, as_batch, as_number, as_real
+from camtorch._arguments import Numbers, as_batch, as_number, as_real
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 class OddPolynomial(Camera):
     """The coefficients k1 k2 ... of x (1 + k1 x^2 + k2 x^4 + ...), any number of them."""
 
-    distortion_names = ("k1", "k2", "k3", "k4")
+    distortion_names: tuple[str, ...] = ("k1", "k2", "k3", "k4")
     default_count = 4
     fit_counts = (4, 6, 8, 10)
 
@@ -34,7 +35,7 @@ class OddPolynomial(Camera):
 class FreePolynomial(Camera):
     """The coefficients k2 k3 ... of x (1 + k2 x + k3 x^2 + ...), any number of them; x is the angle or the radius."""
 
-    distortion_names = ("k2", "k3", "k4")
+    distortion_names: tuple[str, ...] = ("k2", "k3", "k4")
     default_count = 3
     fit_counts: ClassVar[tuple[int, ...]] = (3, 5, 7)
 
@@ -49,11 +50,11 @@ class FreePolynomial(Camera):
     @classmethod
     def from_polynomial(
         cls,
-        centre: TensorLike,
-        coefficients: TensorLike,
+        centre: Numbers,
+        coefficients: Numbers,
         *,
         aspect_ratio: float = 1.0,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
     ) -> Self:
         """From a polynomial without a leading 1: k1 theta + k2 theta^2 + ... pixels.
 

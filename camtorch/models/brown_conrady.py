@@ -30,7 +30,10 @@ class BrownConrady(Camera):
     """
 
     key = "brown_conrady"
-    distortion_names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+    distortion_names: tuple[str, ...] = (
+        *("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+        *("s1", "s2", "s3", "s4", "tau_x", "tau_y"),
+    )
     default_count = 5
     counts: ClassVar[tuple[int, ...]] = (4, 5, 8, 12, 14)
     special_cases = (("pinhole", ()),)

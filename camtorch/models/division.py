@@ -25,7 +25,7 @@ class Division(Camera):
     """
 
     key = "division"
-    distortion_names = ("lambda1",)
+    distortion_names: tuple[str, ...] = ("lambda1",)
     default_count = 1
     special_cases = (("pinhole", ()),)
     fit_starts = ({"lambda1": -0.2}, {"lambda1": -0.05})

@@ -22,7 +22,7 @@ class DoubleSphere(Camera):
     """
 
     key = "double_sphere"
-    distortion_names = ("xi", "alpha")
+    distortion_names: tuple[str, ...] = ("xi", "alpha")
     default_count = 2
     special_cases = (("ucm", ("alpha",)),)
     fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"xi": -0.2, "alpha": 0.6})

@@ -22,7 +22,7 @@ class EUCM(Camera):
     """
 
     key = "eucm"
-    distortion_names = ("alpha", "beta")
+    distortion_names: tuple[str, ...] = ("alpha", "beta")
     default_count = 2
     special_cases = (("ucm", ("alpha",)),)
     fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"alpha": 0.7})

@@ -26,7 +26,7 @@ class Fisheye62(Camera):
     """
 
     key = "fisheye62"
-    distortion_names = ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1")
+    distortion_names: tuple[str, ...] = ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1")
     default_count = 8
     special_cases = (("kannala_brandt", distortion_names[:6]),)
     odd_in_x = frozenset({"p0"})

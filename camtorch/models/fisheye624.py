@@ -26,7 +26,7 @@ class Fisheye624(Camera):
     """
 
     key = "fisheye624"
-    distortion_names = ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3")
+    distortion_names: tuple[str, ...] = ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3")
     default_count = 12
     special_cases = (("fisheye62", distortion_names[:8]),)
     odd_in_x = frozenset({"p0", "s0", "s1"})

@@ -22,7 +22,7 @@ class FOV(Camera):
     """
 
     key = "fov"
-    distortion_names = ("omega",)
+    distortion_names: tuple[str, ...] = ("omega",)
     default_count = 1
     special_cases = (("pinhole", ()),)
     # even in omega: zero is no start

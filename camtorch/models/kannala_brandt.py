@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import TensorLike, as_batch, as_real
+from camtorch._arguments import Numbers, as_batch, as_real
 from camtorch._tracing import is_concrete
 from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
@@ -36,7 +36,7 @@ class KannalaBrandt(OddPolynomial):
 
     @classmethod
     def from_general(
-        cls, intrinsics: TensorLike, coefficients: TensorLike, *, image_size: tuple[int, int] | None = None
+        cls, intrinsics: Numbers, coefficients: Numbers, *, image_size: Sequence[int] | None = None
     ) -> Self:
         """From the paper's form r = k1 theta + k2 theta^3 + ..., which has no leading 1.
 

@@ -26,7 +26,7 @@ class Mei(Camera):
     """
 
     key = "mei"
-    distortion_names = ("xi", "k1", "k2", "p1", "p2")
+    distortion_names: tuple[str, ...] = ("xi", "k1", "k2", "p1", "p2")
     default_count = 5
     special_cases = (("brown_conrady", ("k1", "k2", "p1", "p2")),)
     # along a valley xi and the radial coefficients do nearly the same

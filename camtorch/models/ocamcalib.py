@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import TensorLike, as_real
+from camtorch._arguments import Numbers, as_real
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Stage
 from camtorch.optics.lens import StageAt
-from camtorch.optics.radial import total
+from camtorch.optics.radial import RadialFactor, total
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -25,14 +25,14 @@ class AngleOfAllPowers(AnglePerRadius):
 
     def __init__(self, coefficients: Sequence[Tensor]):
         super().__init__(coefficients)
-        self.ahead = RadiusPolynomial(coefficients)
+        self.ahead: RadialFactor = RadiusPolynomial(coefficients)
 
 
 class Shear(Stage):
     """(x + e y, d x + y): a sensor out of line with the lens."""
 
     def __init__(self, d: Tensor, e: Tensor):
-        self.parameters = (d, e)
+        self.parameters: tuple[Tensor, ...] = (d, e)
 
     def __call__(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         d, e = self.parameters
@@ -79,7 +79,7 @@ class OCamCalib(Camera):
     """
 
     key = "ocamcalib"
-    distortion_names = ("d", "e", "a1", "a2", "a3", "a4")
+    distortion_names: tuple[str, ...] = ("d", "e", "a1", "a2", "a3", "a4")
     default_count = 6
     odd_in_x = odd_in_y = frozenset({"d", "e"})
     quarter_turn = MappingProxyType({"d": "-e", "e": "-d"})
@@ -101,11 +101,11 @@ class OCamCalib(Camera):
     @classmethod
     def from_ocamcalib(
         cls,
-        polynomial: TensorLike,
-        centre: TensorLike,
-        affine: TensorLike = (1.0, 0.0, 0.0),
+        polynomial: Numbers,
+        centre: Numbers,
+        affine: Numbers = (1.0, 0.0, 0.0),
         *,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
     ) -> Self:
         """From the numbers of the toolbox: its x goes down the rows, and its z backwards where ss[0] is negative.
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from camtorch._arguments import TensorLike
+from camtorch._arguments import Numbers
 from camtorch.camera import Camera
 from camtorch.optics import Chart, Lens, Perspective
 
@@ -17,7 +17,7 @@ class Pinhole(Camera):
 
     key = "pinhole"
 
-    def __init__(self, intrinsics: TensorLike, *, image_size: tuple[int, int] | None = None) -> None:
+    def __init__(self, intrinsics: Numbers, *, image_size: Sequence[int] | None = None) -> None:
         super().__init__(intrinsics, image_size=image_size)
 
     @staticmethod

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import TensorLike, as_number, as_real
+from camtorch._arguments import Numbers, as_number, as_real
 from camtorch.camera import Camera
 from camtorch.optics import Chart, EquidistantUpTo, Lens, Planar, RadiusTable
 
@@ -33,7 +33,7 @@ class Tabulated(Camera):
     """
 
     key = "tabulated"
-    distortion_names = (*(f"theta{i}" for i in range(1, 7)), *(f"r{i}" for i in range(1, 7)))
+    distortion_names: tuple[str, ...] = (*(f"theta{i}" for i in range(1, 7)), *(f"r{i}" for i in range(1, 7)))
     default_count = 12
     fit_counts = (128,)
     # a fit samples the curve; near the axis few pixels would determine so many nodes
@@ -79,12 +79,12 @@ class Tabulated(Camera):
     @classmethod
     def from_table(
         cls,
-        centre: TensorLike,
-        angles: TensorLike,
-        radii: TensorLike,
+        centre: Numbers,
+        angles: Numbers,
+        radii: Numbers,
         *,
         pixels_per_unit: float = 1.0,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
     ) -> Self:
         """From a table of angles and image heights, in any unit of length or in pixels.
 

@@ -26,7 +26,7 @@ class ThinPrismFisheye(Camera):
     """
 
     key = "thin_prism_fisheye"
-    distortion_names = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
+    distortion_names: tuple[str, ...] = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
     default_count = 8
     special_cases = (("kannala_brandt", ("k1", "k2", "k3", "k4")),)
     odd_in_x = frozenset({"p2", "sx1"})

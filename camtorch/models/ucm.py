@@ -24,7 +24,7 @@ class UCM(Camera):
     """
 
     key = "ucm"
-    distortion_names = ("alpha",)
+    distortion_names: tuple[str, ...] = ("alpha",)
     default_count = 1
     special_cases = (("pinhole", ()),)
     fit_starts = ({"alpha": 0.1}, {"alpha": 0.5}, {"alpha": 0.7})

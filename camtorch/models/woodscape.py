@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from camtorch._arguments import TensorLike, as_image_size, as_real
+from camtorch._arguments import Numbers, as_image_size, as_real
 from camtorch.models.f_theta import FTheta
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ class WoodScape(FTheta):
     @classmethod
     def from_woodscape(
         cls,
-        coefficients: TensorLike,
-        offset: Sequence[float] = (0.0, 0.0),
+        coefficients: Numbers,
+        offset: Numbers = (0.0, 0.0),
         *,
-        image_size: tuple[int, int],
+        image_size: Sequence[int],
         aspect_ratio: float = 1.0,
     ) -> Self:
         """From the numbers of a calibration file.

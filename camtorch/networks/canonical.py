@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, shown
+from camtorch._module import typed_as
 from camtorch._threads import as_cores_are_free
 from camtorch.augment.change import Change, Part, alone, by_kinds, copied, edited, size_of
 from camtorch.augment.sample import Named, Sample, SampleTransform, without_graph_in_workers
@@ -68,7 +69,7 @@ class CanonicalCamera(SampleTransform):
         focal: float,
         *,
         scales: Literal["depth", "image"] = "depth",
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         camera: Camera | None = None,
         mode: str = "bilinear",
         padding_mode: str = "zeros",
@@ -151,7 +152,9 @@ class CanonicalCamera(SampleTransform):
         return self._resized(sample, named, batched, change.inverse())
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _scale_of_each(self, camera: Camera | Sequence[Camera], count: int) -> Tensor:
         """(count,)."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import as_flag, as_image_size, as_number, as_values, as_whole
-from camtorch._module import GeometryModule
+from camtorch._module import GeometryModule, typed_as
 from camtorch._tracing import in_graph
 from camtorch.calibration.calibrate import as_model
 from camtorch.camera import Camera
@@ -73,7 +73,7 @@ class CameraHead(GeometryModule):
         features: int,
         model: type[Camera] | str | Camera,
         *,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         fov: Sequence[float] | None = None,
         count: int | None = None,
         centre: float = 0.1,
@@ -157,7 +157,9 @@ class CameraHead(GeometryModule):
             return self.camera(self.linear(features.to(self.linear.weight.dtype)))
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def camera(self, numbers: Tensor) -> Camera:
         """The cameras (*B) of numbers (*B, n), in the order of `names`: for a layer of one's own in the place of

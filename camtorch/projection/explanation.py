@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_values, columns, working_dtype
+from camtorch._arguments import Numbers, as_values, columns, working_dtype
 from camtorch.optics.charts import floor_of
 from camtorch.projection.rays import angles_from_axis
 
@@ -21,7 +21,7 @@ _STEPS = 257
 
 
 @torch.no_grad()
-def explain(camera: Camera, points: Tensor) -> list[str]:
+def explain(camera: Camera, points: Numbers) -> list[str]:
     """See `Camera.explain`."""
     valid = camera.project(points)[1]
     parameters = camera.intrinsics, camera.distortion

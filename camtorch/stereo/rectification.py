@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
@@ -22,7 +23,7 @@ from camtorch._arguments import (
     check_path,
     shown,
 )
-from camtorch._module import GeometryModule, Memo
+from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -152,7 +153,9 @@ class Rectification(GeometryModule):
         return of_left(left), of_right(right)
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> tuple[Tensor, Tensor, Tensor]:
         """(B or 1, 1, H, W) bool: pixels that the left camera sees, that the right one sees, that both do."""
@@ -351,7 +354,7 @@ def rectify(
     *,
     projection: Projection = "perspective",
     fov: float | tuple[float, float] | None = None,
-    image_size: tuple[int, int] | None = None,
+    image_size: Sequence[int] | None = None,
     vertical: bool = False,
     align: Align = "mean",
 ) -> Rectification:

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._arguments import as_values, broadcast_shapes
+from camtorch._arguments import Numbers, as_values, broadcast_shapes
 from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
@@ -280,7 +280,7 @@ class AffineWarp(MirrorWarp):
 
     # -- labels
 
-    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
         pixels = pixels if pixels.is_floating_point() else pixels.to(self.source.intrinsics.dtype)
         valid = torch.isfinite(pixels).all(-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -55,7 +56,7 @@ class Dewarp(Warp):
         *,
         projection: Projection = "perspective",
         fov: float | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: Sequence[int] | None = None,
         rotation: Tensor | None = None,
         mode: Mode = "bilinear",
         padding_mode: PaddingMode = "zeros",

@@ -130,7 +130,7 @@ class PlaneWarp(SurfaceWarp):
         back = rotation.mT
         return _carried(rays, back, -(back @ shift[..., None])[..., 0], of_source, far), _ahead(rays, of_source, far)
 
-    def transform_rays(self, rays: Tensor) -> Tensor:
+    def transform_rays(self, rays: Numbers) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
         rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
         rotation = self.plane[0].mT.to(rays.dtype)

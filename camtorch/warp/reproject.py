@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_batch, as_number, check_devices
-from camtorch._module import GeometryModule, Memo
+from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch._tracing import in_graph, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -146,7 +146,9 @@ class Reproject(GeometryModule):
         return result.unflatten(2, (steps, -1)), valid
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels of the source (B, D, H', W', 2), whether there are some, and the depth at which it sees them."""

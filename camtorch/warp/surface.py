@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from camtorch._arguments import Numbers
 from camtorch.rotations import rotate_planes
 from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, scaled, to_positions
 from camtorch.warp.sampling import PaddingMode
@@ -54,7 +55,7 @@ class SurfaceWarp(Warp):
         grid = to_positions(seen, mapped, self.source._size("Warp"))
         return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
 
-    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         rays, has_ray = self.source.unproject(pixels)
         directions, met = self._to_target(rays)
         seen, mapped = self.target.project(directions)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
 from camtorch._arguments import as_number
-from camtorch._module import GeometryModule, Memo
+from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
@@ -138,6 +138,11 @@ class Surround(GeometryModule):
         if not dtype.is_floating_point:
             result = result.round().clamp(torch.iinfo(dtype).min, torch.iinfo(dtype).max)
         return result.to(dtype), valid
+
+    if TYPE_CHECKING:
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
         """The cameras."""

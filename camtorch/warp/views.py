@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import as_number, as_whole, shown
-from camtorch._module import GeometryModule
+from camtorch._module import GeometryModule, typed_as
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.projection.rays import slopes_at_axis
@@ -68,7 +69,12 @@ class Views(GeometryModule):
 
     def forward(self, images: Tensor) -> Tensor:
         """(B, C, H, W) to (B, N, C, S, S)."""
-        return torch.stack([warp(images) for warp in self.warps], 1)
+        return torch.stack([warp(images) for warp in self], 1)
+
+    if TYPE_CHECKING:
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> Tensor:
         """(1, N, 1, S, S) bool: what of each view the camera sees."""

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_coordinates, as_values, as_whole, broadcast_shapes, check_devices
-from camtorch._module import GeometryModule, Memo, is_constant, with_values
+from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, broadcast_shapes, check_devices
+from camtorch._module import GeometryModule, Memo, is_constant, typed_as, with_values
 from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, set_aside
 from camtorch.camera import Camera
 from camtorch.maps.formats import save_map
@@ -199,7 +199,9 @@ class Warp(GeometryModule):
         return render(images, self._learned() if learns else self._kept(inputs, sampled[1]), *sampled)
 
     if TYPE_CHECKING:
-        __call__ = forward  # whose types nn.Module does not tell
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def strips(
         self,
@@ -420,7 +422,7 @@ class Warp(GeometryModule):
 
     # -- labels
 
-    def transform_points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """Move pixels (B, *N, 2), or (*N, 2) for cameras without batch, from the source's to the target's image.
 
         Returns:
@@ -430,14 +432,14 @@ class Warp(GeometryModule):
         moved, mapped = self._move(pixels)
         return moved, mapped & self.target.contains(moved)
 
-    def _move(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         source, target = self._seen_by
         rays, has_ray = source.unproject(pixels)
         moved, mapped = target.project(turn(self.rotation, rays, "pixels"))
         valid = mapped & has_ray
         return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
 
-    def transform_boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
+    def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.
 
         Returns:
@@ -465,7 +467,7 @@ class Warp(GeometryModule):
         enclosing = torch.where(some, torch.cat((low, high), -1), -1.0)
         return enclosing, (mapped & self.target.contains(moved)).any(-1)
 
-    def transform_rays(self, rays: Tensor) -> Tensor:
+    def transform_rays(self, rays: Numbers) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay.
 
         With shutters both frames are those of the middle of the readout.

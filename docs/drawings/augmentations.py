@@ -118,7 +118,8 @@ def main(names: list[str]) -> None:
         exec(code(text), made)
         torch.manual_seed(SEEDS.get(file[1], 1))
         if "augment" in made:
-            sheet = pair(before, made["augment"](before))
+            after = {k: v for k, v in before.items() if k != "head_pose" or title == "FaceNormalizer"}
+            sheet = pair(before, made["augment"](after))
         else:
             views = {name: augment(before) for name, augment in made["augments"].items()}
             sheet = several(before, views)

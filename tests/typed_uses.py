@@ -1,0 +1,165 @@
+"""What users write, and the types they get; test_types.py has it checked in a project that installed camtorch."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+from typing_extensions import assert_type
+
+import camtorch as ct
+from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
+
+Pair = tuple[Tensor, Tensor]
+
+
+def cameras() -> ct.KannalaBrandt:
+    """Plain values of any kind go in, and what comes out is of the same class."""
+    image = np.zeros((480, 640, 3), np.uint8)
+    camera = ct.KannalaBrandt([300, 300.0, 320, 240], np.zeros(4), image_size=image.shape[:2])
+    ct.Pinhole((300, 300, 320, 240), image_size=torch.rand(3, 480, 640).shape[-2:])
+    ct.Pinhole(torch.tensor([300.0, 300, 320, 240]), image_size=[480, 640])
+    ct.BrownConrady.from_matrix(np.eye(3, dtype=np.float32), np.zeros((1, 5)), image_size=(480, 640))
+    assert_type(camera, ct.KannalaBrandt)
+    assert_type(ct.Pinhole.from_fov(60, image_size=(480, 640)), ct.Pinhole)
+    assert_type(camera.crop(0, 0, 100, 100).resize(50, 50).hflip().pad(1, 1, 1, 1), ct.KannalaBrandt)
+    assert_type(camera.to("cpu"), ct.KannalaBrandt)
+    assert_type(camera.to(torch.float64).float().requires_grad_(False).eval(), ct.KannalaBrandt)
+    assert_type(camera.project(torch.rand(5, 3)), Pair)
+    assert_type(camera(torch.rand(5, 3)), Pair)
+    assert_type(camera.unproject([[320.0, 240.0]]), Pair)
+    assert_type(camera.unproject(np.zeros((5, 2))), Pair)
+    assert_type(camera.rays(), Pair)
+    assert_type(camera.contains(torch.rand(5, 2)), Tensor)
+    assert_type((camera.intrinsics, camera.distortion, camera.K, camera.fx), tuple[Tensor, Tensor, Tensor, Tensor])
+    assert_type((camera.height, camera.width), tuple[int, int])
+    assert_type(camera.distortion_names, tuple[str, ...])
+    assert_type(ct.Mei.odd_in_x, frozenset[str])
+    batch = ct.DoubleSphere(torch.tensor([[300.0, 300, 320, 240]]).repeat(4, 1), image_size=(480, 640))
+    assert_type(batch[0], ct.DoubleSphere)
+    assert_type(batch[1:], ct.DoubleSphere)
+    assert_type([one.fx for one in batch], list[Tensor])
+    assert_type(ct.MODELS["pinhole"], type[ct.Camera])
+    assert_type(ct.MODELS["pinhole"].from_fov(60, image_size=(4, 4)), ct.Camera)
+    assert_type(ct.Mixed([batch[0], camera]).project(torch.rand(2, 5, 3)), Pair)
+    assert_type(camera.convert(ct.Fisheye624), ct.Conversion[ct.Fisheye624])
+    assert_type(camera.convert(ct.Fisheye624, max_angle=1.0).camera, ct.Fisheye624)
+    assert_type(camera.convert("fisheye624").camera, ct.Camera)
+    assert_type(camera.convert(ct.Pinhole).rms, Tensor)
+    return camera
+
+
+def files(folder: Path) -> None:
+    """Paths are strings or Paths."""
+    camera = ct.Pinhole.from_fov(60, image_size=(480, 640))
+    ct.save(camera, folder / "camera.json")
+    rig = ct.load(str(folder / "camera.json"))
+    assert_type(rig.camera, ct.Camera)
+    assert_type(dict(rig.items()), dict[str, ct.Camera])
+    poses = {name: ct.Extrinsics([0, 0, 0], [0.1, 0, 0]) for name in ("left", "right")}
+    rig = ct.Rig({"left": camera, "right": camera}, poses)
+    assert_type(rig.cameras["left"], ct.Camera)
+    assert_type(rig.extrinsics["left"], ct.Extrinsics)
+    assert_type(rig.between("left", "right"), ct.Extrinsics)
+    assert_type(rig.requires_grad_(False), ct.Rig)
+
+
+def warps(camera: ct.Camera) -> None:
+    """Images stay tensors, and calls have the types of `forward`."""
+    images = torch.rand(1, 3, 480, 640)
+    dewarp = ct.Dewarp(camera, projection="cylindrical", image_size=images.shape[-2:])
+    assert_type(dewarp(images), Tensor)
+    assert_type(ct.Warp(camera, camera, torch.eye(3)).inverse()(images, mode="nearest"), Tensor)
+    assert_type(dewarp.transform_points(torch.rand(5, 2)), Pair)
+    assert_type(dewarp.transform_boxes(torch.rand(5, 4)), Pair)
+    assert_type(dewarp.target, ct.Camera)
+    assert_type(dewarp.rotation, Tensor | None)
+    assert_type([part for _, part, _ in dewarp.strips(images)], list[Tensor])
+    extrinsics = ct.Extrinsics(np.zeros((3, 1)), [0, 0, 2])
+    assert_type(extrinsics(torch.rand(5, 3)), Tensor)
+    assert_type(extrinsics.inverse().compose(extrinsics).position, Tensor)
+    layer = nn.Sequential(extrinsics, camera)
+    pixels, valid = layer(torch.rand(5, 3))
+    pixels[valid].sum()
+    reproject = ct.Reproject(camera, camera, extrinsics)
+    assert_type(reproject(images, torch.ones(1, 1, 480, 640)), Pair)
+    ground = ct.Extrinsics([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], [0, 1.5, 0])
+    assert_type(ct.BirdsEye(camera, ground, x=(-1, 1), y=(1, 3), resolution=0.1)(images), Tensor)
+    pair = ct.rectify(camera, camera, ct.Extrinsics([0, 0, 0], [-0.1, 0, 0]))
+    assert_type(pair(images, images), Pair)
+    assert_type(pair.left, ct.Warp)
+    assert_type(ct.losses.rays(camera, camera), Tensor)
+    assert_type(ct.losses.rays(camera, camera, reduction="none"), Pair)
+    assert_type(ct.losses.reprojection(camera, camera, torch.rand(5, 3), reduction="none"), Pair)
+    assert_type(ct.solve_pnp(camera, np.random.rand(6, 3) + 2, np.random.rand(6, 2) * 400).rms, Tensor)
+
+
+class Shifted(ct.augment.Augmentation):
+    """An augmentation of a user's own."""
+
+    def __init__(self, shift: tuple[float, float] = (-5, 5), **options: Any):
+        super().__init__({"shift": ct.augment.Range(*shift)}, **options)
+
+    def new_camera(self, source: ct.Camera, values: Mapping[str, Tensor]) -> tuple[ct.Camera, Tensor | None]:
+        zero = torch.zeros_like(values["shift"])
+        moved = source.intrinsics + torch.stack((zero, zero, values["shift"], zero), -1)
+        return ct.augment.camera_like(source, moved, source.distortion, source.image_size), None
+
+
+def augmentations(camera: ct.Camera) -> None:
+    """Samples are dicts, and so is what comes out."""
+    camera = camera.requires_grad_(False)
+    augment = ct.augment.RandomCamera("dms130", fov="source", yaw=5, pitch=(-5, 5), camera=camera)
+    sample = {"image": torch.rand(2, 3, 480, 640), "keypoints": torch.rand(2, 5, 2) * 400}
+    moved = augment(sample)
+    assert_type(moved, dict[str, Any])
+    augment(image=sample["image"], gaze=torch.randn(2, 3), file=["a.jpg", "b.jpg"])
+    chain = ct.augment.Compose([augment, ct.augment.HorizontalFlip(), ct.augment.Resize((240, 320)), Shifted()])
+    assert_type(chain(sample), dict[str, Any])
+    assert_type(chain.to("cpu"), ct.augment.Compose)
+    seeded = ct.data.Seeded(ct.augment.RandomMount(roll=5, camera=camera), seed=0)
+    assert_type(seeded(image=torch.rand(3, 480, 640), key=3), dict[str, Any])
+
+    class Images(Dataset[dict[str, Any]]):
+        def __len__(self) -> int:
+            return 4
+
+        def __getitem__(self, index: int) -> dict[str, Any]:
+            return seeded(image=torch.rand(3, 480, 640), boxes=torch.tensor([[10.0, 10.0, 90.0, 90.0]]), key=index)
+
+    for batch in DataLoader(Images(), batch_size=2, collate_fn=ct.augment.collate):
+        assert len(batch["image"]) == 2
+
+
+class Quintic(ct.Camera):
+    """A model of a user's own: r = theta (1 + k theta^4)."""
+
+    key = "typed_quintic"
+    distortion_names = ("k",)
+    default_count = 1
+
+    @staticmethod
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
+        return Equidistant(), Lens(Planar(Polynomial((torch.zeros_like(k[0]), k[0]))))
+
+
+def own_model() -> None:
+    """It has what every camera has."""
+    camera = Quintic([280.0, 280, 320, 240], [0.01], image_size=(480, 640))
+    assert_type(camera.resize(240, 320), Quintic)
+    assert_type(camera.convert(ct.KannalaBrandt).camera, ct.KannalaBrandt)
+
+
+def calibrations(camera: ct.Camera) -> None:
+    """Corners as OpenCV has them."""
+    board = np.array([[x, y, 0] for y in range(5) for x in range(6)]) * 0.03
+    poses = [ct.Extrinsics([0.3 * i - 0.5, 0.2 * i, 0], [-0.1, -0.1, 0.3]) for i in range(5)]
+    corners = [camera(pose(torch.as_tensor(board)))[0].detach().numpy() for pose in poses]
+    found = ct.calibrate("pinhole", board, corners, image_size=(480, 640))
+    assert_type(found.camera, ct.Camera)
+    assert_type(found.extrinsics, ct.Extrinsics)
+    assert_type(found.rms, float)
+    assert_type(found.uncertainty([[320.0, 240.0]]), Tensor)
