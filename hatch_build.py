@@ -1,13 +1,16 @@
-"""What hatchling does for a wheel beside copying files: it compiles the sampler, if there is a C compiler.
+"""What hatchling does beside copying files: it compiles the sampler for a wheel, if there is a C compiler.
 
 Where there is none, or it fails, the wheel is pure Python and holds the reason, which `camtorch --version` tells:
 installers show what a build says only when asked to (`pip install -v`). scikit-build-core can do the same, and brings
 CMake to a library of two files.
+
+And it makes the README one that an index of packages can show: there its links have no repository around them.
 """
 
 import importlib.util
 import os
 import platform
+import re
 import sys
 import sysconfig
 import tempfile
@@ -16,6 +19,22 @@ from types import ModuleType
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
+
+_RAW = "https://raw.githubusercontent.com/camtorch/camtorch/main"
+_BLOB = "https://github.com/camtorch/camtorch/blob/main"
+
+
+class Readme(MetadataHookInterface):
+    """Links from elsewhere, for `dynamic = ["readme"]`."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Put it in, with images and pages by their whole addresses."""
+        text = Path(self.root, "README.md").read_text("utf-8")
+        text = re.sub(r"(!\[[^]]*\]\()(?!https?:)", rf"\g<1>{_RAW}/", text)
+        text = re.sub(r"(?<!!)(\[[^]]*\]\()(?!https?:|#)", rf"\g<1>{_BLOB}/", text)
+        text = re.sub(r'(\b(?:src|srcset)=")(?!https?:)', rf"\g<1>{_RAW}/", text)
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}
 
 
 class NativeSampler(BuildHookInterface):

@@ -19,6 +19,7 @@ from torch import Tensor
 
 import camtorch.plot as plot
 from camtorch._arguments import check_path
+from camtorch.calibration.calibrate import Calibration
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.svg import Plots, palette
 from camtorch.calibration.verdict import ROUGH, Survey
@@ -28,8 +29,6 @@ from camtorch.projection.rays import image_lattice
 
 if TYPE_CHECKING:
     from PIL import Image
-
-    from camtorch.calibration.calibrate import Calibration
 
     Images: TypeAlias = Sequence[Any] | None
     Names: TypeAlias = Sequence[str] | None

@@ -37,13 +37,14 @@ def add(commands: Commands) -> None:
     """Add the command to a command line."""
     command = commands.add_parser(
         "calibrate",
-        help="calibrate a camera or a rig from photographs of a board",
+        help="calibrate a camera or a rig from photographs or a video of a board",
         description="Calibrate a camera from photographs of a board: camtorch calibrate images/*.jpg --board 9x6 "
-        "--square 25mm -o camera.yml --report report.html",
+        "--square 25mm -o camera.yml --report report.html. A video, board.mp4, does as well: sharp frames that differ "
+        "are taken.",
         allow_abbrev=False,
     )
     command.set_defaults(run=run)
-    command.add_argument("images", nargs="*", metavar="IMAGE", help="files, quoted patterns, or folders")
+    command.add_argument("images", nargs="*", metavar="IMAGE", help="files, quoted patterns, or folders; or a video")
     rigs = command.add_argument_group("several cameras, instead of IMAGE")
     rigs.add_argument("--left", nargs="+", metavar="IMAGE", help="of the left camera of a pair")
     rigs.add_argument("--right", nargs="+", metavar="IMAGE", help="of the right one")
@@ -392,12 +393,16 @@ def _write(
     if arguments.report is None:
         return
     from camtorch.calibration.report import write_report
+    from camtorch.cli import frames
 
     arguments.report.parent.mkdir(parents=True, exist_ok=True)
 
-    def images_of(name: str) -> list[Path | None]:
+    paths = [image.path for of_view in views.values() for image in of_view.values()]
+    there: dict[Path, Any] = {**{path: path for path in paths if path.exists()}, **frames.read(paths)}
+
+    def images_of(name: str) -> list[Any]:
         images = (of_view.get(name) for of_view in views.values())
-        return [image.path if image is not None and image.path.exists() else None for image in images]
+        return [None if image is None else there.get(image.path) for image in images]
 
     def names_of(name: str) -> list[str]:
         return [of_view[name].path.name if name in of_view else view for view, of_view in views.items()]

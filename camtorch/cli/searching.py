@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from camtorch.calibration.boards import Board, Chessboard
 from camtorch.calibration.corners import Corners, ImageCorners, read_corners, write_corners
 from camtorch.calibration.detection import NOT_FOUND, detect
-from camtorch.cli import images
+from camtorch.cli import frames, images, videos
 from camtorch.cli.gathering import together
 from camtorch.cli.terminal import note, progress
 from camtorch.io.hashing import hash_of
@@ -61,8 +61,11 @@ def found_corners(
     board = board or (known.board if known else None)
     if board is None:
         raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
+    films = [path for paths in cameras.values() for path in paths if videos.is_video(path)]
+    if films and len(cameras) > 1:
+        raise ValueError(f"{films[0]}: videos are for one camera: nothing tells which frames of two are of one moment")
     if len(cameras) == 1:
-        places = [("", str(i), image) for i, image in enumerate(cameras[""])]
+        places = [("", str(i), image) for i, image in enumerate(cameras[""]) if image not in films]
     else:
         views, how = together(cameras, match)
         print(f"{len(views)} views of {', '.join(cameras)}, matched {how}")
@@ -70,7 +73,8 @@ def found_corners(
         twice = [str(image) for image, count in Counter(image for *_, image in places).items() if count > 1]
         if twice:
             raise ValueError(f"{twice[0]}: is given as an image of two cameras")
-    found = Corners(board, board.points(), _searched(places, board, known))
+    in_videos = [image for path in films for image in frames.searched(path, board, known)]
+    found = Corners(board, board.points(), [*_searched(places, board, known), *in_videos])
     if path is not None:
         kept = Corners(board, found.points, [*found.images, *_others(known, found.images)])
         if known is None or known.board != board or _told(known) != _told(kept):

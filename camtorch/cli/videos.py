@@ -143,6 +143,30 @@ def size_of(path: Path) -> tuple[int, int] | None:
         return None
 
 
+def length_of(path: Path) -> float:
+    """Seconds; 0 where that is not said.
+
+    Raises:
+        VideoFileError: it cannot be read. ImportError: PyAV is not installed.
+    """
+    with _opened(path) as (container, stream):
+        return float(_length(container, stream))
+
+
+def frames(path: Path) -> Iterator[tuple[float, float, Any]]:
+    """Frames as they are stored: when each is shown, in seconds, the part of the video until then, and PyAV's frame.
+
+    Raises:
+        VideoFileError: it cannot be read. ImportError: PyAV is not installed.
+    """
+    with _opened(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        length, step = float(_length(container, stream)), float(1 / _rate(stream))
+        for number, frame in enumerate(container.decode(stream)):
+            seconds = number * step if frame.time is None else float(frame.time)
+            yield seconds, min(seconds / length, 1.0) if length else 0.0, frame
+
+
 def sized(item: Item) -> Item:
     """The item with the number of its frames, about, if it is a video that says how long it is."""
     if not is_video(item.inputs[0]):

@@ -118,8 +118,7 @@ def main(names: list[str]) -> None:
         exec(code(text), made)
         torch.manual_seed(SEEDS.get(file[1], 1))
         if "augment" in made:
-            after = {k: v for k, v in before.items() if k != "head_pose" or title == "FaceNormalizer"}
-            sheet = pair(before, made["augment"](after))
+            sheet = pair(before, made["augment"](before))
         else:
             views = {name: augment(before) for name, augment in made["augments"].items()}
             sheet = several(before, views)

@@ -1,0 +1,83 @@
+"""From a video of a board to a camera's file, on the command line."""
+
+import cv2
+import numpy as np
+import pytest
+from photographs import fisheye, photograph
+from test_calibrate_cli import BOARD, assert_near, poses
+
+import camtorch as ct
+from camtorch.calibration.corners import read_corners
+from camtorch.cli import frames
+from camtorch.cli.main import main
+
+av = pytest.importorskip("av")
+RATE = 4
+WORDS = ("--board", "9x6", "--square", "30mm", "--model", "kannala_brandt", "--fixed", "k3,k4")
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """A video in which each view rests for half a second, of whose two frames one is blurred; and the true corners."""
+    views = [photograph(BOARD, fisheye(), *map(list, pose), seed=i) for i, pose in enumerate(poses(BOARD, 4))]
+    images, truth = [image for image, _ in views], np.stack([pixels for _, pixels in views])
+    blurred = cv2.GaussianBlur(images[0], (0, 0), 6)
+    # in the third and the sixth half second nothing is sharp; in the last one the board is where it was
+    again = cv2.GaussianBlur(images[1], (0, 0), 0.4)
+    sharp = [images[0], images[1], blurred, images[2], images[3], blurred, again]
+    shown = [frame for image in sharp for frame in (blurred, image)]
+    path = tmp_path_factory.mktemp("film") / "board.mp4"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libx264", rate=RATE, options={"crf": "10"})
+        stream.height, stream.width, stream.pix_fmt = *images[0].shape, "yuv420p"
+        for image in shown:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
+        file.mux(stream.encode(None))
+    return path, truth
+
+
+def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatch):
+    path, truth = filmed
+    monkeypatch.chdir(tmp_path)
+    words = ["calibrate", str(path), *WORDS, "--corners", "corners.json"]
+    assert main([*words, "-o", "camera.yml"]) == 0
+    assert capsys.readouterr().out.startswith(
+        f"{path}: of 5 sharp frames 5 show the board, and 4 of these differ\n"
+        "chessboard, 9x6 inner corners, squares of 30 mm: in 4 of 4 images of 640x480, "
+    )
+    assert_near(ct.load("camera.yml").camera, fisheye(), 1.0)
+    corners = read_corners("corners.json").images
+    assert [image.path.name for image in corners] == [f"board.mp4#t={t}" for t in ("0.250", "0.750", "1.750", "2.250")]
+    for image, pixels in zip(corners, truth, strict=True):
+        assert np.nanmax(np.linalg.norm(image.pixels - pixels, axis=1)) < 0.5
+    # what was found is not searched for again
+    monkeypatch.setattr(frames, "detect", None)
+    assert main([*words, "-o", "again.yml"]) == 0
+    assert (ct.load("again.yml").camera.intrinsics == ct.load("camera.yml").camera.intrinsics).all()
+
+
+def test_frames_are_read_for_the_report(filmed):
+    path, _ = filmed
+    there, gone = path.with_name("board.mp4#t=0.250"), path.with_name("other.mp4#t=0.250")
+    images = frames.read([there, gone, path, None])
+    assert list(images) == [there]
+    assert images[there].shape == (480, 640)
+
+
+def test_videos_are_for_one_camera(filmed, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["calibrate", "--left", str(filmed[0]), "--right", str(filmed[0]), *WORDS, "-o", "rig.json"]) == 2
+    assert "videos are for one camera" in capsys.readouterr().err
+
+
+def test_a_video_without_a_board_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with av.open("grey.mp4", "w") as file:
+        stream = file.add_stream("libx264", rate=RATE)
+        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
+        file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 96), 90, np.uint8), format="gray")))
+        file.mux(stream.encode(None))
+    assert main(["calibrate", "grey.mp4", *WORDS, "-o", "camera.yml"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "grey.mp4: of 1 sharp frames 0 show the board, and 0 of these differ\n"
+    assert "grey.mp4 is left out: no board found in its frames" in err
