@@ -1,4 +1,5 @@
 import copy
+import importlib
 import io
 import math
 import pickle
@@ -713,3 +714,9 @@ def test_last_turns_what_has_no_data_key():
     ahead = aug.last.rays(torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3))
     assert torch.allclose(torch.rad2deg(torch.atan2(ahead[:, 0], ahead[:, 2])), torch.full((3,), -7.0), atol=1e-4)
     assert math.isclose(float(aug.last.target.intrinsics[0, 0]), 95, abs_tol=1e-4)
+
+
+def test_a_kornia_too_old_is_told(monkeypatch):
+    monkeypatch.delattr("kornia.augmentation.base._AugmentationBase._gate")
+    with pytest.raises(ImportError, match=r"needs kornia 0\.9 or newer, which needs Python 3\.11; installed is kornia "):
+        importlib.reload(adapter)

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, cast
 
+import kornia
 import torch
 from kornia.augmentation import GeometricAugmentationBase2D
 from kornia.augmentation.container.params import ParamItem
@@ -28,6 +29,12 @@ from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode, narrow, widen
+
+if not hasattr(GeometricAugmentationBase2D, "_gate"):
+    raise ImportError(
+        "camtorch.augment.kornia needs kornia 0.9 or newer, which needs Python 3.11; installed is kornia "
+        f"{kornia.__version__}"
+    )
 
 __all__ = [
     "CameraAugmentation",

@@ -10,6 +10,7 @@ from torch.autograd import Function
 
 from camtorch._arguments import columns
 from camtorch._threads import as_cores_are_free
+from camtorch._tracing import in_transform
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection.ops import positive, to_planes, without_keeping
 from camtorch.projection.rows import (
@@ -92,6 +93,8 @@ def _power_of_two(size: Tensor) -> Tensor:
     """The largest one not above: to divide by it costs no bit."""
     if torch.compiler.is_compiling():  # which leaves its vectors for bits
         return size
+    if in_transform():  # torch.vmap looks at no bits before torch 2.11
+        return size / torch.frexp(size).mantissa / 2
     exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
     return (size.view(integer) & exponent).view(size.dtype)
 
