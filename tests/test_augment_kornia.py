@@ -718,5 +718,5 @@ def test_last_turns_what_has_no_data_key():
 
 def test_a_kornia_too_old_is_told(monkeypatch):
     monkeypatch.delattr("kornia.augmentation.base._AugmentationBase._gate")
-    with pytest.raises(ImportError, match=r"needs kornia 0\.9 or newer, which needs Python 3\.11; installed is kornia "):
+    with pytest.raises(ImportError, match=r"needs kornia 0\.9 or newer, .* installed is kornia "):
         importlib.reload(adapter)

@@ -62,12 +62,13 @@ class Domain:
     lens: Lens
     looks: int
 
-    def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice = slice(None)):
+    def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice | None = None):
         """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points.
 
         whole, cameras: the domain of which this is a part.
         """
-        self.optics, self.k, self.whole, self.cameras = optics, k, whole, cameras
+        self.optics, self.k, self.whole = optics, k, whole
+        self.cameras = slice(None) if cameras is None else cameras
         self.chart, self.lens = optics(columns(k))
         self.looks = 0
 
