@@ -457,6 +457,8 @@ class Camera(BatchedModule):
         if (
             not isinstance(values, Tensor)
             or any(t.dtype != values.dtype for t in tensors)
+            or values.device != tensors[0].device
+            or values.layout is not torch.strided
             or values.ndim <= dims
             or values.shape[-1] != size
             or values.shape[:dims] != batch
@@ -933,7 +935,7 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     if isinstance(model, type) and model.__module__ == parametrize.__name__:  # of one parametrized camera
         model = model.__bases__[0]
     if not (isinstance(model, type) and issubclass(model, Camera) and model.optics is not Camera.optics):
-        raise TypeError(f"{owner} takes a camera model, or its key in ct.MODELS; got {model!r}")
+        raise TypeError(f"{owner}: model must be a camera model, or its key in ct.MODELS; got {shown(model)}")
     return model
 
 

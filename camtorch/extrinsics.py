@@ -8,7 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_batch, as_real, as_rows, as_vectors, broadcast_shapes, columns
+from camtorch._arguments import (
+    Numbers,
+    as_batch,
+    as_real,
+    as_rows,
+    as_vectors,
+    broadcast_shapes,
+    check_devices,
+    columns,
+)
 from camtorch._module import BatchedModule, typed_as
 from camtorch._tracing import is_concrete
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
@@ -122,6 +131,7 @@ class Extrinsics(BatchedModule):
         """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""
         if not isinstance(other, Extrinsics):
             raise TypeError(f"Extrinsics: compose takes Extrinsics; got {type(other).__name__}")
+        check_devices("Extrinsics", this=self.rotation, other=other.rotation)
         as_batch("Extrinsics", this=(*self.batch_shape, 3), other=(*other.batch_shape, 3))
         mine, its = rotation_matrix(self.rotation), rotation_matrix(other.rotation)
         columns = rotate_planes(mine.unsqueeze(-3), its.mT.unsqueeze(-1).unbind(-2))

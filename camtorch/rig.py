@@ -9,7 +9,7 @@ from typing import TypeVar, cast
 from torch import nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_mapping
+from camtorch._arguments import as_mapping, shown
 from camtorch._module import BatchedModule
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
@@ -153,8 +153,8 @@ class Rig(nn.Module):
         super().__init__()
         self.cameras = NamedModules(Camera, cameras)
         if isinstance(extrinsics, tuple):
-            if len(extrinsics) != 2:
-                raise TypeError(f"Rig: extrinsics must be a dict, or (names, a batch); got {len(extrinsics)} things")
+            if len(extrinsics) != 2 or not isinstance(extrinsics[0], Sequence):
+                raise TypeError(f"Rig: extrinsics must be a dict, or (names, a batch); got {shown(extrinsics)}")
             names, batch = extrinsics
             self.extrinsics = NamedModules(Extrinsics, names=names, batch=batch)
         else:

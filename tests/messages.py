@@ -27,6 +27,8 @@ class Statement(NamedTuple):
     kind: str
     """The class that is raised; "warning"; or the name of the function that raises."""
     arguments: list[ast.expr]
+    tried: bool
+    """Whether it stands between `try` and `except`."""
 
     @property
     def place(self) -> str:
@@ -37,15 +39,17 @@ def statements(path: Path) -> Iterator[Statement]:
     """Those of a file of camtorch, but for what raises again what was caught."""
     names: list[str] = []
 
-    def walk(node: ast.AST) -> Iterator[Statement]:
+    def walk(node: ast.AST, tried: bool = False) -> Iterator[Statement]:
         named = isinstance(node, (ast.FunctionDef, ast.ClassDef))
         if named:
             names.append(node.name)
         kind, arguments = _said_by(node)
         if kind and not (kind not in ("warning", *FAIL) and names[-1:] and names[-1] in FAIL):
-            yield Statement(path.relative_to(PACKAGE.parent).as_posix(), node.lineno, ".".join(names), kind, arguments)
+            yield Statement(
+                path.relative_to(PACKAGE.parent).as_posix(), node.lineno, ".".join(names), kind, arguments, tried
+            )
         for child in ast.iter_child_nodes(node):
-            yield from walk(child)
+            yield from walk(child, (tried and not named) or (isinstance(node, ast.Try) and child in node.body))
         if named:
             names.pop()
 

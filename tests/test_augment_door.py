@@ -125,7 +125,7 @@ def test_cameras_and_draws(camera):
 
 def test_an_image_is_no_sample(camera):
     with pytest.raises(
-        TypeError, match=r"RandomMount takes a dict of fields, or keywords, as in image=...; got Tensor"
+        TypeError, match=r"RandomMount: a sample is a dict of fields, or keywords, as in image=...; got Tensor"
     ):
         RandomMount(camera=camera)(torch.zeros(1, 3, *SIZE))
 

@@ -299,7 +299,7 @@ def test_bad_arguments(changes, words):
         ({"loss": "huber", "loss_scale": "1"}, "loss_scale must be a number"),
         ({"bend": "no"}, "bend must be True or False"),
         ({"progress": "bar"}, "progress must be a function"),
-        ({"model": ct.Camera}, "takes a camera model"),
+        ({"model": ct.Camera}, "model must be a camera model"),
     ],
 )
 def test_arguments_of_other_types(changes, words):

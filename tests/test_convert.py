@@ -373,9 +373,9 @@ def test_edited_images():
     ("arguments", "options", "error", "text"),
     [
         (("fisheye63",), {}, ValueError, "did you mean 'fisheye62'. Known are brown_conrady"),
-        ((3,), {}, TypeError, "takes a camera model"),
-        ((torch.nn.Linear,), {}, TypeError, "takes a camera model"),
-        ((ct.Camera,), {}, TypeError, "takes a camera model"),
+        ((3,), {}, TypeError, "model must be a camera model"),
+        ((torch.nn.Linear,), {}, TypeError, "model must be a camera model"),
+        ((ct.Camera,), {}, TypeError, "model must be a camera model"),
         (("brown_conrady",), {"count": 6}, ValueError, "n = 4, 5, 8, 12 or 14 .*; got count=6"),
         (("brown_conrady",), {"count": -1}, ValueError, "got count=-1"),
         (("pinhole",), {"count": 1}, ValueError, "got count=1"),

@@ -26,11 +26,11 @@ def test_paths_of_every_kind(kind):
 
 
 def test_no_path(tmp_path):
-    with pytest.raises(TypeError, match="load takes the path of a calibration file; got dict"):
+    with pytest.raises(TypeError, match="load: path must be that of a calibration file; got dict"):
         ct.load({"K": K})
     with open(FILES / "opencv_camera.yml") as file, pytest.raises(TypeError, match=r"TextIOWrapper.*file\.name"):
         ct.load(file)
-    with pytest.raises(TypeError, match="save takes the path of a calibration file; got NoneType"):
+    with pytest.raises(TypeError, match="save: path must be that of a calibration file; got NoneType"):
         ct.save(ct.Pinhole([500.0, 500, 320, 240]), None)
     for call in (ct.load, lambda path: ct.save(ct.Pinhole([500.0, 500, 320, 240]), path)):
         with pytest.raises(ct.CameraFileError, match=r"path: a NUL character") as caught:

@@ -73,7 +73,7 @@ def summarise(camera: Camera) -> Summary:
         ValueError: the camera is a batch.
     """
     if camera.batch_shape:
-        raise ValueError(f"a summary is of one camera; got batch dims {tuple(camera.batch_shape)}")
+        raise ValueError(f"summary: camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
     result = Summary(camera, _valid_angle(camera))
     if camera.image_size is not None:
         result.fov = tuple(field_of_view(camera).tolist())

@@ -261,7 +261,8 @@ class Augmentation(SampleTransform):
         Returns:
             `apply` (B,) bool, and for each range a float64 tensor (B,) or (B, size) of that name and unit.
         """
-        if as_whole(count, "count", self._name) < 0:
+        count = as_whole(count, "count", self._name)
+        if count < 0:
             raise ValueError(f"{self._name}: count must not be negative; got {count}")
         return self.drawn(count, self.p, self.same_on_batch, generator)
 

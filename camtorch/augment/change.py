@@ -262,7 +262,7 @@ class Change:
             where = [i] if part.rows is None else (part.rows == i).nonzero()[:, 0].tolist()
             if where:
                 return Change(1, [part.take(torch.tensor(where))])
-        raise IndexError(f"a change of {self.count} samples has no row {i}")
+        raise IndexError(f"Change: no row {i}; it is of {self.count} samples")
 
     def inverse(self) -> Change:
         """The change back. What left the image stays lost, and the light of the lens stays as it is."""

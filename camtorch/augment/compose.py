@@ -81,7 +81,7 @@ class Compose(Augmentation):
         for i, part in enumerate(parts):
             ranges[f"{i}.apply"] = Range(0, 1)
             ranges |= {f"{i}.{key}": interval for key, interval in part.ranges.items()}
-        super().__init__(ranges, camera=camera, fields=fields, antialias=antialias or False, **options)
+        super().__init__(ranges, camera=camera, fields=fields, antialias=antialias, **options)
         self.antialias = antialias
         self.augmentations = nn.ModuleList(parts)
         self.needs_camera: bool = any(part.needs_camera for part in parts)
@@ -147,7 +147,8 @@ class Compose(Augmentation):
         change = self._change(source, {"apply": torch.ones(count, dtype=torch.bool), **draw})
         target = change.target
         if not isinstance(target, Camera):
-            raise ValueError(f"{self._name}: samples would come out with cameras of several models")
+            kinds = sorted({type(one).__name__ for one in target})
+            raise ValueError(f"{self._name}: samples would come out with cameras of several models; got {kinds}")
         return target, change.rotation
 
     def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:

@@ -112,8 +112,13 @@ class FaceNormalizer(SampleTransform):
         forward = centre / distance
         down = torch.linalg.cross(forward, across)
         size = down.norm(dim=-1, keepdim=True)
-        if not torch.compiler.is_compiling() and not bool((torch.isfinite(size) & (size > 1e-6)).all()):
-            raise ValueError(f"{self._name}: a face is at the camera, not finite, or seen along the head's x axis")
+        usable = torch.isfinite(size) & (size > 1e-6)
+        if not torch.compiler.is_compiling() and not bool(usable.all()):
+            row = int((~usable).flatten().nonzero()[0])
+            raise ValueError(
+                f"{self._name}: a face is at the camera, not finite, or seen along the head's x axis; sample {row} has "
+                f"its centre at {centre[row].tolist()}"
+            )
         scale = self.distance / distance.detach()
         if is_concrete(scale) and not bool(((scale < _ODD) & (scale > 1 / _ODD)).all()):
             at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())

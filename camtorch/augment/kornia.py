@@ -20,7 +20,7 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_part
+from camtorch._arguments import as_part, shown
 from camtorch._module import Memo
 from camtorch.augment import compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
@@ -440,7 +440,11 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
     if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
         cameras = collate_cameras(cameras)
     if not isinstance(cameras, Camera) or cameras.is_mixed:
-        raise TypeError("with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size")
+        got = [type(one).__name__ for one in cameras] if isinstance(cameras, list) else type(cameras).__name__
+        raise TypeError(
+            "with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size, in a list; "
+            f"got {got}"
+        )
     found: list[Params] = []
 
     def changed(params: Any) -> Any:
@@ -451,7 +455,7 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
 
     result = changed(params)
     if not found:
-        raise ValueError("with_cameras: these are params of no camera augmentation")
+        raise ValueError(f"with_cameras: params must be those of a camera augmentation; got {shown(params)}")
     return result
 
 

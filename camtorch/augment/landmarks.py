@@ -180,7 +180,9 @@ class Mirroring:
         Kind None is of what does not move itself and has a table by its name, as the visibility of each landmark.
         """
         if kind is None and value.ndim < 2:
-            raise ValueError(f"{self.owner}: {name} has a table of landmarks, and must be (B, N, ...)")
+            raise ValueError(
+                f"{self.owner}: {name} has a table of landmarks, and must be (B, N, ...); got {shown(value)}"
+            )
         if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3):
             return value
         order = self.order(name, kind, value.shape[1])

@@ -325,7 +325,7 @@ class SampleTransform(nn.Module):
         """The sample and the keyword arguments as one dict."""
         if sample is not None and not isinstance(sample, Mapping):
             got = type(sample).__name__
-            raise TypeError(f"{self._name} takes a dict of fields, or keywords, as in image=...; got {got}")
+            raise TypeError(f"{self._name}: a sample is a dict of fields, or keywords, as in image=...; got {got}")
         return {**(sample or {}), **fields}
 
     def _sorted(self, sample: Sample) -> Named:

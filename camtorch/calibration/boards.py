@@ -276,10 +276,12 @@ def board_of(options: Mapping[str, Any]) -> Board:
     given = dict(options)
     kind = BOARDS.get(given.pop("type", ""))
     if kind is None:
-        raise ValueError(f"a board's type must be one of {', '.join(BOARDS)}; got {options.get('type')!r}")
+        raise ValueError(f"board: type must be one of {', '.join(BOARDS)}; got {options.get('type')!r}")
     known = {field.name for field in fields(kind)}
     if not {"columns", "rows"} <= set(given) <= known:
-        raise ValueError(f"a {kind.kind} has {', '.join(sorted(known))}; got {', '.join(sorted(given)) or 'nothing'}")
+        raise ValueError(
+            f"board: a {kind.kind} has {', '.join(sorted(known))}; got {', '.join(sorted(given)) or 'nothing'}"
+        )
     return kind(**given)
 
 
@@ -293,14 +295,16 @@ def dictionary_of(name: str) -> Any:
     known = {key[5:].lower(): key for key in dir(aruco) if key.startswith("DICT_")}
     key = known.get(name.lower().removeprefix("dict_"))
     if key is None:
-        raise ValueError(f"no dictionary of markers is called {name!r}; OpenCV has {', '.join(sorted(known))}")
+        raise ValueError(f"board: no dictionary of markers is called {name!r}; OpenCV has {', '.join(sorted(known))}")
     return aruco.getPredefinedDictionary(getattr(aruco, key))
 
 
 def _tag(dictionary: str, number: int, border: int, x: float, y: float, side: float) -> Cells:
     markers = dictionary_of(dictionary)
     if number >= len(markers.bytesList):
-        raise ValueError(f"the dictionary {dictionary} has {len(markers.bytesList)} markers, and the board needs more")
+        raise ValueError(
+            f"board: the dictionary {dictionary} has {len(markers.bytesList)} markers, and the board needs more"
+        )
     cells = markers.markerSize + 2 * border
     return Cells(markers.generateImageMarker(number, cells, borderBits=border) == 0, x, y, side / cells)
 

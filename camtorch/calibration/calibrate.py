@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_whole
+from camtorch._arguments import as_number, as_whole, shown
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations
@@ -87,7 +87,7 @@ def as_model(
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
-    unknown = [name for name in fixed if name not in names]
+    unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
     if unknown:
         raise ValueError(
             f"{owner}: fixed names {', '.join(map(repr, unknown))}; {model.__name__} has {', '.join(names)}"
@@ -114,13 +114,9 @@ def as_options(
     loss: str | None, loss_scale: float, bend: bool, progress: Callable[[int, float], None] | None, owner: str
 ) -> None:
     """Refuse what is no loss, no flag and no function."""
-    if loss is not None and loss not in LOSSES:
-        raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {loss!r}")
-    try:
-        finite = math.isfinite(loss_scale)
-    except TypeError:
-        raise TypeError(f"{owner}: loss_scale must be a number of pixels; got {loss_scale!r}") from None
-    if not (finite and loss_scale > 0):
+    if loss is not None and not (isinstance(loss, str) and loss in LOSSES):
+        raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {shown(loss)}")
+    if not 0 < as_number(loss_scale, "loss_scale", owner) < math.inf:
         raise ValueError(f"{owner}: loss_scale must be positive pixels; got {loss_scale}")
     if not isinstance(bend, bool):
         raise TypeError(f"{owner}: bend must be True or False; got {bend!r}")

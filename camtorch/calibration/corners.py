@@ -107,9 +107,12 @@ def _image(record: dict[str, Any], count: int, folder: Path) -> ImageCorners:
     pixels, rows = np.full((count, 2), np.nan), _numbers(record["corners"], 3)
     indices = rows[:, 0].astype(int)
     if (indices != rows[:, 0]).any() or (indices < 0).any() or (indices >= count).any():
-        raise ValueError(f"corners must begin with the number of a point, 0 to {count - 1}")
-    if len(set(indices.tolist())) < len(indices):
-        raise ValueError("a point appears twice")
+        raise ValueError(
+            f"corners must begin with the number of a point, 0 to {count - 1}; got {rows[:, 0].tolist()!s:.60}"
+        )
+    numbers = indices.tolist()
+    if len(set(numbers)) < len(numbers):
+        raise ValueError(f"a point appears twice: {next(n for n in numbers if numbers.count(n) > 1)}")
     pixels[indices] = rows[:, 1:]
     size = None
     if record.get("width") is not None:

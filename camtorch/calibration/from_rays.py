@@ -116,7 +116,7 @@ def _observations(
                 f"{owner}: weights must broadcast against the rays {tuple(shape)}; got {tuple(given.shape)}"
             ) from None
         if bool((given < 0).any()) or not bool(torch.isfinite(given).all()):
-            raise ValueError(f"{owner}: weights must be finite, and not negative")
+            raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
         # of squares: the fit weighs errors
         flat_weights = flat_weights * given.sqrt()
     axis = flat_rays.new_tensor([0.0, 0.0, 1.0])

@@ -95,7 +95,7 @@ def page(board: Board, paper: tuple[float, float] | None, words: Sequence[str]) 
         part = largest(board, paper)
         if part < 1:
             raise ValueError(
-                f"a board of {wide:.6g} x {high:.6g} mm does not fit on paper of {paper[0]:g} x {paper[1]:g} mm with "
+                f"board: {wide:.6g} x {high:.6g} mm does not fit on paper of {paper[0]:g} x {paper[1]:g} mm with "
                 f"margins of {_MARGIN:g} mm: it would with its lengths times {math.floor(1000 * part) / 1000:g}"
             )
     x, y = (paper[0] - wide) / 2, (paper[1] - _FOOT - high) / 2

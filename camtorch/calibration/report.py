@@ -104,7 +104,9 @@ def write_report(
 
 def _rig_shots(calibration: RigCalibration, images: Any, names: Any) -> dict[str, _Shots]:
     if images is not None and not isinstance(images, Mapping):
-        raise TypeError("write_report: images of a rig are a mapping from the names of its cameras")
+        raise TypeError(
+            f"write_report: images of a rig are a mapping from the names of its cameras; got {type(images).__name__}"
+        )
     for what, given in (("images", images), ("names", names)):
         stray = [name for name in given if name not in calibration.cameras] if isinstance(given, Mapping) else []
         if stray:

@@ -93,7 +93,7 @@ class Encoder:
             codec = av.Codec(self.codec, "w")
         except av.codec.codec.UnknownCodecError:
             raise ValueError(
-                f"--codec {self.codec}: there is no such encoder; there are {', '.join(_QUALITIES)}, ffv1 ..."
+                f"--codec {self.codec}: there is no such encoder; there are {', '.join(_QUALITIES)}, ffv1 and others"
             ) from None
         if codec.type != "video":
             raise ValueError(f"--codec {self.codec}: an encoder of {codec.type}, not of video")

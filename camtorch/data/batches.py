@@ -71,7 +71,8 @@ class MapBatches:
         if self._move.draws and not self._keys:
             raise ValueError(
                 f'{_OWNER}: key must name the column whose value names a row, as in key="path" after '
-                "read_images(..., include_paths=True): what a row draws follows from it, and not from its place"
+                "read_images(..., include_paths=True): what a row draws follows from it, and not from its place; "
+                f"got key={key!r}"
             )
 
     def set_epoch(self, epoch: int) -> None:

@@ -50,7 +50,7 @@ def parse(record: Record) -> Rig:
             place = entry["T_Device_Camera"]
             quaternion = place["UnitQuaternion"]
             if len(quaternion) != 2:
-                quaternion.fail("is not [w, [x, y, z]]")
+                quaternion.fail(f"is not [w, [x, y, z]], but {quaternion.value!r:.60}")
             w, xyz = quaternion
             extrinsics[name] = poses.from_quaternion(
                 quaternion, [w.number(), *xyz.numbers(3)], place["Translation"].numbers(3), undo=True

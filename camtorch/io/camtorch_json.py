@@ -82,7 +82,7 @@ def _same_batch(record: Record, *tensors: Tensor) -> None:
 
 def _two(record: Record) -> Record:
     if len(record) != 2:
-        record.fail("a size is [height, width]")
+        record.fail(f"a size is [height, width]; this has {len(record)} numbers")
     return record
 
 
@@ -101,7 +101,7 @@ def _flat(record: Record, depth: int) -> tuple[list[float], list[int]]:
         record.fail("nested too deeply")
     parts = [_flat(item, depth + 1) for item in record]
     if any(shape != parts[0][1] for _, shape in parts):
-        record.fail("rows of different lengths")
+        record.fail(f"rows of different lengths: {len(set(map(str, (shape for _, shape in parts))))} of them")
     return [value for values, _ in parts for value in values], [len(parts), *(parts[0][1] if parts else [])]
 
 

@@ -94,7 +94,7 @@ def _from_text(path: str, content: bytes) -> dict[str, Camera]:
         record.few(len(cameras))
         words = record.value
         if len(words) < 4:
-            record.fail("less than an id, a model, a width and a height")
+            record.fail(f"less than an id, a model, a width and a height: {len(words)} words")
         first, name, width, height, *values = record
         identity = str(first.whole(0, LARGEST_ID, "camera id"))
         if identity in cameras:

@@ -77,12 +77,12 @@ def _from_text(path: str, file: BinaryIO) -> Images:
         if not words or words[0].startswith(b"#"):
             passed += 1
             if passed > MOST_COMMENTS:
-                Record(path, None, f"line {line_number}").fail("too many lines without an image")
+                Record(path, None, f"line {line_number}").fail(f"more than {MOST_COMMENTS} lines without an image")
             continue
         record = Record(path, None, f"line {line_number}")
         if len(words) < 10:
             _text(record, line)
-            record.fail("less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME")
+            record.fail(f"less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {len(words)} words")
         if len(names) >= _MOST_IMAGES:
             record.fail(f"more than {_MOST_IMAGES} images")
         try:
@@ -96,7 +96,7 @@ def _from_text(path: str, file: BinaryIO) -> Images:
         cameras.append(identities[words[8]])
         name = words[9].strip()
         if len(name) > _LONGEST_NAME:
-            record.fail("the name of the image has no end")
+            record.fail(f"the name of the image has no end within {_LONGEST_NAME} bytes")
         names.append(_text(record, name))
         places.append(line_number)
         points = file.readline(_LONGEST_LINE)  # of the image; the line may be empty
@@ -132,7 +132,7 @@ def _from_bytes(path: str, file: BinaryIO) -> Images:
         if end + 9 > len(block) or (end < 0 and len(block) < _HEAD.size + _LONGEST_NAME):
             record.fail("the file ends within this image")
         if end < 0 or end - _HEAD.size > _LONGEST_NAME:
-            record.fail("the name of the image has no end")
+            record.fail(f"the name of the image has no end within {_LONGEST_NAME} bytes")
         _, *pose, camera = _HEAD.unpack_from(block)
         (points,) = struct.unpack_from("<Q", block, end + 1)
         places.append(position)

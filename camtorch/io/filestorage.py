@@ -142,7 +142,7 @@ class _Elements:
     def counted(self, more: int) -> None:
         self.count += more
         if self.count > _MOST_VALUES:
-            self.fail("too many values")
+            self.fail(f"too many values: more than {_MOST_VALUES} are not read")
 
     def text(self, text: str) -> None:
         self.open[-1][1].append(text)

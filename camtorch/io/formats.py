@@ -69,7 +69,7 @@ def _path(path: Any, owner: str) -> str:
         name = os.fsdecode(path)
     except TypeError:
         hint = "; it may lie beside others, so name it: file.name" if hasattr(path, "read") else ""
-        raise TypeError(f"{owner} takes the path of a calibration file; got {type(path).__name__}{hint}") from None
+        raise TypeError(f"{owner}: path must be that of a calibration file; got {type(path).__name__}{hint}") from None
     if "\0" in name:
         raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
     return name
@@ -129,7 +129,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
     if not isinstance(rig, Rig):
         part = next((name for name in ("camera", "rig") if isinstance(getattr(rig, name, None), (Camera, Rig))), None)
         hint = f", whose .{part} it takes" if part else ""
-        raise TypeError(f"save takes a Rig or a Camera; got {type(rig).__name__}{hint}")
+        raise TypeError(f"save: a Rig or a Camera can be saved; got {type(rig).__name__}{hint}")
     path = _path(path, "save")
     if not rig.cameras:
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
@@ -158,7 +158,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
 def _known(format: str | None) -> str | None:
     name = None if format is None else str(format).lower()
     if name is not None and name not in FORMATS:
-        raise ValueError(f"unknown format {format!r}; known are {', '.join(sorted(FORMATS))}")
+        raise ValueError(f"format: {format!r} is not known here; known are {', '.join(sorted(FORMATS))}")
     return name
 
 

@@ -99,11 +99,12 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
     key = _MODELS[model]
     if key == "equirectangular":
         if size is None:
-            merged["w"].fail("missing")
+            merged.need("w", "h")
+        assert size is not None
         return merged.camera(key, panorama(size), [], size)
     focals = [focal for focal in (_focal(merged, "x", "w"), _focal(merged, "y", "h")) if focal is not None]
     if not focals:
-        merged["fl_x"].fail("missing")
+        merged.need("fl_x")
     centre = [merged[c].number() if c in merged else merged[side].side() / 2 for c, side in (("cx", "w"), ("cy", "h"))]
     key, distortion = _distortion(merged, key)
     return merged.camera(key, [focals[0], focals[-1], centre[0] - 0.5, centre[1] - 0.5], distortion, size)

@@ -321,7 +321,7 @@ class Tree:
     def _put(self, value: Any, count: int, anchor: str | None) -> None:
         self._count += 1
         if self._count > _MOST_VALUES:
-            self.fail("too many values")
+            self.fail(f"too many values: more than {_MOST_VALUES} are not read")
         if anchor:
             self._anchors[anchor] = (value, count)
         if not self._open:
@@ -330,7 +330,7 @@ class Tree:
         top = self._open[-1]
         top[3] += count
         if top[3] > _MOST_VALUES:  # an alias costs nothing here, but whoever walks through it pays
-            self.fail("too many values")
+            self.fail(f"too many values: more than {_MOST_VALUES} are not read")
         container, key = top[:2]
         if isinstance(container, list):
             container.append(value)

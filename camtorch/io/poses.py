@@ -168,7 +168,7 @@ def vector_of_matrix(record: Record, matrix: Matrix) -> list[float]:
     """The rotation vector of a rotation matrix, to the precision that files store it with."""
     a, b, c = matrix
     if any(abs(value) > 2 for row in matrix for value in row):
-        record.fail("no rotation: some of its numbers are beyond 1")
+        record.fail(f"no rotation, whose numbers are within 1: {max((v for row in matrix for v in row), key=abs):.6g}")
     error = max(
         abs(math.fsum(x * y for x, y in zip(p, q, strict=True)) - (p is q)) for p in (a, b, c) for q in (a, b, c)
     )
@@ -236,7 +236,7 @@ def rows_of(record: Record) -> list[list[float]]:
     """A 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
     rows = record.rows(4 if len(record) == 4 else 3, 4)
     if rows[3:] and rows[3] != [0, 0, 0, 1]:
-        record.fail("the last row is not 0 0 0 1")
+        record.fail(f"the last row is not 0 0 0 1, but {rows[3]}")
     return [*rows[:3], [0.0, 0.0, 0.0, 1.0]]
 
 

@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 from collections.abc import Collection, Iterable, Iterator
+from itertools import islice
 from typing import Any, NoReturn
 
 import torch
@@ -16,6 +17,7 @@ from camtorch.models import MODELS
 
 LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000
+_SHOWN = 8
 _LONGEST_NUMBER = 400  # no double needs as many characters
 
 
@@ -39,24 +41,39 @@ class Record:
         """Raise the CameraFileError of this place."""
         raise CameraFileError(self.path, self.place or "content", reason) from None
 
+    def _found(self) -> str:
+        """What stands there, for an error."""
+        if isinstance(self.value, dict):
+            return f"keys and values, {', '.join(f'{key!r:.30}' for key in islice(self.value, 3)) or 'none'}"
+        if isinstance(self.value, list):
+            return f"a list of {len(self.value)}"
+        return "nothing" if self.value is None else f"{self.value!r:.60}"
+
     # -- mappings
 
     def keys(self) -> list[str]:
         """The keys of a mapping."""
         if not isinstance(self.value, dict):
-            self.fail("not keys and values")
+            self.fail(f"not keys and values, but {self._found()}")
         return list(self.value)
 
     def __contains__(self, key: str) -> bool:
         if not isinstance(self.value, dict):
-            self.fail("not keys and values")
+            self.fail(f"not keys and values, but {self._found()}")
         return key in self.value
 
     def __getitem__(self, key: str) -> Record:
         found = self.get(key)
         if found is None:
-            Record(self.path, None, self.place_of(key)).fail("missing")
+            there = ", ".join(f"{name!r:.30}" for name in islice(self.value, _SHOWN)) or "nothing"
+            more = ", ..." if len(self.value) > _SHOWN else ""
+            Record(self.path, None, self.place_of(key)).fail(f"missing; there is {there}{more}")
         return found
+
+    def need(self, *keys: str) -> None:
+        """Raise a CameraFileError unless all of these keys are here."""
+        for key in keys:
+            self[key]
 
     def get(self, key: str) -> Record | None:
         """The value of a key, or None."""
@@ -71,13 +88,13 @@ class Record:
 
     def __iter__(self) -> Iterator[Record]:
         if not isinstance(self.value, list):
-            self.fail("no list")
+            self.fail(f"no list, but {self._found()}")
         for i, item in enumerate(self.value):
             yield Record(self.path, item, f"{self.place}[{i}]")
 
     def __len__(self) -> int:
         if not isinstance(self.value, list):
-            self.fail("no list")
+            self.fail(f"no list, but {self._found()}")
         return len(self.value)
 
     # -- values
@@ -85,7 +102,7 @@ class Record:
     def text(self) -> str:
         """A text."""
         if not isinstance(self.value, str):
-            self.fail("no text")
+            self.fail(f"no text, but {self._found()}")
         return self.value
 
     def number(self) -> float:
@@ -98,7 +115,7 @@ class Record:
                 number = float(self.value)
         if not math.isfinite(number):
             written = isinstance(self.value, (str, float))
-            self.fail(f"{self.value!r:.60} is no finite number" if written else "is no number")
+            self.fail(f"{self.value!r:.60} is no finite number" if written else f"is no number, but {self._found()}")
         return number
 
     def whole(self, low: int, high: int, what: str) -> int:
@@ -177,7 +194,7 @@ class Record:
             place = Record(self.path, None, f"{self.place}[1]")
             place.fail(f"a skew of {skew:g}, which no model here has; write 0 there to ignore it as OpenCV does")
         if below or bottom != [0, 0, 1]:
-            self.fail("is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+            self.fail(f"is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], but {matrix}")
         return [fx, fy, cx, cy]
 
     def model(self, key: str) -> type[Camera]:

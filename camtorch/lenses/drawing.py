@@ -112,8 +112,8 @@ def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses
     if not bool(chosen.any()):
         widest = math.floor(float(wide.max()))
         raise ValueError(
-            f"no real lens shows {fov[0]:g} to {fov[1]:g} degrees across images of (height, width) {size}; the widest "
-            f"shows {widest}. fov=(low, high) is a range of degrees"
+            f"fov: no real lens shows {fov[0]:g} to {fov[1]:g} degrees across images of (height, width) {size}; the "
+            f"widest shows {widest}. fov=(low, high) is a range of degrees"
         )
     return Lenses(found[chosen], distortion[chosen], reach[chosen])
 

@@ -38,10 +38,10 @@ class Exact:
                 f"{owner}: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
                 "cameras, so take each ct.Warp(source[i], target[i], rotation[i])"
             )
-        if warp._moments():
+        if moments := warp._moments():
             raise ValueError(
-                f"{owner}: the blur of an exposure takes each pixel from many positions, and a map holds one; a "
-                "target_shutter with exposure=0 has one"
+                f"{owner}: the blur of an exposure takes each pixel from {len(moments)} positions, and a map holds one; "
+                "a target_shutter with exposure=0 has one"
             )
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source._size(owner)

@@ -228,7 +228,7 @@ def _path(path: Any, owner: str) -> str:
     try:
         name = os.fsdecode(path)
     except TypeError:
-        raise TypeError(f"{owner} takes the path of a file; got {type(path).__name__}") from None
+        raise TypeError(f"{owner}: path must be that of a file; got {type(path).__name__}") from None
     if "\0" in name:
         raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
     return name
@@ -252,5 +252,5 @@ def _chosen(path: str, format: str | None) -> MapFormat:
 def _named(format: str) -> MapFormat:
     found = next((known for known in _FORMATS if known.name == str(format).lower()), None)
     if found is None:
-        raise ValueError(f"unknown format {format!r} of a map; known are {', '.join(FORMATS)}")
+        raise ValueError(f"format: {format!r} is no format of a map that is known here; known are {', '.join(FORMATS)}")
     return found

@@ -90,7 +90,7 @@ class CanonicalCamera(SampleTransform):
             raise ValueError(f"{self._name}: images keep their size where depth is scaled; got image_size={image_size}")
         self.focal, self.scales = focal, scales
         self.image_size = as_image_size(image_size, self._name)
-        self.options = as_options(self._name, mode, padding_mode, fill, antialias or False, tolerance)
+        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         self.antialias = antialias
 
     def scale(self, camera: Camera) -> Tensor:

@@ -47,7 +47,7 @@ def axes_or_new(ax: Axes | None) -> Axes:
 def check_single(camera: Camera) -> None:
     """Refuse a batch."""
     if camera.batch_shape:
-        raise ValueError(f"a plot shows single cameras; got batch dims {tuple(camera.batch_shape)}")
+        raise ValueError(f"plot: the camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
 
 
 def size_of(camera: Camera) -> tuple[int, int]:

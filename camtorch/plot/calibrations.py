@@ -223,7 +223,7 @@ def views(calibration: Calibration, ax: Axes | None = None, *, names: Sequence[s
     rms = shots.rms
     count = len(calibration.image_points)
     if names is not None and len(names) != count:
-        raise ValueError(f"{count} views, and names for {len(names)}")
+        raise ValueError(f"plot: {count} views, and names for {len(names)}")
     labels = [str(number) if names is None else printable(names[number]) for number in shots.numbers]
     ax.bar(np.arange(len(rms)), np.nan_to_num(rms), color=COLOURS[0], width=0.8)
     ax.axhline(float(calibration.rms), color=INK, linestyle="--", linewidth=1)
@@ -253,14 +253,18 @@ def view(calibration: Calibration, number: int, ax: Axes | None = None, *, image
     ax, shots = axes_or_new(ax), sightings(calibration)
     height, width = size_of(calibration.camera)
     if number not in shots.numbers:
-        raise ValueError(f"no view {number} with corners; of {len(calibration.image_points)} {len(shots.numbers)} have")
+        raise ValueError(
+            f"plot: no view {number} with corners; of {len(calibration.image_points)} {len(shots.numbers)} have"
+        )
     index = shots.numbers.index(number)
     draw_frame(ax, height, width)
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
     if image is not None:
         image = np.asarray(image)
         if image.shape[:2] != (height, width):
-            raise ValueError(f"an image of {image.shape[:2]} for a camera of image_size {(height, width)}")
+            raise ValueError(
+                f"plot: image is {image.shape[:2]} (height, width), and the camera's image_size {(height, width)}"
+            )
         ax.imshow(image, extent=edges, cmap="gray", zorder=0)
     use = shots.seen[index] & shots.inliers[index]
     pixels, errors = shots.pixels[index][use], shots.errors[index][use]

@@ -121,7 +121,7 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
     cameras = cameras if isinstance(cameras, Sequence) else [cameras]
     labels = labels or [camera.key for camera in cameras]
     if len(labels) != len(cameras):
-        raise ValueError(f"{len(cameras)} cameras, and labels for {len(labels)}")
+        raise ValueError(f"plot: {len(cameras)} cameras, and labels for {len(labels)}")
     ax = axes_or_new(ax)
     shown = seen = 0.0
     for i, (camera, label, colour) in enumerate(zip(cameras, labels, cycle(len(cameras)), strict=True)):
@@ -205,7 +205,7 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
     ax = axes_or_new(ax)
     names = [name for name in rig.cameras if name in rig.extrinsics]
     if not names:
-        raise ValueError("a plot of a rig shows cameras with extrinsics; got none")
+        raise ValueError(f"plot: the cameras of a rig need extrinsics; got a rig of {list(rig.cameras)} without")
     places = torch.stack([rig.extrinsics[name].position for name in names]).double().numpy(force=True)
     spread = np.ptp(places, axis=0)
     above = spread[1] <= max(spread[0], spread[2])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole, broadcast_shapes, working_dtype
+from camtorch._arguments import as_whole, broadcast_shapes, check_devices, working_dtype
 from camtorch._tracing import in_transform, is_concrete
 from camtorch.extrinsics import Extrinsics
 from camtorch.rotations import rotate_planes, rotation_matrix
@@ -64,6 +64,7 @@ def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: s
         hint = hint if hasattr(extrinsics, "shape") else ""
         got = type(extrinsics).__name__
         raise TypeError(f"{owner}: extrinsics must be ct.Extrinsics, camera from world; got {got}{hint}")
+    check_devices(owner, camera=rays, extrinsics=extrinsics.rotation)
     dtype, (height, width) = working_dtype(rays, extrinsics.rotation, extrinsics.translation), rays.shape[-3:-1]
     batch = _broadcast(rays.shape[:-3], extrinsics.batch_shape, "extrinsics", owner)
     planes = [plane.to(dtype).expand(*batch, height, width).flatten(-2) for plane in rays.unbind(-1)]

@@ -461,7 +461,7 @@ def as_options(
         "mode": one_of(mode, MODES, "mode", owner),
         "padding_mode": one_of(padding_mode, PADDINGS, "padding_mode", owner),
         "fill": as_fill(fill, owner),
-        "antialias": as_flag(antialias, "antialias", owner),
+        "antialias": antialias is not None and as_flag(antialias, "antialias", owner),
         "tolerance": tolerance,
     }
 

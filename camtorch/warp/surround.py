@@ -124,6 +124,9 @@ class Surround(GeometryModule):
             raise TypeError(f"Surround: images must be tensors (B, C, H, W) by name, or in a list; got {given}")
         if len(images) != len(self.names):
             raise ValueError(f"Surround: {len(self.names)} cameras, {list(self.names)}; got {len(images)} images")
+        counts = {name: len(image) for name, image in zip(self.names, images, strict=True)}
+        if len(set(counts.values()) - {1}) > 1:
+            raise ValueError(f"Surround: images must be as many of each camera; got {counts}")
         weights = self._weights()
         dtype = images[0].dtype
         result: Tensor | None = None

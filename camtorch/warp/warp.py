@@ -459,6 +459,8 @@ class Warp(GeometryModule):
     def enclose(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """As `transform_boxes`, of closed polygons (B, *N, K, 2), or (*N, K, 2)."""
         corners = as_coordinates(corners, "corners", 2, "Warp", self.source.intrinsics.device, "B, *N, K")
+        if corners.ndim < 2:
+            raise ValueError(f"Warp: corners must be (B, *N, K, 2); got shape {tuple(corners.shape)}")
         moved, mapped = self._move(along_edges(corners, EDGE_SAMPLES))
         mapped = mapped & torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
         some = mapped.any(-1, keepdim=True)
