@@ -569,7 +569,7 @@ def test_errors_say_what_is_wrong():
         adapter.with_cameras(params, several(2))
     with pytest.raises(TypeError, match="must be a Camera"):
         adapter.with_cameras(params, [camera(), None])
-    with pytest.raises(ValueError, match="no camera augmentation"):
+    with pytest.raises(ValueError, match="those of a camera augmentation"):
         adapter.with_cameras(K.AugmentationSequential(K.RandomAffine(3.0)).forward_parameters(images().shape), camera())
     with pytest.raises(ValueError, match="3 samples, here are 2"):
         aug(images(2), params=params)

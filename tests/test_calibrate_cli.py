@@ -375,7 +375,7 @@ def test_what_cannot_be_calibrated(capsys, words, text):
     [
         (lambda c: c.pop("camtorch_corners"), "no file of corners, which begin with"),
         (lambda c: c.pop("images"), "images: 'images' is missing"),
-        (lambda c: c.update(board={"type": "moon"}), "board: type must be one of"),
+        (lambda c: c.update(board={"type": "moon"}), "board: a board's type must be one of"),
         (lambda c: c.update(board=None, points=[[1, 2]]), "points: must be rows of 3 finite numbers"),
         (lambda c: c["images"][1].update(corners=[[54, 1, 2]]), "images[1]: corners must begin with the number of a"),
         (lambda c: c["images"][1].update(corners=[[1, 1, 2]] * 2), "images[1]: a point appears twice"),

@@ -4,9 +4,16 @@
 """
 
 import ast
+import math
 import re
 
+import numpy as np
+import pytest
+import torch
 from messages import everything
+
+import camtorch as ct
+from camtorch.augment import kornia as adapter
 
 # -- laws of the statements
 
@@ -24,6 +31,8 @@ _EXCEPTIONS = {
     "shapes {": "caught by whoever names them",
     "no camera in the sample": "named by the caller, with the sample",
     "what makes the warp of a camera": "named by the caller, with the sample",
+    "a board's type must be": "told by the caller, with the place in the file",
+    "a {kind.kind} has": "told by the caller, with the place in the file",
     "the key {repeated": "told by the caller, with the file",
 }
 _LACKS = re.compile(r"\b(no|needs?|give|nothing|neither|empty)\b")  # what says what is missing shows nothing
@@ -106,3 +115,208 @@ def test_messages_of_calls_show_what_was_passed():
         (s, t) for s, t in OF_CALLS if "{" not in owners.sub("", t) and not (_LACKS.search(t) or t.startswith(known))
     ]
     assert not of(wrong)
+
+
+# -- what wrong calls are told, of errors that no other test asks for
+
+SIZE = (24, 32)
+CAMERA = ct.KannalaBrandt([20.0, 20.0, 15.5, 11.5], [0.02, -0.01, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
+BATCH = ct.Pinhole(torch.tensor([[20.0, 20.0, 15.5, 11.5]] * 2), image_size=SIZE).requires_grad_(False)
+GRID = ct.Pinhole(torch.tensor([[[20.0, 20.0, 15.5, 11.5]] * 2] * 2), image_size=SIZE).requires_grad_(False)
+MIXED = ct.Mixed([CAMERA, BATCH[0]])
+POSE = ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]).requires_grad_(False)
+DOWN = ct.Extrinsics.from_matrix(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2.0])
+ONE = ct.Rig({"a": CAMERA}, {"a": POSE})
+WARP = ct.Warp(CAMERA, BATCH[0])
+PAIR = ct.rectify(BATCH[0], BATCH[0], POSE, fov=1.0, image_size=SIZE)
+PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
+IMAGES, META = torch.zeros(2, 3, *SIZE), torch.zeros(5, 3, device="meta")
+LEAF = torch.ones((), requires_grad=True)
+augment = ct.augment
+
+WRONG = [
+    # what is no tensor, or not such a one
+    (lambda: ct.Pinhole([LEAF] * 4), TypeError, r"Pinhole: intrinsics is a list of tensors that require grad"),
+    (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points is a list of tensors that require grad; torch.stack"),
+    (
+        lambda: CAMERA.project(torch.ones(5, 3).to_sparse()),
+        TypeError,
+        r"points must be a dense tensor; got torch.sparse",
+    ),
+    (lambda: CAMERA.project(META), ValueError, r"points must be on cpu, as KannalaBrandt; got meta"),
+    (lambda: CAMERA.contains(torch.ones(3)), ValueError, r"pixels must be \(..., 2\); got shape \(3,\)"),
+    (lambda: MIXED.explain(7), ValueError, r"Mixed: points must be \(\*B, \*N, 3\).* got shape \(\)"),
+    (lambda: WARP.transform_rays(torch.ones(2)), ValueError, r"Warp: rays must be \(B, \*N, 3\); got shape \(2,\)"),
+    (lambda: WARP.enclose(torch.ones(2)), ValueError, r"corners must be \(B, \*N, K, 2\); got shape \(2,\)"),
+    (lambda: WARP(IMAGES.to("meta")), ValueError, r"Warp: images is on meta, source is on cpu; .to\(device\)"),
+    (lambda: ct.Warp(CAMERA, BATCH[0].to("meta")), ValueError, r"source is on cpu, target is on meta"),
+    (lambda: WARP.strips(IMAGES, rows=2.5), TypeError, r"Warp: rows must be a whole number; got 2.5"),
+    (lambda: ct.Extrinsics(META[0], META[0]).compose(POSE), ValueError, r"this is on meta, other is on cpu"),
+    (lambda: POSE.compose(np.eye(4)), TypeError, r"Extrinsics: compose takes Extrinsics; got ndarray"),
+    (lambda: augment.outlines([1, 2, 3]), ValueError, r"outlines: boxes must be \(..., 4\) = x1.*got shape \(3,\)"),
+    (lambda: augment.to_pitch_yaw([1, 2]), ValueError, r"to_pitch_yaw: gaze must be \(..., 3\); got shape \(2,\)"),
+    (lambda: augment.from_pitch_yaw("up"), TypeError, r"from_pitch_yaw: angles must be a tensor; got str"),
+    (lambda: augment.mount_rotation(None, 0, 0), TypeError, r"mount_rotation: yaw must be a tensor; got NoneType"),
+    (lambda: augment.mount_rotation([1, 2], [1, 2, 3], 0), ValueError, r"of one shape .*yaw \(2,\), pitch \(3,\)"),
+    (lambda: ct.losses.angles(7, [0, 0, 1]), ValueError, r"angles: first must be \(..., 3\); got shape \(\)"),
+    (
+        lambda: augment.RandomMount(camera=CAMERA)(image=np.array(["a"])),
+        TypeError,
+        r"image must be a tensor of real .*<U1",
+    ),
+    # what is no number, flag, word, mapping
+    (
+        lambda: ct.Warp(CAMERA, CAMERA, antialias="False"),
+        TypeError,
+        r"Warp: antialias must be True or False; got 'False'",
+    ),
+    (lambda: ct.Warp(CAMERA, CAMERA, tolerance="0"), TypeError, r"Warp: tolerance must be a number; got '0'"),
+    (lambda: ct.Warp(CAMERA, CAMERA, fill="0"), TypeError, r"fill must be a number or one for each channel; got '0'"),
+    (lambda: ct.Warp(CAMERA, CAMERA, mode=np.zeros((2, 2))), ValueError, r"mode must be one of .*ndarray of shape"),
+    (lambda: CAMERA.convert("mei", max_angle="90"), TypeError, r"convert: max_angle must be a number; got '90'"),
+    (lambda: CAMERA.convert("mei", tolerance=None), TypeError, r"convert: tolerance must be a number; got None"),
+    (
+        lambda: ct.KannalaBrandt.from_matrix(np.eye(3), ignore_skew="no"),
+        TypeError,
+        r"ignore_skew must be True or False",
+    ),
+    (lambda: BATCH["a"], TypeError, r"Pinhole: a batch is indexed by whole numbers, slices and masks; got 'a'"),
+    (lambda: MIXED["a"], TypeError, r"Mixed: it is indexed by whole numbers, slices and masks; got 'a'"),
+    (lambda: ct.Mixed([CAMERA], order="first"), TypeError, r"Mixed: order must be places among 1 cameras.*'first'"),
+    (lambda: ct.Mixed.of_groups([CAMERA]), TypeError, r"Mixed: groups must be pairs \(rows, cameras\)"),
+    (lambda: MIXED.by_groups("mei"), TypeError, r"Mixed: change must be a function of a camera.*got 'mei'"),
+    (lambda: MIXED.distortion_names, TypeError, r"Mixed: cameras of several models have no distortion in common"),
+    (lambda: MIXED.with_tensors(), TypeError, r"Mixed: cameras of several models have no tensors in common"),
+    (lambda: ct.Rig(CAMERA), TypeError, r"Rig: cameras must be a dict, as \{'left': Camera\}; got KannalaBrandt"),
+    (lambda: ct.Rig({"a": CAMERA}, POSE), TypeError, r"Rig: extrinsics must be a dict, as \{'left': Extrinsics\}"),
+    (lambda: ct.Rig({"a": CAMERA}, (1, 2)), TypeError, r"Rig: extrinsics must be a dict, or \(names, a batch\)"),
+    (lambda: ct.Rig({"a": CAMERA}, images=["a"]), TypeError, r"Rig: images must be a dict"),
+    (lambda: ONE.cameras["b"], KeyError, r"no Camera is called 'b'; there are 'a'"),
+    (lambda: ONE.camera_of(["a"]), ValueError, r"no camera and no image is called \['a'\]"),
+    # views, stereo, planes
+    (lambda: ct.views.ring(CAMERA, 3, fov="60"), TypeError, r"ring: fov must be a number; got '60'"),
+    (lambda: ct.views.ring(CAMERA, 3, fov=4.0), ValueError, r"ring: fov must be radians between 0 and pi; got 4.0"),
+    (lambda: ct.views.cube(BATCH), ValueError, r"cube: takes one camera; got batch_shape=\(2,\)"),
+    (lambda: ct.views.cube(CAMERA, 0), ValueError, r"cube: size must be at least 1; got 0"),
+    (
+        lambda: ct.views.cube(CAMERA, 8).back(None),
+        ValueError,
+        r"Views: views must be a tensor \(B, 6, C, 8, 8\); got None",
+    ),
+    (lambda: ct.surround(ONE, CAMERA, distance="far"), TypeError, r"surround: distance must be a number; got 'far'"),
+    (lambda: ct.surround(ONE, CAMERA, distance=0), ValueError, r"surround: distance must be positive; got 0.0"),
+    (lambda: ct.surround(ONE, CAMERA, blend=math.inf), ValueError, r"surround: blend must be pixels, zero or more"),
+    (lambda: ct.surround(ONE, CAMERA).warp("b"), ValueError, r"Surround: no camera is called 'b'; there are \['a'\]"),
+    (lambda: ct.surround(ONE, CAMERA)(IMAGES), TypeError, r"Surround: images must be tensors .* got Tensor"),
+    (
+        lambda: ct.BirdsEye(CAMERA, DOWN, x=3, y=(0, 1), resolution=1),
+        TypeError,
+        r"BirdsEye: x must be \(from, to\).* got 3",
+    ),
+    (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution="1"), TypeError, r"resolution must be a number"),
+    (
+        lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution=9),
+        ValueError,
+        r"at 9.0 units per pixel make no",
+    ),
+    (lambda: ct.Reproject(GRID, CAMERA, POSE), ValueError, r"Reproject: cameras and extrinsics may have one batch dim"),
+    (lambda: ct.RollingShutter(0.01, [0, 0, 0], samples=0), ValueError, r"samples and gamma must be positive; got 0"),
+    (
+        lambda: ct.RollingShutter(0.01, [0, 0, 0]).times([0, 0], None),
+        TypeError,
+        r"RollingShutter: image_size must be two",
+    ),
+    (lambda: ct.rectify(GRID, GRID, POSE), ValueError, r"rectify: cameras and extrinsics may have one batch dim"),
+    (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(1, 1, 1)), ValueError, r"fov must be horizontal, or .*\(1, 1, 1\)"),
+    (lambda: ct.rectify(CAMERA, CAMERA, POSE, vertical="no"), TypeError, r"vertical must be True or False; got 'no'"),
+    (lambda: PAIR.disparity_range(5, 1), ValueError, r"depths must be 0 < near < far; got near=5.0, far=1.0"),
+    (lambda: PAIR.depth_range(5, 1), ValueError, r"disparities must be least < most; got least=5.0, most=1.0"),
+    (lambda: PAIR.disparity_to_points(torch.ones(SIZE), "all"), TypeError, r"valid must be a mask .*got 'all'"),
+    (lambda: PAIR.disparity_to_points(torch.ones(SIZE), [True]), ValueError, r"valid must have the shape of disparity"),
+    (lambda: PAIR.disparity("points"), TypeError, r"Rectification.disparity: points must be a tensor; got str"),
+    (lambda: PAIR.save(None), TypeError, r"Rectification.save: path must name a file; got None"),
+    (lambda: ct.Dewarp(CAMERA, fov="90"), TypeError, r"Dewarp: fov must be a number; got"),
+    # augmentations
+    (lambda: augment.RandomMount(zoom=1.0), ValueError, r"zoom must lie within .*got 1.0, which stands for \(0, 2\)"),
+    (lambda: augment.RandomMount(p="half"), TypeError, r"RandomMount: p must be a number; got 'half'"),
+    (lambda: augment.RandomMount(same_on_batch="no"), TypeError, r"same_on_batch must be True or False; got 'no'"),
+    (lambda: augment.RandomMount(fields=["image"]), TypeError, r"RandomMount: fields must be a dict, as"),
+    (lambda: augment.RandomMount(fov=(20, 30), camera=CAMERA).draw("2"), TypeError, r".* got '2'|fov"),
+    (lambda: augment.RandomMount().draw(2, 7), TypeError, r"generator must be a torch.Generator, or None; got 7"),
+    (lambda: augment.Range("a", 1), TypeError, r"Range: low must be a number; got 'a'"),
+    (lambda: augment.Resize(0), ValueError, r"Resize: size must be positive; got 0"),
+    (lambda: augment.Rotate90((0, 1, 2)), ValueError, r"Rotate90: times must be one number or \(least, most\)"),
+    (lambda: augment.Rotate90((3, 1)), ValueError, r"Rotate90: times must be \(least, most\), and step positive"),
+    (lambda: augment.HorizontalFlip(landmarks=7), TypeError, r"HorizontalFlip: landmarks must be one of .*got 7"),
+    (lambda: augment.HorizontalFlip(swap_sides="no"), TypeError, r"swap_sides must be True or False; got 'no'"),
+    (
+        lambda: augment.Compose([augment.RandomMount()], min_filled=1),
+        TypeError,
+        r"Compose: there is no min_filled here",
+    ),
+    (lambda: augment.FaceNormalizer(image_size=None), TypeError, r"image_size must be two integers .*got None"),
+    (lambda: augment.FaceNormalizer(focal="960"), TypeError, r"FaceNormalizer: focal must be a number; got '960'"),
+    (lambda: augment.FaceNormalizer(axis=3), TypeError, r"FaceNormalizer: axis must be a pixel \(u, v\); got 3"),
+    (lambda: augment.FaceNormalizer()(image=IMAGES, camera="c"), TypeError, r"FaceNormalizer: camera must be a Camera"),
+    (lambda: augment.collate(7), TypeError, r"collate: samples must be a list of samples; got int"),
+    (lambda: augment.collate([]), ValueError, r"collate: samples must not be empty"),
+    (lambda: adapter.with_cameras([], "camera"), TypeError, r"cameras must be a Camera with a batch dim.*got str"),
+    (lambda: adapter.with_cameras([], BATCH), ValueError, r"params must be those of a camera augmentation; got \[\]"),
+    # networks, data, calibration
+    (lambda: ct.CameraHead(0, "mei", image_size=SIZE), ValueError, r"CameraHead: features must be at least 1; got 0"),
+    (
+        lambda: ct.CameraHead(8, "mei", image_size=SIZE, fov="wide"),
+        TypeError,
+        r"fov must be the least and .*got 'wide'",
+    ),
+    (lambda: ct.CameraHead(8, "mei", image_size=SIZE, centre="a"), TypeError, r"centre must be a number; got 'a'"),
+    (
+        lambda: ct.CanonicalCamera(20.0).scale("camera"),
+        TypeError,
+        r"CanonicalCamera.scale: camera must be a Camera; got str",
+    ),
+    (lambda: ct.data.to_columns("camera"), TypeError, r"to_columns: camera must be a Camera; got str"),
+    (
+        lambda: ct.data.to_columns(ct.Pinhole([1, 1, 0, 0])),
+        ValueError,
+        r"must have an image_size .*got image_size None",
+    ),
+    (lambda: ct.data.from_columns(7), TypeError, r"from_columns: columns must be a dict of columns; got int"),
+    (lambda: ct.data.from_columns({}), ValueError, r"from_columns: camera_model, .* is missing"),
+    (lambda: ct.data.MapBatches(WARP, key=7), TypeError, r"MapBatches: key must be the name of a column.*got 7"),
+    (lambda: ct.data.MapBatches(WARP)({"image": 3}), TypeError, r"columns must be arrays or lists; got .*'int'"),
+    (
+        lambda: ct.data.MapBatches(ct.Warp(BATCH, BATCH)),
+        ValueError,
+        r"the warp must be a single one; got batch dims \(2,\)",
+    ),
+    (lambda: ct.data.MapSamples(WARP, key=[]), TypeError, r"MapSamples: key must name an entry of a sample; got \[\]"),
+    (
+        lambda: ct.triangulate(7, [POSE] * 2, torch.ones(2, 5, 2)),
+        TypeError,
+        r"cameras must be Camera in a list; got a int",
+    ),
+    (
+        lambda: ct.fit("mei", PIXELS, RAYS, weights=torch.ones(3)),
+        ValueError,
+        r"weights must broadcast against the rays",
+    ),
+    (lambda: ct.fit("mei", PIXELS, RAYS, weights=-torch.ones(SIZE)), ValueError, r"weights must be .*got down to -1"),
+    (lambda: ct.write_report(CAMERA, "a.html"), TypeError, r"calibration must be what calibrate returns; got Kannala"),
+    # models, files, maps
+    (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], image_size=None), ValueError, r"give its image_size=\(height"),
+    (
+        lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], 3, image_size=SIZE),
+        ValueError,
+        r"offset must be \(2,\) = cx_off",
+    ),
+    (lambda: ct.io.opencv.read(None), TypeError, r"io.opencv.read: path must name a file; got None"),
+    (lambda: ct.load_map("\0"), ct.CameraFileError, r"path: a NUL character, which no path has"),
+    (lambda: WARP.save("a.npy", "depthai", order=["yx"]), ValueError, r"order must be 'yx' .*got \['yx'\]"),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "says"), WRONG, ids=[says[:40] for _, _, says in WRONG])
+def test_wrong_calls_are_told_in_words(call, error, says):
+    with pytest.raises(error, match=says):
+        call()

@@ -329,7 +329,7 @@ def test_what_the_name_does_not_say_is_asked_for(tmp_path):
         ct.save(camera(), tmp_path / "a.yaml", "ply")
     with pytest.raises(ValueError, match="format: 'ply' is not known here"):
         ct.load(tmp_path / "a.yaml", "ply")
-    with pytest.raises(TypeError, match="takes a Rig or a Camera; got list"):
+    with pytest.raises(TypeError, match="a Rig or a Camera can be saved; got list"):
         ct.save([camera()], tmp_path / "a.json")
     with pytest.raises(TypeError, match=r"got Conversion, whose \.camera it takes"):
         ct.save(camera().convert("kannala_brandt"), tmp_path / "a.json")

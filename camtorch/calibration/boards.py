@@ -276,12 +276,10 @@ def board_of(options: Mapping[str, Any]) -> Board:
     given = dict(options)
     kind = BOARDS.get(given.pop("type", ""))
     if kind is None:
-        raise ValueError(f"board: type must be one of {', '.join(BOARDS)}; got {options.get('type')!r}")
+        raise ValueError(f"a board's type must be one of {', '.join(BOARDS)}; got {options.get('type')!r}")
     known = {field.name for field in fields(kind)}
     if not {"columns", "rows"} <= set(given) <= known:
-        raise ValueError(
-            f"board: a {kind.kind} has {', '.join(sorted(known))}; got {', '.join(sorted(given)) or 'nothing'}"
-        )
+        raise ValueError(f"a {kind.kind} has {', '.join(sorted(known))}; got {', '.join(sorted(given)) or 'nothing'}")
     return kind(**given)
 
 

@@ -40,8 +40,8 @@ class Exact:
             )
         if moments := warp._moments():
             raise ValueError(
-                f"{owner}: the blur of an exposure takes each pixel from {len(moments)} positions, and a map holds one; "
-                "a target_shutter with exposure=0 has one"
+                f"{owner}: the blur of an exposure takes each pixel from {len(moments)} positions, and a map holds "
+                "one; a target_shutter with exposure=0 has one"
             )
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source._size(owner)

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_image_size
+from camtorch._arguments import as_image_size, as_number
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import image_lattice
@@ -95,10 +95,7 @@ class Dewarp(Warp):
 
 def _plane_width(projection: str, fov: float) -> float:
     widest = math.pi if projection == "perspective" else 2 * math.pi
-    try:
-        fov = float(fov)
-    except (TypeError, ValueError):
-        raise TypeError(f"Dewarp: fov must be a number; got {type(fov).__name__}") from None
+    fov = as_number(fov, "fov", "Dewarp")
     if not (1e-6 < fov < widest or fov == widest == 2 * math.pi):
         raise ValueError(
             f"Dewarp: fov must be in radians, between 0 and {widest:.4g} for a {projection} target; got {fov!r}"
