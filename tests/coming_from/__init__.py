@@ -23,9 +23,10 @@ def row(*keys, slow=False):
     return register
 
 
-def trap(check):
+def trap(check, slow=False):
     """Register the check of what a page says under "Traps"."""
-    TRAPS.append(pytest.param(check, id=f"{check.__module__.split('.')[-1]}: {check.__name__}"))
+    name = f"{check.__module__.split('.')[-1]}: {check.__name__}"
+    TRAPS.append(pytest.param(check, id=name, marks=[pytest.mark.slow] if slow else []))
     return check
 
 

@@ -1,5 +1,7 @@
 """The rows of the page on COLMAP."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -217,7 +219,7 @@ def quaternions(tmp_path):
     close(moved().rotation.quat, [x, y, z, w], 1e-9)
 
 
-@trap
+@functools.partial(trap, slow=True)
 def one_focal_length(tmp_path):
     camera = lens(params=[75.0, 75.0, 80.0, 60.0, -0.1, 0.0, 0.0, 0.0]).requires_grad_()
     parametrize.register_parametrization(camera, "intrinsics", ct.TiedFocal())

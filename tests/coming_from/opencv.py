@@ -302,7 +302,7 @@ def chessboard_corners():
     assert ours.rms < 0.3
 
 
-@row("cv2.warpPerspective")
+@row("cv2.warpPerspective", slow=True)
 def homographies():
     here = ct.Pinhole.from_matrix(K, image_size=SIZE).requires_grad_(False)
     turn = P @ TURN @ np.linalg.inv(K)
@@ -481,6 +481,22 @@ def omnidir_map():
     same_images(warped(warp), cv2.remap(photograph(), *maps, cv2.INTER_LINEAR))
     theirs = cv2.omnidir.undistortImage(photograph(), K, D5[None, :4], XI, flags, Knew=P, new_size=WH, R=TURN)
     same_images(warped(warp), theirs)
+
+
+@row("cv2.omnidir.RECTIFY_LONGLATI")
+def omnidir_panorama():
+    longlati = np.array([[40.0, 0, 10.0], [0, 35.0, 5.0], [0, 0, 1]])
+    quarter = np.array([40.0, 35.0, 10.0 + 20 * np.pi, 5.0 + 17.5 * np.pi])
+    panorama = ct.LatLon(quarter, image_size=SIZE).requires_grad_(False)
+    rays, valid = panorama.rays()
+    x, y = ((panorama.pixel_grid().numpy() - longlati[:2, 2]) / [40.0, 35.0]).transpose(2, 0, 1)
+    documented = np.stack([-np.cos(x), -np.sin(x) * np.cos(y), np.sin(x) * np.sin(y)], -1)
+    close(rays[valid], documented[valid.numpy()])
+    if hasattr(cv2, "omnidir"):
+        flags = cv2.omnidir.RECTIFY_LONGLATI
+        maps = cv2.omnidir.initUndistortRectifyMap(K, D5[None, :4], XI, TURN, longlati, WH, cv2.CV_32FC1, flags)
+        theirs = cv2.remap(photograph(), *maps, cv2.INTER_LINEAR)
+        same_images(warped(ct.Warp(mei(), panorama, tensor(TURN))), theirs)
 
 
 @row("cv2.omnidir.calibrate", slow=True)
