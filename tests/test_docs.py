@@ -166,6 +166,7 @@ def test_links_of_the_root_lead_somewhere():
     broken = []
     for page, target in links:
         path, _, anchor = target.partition("#")
+        path = path or page
         text = (ROOT / path).read_text() if path.endswith(".md") and (ROOT / path).exists() else ""
         anchors = [
             re.sub(r"[^\w\s-]", "", title).lower().replace(" ", "-") for title in re.findall(r"^#+ (.*)", text, re.M)
