@@ -8,7 +8,7 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
 
 import torch
 from torch import Tensor
@@ -113,6 +113,34 @@ def draw(
     if rows == count:
         return values
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
+
+
+class CommonOptions(TypedDict, total=False):
+    """What edits and other augmentations take; see `Augmentation`."""
+
+    camera: Camera | None
+    p: float
+    same_on_batch: bool
+    fields: Mapping[str, str] | None
+    mode: str
+    padding_mode: str
+    fill: float | Sequence[float]
+    mask_fill: float
+    valid_mask: bool
+    tolerance: float
+
+
+class EditOptions(CommonOptions, total=False):
+    """What every edit takes; see `Edit`."""
+
+    antialias: bool | None
+
+
+class RandomOptions(CommonOptions, total=False):
+    """What every other augmentation takes; see `Augmentation`."""
+
+    antialias: bool
+    min_filled: float | None
 
 
 class Augmentation(SampleTransform):

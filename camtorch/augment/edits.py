@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_whole
 from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.augmentation import Augmentation, Range, as_range
+from camtorch.augment.augmentation import Augmentation, EditOptions, Range, as_range
 from camtorch.augment.change import Change, Part, by_kinds, edited, size_of
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.camera import Camera, quarter_turns
 from camtorch.warp.affine import AffineWarp, after, on_rays
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 Size = int | Sequence[int]
 
@@ -163,7 +166,7 @@ class RandomResizedCrop(Edit):
         *,
         scale: Sequence[float] = (0.08, 1.0),
         ratio: Sequence[float] = (3 / 4, 4 / 3),
-        **options: Any,
+        **options: Unpack[EditOptions],
     ):
         name = type(self).__name__
         ratios = as_range(ratio, "ratio", name, least=1e-3, most=1e3)
@@ -196,7 +199,7 @@ class RandomCrop(Edit):
         options: see `Edit`.
     """
 
-    def __init__(self, size: Size, **options: Any):
+    def __init__(self, size: Size, **options: Unpack[EditOptions]):
         super().__init__({"place": Range(0, 1, 2)}, **options)
         self.image_size: tuple[int, int] | None = _as_size(size, self._name)
 
@@ -219,7 +222,7 @@ class CenterCrop(Edit):
         options: see `Edit`.
     """
 
-    def __init__(self, size: Size, **options: Any):
+    def __init__(self, size: Size, **options: Unpack[EditOptions]):
         super().__init__(**options)
         self.image_size: tuple[int, int] | None = _as_size(size, self._name)
 
@@ -241,7 +244,7 @@ class Resize(Edit):
 
     shorter: int | None
 
-    def __init__(self, size: Size, **options: Any):
+    def __init__(self, size: Size, **options: Unpack[EditOptions]):
         super().__init__(**options)
         alone = size[0] if isinstance(size, Sequence) and len(size) == 1 else size  # torchvision's (256,) is 256
         self.shorter = None if isinstance(alone, Sequence) else as_whole(alone, "size", self._name)
@@ -270,7 +273,7 @@ class Pad(Edit):
 
     least: tuple[int, int] | None
 
-    def __init__(self, padding: Size | None = None, *, size: Size | None = None, **options: Any):
+    def __init__(self, padding: Size | None = None, *, size: Size | None = None, **options: Unpack[EditOptions]):
         super().__init__(**options)
         if (padding is None) == (size is None):
             raise TypeError(f"{self._name}: give either padding or size; got {padding!r} and {size!r}")
@@ -311,7 +314,7 @@ class Rotate90(Edit):
 
     times: tuple[int, int, int]
 
-    def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Any):
+    def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Unpack[EditOptions]):
         name = type(self).__name__
         ends = tuple(times) if isinstance(times, Sequence) else (times, times)
         if len(ends) != 2:
