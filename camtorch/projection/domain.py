@@ -95,13 +95,17 @@ class Domain:
                     made.__dict__[name] = mixed(self.__dict__[name], other.__dict__[name])
         return made
 
+    def _set(self, **tables: object) -> None:
+        """Tables that are not cached at first use: a compiler cannot follow the lock of a cached property."""
+        for name, table in tables.items():
+            setattr(self, name, table)
+
     def with_tables(self, inner2: Tensor, limits2: Tensor, table: Tensor) -> Domain:
         """The same domain with tables that were made elsewhere."""
-        # set, not cached: a compiler cannot follow the lock of a cached property
         usual2 = inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
         inverse = InverseTable(table) if self.lens.radial else None
-        self.__dict__.update(inner2=inner2, usual2=usual2, limits2=limits2, inverse=inverse)
-        self.__dict__.update(staged=None, all_staged=False)  # which takes a look
+        self._set(inner2=inner2, usual2=usual2, limits2=limits2, inverse=inverse)
+        self._set(staged=None, all_staged=False)  # which takes a look
         return self
 
     def at_hand(self) -> Domain:
@@ -111,7 +115,7 @@ class Domain:
                 staged = torch.isfinite(self.circle2) if self.lens.rest is not None else None
                 limits2, outline = limits_and_outline(self.optics, self.k)
                 limits2 = limits2 if staged is None else torch.where(staged, 0.0, limits2)
-                self.__dict__.update(staged=staged, all_staged=False, limits2=limits2, outline=outline)
+                self._set(staged=staged, all_staged=False, limits2=limits2, outline=outline)
             return self
         # constants: none is a view of another
         made = Domain(self.optics, self.k.clone())
@@ -120,8 +124,8 @@ class Domain:
             return made
         tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]
         tables += [] if self.lens.is_radial else ["limits2"]
-        made.__dict__.update({name: getattr(self, name).clone() for name in tables})
-        made.__dict__.update(staged=self.staged, all_staged=self.all_staged, inverse=None, outline=None)
+        made._set(**{name: getattr(self, name).clone() for name in tables})
+        made._set(staged=self.staged, all_staged=self.all_staged, inverse=None, outline=None)
         if self.inverse is not None:
             made.__dict__["inverse"] = InverseTable(self.table, is_constant=True)
         if not (self.lens.is_radial or self.all_staged):
