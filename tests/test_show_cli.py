@@ -325,7 +325,7 @@ def test_a_summary_says_what_it_cannot_know():
     assert summarise(folded).corners == ("no ray",) * 4
     lost = ct.BrownConrady([300.0, 300, 9e5, 240], [-0.5, 0, 0, 0], image_size=(480, 640))
     assert summarise(lost).fov == (0, 0, 0)
-    with pytest.raises(ValueError, match="one camera"):
+    with pytest.raises(ValueError, match="must be a single one"):
         summarise(ct.Pinhole(torch.ones(2, 4)))
 
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_mapping
+from camtorch._arguments import as_flag, as_mapping
 from camtorch.augment.augmentation import Augmentation, Range, draw
 from camtorch.augment.change import Change
 from camtorch.augment.edits import Edit, change_by
@@ -81,7 +81,13 @@ class Compose(Augmentation):
         for i, part in enumerate(parts):
             ranges[f"{i}.apply"] = Range(0, 1)
             ranges |= {f"{i}.{key}": interval for key, interval in part.ranges.items()}
-        super().__init__(ranges, camera=camera, fields=fields, antialias=antialias, **options)
+        super().__init__(
+            ranges,
+            camera=camera,
+            fields=fields,
+            antialias=antialias is not None and as_flag(antialias, "antialias", name),
+            **options,
+        )
         self.antialias = antialias
         self.augmentations = nn.ModuleList(parts)
         self.needs_camera: bool = any(part.needs_camera for part in parts)

@@ -447,7 +447,7 @@ class Options(TypedDict):
 
 
 def as_options(
-    owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool, tolerance: float | None
+    owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool | None, tolerance: float | None
 ) -> Options:
     """The checked options of a `Warp`, by name.
 
