@@ -193,7 +193,7 @@ def calibrate():
     *_, deviations, _, _ = cv2.calibrateCameraExtended([board] * 13, corners, wh, None, None)
     std = ours.std.numpy()
     np.testing.assert_allclose(std / deviations[:9, 0], np.full(9, std[0] / deviations[0, 0]), rtol=1e-3)
-    assert [residual.shape for residual in ours.residuals] == [(54, 2)] * 13
+    assert [tuple(residual.shape) for residual in ours.residuals] == [(54, 1, 2)] * 13
 
 
 @row("cv2.CALIB_USE_INTRINSIC_GUESS", "cv2.CALIB_FIX_FOCAL_LENGTH", slow=True)
