@@ -24,6 +24,7 @@ def execute(path: Path) -> None:
         NotebookClient(
             notebook,
             timeout=600,
+            coalesce_streams=True,
             extra_arguments=["--InlineBackend.figure_formats=jpeg"],
             resources={"metadata": {"path": folder}},
         ).execute()
