@@ -46,6 +46,7 @@ def test_what_is_saved_is_clean(path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # matplotlib given torch's tensors
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
 def test_its_cells_run(path, tmp_path, monkeypatch):
     pytest.importorskip("av")
