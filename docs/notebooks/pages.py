@@ -5,6 +5,7 @@ Nothing is executed, and the pages have the site's own looks, light and dark, an
 
 import base64
 import json
+import textwrap
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -45,5 +46,6 @@ def rendered(notebook: dict[str, Any], name: str) -> tuple[str, dict[str, bytes]
                 parts.append(f"![{heading}]({figure})")
             else:
                 text = "".join(output.get("text", data.get("text/plain", "")))
-                parts.append(f"```text\n{text.rstrip()}\n```")
+                lines = (textwrap.fill(line, 88) if len(line) > 100 else line for line in text.rstrip().splitlines())
+                parts.append("```text\n" + "\n".join(lines) + "\n```")
     return "\n\n".join(parts) + "\n", figures
