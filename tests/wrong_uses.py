@@ -24,5 +24,4 @@ ct.Warp(camera, camera)(np.zeros((1, 3, 480, 640)))  # type: ignore[arg-type]  #
 ct.Dewarp(camera, projection="flat")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 ct.load(3)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 ct.losses.rays(camera, camera, reduction="sum")  # type: ignore[call-overload]  # pyright: ignore
-ct.augment.RandomCamera(yow=5)  # type: ignore[call-arg]  # pyright: ignore[reportCallIssue]
 ct.augment.Resize((240, 320), mod="nearest")  # type: ignore[call-arg]  # pyright: ignore[reportCallIssue]

@@ -115,8 +115,8 @@ def draw(
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
 
 
-class CommonOptions(TypedDict, total=False):
-    """What edits and other augmentations take; see `Augmentation`."""
+class EditOptions(TypedDict, total=False):
+    """What every edit takes; see `Edit`."""
 
     camera: Camera | None
     p: float
@@ -127,20 +127,8 @@ class CommonOptions(TypedDict, total=False):
     fill: float | Sequence[float]
     mask_fill: float
     valid_mask: bool
-    tolerance: float
-
-
-class EditOptions(CommonOptions, total=False):
-    """What every edit takes; see `Edit`."""
-
     antialias: bool | None
-
-
-class RandomOptions(CommonOptions, total=False):
-    """What every other augmentation takes; see `Augmentation`."""
-
-    antialias: bool
-    min_filled: float | None
+    tolerance: float
 
 
 class Augmentation(SampleTransform):
@@ -226,7 +214,7 @@ class Augmentation(SampleTransform):
         fill: float | Sequence[float] = 0.0,
         mask_fill: float = 0.0,
         valid_mask: bool = False,
-        antialias: bool = False,
+        antialias: bool | None = False,
         tolerance: float = 0.001,
         min_filled: float | None = None,
         **unknown: object,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from camtorch._arguments import as_image_size, broadcast_shapes
 from camtorch._module import Memo, same
 from camtorch._tracing import in_graph, is_concrete
-from camtorch.augment.augmentation import Augmentation, RandomOptions, Range, as_range
+from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
@@ -28,9 +28,6 @@ from camtorch.rotations import mount_rotation
 from camtorch.warp.light import vignetting
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp, along_edges
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 RangeLike = float | Sequence[float]
 
@@ -122,7 +119,7 @@ class RandomCamera(Augmentation):
         readout: RangeLike | None = None,
         exposure: RangeLike | None = None,
         image_size: Sequence[int] | None = None,
-        **options: Unpack[RandomOptions],
+        **options: Any,
     ):
         super().__init__(**options)
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
