@@ -4,6 +4,7 @@
 and is made by its name only.
 """
 
+import functools
 import io
 import sys
 import tempfile
@@ -39,7 +40,7 @@ def moved(before: LabelledImage, warp: ct.Warp) -> LabelledImage:
     return LabelledImage(warp(before.image[None])[0], warp.target, new, [], keypoints_valid, boxes_valid)
 
 
-def overview(columns: int) -> Image.Image:
+def overview(columns: int = 4) -> Image.Image:
     """A fisheye image, dewarped, and as other cameras would have seen it."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
     fisheye = rendered(driver(lens.double().requires_grad_(False)))
@@ -269,9 +270,8 @@ def by_commands() -> None:
         path = HERE / f"{words[1] if words[0] == 'demo' and words[1:] else words[0]}.jpg"
         main([*words, "-o", str(path), "--force"])
         image = Image.open(path)
-        if words[1:] == ["camera"]:
-            image = image.resize((image.width * 3 // 4, image.height * 3 // 4), Image.Resampling.LANCZOS)
-        image.save(path, quality=85)
+        image.thumbnail((1100, 2000), Image.Resampling.LANCZOS)
+        image.save(path, quality=75)
 
 
 SHEETS = {
@@ -280,6 +280,7 @@ SHEETS = {
     "fields": (fields, 85),
     "maps": (maps, 85),
     "overview": (overview, 88),
+    "overview-phone": (functools.partial(overview, 2), 85),
     "edits": (edits, 85),
 }
 """Name of the file -> what draws it, and its quality."""
