@@ -9,16 +9,16 @@ import torch
 from PIL import Image, ImageDraw, ImageFilter
 
 import camtorch as ct
-from camtorch._drawing import INK, PAPER, RIM, Marks, font, shown
+from camtorch._drawing import INK, PAPER, Marks, font, shown
 from camtorch.cli.labelled_image import LabelledImage
 from camtorch.cli.labels import Labels
 from camtorch.cli.sheet import arrows
 from camtorch.demo import cabin, example
 from drawings.pages import IMAGES, code, sections
+from drawings.sheets import GAP, TILE, WIDTH, pair, put
 
 VIOLET = (150, 60, 230)
-WIDTH, TILE, GAP, BAND = 960, (345, 460), 13, 28
-"""Pixels: of a picture, of an image at its most (height, width), between them, of a caption."""
+BAND = 28  # pixels of a caption
 SEEDS = {"mount": 3, "real": 7, "resized-crop": 4, "crop": 2, "camera": 4}
 """Of draws, by the file's name; 1 otherwise."""
 
@@ -70,15 +70,10 @@ def scale_of(of: dict[str, Any], height: int, width: int, most: float) -> float:
     return min(height / of["image"].shape[-2], width / of["image"].shape[-1], most)
 
 
-def pair(before: dict[str, Any], after: dict[str, Any]) -> Image.Image:
-    """Before on the left, after on the right, in one scale where they fit."""
-    height, width = TILE
-    scale = scale_of(before, height, width, 9)
-    tiles = [marked(before, scale), marked(after, scale_of(after, height, width, scale))]
-    sheet = Image.new("RGB", (WIDTH, max(tile.height for tile in tiles) + 2 * GAP), PAPER)
-    for i, tile in enumerate(tiles):
-        put(sheet, tile, GAP + i * (width + GAP) + (width - tile.width) // 2, (sheet.height - tile.height) // 2)
-    return sheet
+def in_one_scale(before: dict[str, Any], after: dict[str, Any]) -> tuple[Image.Image, Image.Image]:
+    """Before and after, in one scale where they fit."""
+    scale = scale_of(before, *TILE, 9)
+    return marked(before, scale), marked(after, scale_of(after, *TILE, scale))
 
 
 def several(before: dict[str, Any], after: dict[str, dict[str, Any]]) -> Image.Image:
@@ -97,12 +92,6 @@ def several(before: dict[str, Any], after: dict[str, dict[str, Any]]) -> Image.I
     return sheet
 
 
-def put(sheet: Image.Image, tile: Image.Image, left: int, top: int) -> None:
-    """An image with a rim."""
-    sheet.paste(tile, (left, top))
-    ImageDraw.Draw(sheet).rectangle((left - 1, top - 1, left + tile.width, top + tile.height), outline=RIM)
-
-
 def main(names: list[str]) -> None:
     """Make the pictures of all augmentations, or of some by the names of their files."""
     folder = IMAGES / "augment"
@@ -118,7 +107,7 @@ def main(names: list[str]) -> None:
         exec(code(text), made)
         torch.manual_seed(SEEDS.get(file[1], 1))
         if "augment" in made:
-            sheet = pair(before, made["augment"](before))
+            sheet = pair(*in_one_scale(before, made["augment"](before)))
         else:
             views = {name: augment(before) for name, augment in made["augments"].items()}
             sheet = several(before, views)

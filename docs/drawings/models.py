@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import math
 
 import matplotlib
-
-matplotlib.use("agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -20,10 +16,11 @@ from camtorch.demo import room
 from camtorch.plot.axes import COLOURS, GREY, INK, NO_RAYS
 from camtorch.projection.rays import followed, image_lattice
 from drawings.pages import IMAGES, code, sections
+from drawings.sheets import GAP, WIDTH, drawn
+from drawings.svg import PAPER, RIM
 
-PAPER, RIM = "#faf5eb", "#d6cab6"
-WIDTH, PANEL, STRIP, GAP = 960, (348, 460), 300, 13
-"""Pixels: of a picture, of its upper panels (height, width), of its lower one, around them."""
+PANEL, STRIP = (348, 460), 300
+"""Pixels: of the upper panels (height, width), of the lower one."""
 CELLS = 8  # of a face of the cube, along each side
 FACES = {2: (COLOURS[0], COLOURS[1]), 0: (COLOURS[2], COLOURS[2]), 1: (COLOURS[3], COLOURS[3])}
 """Axis: colours of the face at +1 and of that at -1."""
@@ -173,14 +170,6 @@ def picture(camera: ct.Camera) -> Image.Image:
     sheet = drawn(figure)
     sheet.paste(room_image(small), (GAP + (width - small.width) // 2, top))
     return sheet
-
-
-def drawn(figure: plt.Figure) -> Image.Image:
-    """A figure as an image; it is closed."""
-    file = io.BytesIO()
-    figure.savefig(file, dpi=figure.dpi)
-    plt.close(figure)
-    return Image.open(file).convert("RGB")
 
 
 def overview(made: dict[str, ct.Camera]) -> Image.Image:

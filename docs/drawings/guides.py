@@ -1,0 +1,286 @@
+"""The pictures of the guides."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from photographs import fisheye, photograph
+from PIL import Image, ImageDraw
+
+import camtorch as ct
+from camtorch._drawing import INK, PAPER
+from camtorch.calibration.boards import Chessboard
+from camtorch.cli.labelled_image import LabelledImage, rendered
+from camtorch.cli.labels import Labels
+from camtorch.cli.sheet import marked
+from camtorch.demo import room
+from camtorch.demo.example import driver
+from camtorch.demo.exposure import expose
+from camtorch.rotations import mount_rotation
+from drawings.pages import IMAGES
+from drawings.sheets import drawn, in_rows, tiles
+
+SEED = 4
+PAGE = [value / 255 for value in PAPER]  # as matplotlib has colours
+
+
+def moved(before: LabelledImage, warp: ct.Warp) -> LabelledImage:
+    """An image with its labels, warped."""
+    labels = before.labels
+    keypoints, keypoints_valid = warp.transform_points(labels.keypoints)
+    boxes, boxes_valid = warp.transform_boxes(labels.boxes)
+    new = Labels(keypoints, boxes, warp.transform_rays(labels.eyes), warp.transform_rays(labels.gaze))
+    return LabelledImage(warp(before.image[None])[0], warp.target, new, [], keypoints_valid, boxes_valid)
+
+
+def overview(columns: int = 4) -> Image.Image:
+    """A fisheye image, dewarped, and as other cameras would have seen it."""
+    lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
+    fisheye = rendered(driver(lens.double().requires_grad_(False)))
+    straight = moved(fisheye, ct.Dewarp(fisheye.camera, fov=1.75, image_size=(480, 640)))
+    mount = {"yaw": 12, "pitch": 8, "roll": 20}
+    new = ct.augment.RandomCamera("dms90", **mount, fov="source", min_filled=0.98, image_size=(480, 640))
+    sample = {"keypoints": fisheye.labels.keypoints.expand(2, -1, -1), "camera": fisheye.camera}
+    sample = new(sample, draw=new.draw(2, torch.Generator().manual_seed(SEED)))
+    warps = [ct.Warp(fisheye.camera, c, r) for c, r in zip(sample["camera"], sample["rotation"], strict=True)]
+    others = [moved(fisheye, warp) for warp in warps]
+    panels = [
+        (fisheye, "a fisheye of 170 degrees"),
+        (straight, "dewarped"),
+        *((other, "another lens and mount") for other in others),
+    ]
+    return labelled(panels, columns)
+
+
+def labelled(panels: list[tuple[LabelledImage, str]], columns: int) -> Image.Image:
+    """Images with their labels, small, and titles."""
+    return in_rows([(marked(view, 300, 400), title) for view, title in panels], columns)
+
+
+def lenses() -> Image.Image:
+    """One fisheye image as lenses that exist would have seen it."""
+    source = ct.KannalaBrandt.from_fov(200, image_size=(900, 1200)).requires_grad_(False)
+    image, panels = room.render(source, samples=4)[None], []
+    names = "Laowa 7.5mm Panasonic G7", "GoPro HERO9 wide", "DJI Osmo Action", "Sony ZV-E10 16mm", "iPhone 13 pro"
+    for name in (*names, "Pixel 6"):
+        camera = ct.lenses.find(name, image_size=(1080, 1920)).float().resize(225, 400)
+        degrees = float(camera.field_of_view[0].rad2deg())
+        panels.append((ct.Warp(source, camera, antialias=True)(image)[0], f"{name}: {degrees:.0f} degrees"))
+    return tiles(panels, 3)
+
+
+def shutters() -> Image.Image:
+    """An image as a rolling shutter takes it while the camera turns, that undone, and the blur of an exposure."""
+    source = ct.KannalaBrandt.from_fov(130, image_size=(300, 400)).requires_grad_(False)
+    rates = torch.tensor([1.0, -5.0, 4.0])
+    times = 0.03 * ((torch.arange(300) + 0.5) / 300 - 0.5)
+    x, y, z = rates.tolist()
+    turns = torch.linalg.matrix_exp(times[:, None, None] * torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    rolled = expose(source, lambda rays: room.radiance((turns[:, None] @ rays[..., None])[..., 0]), samples=8)
+    straight = ct.Pinhole.from_fov(95, image_size=(300, 400)).requires_grad_(False)
+    shutter = ct.RollingShutter(0.03, rates)
+    blur = ct.RollingShutter(0.0, rates, exposure=0.01, gamma=2.2, samples=24)
+    still = room.render(source, samples=8)
+    panels = [
+        (rolled, "rows rendered one by one, turning"),
+        (ct.Warp(source, straight)(rolled[None])[0], "lens undone"),
+        (ct.Warp(source, straight, shutter=shutter)(rolled[None])[0], "lens and shutter undone"),
+        (ct.Warp(source, straight, target_shutter=blur)(still[None])[0], "an exposure put on"),
+    ]
+    return tiles(panels, 4)
+
+
+def mounted(pitch: float, roll: float) -> torch.Tensor:
+    """(3, 3) camera from room, of a camera that looks up by `pitch` and leans right by `roll` degrees."""
+    return mount_rotation(*(torch.tensor(float(angle), dtype=torch.float64) for angle in (0, pitch, roll)))
+
+
+def fields() -> Image.Image:
+    """Latitude and up over images of a room, by cameras that hang in it differently."""
+    size = (480, 640)
+    lens = ct.KannalaBrandt.from_fov(170, image_size=size, distortion=[0.02, -0.01, 0.003, -0.001]).double()
+    narrow = ct.Pinhole.from_fov(80, image_size=size).double()
+    panels = [
+        (narrow, (0, 0), "a pinhole camera, level"),
+        (narrow, (-12, 14), "looking down, leaning"),
+        (lens, (-12, 14), "a fisheye of 170 degrees, likewise"),
+    ]
+    found = []
+    for camera, (pitch, roll), title in panels:
+        turned = mounted(pitch, roll)
+        image = (room.render(camera, turned, samples=3) * 255).byte().permute(1, 2, 0).numpy()
+        tile = Image.fromarray((0.45 * image + 0.55 * 255).astype("uint8"))
+        down = turned[:, 1]  # y of the room
+        latitude, _, valid = camera.perspective_field(down)
+        bands = (latitude.rad2deg() / 15).floor()
+        edge = torch.zeros_like(valid)
+        edge[1:, 1:] = (bands[1:, 1:] != bands[:-1, 1:]) | (bands[1:, 1:] != bands[1:, :-1])
+        horizon = edge & (latitude.abs() < 0.02)
+        draw = ImageDraw.Draw(tile)
+        for where, colour in ((edge & valid, (60, 110, 180)), (horizon & valid, (200, 60, 50))):
+            for v, u in where.nonzero().tolist():
+                draw.rectangle((u - 1, v - 1, u, v), colour)
+        _, up, seen = camera.perspective_field(down, stride=40)
+        for (u, v), (x, y), shown in zip(
+            camera.pixel_grid(40).flatten(0, 1).tolist(),
+            up.flatten(0, 1).tolist(),
+            seen.flatten().tolist(),
+            strict=True,
+        ):
+            if shown:
+                draw.line((u, v, u + 18 * x, v + 18 * y), INK, 2)
+                draw.ellipse((u - 3, v - 3, u + 3, v + 3), INK)
+        found.append((tile.resize((320, 240), Image.Resampling.LANCZOS), title))
+    return in_rows(found, len(found))
+
+
+def edits() -> Image.Image:
+    """Edits of a fisheye image, and a chain of them with another lens."""
+    augment = ct.augment
+    lens = ct.KannalaBrandt.from_fov(130, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
+    before = rendered(driver(lens.double().requires_grad_(False)))
+    crop, flip = augment.RandomResizedCrop((480, 640), scale=(0.5, 0.5)), augment.HorizontalFlip(p=1.0)
+    whole = augment.RandomResizedCrop((480, 640), scale=(0.85, 0.85))
+    other = augment.RandomCamera("dms130", fov="source", min_filled=0.97, yaw=4, pitch=4, roll=(18, 18), crop=None)
+    chain = augment.Compose([whole, flip, other])
+    named = {
+        "RandomResizedCrop": crop,
+        "HorizontalFlip": flip,
+        "Rotate90": augment.Rotate90(1),
+        "Pad": augment.Pad(size=(640, 640), fill=210),
+        "crop, flip, another lens and mount: one warp": chain,
+    }
+    panels = [(before, "an image with its labels")]
+    for title, edit in named.items():
+        torch.manual_seed(SEED)
+        labels = before.labels
+        given = {"keypoints": labels.keypoints, "boxes": labels.boxes, "points": labels.eyes, "gaze": labels.gaze}
+        out = edit(image=before.image, camera=before.camera, **given)
+        moved_labels = Labels(out["keypoints"], out["boxes"], out["points"], out["gaze"])
+        flags = out["keypoints_valid"], out["boxes_valid"]
+        panels.append((LabelledImage(out["image"], out["camera"], moved_labels, [], *flags), title))
+    return labelled(panels, 3)
+
+
+def maps() -> Image.Image:
+    """What meshes of a fisheye are off by: on the source, and over the target."""
+    lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
+    fisheye = rendered(driver(lens.double().requires_grad_(False)))
+    warp = ct.Dewarp(fisheye.camera, projection="cylindrical", fov=2.9, image_size=(480, 640))
+    images = [image[0].permute(1, 2, 0) for image in (fisheye.image[None], warp(fisheye.image[None]))]
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/map.bin"
+        found = []
+        for format, title in (("dw100", "DW100: every 16 px, in 1/16 px"), ("ti_ldc", "TI LDC: every 8 px, in 1/8 px")):
+            report = warp.save(path, format)
+            found.append(
+                (
+                    f"{title}\n{report.max_error:.2f} px at most, rms {report.rms_error:.2f}",
+                    ct.load_map(path).error(warp),
+                )
+            )
+        warp.save(path, "depthai")
+        mesh = ct.load_map(path).positions
+    figure, axes = plt.subplots(1, 4, figsize=(16.4, 3.9), facecolor=PAGE, layout="constrained")
+    for axis, image, title in zip(axes, images, ("a fisheye, and a mesh of every 16 px", "dewarped"), strict=False):
+        axis.imshow(image)
+        axis.set_title(title)
+    for lines, ends in ((mesh[::16], mesh.shape[1]), (mesh[:, ::16].transpose(0, 1), mesh.shape[0])):
+        for line in lines[:, :ends]:
+            axes[0].plot(*line.T, color="white", linewidth=0.5)
+    most = max(float(error.nan_to_num(0).max()) for _, error in found)
+    for axis, (title, error) in zip(axes[2:], found, strict=True):
+        shown = axis.imshow(error, cmap="magma", vmin=0, vmax=most)
+        axis.set_title(title)
+    figure.colorbar(shown, ax=axes[2:], label="px of the source", pad=0.01)
+    for axis in axes:
+        axis.set(xticks=[], yticks=[], xlim=(-0.5, 639.5), ylim=(479.5, -0.5))
+    return drawn(figure, bbox_inches="tight")
+
+
+def dewarp() -> Image.Image:
+    """A fisheye image of a room, and what `ct.Dewarp` makes of it."""
+    lens = ct.KannalaBrandt.from_fov(190, image_size=(600, 800), distortion=[0.02, -0.01, 0.003, -0.001])
+    lens = lens.requires_grad_(False)
+    image = room.render(lens, samples=4)[None]
+    size = (300, 400)
+    options = {"image_size": size, "antialias": True}
+    warps = {
+        "a fisheye of 190 degrees": ct.Warp(lens, lens.resize(*size), antialias=True),
+        "perspective, 100 degrees": ct.Dewarp(lens, fov=1.75, **options),
+        "cylindrical, 180 degrees": ct.Dewarp(lens, projection="cylindrical", fov=3.14, **options),
+        "equirectangular": ct.Dewarp(lens, projection="equirectangular", **options),
+    }
+    return tiles([(warp(image)[0], title) for title, warp in warps.items()], 2)
+
+
+def calibration() -> Image.Image:
+    """Photographs of a board with the corners that were found, and how far projections are known."""
+    board, lens = Chessboard(9, 6, 0.024), fisheye()
+    poses = [
+        ((0.5 * np.cos(a), 0.5 * np.sin(a), 0.1), (0.12 * np.sin(a) - 0.1, 0.08 * np.cos(a) - 0.07, 0.18 + 0.01 * a))
+        for a in np.linspace(0, 6, 12)
+    ]
+    views = [photograph(board, lens, *pose, seed=i) for i, pose in enumerate(poses)]
+    found = [cv2.findChessboardCornersSB(image, (9, 6))[1] for image, _ in views]
+    seen = [np.full((54, 2), np.nan) if corners is None else corners.reshape(54, 2) for corners in found]
+    result = ct.calibrate("kannala_brandt", board.points(), seen, image_size=(480, 640))
+    figure, axes = plt.subplots(2, 2, figsize=(8.3, 6.6), facecolor=PAGE, layout="constrained")
+    for axis, i in zip(axes.flat, (1, 6, 11), strict=False):
+        axis.imshow(views[i][0], cmap="gray", vmin=0, vmax=255)
+        axis.plot(*seen[i].T, "o", color="#e0245e", markersize=3.5)
+        axis.set(xticks=[], yticks=[], title=f"photograph {i}, and its corners")
+    ct.plot.uncertainty(result, axes[1, 1])
+    axes[1, 1].set_title("how far projections are known")
+    return drawn(figure)
+
+
+def learn() -> Image.Image:
+    """A camera that learns from rays and pixels: the image that it dewarps, while it does."""
+    truth = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
+    image = room.render(truth.requires_grad_(False), samples=4)[None]
+    points, _ = truth.unproject(truth.pixel_grid(40).reshape(-1, 2))
+    wanted = truth.pixel_grid(40).reshape(-1, 2)
+    camera = ct.KannalaBrandt([260.0, 260.0, 290.0, 255.0], image_size=(480, 640))
+    groups = [{"params": [camera.intrinsics], "lr": 1.0}, {"params": [camera.distortion], "lr": 0.002}]
+    optimizer = torch.optim.Adam(groups)
+    target = ct.Pinhole.from_fov(100, image_size=(300, 400)).requires_grad_(False)
+    panels = [(ct.Warp(truth, truth.resize(300, 400), antialias=True)(image)[0], "a fisheye of 170 degrees")]
+    for step in range(301):
+        pixels, valid = camera(points)
+        loss = (pixels - wanted)[valid].square().sum(-1).mean()
+        if step in (0, 20, 300):
+            with torch.no_grad():
+                straight = ct.Warp(camera, target, antialias=True)(image)[0]
+            panels.append((straight, f"dewarped after {step} steps: {loss.sqrt():.1f} px"))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return tiles(panels, 2)
+
+
+PICTURES = {
+    "overview": overview,
+    "overview-phone": functools.partial(overview, 2),
+    "dewarp": dewarp,
+    "lenses": lenses,
+    "shutter": shutters,
+    "edits": edits,
+    "fields": fields,
+    "learn": learn,
+    "calibration": calibration,
+    "maps": maps,
+}
+"""Name of the file -> what draws it."""
+
+
+def main(names: list[str]) -> None:
+    """Make all of them, or those that are named."""
+    for name, draw in PICTURES.items():
+        if not names or name in names:
+            draw().save(IMAGES / f"{name}.jpg", quality=82, optimize=True)
