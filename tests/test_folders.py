@@ -213,6 +213,8 @@ def refused_suffix(capsys, suffix):
     ("words", "text"),
     [
         (["dewarp", "in", "--camera", "camera.yml"], "into which folder? -o OUT/"),
+        (["dewarp", "in/1.png", "camera.yml"], "camera.yml: a calibration, not an image; --camera camera.yml names it"),
+        (["dewarp", "in", "camera.yml", "-o", "o.png"], "--camera camera.yml names it"),
         (["dewarp", "in", "none", "--camera", "camera.yml", "-o", "out"], "none: no such file or folder"),
         (["dewarp", "in", "--camera", "camera.yml", "-o", "camera.yml"], "camera.yml: is no folder"),
         (["dewarp", "in", "-o", "out"], "which camera took it? --camera FILE"),

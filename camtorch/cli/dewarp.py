@@ -6,6 +6,7 @@ import argparse
 import glob
 import math
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -184,8 +185,9 @@ def _many(arguments: argparse.Namespace) -> int:
     from camtorch.jobs import inputs, items
     from camtorch.jobs.manifest import Manifest
 
-    output, shard = many.output_folder(arguments.output), items.Shard.of_environment()
     known = inputs.IMAGES | set(videos.FORMATS)
+    _check_no_calibration(arguments, known)
+    output, shard = many.output_folder(arguments.output), items.Shard.of_environment()
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
         raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
     found = inputs.find(arguments.image, known, output)
@@ -210,6 +212,24 @@ def _many(arguments: argparse.Namespace) -> int:
         units="frames" if any(item.size != 1 for item in mine) else "images",
         told=told,
     )[0]
+
+
+def _check_no_calibration(arguments: argparse.Namespace, known: Collection[str]) -> None:
+    """Who names a calibration without an option means it for --camera.
+
+    Raises:
+        ValueError: a file among the inputs is one.
+    """
+    from camtorch.io import CameraFileError, load
+
+    for word in arguments.image:
+        if not os.path.isfile(word) or Path(word).suffix.lower() in known:
+            continue
+        try:
+            load(word)
+        except (CameraFileError, OSError):
+            continue
+        raise ValueError(f"{word}: a calibration, not an image; --camera {word} names it")
 
 
 def _item(found: Any, output: Path, suffix: str | None) -> Item:
