@@ -117,6 +117,13 @@ def test_cameras_and_draws(camera):
         mount(keypoints=points, camera=camera, draw={**mount.draw(2), "yaw": torch.zeros(2, 1)})
     with pytest.raises(ValueError, match="nothing to invert; call it first"):
         mount.inverse(keypoints=points)
+    zooming = RandomMount(zoom=(1, 2))
+    samples = [zooming(keypoints=points, camera=camera) for _ in range(2)]
+    zooming.inverse(samples[1])
+    with pytest.raises(
+        ValueError, match=r"Pinhole\(.*is not the one that this change made: the sample is of another call"
+    ):
+        zooming.inverse(samples[0])
     half = RandomMount(p=0.5, image_size=(15, 20))
     draw = {**half.draw(2), "apply": torch.tensor([True, False])}
     with pytest.raises(ValueError, match="with p < 1 the image_size must be that of the images"):

@@ -121,4 +121,6 @@ def test_the_door():
         plot.difference(fisheye(), fisheye(image_size=(10, 10)))
     with pytest.raises(ValueError, match="1 cameras, and labels for 2"):
         plot.radius_curve(fisheye(), labels=["a", "b"])
+    with pytest.raises(TypeError, match=r"ax must be Axes of matplotlib; got KannalaBrandt. Several cameras are one"):
+        plot.radius_curve(fisheye(), fisheye())
     matplotlib.pyplot.close("all")

@@ -491,11 +491,19 @@ class Augmentation(SampleTransform):
         """Move a sample back: by the last call's change, or by that of a `draw` and the `camera` before it.
 
         What left the image stays lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
+
+        Raises:
+            ValueError: nothing was called, or the sample's camera is not the one that the change made.
         """
         sample = self._given(sample, fields)
         change = self.last if draw is None else self.change(camera, draw)
         if change is None:
             raise ValueError(f"{self._name}: nothing to invert; call it first, or give draw= and camera=")
+        if "camera" in sample and not change.leads_to(sample["camera"]):
+            raise ValueError(
+                f"{self._name}: the sample's camera {sample['camera']!r:.60} is not the one that this change made: "
+                "the sample is of another call, whose draw= and the camera= before it are wanted"
+            )
         change = change.inverse()
         named, batched, count, _ = self._batch({**sample, "camera": change.source})
         if count != change.count:

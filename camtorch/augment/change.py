@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._tracing import may_look
+from camtorch._tracing import is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, held, kind, remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
@@ -18,6 +18,7 @@ from camtorch.warp.sampling import Mode, Options, narrow, widen
 from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
 
+_ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
 Moved = TypeVar("Moved", Tensor, tuple[Tensor, Tensor])
 
 
@@ -124,6 +125,12 @@ def _both_turns(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     return (second.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
 
 
+def _intrinsics(cameras: Camera | Sequence[Camera]) -> Tensor:
+    """(n, 4), of all of them."""
+    rows = [cameras] if isinstance(cameras, Camera) else cameras
+    return torch.cat([camera.intrinsics.detach().reshape(-1, 4) for camera in rows])
+
+
 class Change:
     """What a draw does to a batch of `count` samples; made by an augmentation's `change`.
 
@@ -172,6 +179,13 @@ class Change:
                 _chosen(gate, camera, part.camera) for gate, camera, part in zip(gates, after, self.parts, strict=True)
             ]
         return self._cameras(after)
+
+    def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
+        """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
+        ours, theirs = (_intrinsics(cameras).cpu() for cameras in (self.target, camera))
+        if not (is_concrete(ours) and is_concrete(theirs)):
+            return True
+        return ours.shape == theirs.shape and torch.allclose(ours.double(), theirs.double(), rtol=_ROUNDED)
 
     def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
         counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]

@@ -35,8 +35,16 @@ def require_matplotlib() -> None:
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
-    """The Axes, or new ones in a figure of their own."""
+    """The Axes, or new ones in a figure of their own.
+
+    Raises:
+        TypeError: something else.
+    """
     if ax is not None:
+        if not hasattr(ax, "get_figure"):
+            raise TypeError(
+                f"plot: ax must be Axes of matplotlib; got {type(ax).__name__}. Several cameras are one list, [a, b]"
+            )
         return ax
     require_matplotlib()
     from matplotlib import pyplot  # which chooses how figures are shown: not before it has to
