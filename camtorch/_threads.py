@@ -16,13 +16,10 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
+from camtorch._tracing import is_tracing
+
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-def is_tracing() -> bool:
-    """Whether torch.compile or torch.jit.trace is at work."""
-    return torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
 
 
 def spread(work: Callable[[], object], threads: int) -> None:

@@ -64,12 +64,21 @@ def in_memory(tensor: Tensor) -> bool:
 
 def is_recorded() -> bool:
     """Whether torch's operators are recorded, or a mode changes what they do: what goes past them would be lost."""
+    return _in_jit_trace() or torch._C._len_torch_dispatch_stack() > 0
+
+
+def is_tracing() -> bool:
+    """Whether torch.compile or torch.jit.trace is at work."""
+    return torch.compiler.is_compiling() or _in_jit_trace()
+
+
+def _in_jit_trace() -> bool:
     tracing: bool = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return tracing or torch._C._len_torch_dispatch_stack() > 0
+    return tracing
 
 
-is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
-"""Whether what is traced shall run elsewhere, where there are no operators of our own. Newer than torch 2.6."""
+is_exporting = torch.compiler.is_exporting
+"""Whether what is traced shall run elsewhere, where there are no operators of our own."""
 
 
 def is_for_here() -> bool:

@@ -48,11 +48,6 @@ class Model:
         """Of all parameters."""
         return (*INTRINSICS, *(self.kind.names_of(self.count) or ()))
 
-    @property
-    def is_fixed(self) -> bool:
-        """Whether nothing of it learns."""
-        return not bool(self.free.any())
-
 
 def as_model(
     model: type[Camera] | str | Camera,
