@@ -11,6 +11,8 @@ from torch import Tensor
 from camtorch._arguments import Numbers, as_batch, as_coordinates, as_values, as_whole, broadcast_shapes, shown
 from camtorch.camera import Camera
 
+__all__ = ["angles", "rays", "reprojection"]
+
 
 def angles(first: Tensor, second: Tensor) -> Tensor:
     """(...) radians between directions (..., 3), from 0 to pi; exact to rounding for the smallest and the largest.
