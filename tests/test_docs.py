@@ -56,7 +56,9 @@ def photographs():
 def write_corners():
     """Of OpenCV's photographs."""
     left, _ = opencv_left()
-    np.savez("corners.npz", object_points=left.object_points, image_points=left.image_points)
+    unseen = np.full_like(left.image_points[:1], np.nan)  # as an image in which no board was found
+    seen = np.concatenate([left.image_points[:2], unseen, left.image_points[2:]])
+    np.savez("corners.npz", object_points=left.object_points, image_points=seen)
 
 
 def write_calibration_data():
@@ -112,6 +114,7 @@ def folder(tmp_path, monkeypatch, request):
 
 
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # torch's own, in torch.onnx.export
+@pytest.mark.filterwarnings("ignore:.*nothing was seen in view 2:UserWarning")  # which is so in corners.npz
 # Python 3.12 and later warn of forks beside threads, ray of itself; webdataset leaves its files to the collector
 @pytest.mark.filterwarnings(
     "ignore:.*fork.*:DeprecationWarning", "ignore::DeprecationWarning:ray", "ignore:unclosed file:ResourceWarning"
