@@ -5,6 +5,7 @@ reaches it.
 """
 
 import ast
+import builtins
 import importlib.abc
 import importlib.machinery
 import json
@@ -123,7 +124,7 @@ class Recorder:
         if gathers:
             file.unlink(missing_ok=True)
         assert "camtorch" not in sys.modules
-        setattr(__import__("builtins"), _RECORD, self.record)
+        setattr(builtins, _RECORD, self.record)
         sys.meta_path.insert(0, _Finder())
 
     def record(self, said: object) -> object:

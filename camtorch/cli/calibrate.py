@@ -15,6 +15,7 @@ from camtorch.cli.terminal import note, progress
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from camtorch.calibration.boards import Board
@@ -398,9 +399,12 @@ def _write(
     arguments.report.parent.mkdir(parents=True, exist_ok=True)
 
     paths = [image.path for of_view in views.values() for image in of_view.values()]
-    there: dict[Path, Any] = {**{path: path for path in paths if path.exists()}, **frames.read(paths)}
+    there: dict[Path, Path | NDArray[np.uint8]] = {
+        **{path: path for path in paths if path.exists()},
+        **frames.read(paths),
+    }
 
-    def images_of(name: str) -> list[Any]:
+    def images_of(name: str) -> list[Path | NDArray[np.uint8] | None]:
         images = (of_view.get(name) for of_view in views.values())
         return [None if image is None else there.get(image.path) for image in images]
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,7 +44,7 @@ class Drivers:
     def __len__(self) -> int:
         return len(self.pose)
 
-    def __getitem__(self, index: Any) -> Drivers:
+    def __getitem__(self, index: Tensor | slice | int) -> Drivers:
         index = slice(index, index + 1 or None) if isinstance(index, int) else index
         return Drivers(self.pose[index], self.gaze[index], self.looks[index])
 

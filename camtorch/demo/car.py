@@ -6,7 +6,6 @@ Convention: that of `cabin`; positions and rays are planes (x, y, z) of N values
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,7 +43,9 @@ BOXES = (
 MOVING = 3
 
 
-def slabs(origin: Sequence[Any], ray: Planes, low: Sequence[Any], high: Sequence[Any]) -> tuple[Tensor, Tensor]:
+def slabs(
+    origin: Sequence[Tensor | float], ray: Planes, low: Sequence[Tensor | float], high: Sequence[Tensor | float]
+) -> tuple[Tensor, Tensor]:
     """Distances at which rays enter (0 if they start inside) and leave a box."""
     near, far = torch.zeros(()), torch.tensor(torch.inf)
     for o, r, a, b in zip(origin, ray, low, high, strict=True):
@@ -53,7 +54,7 @@ def slabs(origin: Sequence[Any], ray: Planes, low: Sequence[Any], high: Sequence
     return near, far
 
 
-def cushion(p: Planes, half: Sequence[Any], round_: float) -> tuple[Tensor, Tensor]:
+def cushion(p: Planes, half: Sequence[Tensor | float], round_: float) -> tuple[Tensor, Tensor]:
     """The distance to a box with round edges, and (3, N) the way to it."""
     out = torch.stack([c.abs() - h + round_ for c, h in zip(p, half, strict=True)])
     gap = out.clamp(min=0)

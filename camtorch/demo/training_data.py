@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -75,7 +75,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.image)
 
-    def __getitem__(self, index: Any) -> Samples:
+    def __getitem__(self, index: Tensor | slice | int) -> Samples:
         return Samples(*(value[index] for value in vars(self).values()))
 
     @staticmethod
