@@ -6,7 +6,7 @@ import math
 import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 import torch
@@ -147,10 +147,9 @@ def as_flag(value: Any, name: str, owner: str) -> bool:
     Raises:
         TypeError: neither, as "False" is.
     """
-    if value is True or value is False:
-        return value
-    if isinstance(value, (int, np.bool_)) and value in (0, 1):
-        return bool(value)
+    plain = value.item() if isinstance(value, (Tensor, np.ndarray, np.generic)) and not value.ndim else value
+    if isinstance(plain, int) and plain in (0, 1):
+        return bool(plain)
     raise TypeError(f"{owner}: {name} must be True or False; got {shown(value)}")
 
 
@@ -181,16 +180,23 @@ def as_part(value: Any, name: str, owner: str, kind: str = "part") -> float:
 
 
 def as_mapping(value: Any, name: str, owner: str, form: str) -> Mapping[Any, Any]:
-    """A mapping, an empty one of None.
+    """A mapping, or what torch has instead of one; an empty one of None.
 
     Raises:
         TypeError: it is none.
     """
     if value is None:
         return {}
+    if isinstance(value, (nn.ModuleDict, nn.ParameterDict)):
+        return dict(value.items())
     if not isinstance(value, Mapping):
         raise TypeError(f"{owner}: {name} must be a dict, as {form}; got {shown(value)}")
     return value
+
+
+def is_list(value: object) -> TypeGuard[Sequence[Any]]:
+    """Whether it is a list, a tuple, or another sequence, as files of options have them; no text."""
+    return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
 def check_path(path: Any, owner: str) -> None:

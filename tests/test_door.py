@@ -1,6 +1,7 @@
 """Bad input is refused at the door: the message names the argument and shows what was passed."""
 
 import re
+from collections import UserList
 
 import numpy as np
 import pytest
@@ -217,3 +218,49 @@ def test_general_kannala_brandt():
         make_general(INTRINSICS, "1 2")
     with refuses(ValueError, "intrinsics", "(3,)"):
         make_general([1.0, 2.0, 3.0], [1.0, 0.1])
+
+
+# -- what is not refused
+
+
+@pytest.mark.parametrize("yes", [1, np.bool_(True), np.int64(1), np.array(True), torch.tensor(True), torch.tensor(1)])
+def test_flags_may_be_those_of_numpy_and_torch(yes):
+    assert ct.augment.HorizontalFlip(same_on_batch=yes).same_on_batch is True
+    assert ct.augment.HorizontalFlip(same_on_batch=yes ^ yes).same_on_batch is False
+
+
+@pytest.mark.parametrize("no", ["False", 2, 1.0, None, torch.tensor([True])])
+def test_what_is_no_flag(no):
+    with refuses(TypeError, "same_on_batch must be True or False"):
+        ct.augment.HorizontalFlip(same_on_batch=no)
+
+
+class Options(UserList):
+    """A list of files of options, which is none of Python's."""
+
+
+def test_sequences_and_mappings_need_not_be_python_s():
+    left, right = (ct.MODELS[key].from_fov(90, image_size=(12, 16)).requires_grad_(False) for key in ("pinhole", "ucm"))
+    rig = ct.Rig(torch.nn.ModuleDict({"left": left, "right": right}))
+    assert list(rig.cameras) == ["left", "right"]
+    assert rig.cameras["right"] is right
+    batch = ct.augment.collate(Options([{"image": torch.ones(3)}, {"image": torch.zeros(3)}]))
+    assert batch["image"].tolist() == [[1.0] * 3, [0.0] * 3]
+    with refuses(TypeError, "collate: samples must be a list"):
+        ct.augment.collate("samples")
+    moves = ct.data.MapBatches(ct.augment.RandomCamera("webcam", camera=left), key=Options(["path"]))
+    image = np.zeros((1, *left.image_size, 3), np.uint8)
+    assert moves({"image": image, "path": np.array(["a"])})["image"].shape == image.shape
+
+
+def test_images_of_a_surround_may_be_stacked():
+    camera = ct.Pinhole.from_fov(90, image_size=(12, 16)).requires_grad_(False)
+    poses = [ct.Extrinsics.from_matrix(torch.eye(4)) for _ in range(2)]
+    rig = ct.Rig({"a": camera, "b": camera}, dict(zip("ab", poses, strict=True)))
+    surround = ct.surround(rig, ct.Pinhole.from_fov(60, image_size=(8, 8)))
+    images = torch.rand(2, 1, 3, 12, 16)
+    (stacked, _), (listed, _) = surround(images), surround(list(images))
+    assert stacked.equal(listed)
+    assert surround(Options(images))[0].equal(listed)
+    with refuses(TypeError, "Surround: images must be tensors"):
+        surround(images[:, 0])

@@ -195,6 +195,15 @@ def test_depth_and_disparity_ranges():
     assert found.disparity_range(0.5) == pytest.approx((0.0, focal * 0.1 / 0.5))
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64, torch.int64])
+def test_disparities_keep_the_dtype_of_points(dtype):
+    camera, pose = ct.Pinhole.from_fov(90, image_size=(100, 100)), ct.Extrinsics([0.0] * 3, [-0.1, 0.0, 0.0])
+    disparity, valid = ct.rectify(camera, camera, pose, fov=1.5).disparity(torch.tensor([0, 0, 2], dtype=dtype))
+    assert disparity.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
+    assert valid
+    assert disparity.item() > 1
+
+
 def test_disparities_of_no_sense_are_invalid():
     found = fisheyes(image_size=(4, 5))
     disparity = torch.tensor([1.0, 0.0, -1.0, math.nan, math.inf]).double().expand(4, 5).contiguous()

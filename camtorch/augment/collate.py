@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from camtorch._arguments import is_list
 from camtorch.augment.change import expanded, joined
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, kind
@@ -27,7 +28,7 @@ def collate(samples: Sequence[object]) -> object:
     Raises:
         TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list.
     """
-    if not isinstance(samples, (list, tuple)):
+    if not is_list(samples):
         raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
     if not samples:
         raise ValueError("collate: samples must not be empty; got an empty list")

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from camtorch._arguments import shown
+from camtorch._arguments import is_list, shown
 from camtorch.augment.sample import IMAGES, Sample
 from camtorch.camera import Camera
 from camtorch.data.columns import PARTS, to_columns
@@ -65,8 +65,8 @@ class MapBatches:
         fields: Mapping[str, str] | None = None,
     ):
         self._move = Mover(transform, _OWNER, seed, epoch, fields)
-        self._keys = [key] if isinstance(key, str) else list(key) if isinstance(key, (list, tuple)) else []
-        if not (key is None or isinstance(key, (str, list, tuple))) or not all(isinstance(k, str) for k in self._keys):
+        self._keys = [key] if isinstance(key, str) else list(key) if is_list(key) else []
+        if not (key is None or isinstance(key, str) or is_list(key)) or not all(isinstance(k, str) for k in self._keys):
             raise TypeError(f"{_OWNER}: key must be the name of a column, or several in a list; got {shown(key)}")
         if self._move.draws and not self._keys:
             raise ValueError(

@@ -240,8 +240,8 @@ class Rectification(GeometryModule):
 
     def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The disparity of points (*B, *N, 3) of the frame of the rectified left camera, and whether both see them."""
-        baseline = self.baseline
-        points, _ = as_points(points, "points", 3, baseline.shape, (baseline,), "Rectification.disparity")
+        numbers, baseline = self.camera_left.intrinsics, self.baseline  # float64, which points need not become
+        points, _ = as_points(points, "points", 3, baseline.shape, (numbers,), "Rectification.disparity")
         baseline = baseline.to(points.dtype)
         axis = 1 if self.vertical else 0
         shift = torch.nn.functional.one_hot(torch.tensor(axis, device=points.device), 3).to(points.dtype)

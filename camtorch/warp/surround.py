@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
-from camtorch._arguments import as_number
+from camtorch._arguments import as_number, is_list
 from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -106,7 +106,8 @@ class Surround(GeometryModule):
         """The blended images, and where some camera sees something.
 
         Args:
-            images: by the name of a camera, or in their order: (B, C, H, W) each of its camera's image_size.
+            images: by the name of a camera, or in their order, in a list or stacked: (B, C, H, W) each of its camera's
+                image_size.
 
         Returns:
             (B, C, H', W') of the dtype of the images, integers rounded, and valid (1, 1, H', W') bool.
@@ -118,7 +119,7 @@ class Surround(GeometryModule):
             if set(images) != set(self.names):
                 raise ValueError(f"Surround: images must be of the cameras {list(self.names)}; got {list(images)}")
             images = [images[name] for name in self.names]
-        listed = isinstance(images, (list, tuple))
+        listed = is_list(images) or (isinstance(images, Tensor) and images.ndim == 5)
         if not listed or not all(isinstance(image, Tensor) for image in images):
             given = [type(one).__name__ for one in images] if listed else type(images).__name__
             raise TypeError(f"Surround: images must be tensors (B, C, H, W) by name, or in a list; got {given}")
