@@ -691,3 +691,13 @@ def test_the_command_says_what_it_cannot_do(words, match, folder, capsys):
     assert main(["map", "camera.json", *words.split()]) == 2
     assert match in capsys.readouterr().err
     assert os.listdir(folder) == ["camera.json"]
+
+
+def test_masks_stay_bool_and_large_integers_whole(tmp_path):
+    camera = ct.Pinhole([10.0, 10.0, 3.5, 3.5], image_size=(8, 8)).requires_grad_(False)
+    ct.Warp(camera, camera).save(tmp_path / "map.npz")
+    found = ct.load_map(tmp_path / "map.npz")
+    mask = torch.arange(64).reshape(1, 1, 8, 8) % 3 == 0
+    assert found(mask).equal(mask)
+    labels = torch.full((1, 1, 8, 8), 2**24 + 1, dtype=torch.int32)
+    assert found(labels, mode="nearest").equal(labels)

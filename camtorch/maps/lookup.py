@@ -10,6 +10,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.maps.exact import Exact
+from camtorch.warp.sampling import narrow, widen
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
@@ -67,7 +68,7 @@ class LookupMap:
         return ((x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5))[None, None]
 
     def __call__(self, images: Tensor, mode: str = "bilinear", padding_mode: str = "zeros") -> Tensor:
-        """Apply it to images (B, C, H, W) of the source's size, floating point or integer; the dtype stays.
+        """Apply it to images (B, C, H, W) of the source's size, floating point, integer or bool; the dtype stays.
 
         Args:
             images: of the source.
@@ -90,13 +91,9 @@ class LookupMap:
                 f"LookupMap: images must be a dense tensor (B, C, {self.source_size[0]}, {self.source_size[1]}) of "
                 f"real numbers; got {what} {shape}"
             )
-        values = images if images.is_floating_point() else images.float()
+        values = images if images.is_floating_point() else widen(images)
         grid = self.grid().to(values).expand(shape[0], -1, -1, -1)
-        result = F.grid_sample(values, grid, mode, padding_mode, align_corners=False)
-        if images.is_floating_point():
-            return result
-        low, high = torch.iinfo(images.dtype).min, torch.iinfo(images.dtype).max
-        return result.round().clamp(low, high).to(images.dtype)
+        return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
 
     def error(self, warp: Warp) -> Tensor:
         """(H', W') float64: how far it is from a warp, in pixels of the source; NaN where the warp shows nothing.
