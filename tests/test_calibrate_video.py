@@ -1,5 +1,7 @@
 """From a video of a board to a camera's file, on the command line."""
 
+from fractions import Fraction
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from test_calibrate_cli import BOARD, assert_near, poses
 
 import camtorch as ct
 from camtorch.calibration.corners import read_corners
-from camtorch.cli import frames
+from camtorch.cli import frames, videos
 from camtorch.cli.main import main
 
 av = pytest.importorskip("av")
@@ -62,6 +64,24 @@ def test_frames_are_read_for_the_report(filmed):
     images = frames.read([there, gone, path, None])
     assert list(images) == [there]
     assert images[there].shape == (480, 640)
+
+
+def test_time_stamps_may_begin_late(tmp_path):
+    board, hour = photograph(BOARD, fisheye(), *map(list, next(iter(poses(BOARD, 1)))), seed=0)[0], 3600
+    path = tmp_path / "live.mkv"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("ffv1", rate=RATE)
+        stream.height, stream.width, stream.pix_fmt = *board.shape, "gray"
+        for i in range(3 * RATE):
+            frame = av.VideoFrame.from_ndarray(board, format="gray")
+            frame.pts, frame.time_base = hour * RATE + i, Fraction(1, RATE)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode(None))
+    assert videos.length_of(path) == pytest.approx(3, abs=0.3)
+    times, parts = zip(*((seconds, part) for seconds, part, _ in videos.frames(path)), strict=True)
+    assert (times[0], times[-1]) == (hour, hour + 2.75)
+    assert parts[0] == 0
+    assert parts[-1] == pytest.approx(0.92, abs=0.09)
 
 
 def test_videos_are_for_one_camera(filmed, tmp_path, capsys, monkeypatch):

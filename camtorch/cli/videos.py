@@ -162,9 +162,11 @@ def frames(path: Path) -> Iterator[tuple[float, float, Any]]:
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
         length, step = float(_length(container, stream)), float(1 / _rate(stream))
+        start = None
         for number, frame in enumerate(container.decode(stream)):
             seconds = number * step if frame.time is None else float(frame.time)
-            yield seconds, min(seconds / length, 1.0) if length else 0.0, frame
+            start = seconds if start is None else start
+            yield seconds, min((seconds - start) / length, 1.0) if length else 0.0, frame
 
 
 def sized(item: Item) -> Item:
@@ -187,7 +189,10 @@ def _length(container: Any, stream: Any) -> Fraction:
     if stream.duration is not None and stream.time_base is not None:
         duration: Fraction = stream.duration * stream.time_base
         return duration
-    return Fraction(container.duration or 0, 1_000_000)
+    duration, start = container.duration or 0, container.start_time or 0
+    if "matroska" in container.format.name and start < duration:  # which says when it ends
+        duration -= start
+    return Fraction(duration, 1_000_000)
 
 
 # -- planes
