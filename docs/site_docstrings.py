@@ -17,5 +17,5 @@ class Plain(griffe.Extension):
             return
         text = SECTION.sub(lambda found: found[0].replace(":", "&#58;").replace("&#58;", ":", 1), obj.docstring.value)
         words = text.split("`")
-        words[::2] = [re.sub(r"\*(?=[A-Z])", r"\\*", word) for word in words[::2]]
+        words[::2] = [re.sub(r"(?<!\*)\*(?=[A-Z])", r"\\*", word) for word in words[::2]]
         obj.docstring.value = "`".join(words)
