@@ -37,8 +37,8 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
 
     Args:
         path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, OCamCalib or camtorch; an
-            archive of `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
-            beside the cameras are read with them.
+            archive of `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's
+            images beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
 
     Returns:
