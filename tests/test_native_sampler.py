@@ -20,6 +20,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import camtorch as ct
+from camtorch._dtypes import widen
 from camtorch.native import build as building
 from camtorch.native import sampler
 from camtorch.native.library import library
@@ -125,7 +126,7 @@ def both(images, where, mode, padding, fill=(0.0,), span=None):
     with counted() as calls:
         result = sampling.render(images, where, mode, padding, fill)
     # what is computed in float32 is sampled so too, if nothing is to be filled in afterwards
-    wide = padding == "zeros" and sampling.widen(images[:0]).dtype == torch.float32
+    wide = padding == "zeros" and widen(images[:0]).dtype == torch.float32
     assert bool(calls) == (sampler.takes(images.dtype, mode) or wide)
     with torch_alone(), counted() as calls:
         expected = sampling.render(images, where, mode, padding, fill)

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch._dtypes import narrow, widen
 from camtorch._tracing import is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, held, kind, remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
-from camtorch.warp.sampling import Mode, Options, narrow, widen
+from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_part, shown
+from camtorch._dtypes import narrow, widen
 from camtorch._module import Memo
 from camtorch.augment import compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
@@ -28,7 +29,7 @@ from camtorch.augment.change import Change, camera_like
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
 from camtorch.camera import Camera
-from camtorch.warp.sampling import Mode, narrow, widen
+from camtorch.warp.sampling import Mode
 
 if not hasattr(GeometricAugmentationBase2D, "_gate"):
     raise ImportError(

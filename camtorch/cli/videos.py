@@ -189,10 +189,10 @@ def _length(container: Any, stream: Any) -> Fraction:
     if stream.duration is not None and stream.time_base is not None:
         duration: Fraction = stream.duration * stream.time_base
         return duration
-    duration, start = container.duration or 0, container.start_time or 0
-    if "matroska" in container.format.name and start < duration:  # which says when it ends
-        duration -= start
-    return Fraction(duration, 1_000_000)
+    end, start = container.duration or 0, container.start_time or 0  # microseconds
+    if "matroska" in container.format.name and start < end:  # others say how long it is
+        end -= start
+    return Fraction(end, 1_000_000)
 
 
 # -- planes

@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch._dtypes import narrow, widen
 from camtorch.maps.exact import Exact
-from camtorch.warp.sampling import narrow, widen
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp

@@ -10,11 +10,12 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values, broadcast_shapes
+from camtorch._dtypes import narrow, widen
 from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, narrow, render, widen
+from camtorch.warp.sampling import Fill, Mode, PaddingMode, render
 from camtorch.warp.warp import Warp
 
 SHRINKS = 1.5

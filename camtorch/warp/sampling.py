@@ -12,6 +12,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._arguments import as_flag, as_number, shown
+from camtorch._dtypes import narrow, wide_dtype, widen
 from camtorch._threads import as_cores_are_free, thread_count
 from camtorch._tracing import converted, in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
@@ -131,12 +132,12 @@ def _by_torch(
     """What `grid_sample` makes of B images."""
     count, dtype = images.shape[0], images.dtype
     plain = images.is_cpu and not in_graph(images) and not in_transform()
-    wide, finite = dtype == _wide(dtype), not dtype.is_floating_point
+    wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
     if isinstance(where, Lattice):
         where = where.pixels
     if mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
         return _pick(images, where, padding_mode, fill)
-    where = where._replace(grid=converted(where.grid, _wide(dtype)))
+    where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
     plain = plain and not in_graph(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
@@ -256,7 +257,9 @@ class Pyramid:
         """Of a dtype to compute in."""
         size = [max(side // 2, 1) for side in self.images.shape[-2:]]
         # a copy in another dtype is large
-        channels = self.images.split(1 if self.images.dtype != _wide(self.images.dtype) else self.images.shape[1], 1)
+        channels = self.images.split(
+            1 if self.images.dtype != wide_dtype(self.images.dtype) else self.images.shape[1], 1
+        )
         halves = [F.interpolate(widen(c), size, mode="bilinear", align_corners=False, antialias=True) for c in channels]
         return Pyramid(torch.cat(halves, 1), self.finite)
 
@@ -486,30 +489,6 @@ def as_fill(fill: Fill, owner: str) -> tuple[float, ...]:
     if not values or not all(map(math.isfinite, values)):
         raise ValueError(f"{owner}: fill must be finite, a number or one for each channel; got {shown(fill)}")
     return values
-
-
-def _wide(dtype: torch.dtype) -> torch.dtype:
-    """The dtype to compute in: every value, a class id too, is exact in it, up to 2^53."""
-    if dtype.is_floating_point:
-        return torch.promote_types(dtype, torch.float32)
-    return torch.float64 if dtype.itemsize > 2 else torch.float32
-
-
-def widen(images: Tensor) -> Tensor:
-    """In the dtype to compute in."""
-    return images.to(_wide(images.dtype))
-
-
-def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """What `widen` gave, back in its dtype: integers are rounded and stay in range, bool is true from one half on."""
-    if dtype == torch.bool and values.is_floating_point():
-        return values >= 0.5
-    if not dtype.is_floating_point and values.is_floating_point():
-        low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
-        # the largest int64 is no float64: the next one would wrap around
-        top = float(high) if int(float(high)) == high else math.nextafter(float(high), 0.0)
-        values = values.round().clamp(float(low), top)
-    return values.to(dtype)
 
 
 class _Sample(torch.autograd.Function):

@@ -23,11 +23,11 @@ from camtorch._arguments import (
     broadcast_shapes,
     shown,
 )
+from camtorch._dtypes import narrow, widen
 from camtorch._module import GeometryModule
 from camtorch._tracing import in_graph, in_transform, is_concrete, keeps_graph
 from camtorch.camera import Camera
 from camtorch.optics.special import cosc_root, sinc_root
-from camtorch.warp.sampling import narrow, widen
 
 Direction = Literal["down", "up", "right", "left"]
 DIRECTIONS: tuple[Direction, ...] = get_args(Direction)

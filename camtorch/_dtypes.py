@@ -1,0 +1,32 @@
+"""The dtypes in which images are computed, and the way back to their own."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def wide_dtype(dtype: torch.dtype) -> torch.dtype:
+    """The dtype to compute in: every value, a class id too, is exact in it, up to 2^53."""
+    if dtype.is_floating_point:
+        return torch.promote_types(dtype, torch.float32)
+    return torch.float64 if dtype.itemsize > 2 else torch.float32
+
+
+def widen(images: Tensor) -> Tensor:
+    """In the dtype to compute in."""
+    return images.to(wide_dtype(images.dtype))
+
+
+def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """What `widen` gave, back in its dtype: integers are rounded and stay in range, bool is true from one half on."""
+    if dtype == torch.bool and values.is_floating_point():
+        return values >= 0.5
+    if not dtype.is_floating_point and values.is_floating_point():
+        low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
+        # the largest int64 is no float64: the next one would wrap around
+        top = float(high) if int(float(high)) == high else math.nextafter(float(high), 0.0)
+        values = values.round().clamp(float(low), top)
+    return values.to(dtype)
