@@ -138,6 +138,7 @@ def rays():
     close(grid[0, 0], torch.tensor([1 / WIDTH - 1, 1 / HEIGHT - 1]), 1e-6)
     close(grid, fisheye().pixel_grid() * 2 / torch.tensor([WIDTH, HEIGHT]) + grid[0, 0], 1e-6)
     found, seen = fisheye().rays()
+    close(fisheye().unproject(fisheye().pixel_grid())[0], found, 1e-6)
     close(found.norm(dim=-1)[seen], torch.ones(int(seen.sum())), 1e-5)
     if library is not None:
         made = theirs("OpenCVFisheyeCamera", FISHEYE, theta_max=1.2)
@@ -231,7 +232,7 @@ def crop_and_flip():
 
 @row("nvtorchcam.utils.normalized_intrinsics_from_pixel_intrinsics")
 def pixel_intrinsics():
-    of_edges = INTRINSICS + torch.tensor([0, 0, 0.5, 0.5])
+    of_edges = pinhole().intrinsics + torch.tensor([0, 0, 0.5, 0.5])
     close(torch.cat([of_edges[:2] / HALF, of_edges[2:] / HALF - 1]), AFFINE, 1e-6)
     if library is not None:
         close(library.utils.normalized_intrinsics_from_pixel_intrinsics(of_edges, SIZE), AFFINE, 1e-6)

@@ -156,6 +156,7 @@ def matrix(shift):
 @row("pytorch3d.utils.opencv_from_cameras_projection", "pytorch3d.utils.cameras_from_opencv_projection")
 def opencv():
     close(camera().K[0], matrix(0.5), 1e-4)
+    close(ct.Pinhole.from_matrix(matrix(0.0), image_size=SIZE).K, matrix(0.0), 1e-4)
     needed()
     utils = optional("pytorch3d.utils")
     size = torch.tensor([SIZE])
