@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import Numbers, as_points, shown, working_dtype
+from camtorch._arguments import Numbers, as_points, no_camera, shown, working_dtype
 from camtorch._module import Memo
 from camtorch._tracing import in_graph
 from camtorch.camera import Camera, new_cameras, per_row
@@ -310,7 +310,7 @@ def _members(cameras: Any) -> list[Camera]:
         raise TypeError(f"Mixed: cameras must be a list of cameras; got {type(cameras).__name__}") from None
     for i, camera in enumerate(given):
         if not isinstance(camera, Camera):
-            raise TypeError(f"Mixed: cameras[{i}] must be a Camera; got {type(camera).__name__}")
+            raise TypeError(f"Mixed: cameras[{i}] must be a Camera; got {no_camera(camera)}")
     return _checked([one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))])
 
 

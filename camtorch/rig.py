@@ -6,7 +6,7 @@ from collections.abc import ItemsView, Iterator, KeysView, Mapping, MutableMappi
 from itertools import islice
 from typing import TypeVar, cast
 
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_mapping, shown
@@ -17,6 +17,7 @@ from camtorch.extrinsics import Extrinsics
 
 M = TypeVar("M", bound=BatchedModule)
 _SHOWN = 8
+_OF_CAMERAS = ("intrinsics", "distortion", "image_size")  # beside what their class has
 
 
 class NamedModules(nn.Module, MutableMapping[str, M]):
@@ -118,6 +119,15 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
         return "\n".join((f"{self._kind.__name__} by name:", *lines))
 
 
+def way_to_cameras(rig: Rig) -> str:
+    """Where the cameras of a rig are, for errors about what only a camera can."""
+    if len(rig.cameras) == 1:
+        return "whose only camera is its .camera"
+    some = ", ".join(f"rig[{name!r}]" for name in islice(rig.cameras, _SHOWN))
+    more = f" and {len(rig.cameras) - _SHOWN} more" if len(rig.cameras) > _SHOWN else ""
+    return f"whose cameras are {some}{more}" if some else "which has no camera"
+
+
 class Rig(nn.Module):
     """Cameras by name, and their poses.
 
@@ -212,6 +222,14 @@ class Rig(nn.Module):
                 posed = ", ".join(map(repr, list(self.extrinsics)[:_SHOWN])) or "none"
                 raise ValueError(f"Rig: {name!r} has no pose in rig.extrinsics; there is {posed}")
         return self.extrinsics[right].compose(self.extrinsics[left].inverse())
+
+    def __getattr__(self, name: str) -> Tensor | nn.Module:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            if name in _OF_CAMERAS or (not name.startswith("_") and hasattr(Camera, name)):
+                raise AttributeError(f"Rig: {name} is a camera's, and this is a Rig, {way_to_cameras(self)}") from None
+            raise
 
     def __getitem__(self, name: str) -> Camera:
         """The same as `camera_of`, but that an unknown name is a KeyError."""

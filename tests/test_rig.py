@@ -145,3 +145,24 @@ def test_two_hundred_thousand_images():
     assert "200000 posed images" in repr(rig)
     assert rig.extrinsics["images/199999.jpg"].batch_shape == ()
     assert time.process_time() - start < 5
+
+
+def test_who_takes_it_for_a_camera_is_told_where_those_are():
+    camera = ct.Pinhole.from_fov(70, image_size=(480, 640))
+    one, two = ct.Rig({"left": camera}), ct.Rig({"left": camera, "right": camera})
+    for name in ("project", "K", "intrinsics", "image_size"):
+        with pytest.raises(AttributeError, match=rf"{name} is a camera's, .* a Rig, whose only camera is its \.camera"):
+            getattr(one, name)
+        assert not hasattr(two, name)
+    with pytest.raises(AttributeError, match="no attribute 'unknown'"):
+        one.unknown  # noqa: B018
+    with pytest.raises(TypeError, match=r"Dewarp: camera must be a Camera; got Rig, whose only camera is its \.camera"):
+        ct.Dewarp(one)
+    with pytest.raises(TypeError, match=r"got Rig, whose cameras are rig\['left'\], rig\['right'\]$"):
+        ct.solve_pnp(two, torch.rand(5, 3), torch.rand(5, 2))
+    with pytest.raises(TypeError, match="got Rig, which has no camera"):
+        ct.Dewarp(ct.Rig({}))
+    with pytest.raises(TypeError, match=r"got str; ct\.load\('camera\.yml'\)\.camera is that of a file"):
+        ct.Dewarp("camera.yml")
+    with pytest.raises(TypeError, match=r"got str$"):
+        ct.augment.RandomMount(camera="pinhole")

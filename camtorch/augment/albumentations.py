@@ -18,6 +18,7 @@ import torch
 from albumentations.core.type_definitions import Targets
 from torch import Tensor
 
+from camtorch._arguments import no_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change, copied, singles, size_of
 from camtorch.augment.numpy import as_array, as_tensor
@@ -74,7 +75,7 @@ class Transform(A.DualTransform):
         if not isinstance(augmentation, Augmentation):
             raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
         if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"{_OWNER}: camera must be a Camera; got {type(camera).__name__}")
+            raise TypeError(f"{_OWNER}: camera must be a Camera; got {no_camera(camera)}")
         super().__init__(p=augmentation.p if p is None else p)
         self.augmentation, self.camera = augmentation, camera
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, shown
+from camtorch._arguments import as_image_size, as_number, no_camera, shown
 from camtorch._module import typed_as
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete
@@ -144,7 +144,7 @@ class FaceNormalizer(SampleTransform):
         sample = self._given(sample, fields)
         named, batched, _, camera = self._batch(sample)
         if not isinstance(camera, Camera):
-            raise TypeError(f"{self._name}: camera must be a Camera; got {type(camera).__name__}")
+            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
         kinds = {name: value for name, (_, value) in named.items()}
         listed = [name for name in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(name), list)]
         if listed:

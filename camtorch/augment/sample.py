@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch._arguments import as_coordinates, as_flag, as_mapping, as_number
+from camtorch._arguments import as_coordinates, as_flag, as_mapping, as_number, no_camera
 from camtorch.augment.change import Change, alone, copied, on_device, singles
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
@@ -283,7 +283,7 @@ class SampleTransform(nn.Module):
         super().__init__()
         self._name = type(self).__name__
         if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"{self._name}: camera must be a Camera; got {type(camera).__name__}")
+            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
         self.camera = camera
         self.fields = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
@@ -380,7 +380,7 @@ class SampleTransform(nn.Module):
         for i, one in enumerate(cameras):
             name = f"camera[{i}]" if isinstance(camera, (list, tuple)) else "camera"
             if not isinstance(one, Camera):
-                raise TypeError(f"{self._name}: {name} must be a Camera; got {type(one).__name__}")
+                raise TypeError(f"{self._name}: {name} must be a Camera; got {no_camera(one)}")
             if one.image_size is None:
                 raise ValueError(f"{self._name}: {name} needs an image_size=(height, width)")
             shape = tuple(one.batch_shape)

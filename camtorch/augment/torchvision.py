@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from camtorch._arguments import no_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change, singles
 from camtorch.augment.numpy import as_array, as_tensor
@@ -81,7 +82,7 @@ class Transform(v2.Transform):
         if not isinstance(augmentation, Augmentation):
             raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
         if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"{_OWNER}: camera must be a Camera; got {type(camera).__name__}")
+            raise TypeError(f"{_OWNER}: camera must be a Camera; got {no_camera(camera)}")
         self.augmentation = augmentation
         self.camera, self.valid = camera, bool(valid)
         self._flags: list[tuple[Tensor, Tensor]] = []

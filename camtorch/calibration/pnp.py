@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch._arguments import Numbers, broadcast_shapes, working_dtype
+from camtorch._arguments import Numbers, broadcast_shapes, no_camera, working_dtype
 from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, as_vectors, learns, rows_of
 from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
@@ -128,7 +128,7 @@ class _Task(NamedTuple):
         """What users pass, checked."""
         owner = "solve_pnp"
         if not isinstance(camera, Camera):
-            raise TypeError(f"{owner}: camera must be a camera, as ct.KannalaBrandt(...); got {type(camera).__name__}")
+            raise TypeError(f"{owner}: camera must be a camera, as ct.KannalaBrandt(...); got {no_camera(camera)}")
         device = camera.intrinsics.device
         points = as_vectors(object_points, "object_points", 3, owner, device)
         seen_at = as_vectors(pixels, "pixels", 2, owner, device)

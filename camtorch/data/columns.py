@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from camtorch._arguments import no_camera
 from camtorch.augment.collate import collate_cameras
 from camtorch.camera import MODELS, Camera
 
@@ -28,7 +29,7 @@ def to_columns(camera: Camera, name: str = "camera") -> dict[str, Any]:
         TypeError: no camera. ValueError: one without image_size, or of several batch dims.
     """
     if not isinstance(camera, Camera):
-        raise TypeError(f"to_columns: camera must be a Camera; got {type(camera).__name__}")
+        raise TypeError(f"to_columns: camera must be a Camera; got {no_camera(camera)}")
     if camera.image_size is None or len(camera.batch_shape) > 1:
         raise ValueError(
             "to_columns: the camera must have an image_size and one batch dim at most; got image_size "

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, shown
+from camtorch._arguments import as_image_size, as_number, no_camera, shown
 from camtorch._module import typed_as
 from camtorch._threads import as_cores_are_free
 from camtorch.augment.change import Change, Part, alone, by_kinds, copied, edited, size_of
@@ -96,7 +96,7 @@ class CanonicalCamera(SampleTransform):
     def scale(self, camera: Camera) -> Tensor:
         """(*B,): s of cameras (*B), `focal` by their focal length. Its gradients go to fx and fy."""
         if not isinstance(camera, Camera):
-            raise TypeError(f"{self._name}.scale: camera must be a Camera; got {type(camera).__name__}")
+            raise TypeError(f"{self._name}.scale: camera must be a Camera; got {no_camera(camera)}")
         if isinstance(camera, Mixed):
             return camera._in_order(torch.cat([self.scale(group) for _, group in camera.groups]))
         k = camera.distortion.detach()

@@ -8,7 +8,16 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_batch, as_coordinates, as_values, as_whole, broadcast_shapes, shown
+from camtorch._arguments import (
+    Numbers,
+    as_batch,
+    as_coordinates,
+    as_values,
+    as_whole,
+    broadcast_shapes,
+    no_camera,
+    shown,
+)
 from camtorch.camera import Camera
 
 __all__ = ["angles", "rays", "reprojection"]
@@ -183,7 +192,7 @@ def _check(predicted: object, target: object, owner: str) -> torch.Size:
     """The batch dims of two cameras."""
     for camera, name in ((predicted, "predicted"), (target, "target")):
         if not isinstance(camera, Camera):
-            raise TypeError(f"{owner}: {name} must be a Camera; got {type(camera).__name__}")
+            raise TypeError(f"{owner}: {name} must be a Camera; got {no_camera(camera)}")
     assert isinstance(predicted, Camera)
     assert isinstance(target, Camera)
     shapes = predicted.batch_shape, target.batch_shape

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, broadcast_shapes, check_devices
+from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, broadcast_shapes, check_devices, no_camera
 from camtorch._module import GeometryModule, Memo, is_constant, typed_as, with_values
 from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, set_aside
 from camtorch.camera import Camera
@@ -45,7 +45,7 @@ _SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     """The camera, if it is one and knows the size of its image."""
     if not isinstance(camera, Camera):
-        raise TypeError(f"{owner}: {name} must be a Camera; got {type(camera).__name__}")
+        raise TypeError(f"{owner}: {name} must be a Camera; got {no_camera(camera)}")
     if camera.image_size is None:
         raise ValueError(f"{owner}: the {name} needs an image_size=(height, width)")
     return camera
