@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 import torch
 
@@ -51,6 +52,48 @@ def test_the_code_of_a_model_makes_one(pages):
         exec(pages.code(section), made)
         assert type(made["camera"]).__name__ == name
         assert made["camera"].image_size is not None
+
+
+INVERSE = ("Division", "FThetaBackward", "OCamCalib", "Tabulated")  # whose formulas go the other way, or are none
+ALL_TERMS = [0.05, -0.02, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003, 0.001, 0.002, -0.001, 0.003]
+
+
+def computed(formula, values):
+    """The assignments of a printed formula, carried out; ... is what had the name before, or the rest of a series."""
+    formula = re.sub(r"\n +", " ", formula)
+    for name, expression in re.findall(r"(?:^|  )(\w+) = (.+?)(?=   *\w+ = |$)", formula, re.M):
+        code = re.sub(r"^\.\.\.", name, expression.strip()).replace(" + ...", "").replace("^", "**")
+        values[name] = eval(re.sub(r"(?<=[\w)]) (?=[\w(])", " * ", code), values)
+    return values
+
+
+def test_printed_formulas_are_what_models_compute(pages):
+    found = pages.sections("models.md")
+    x, y = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 100))
+    ray = {"x": x, "y": y, "z": np.ones(100), "d": np.sqrt(x**2 + y**2 + 1), "phi": np.arctan2(y, x)}
+    named = {"atan2": np.arctan2, "atan": np.arctan, "asin": np.arcsin}
+    functions = {name: getattr(np, name) for name in ("hypot", "sqrt", "sin", "cos", "tan")} | named
+    for name in found.keys() - set(INVERSE):
+        formula = re.search(r"```\n(.*?)```", found[name], re.S)[1]
+        if name == "Fisheye624":
+            formula = re.search(r"```\n(.*?)```", found["Fisheye62"], re.S)[1] + formula
+        made = {}
+        exec(pages.code(found[name]), made)
+        camera = made["camera"].double()
+        if not {*re.findall(r"\b[ks]\d\b", formula)} <= {*camera.distortion_names}:
+            more = ALL_TERMS if name == "BrownConrady" else ALL_TERMS[:2]
+            camera = type(camera)(camera.intrinsics.data, more, image_size=camera.image_size).double()
+        shown = {*re.findall(r"\w+", formula)}  # of a series only its first coefficients
+        with torch.no_grad():
+            camera.distortion *= torch.tensor([float(coefficient in shown) for coefficient in camera.distortion_names])
+        coefficients = dict(zip(camera.distortion_names, camera.distortion.tolist(), strict=True))
+        values = functions | ray | {"theta": np.arctan(np.hypot(x, y))} | coefficients
+        values = computed(formula, values)
+        pixels, valid = camera.project(np.stack([x, y, np.ones(100)], -1))
+        fx, fy, cx, cy = camera.intrinsics.tolist()
+        printed = np.stack([fx * values["a"] + cx, fy * values["b"] + cy], -1)
+        assert valid.sum() > 50, name
+        np.testing.assert_allclose(pixels[valid].detach(), printed[valid], rtol=0, atol=1e-6, err_msg=name)
 
 
 def augmentations():
