@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"Medians of at most {options.repeats} rounds, in which the contestants take turns.", flush=True)
     results = {}
     start = time.perf_counter()
-    for name in SUBJECTS if given.subject == "all" else (given.subject,):
+    for name in given.subject or SUBJECTS:
         records, tables = SUBJECTS[name].run(options)
         results[name] = [asdict(record) for record in records]
         progress("")
@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Measure camtorch beside OpenCV, kornia and the floor of this machine: speed, memory and accuracy. "
         "Tables go to stdout as markdown, progress to stderr. (2.0x) means: takes twice as long.",
     )
-    parser.add_argument("subject", nargs="?", choices=[*SUBJECTS, "all"], default="all", help="default: all")
+    parser.add_argument("subject", nargs="*", choices=list(SUBJECTS), help="default: all")
     parser.add_argument("--size", type=_positive, metavar="N", help="points of the subject points (default: 1000000)")
     parser.add_argument(
         "--model",

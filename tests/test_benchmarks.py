@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks import page
 from benchmarks.busy import Busy
 from benchmarks.options import Options
 from benchmarks.tables import Record
@@ -136,6 +137,7 @@ def test_busy_processes_spin_when_told_and_are_gone_after_an_error():
 def test_busy_processes_end_with_whoever_started_them(ending):
     code = """
 import signal, time
+from benchmarks import page
 from benchmarks.busy import Busy
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
 with Busy(2) as busy:
@@ -167,3 +169,14 @@ def _seconds(pid: int) -> float:
     """Of the processor's time."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_the_page_shows_the_figures_of_one_run():
+    run = json.loads(page.FIGURES.read_text())
+    assert page.filled(page.PAGE.read_text(), run) == page.PAGE.read_text()
+    changed = json.loads(page.FIGURES.read_text())
+    for record in changed["results"]["points"]:
+        record["value"] *= 3
+    assert page.filled(page.PAGE.read_text(), changed) != page.PAGE.read_text()
+    with pytest.raises(ValueError, match="0 places <!-- machine -->"):
+        page.filled("", run)
