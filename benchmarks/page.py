@@ -70,6 +70,7 @@ def shown(run: Run) -> dict[str, Any]:
         subject: [{**r, "value": float(f"{r['value']:.4g}")} for r in found] for subject, found in results.items()
     }
     results["points"] = [record for record in results["points"] if record["case"] in _POINTS]
+    results["augment"] = [r for r in results["augment"] if r["quantity"] != "seconds" or _LOADER not in r["case"]]
     results["images"] = [record for record in results["images"] if _is_shown(record["case"], record["operation"])]
     return {"machine": run["machine"], "arguments": run["arguments"], "results": results}
 
@@ -175,8 +176,12 @@ def _images(run: Run) -> str:
 def _augment(run: Run) -> str:
     columns = {OURS: (OURS,), "RandomAffine": ("kornia RandomAffine",), "OpenCV": ("OpenCV",)}
     columns |= {"torchvision, by sample": ("torchvision crop, flip",), "one draw": ("torchvision, one draw",)}
-    rows = [(_named(f"{case}, {operation}"), times) for (case, operation), times in _figures(run, "augment").items()]
-    return _table("8 images, ms", [row for row in rows if OURS in row[1]], columns)
+    rows = [
+        (_named(f"{case}, {operation}"), times)
+        for (case, operation), times in _figures(run, "augment").items()
+        if not case.startswith(_LOADER)
+    ]
+    return _table("8 images, ms", rows, columns)
 
 
 def _loader(run: Run) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import NoneType
 
 import torch
 from torch import Tensor
@@ -23,7 +24,8 @@ def has_tangent(tensor: Tensor) -> bool:
 
 def in_transform() -> bool:
     """Whether a transform of torch.func is under way."""
-    return torch._C._functorch.peek_interpreter_stack() is not None
+    # for dynamo what comes out is an object, and "is not None" of any object true
+    return not isinstance(torch._C._functorch.peek_interpreter_stack(), NoneType)
 
 
 def in_graph(tensor: Tensor) -> bool:

@@ -9,6 +9,7 @@ from cameras import KEYS, fan, make, one, pixel_lattice, spread
 from torch.autograd import gradcheck
 
 import camtorch as ct
+from camtorch._tracing import in_transform
 from camtorch.optics.charts import Perspective
 from camtorch.projection import ops, rows, unproject
 from camtorch.projection.unproject import invert
@@ -175,3 +176,27 @@ def test_no_cameras_make_no_images():
     source = ct.Pinhole(torch.ones(0, 4), image_size=(8, 8)).requires_grad_(False)
     nothing = ct.Warp(source, ct.Pinhole([4.0, 4, 4, 4], image_size=(8, 8)).requires_grad_(False))
     assert nothing(torch.rand(0, 1, 8, 8)).shape == (0, 1, 8, 8)
+
+
+def test_compiled_code_knows_whether_it_is_in_a_transform():
+    def flagged(x):
+        return x + 1 if in_transform() else x
+
+    once = torch.compile(flagged, fullgraph=True, backend="eager")
+    assert once(torch.zeros(1)).item() == 0
+    mapped = torch.compile(torch.func.vmap(flagged), fullgraph=True, backend="eager")
+    assert mapped(torch.zeros(1)).item() == 1
+
+
+def test_compiled_code_for_a_cpu_takes_interleaved_points_apart_first():
+    graphs = []
+
+    def backend(graph, inputs):
+        graphs.append(str(graph.graph))
+        return graph
+
+    camera = ct.Pinhole([300.0, 300.0, 320.0, 240.0]).requires_grad_(False)
+    points = torch.rand(50, 3) + 1
+    pixels, _ = torch.compile(camera.project, fullgraph=True, backend=backend)(points)
+    torch.testing.assert_close(pixels, camera.project(points)[0])
+    assert "camtorch.to_planes" in graphs[0]  # or the loop over points is not vectorised
