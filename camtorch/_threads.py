@@ -16,7 +16,7 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
-from camtorch._tracing import is_tracing
+from camtorch._tracing import in_jit_trace
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -157,7 +157,7 @@ def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if is_tracing():  # its sizes are tensors
+        if torch.compiler.is_compiling() or in_jit_trace():  # its sizes are tensors
             return function(*args, **kwargs)
         if _mine.threads:  # of a function that called this one, and goes on as before
             was_alone = _mine.is_alone
@@ -183,7 +183,7 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if is_tracing() or _limits is None or _mine.stays_alone:
+        if torch.compiler.is_compiling() or in_jit_trace() or _limits is None or _mine.stays_alone:
             return function(*args, **kwargs)
         threads, was_alone = _mine.threads, _mine.is_alone
         _mine.threads, _mine.stays_alone = threads or torch.get_num_threads(), True

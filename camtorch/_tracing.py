@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import NoneType
 
@@ -66,18 +66,11 @@ def in_memory(tensor: Tensor) -> bool:
 
 def is_recorded() -> bool:
     """Whether torch's operators are recorded, or a mode changes what they do: what goes past them would be lost."""
-    return _in_jit_trace() or torch._C._len_torch_dispatch_stack() > 0
+    return in_jit_trace() or torch._C._len_torch_dispatch_stack() > 0
 
 
-def is_tracing() -> bool:
-    """Whether torch.compile or torch.jit.trace is at work."""
-    return torch.compiler.is_compiling() or _in_jit_trace()
-
-
-def _in_jit_trace() -> bool:
-    tracing: bool = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return tracing
-
+in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
+"""Whether torch.jit.trace is at work."""
 
 is_exporting = torch.compiler.is_exporting
 """Whether what is traced shall run elsewhere, where there are no operators of our own."""

@@ -9,10 +9,18 @@ from cameras import one
 
 import camtorch as ct
 
-# files, functions; where other processes keep the cores busy, a look at them takes up to two functions more
-# one of the files is `_portable`, whose functions do here what torch's do
+# files, functions; one of the files is `_portable`, whose functions do here what torch's do
 MOST = {"project": (9, 33), "unproject": (9, 40)}
 ROOT = Path(ct.__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def alone():
+    """One thread of torch: with more a call looks whether their cores are free, in as many functions as it takes."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def entered(function, *arguments):
