@@ -128,10 +128,8 @@ def shown(value: object) -> str:
 
 def no_camera(value: object) -> str:
     """What was passed instead of a camera, for an error: of a rig and of a file with the way to theirs."""
-    from camtorch.rig import Rig, way_to_cameras
-
-    if isinstance(value, Rig):
-        return f"Rig, {way_to_cameras(value)}"
+    if hasattr(type(value), "_way_to_cameras"):  # a Rig, whose module needs this one
+        return f"{type(value).__name__}, {value._way_to_cameras()}"  # type: ignore[attr-defined]
     if isinstance(value, os.PathLike) or (isinstance(value, str) and os.path.splitext(value)[1]):
         return f"{type(value).__name__}; ct.load({os.fspath(value)!r:.60}).camera is that of a file"
     return type(value).__name__

@@ -119,15 +119,6 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
         return "\n".join((f"{self._kind.__name__} by name:", *lines))
 
 
-def way_to_cameras(rig: Rig) -> str:
-    """Where the cameras of a rig are, for errors about what only a camera can."""
-    if len(rig.cameras) == 1:
-        return "whose only camera is its .camera"
-    some = ", ".join(f"rig[{name!r}]" for name in islice(rig.cameras, _SHOWN))
-    more = f" and {len(rig.cameras) - _SHOWN} more" if len(rig.cameras) > _SHOWN else ""
-    return f"whose cameras are {some}{more}" if some else "which has no camera"
-
-
 class Rig(nn.Module):
     """Cameras by name, and their poses.
 
@@ -223,12 +214,22 @@ class Rig(nn.Module):
                 raise ValueError(f"Rig: {name!r} has no pose in rig.extrinsics; there is {posed}")
         return self.extrinsics[right].compose(self.extrinsics[left].inverse())
 
+    def _way_to_cameras(self) -> str:
+        """Where they are, for errors about what only a camera can."""
+        if len(self.cameras) == 1:
+            return "whose only camera is its .camera"
+        some = ", ".join(f"rig[{name!r}]" for name in islice(self.cameras, _SHOWN))
+        more = f" and {len(self.cameras) - _SHOWN} more" if len(self.cameras) > _SHOWN else ""
+        return f"whose cameras are {some}{more}" if some else "which has no camera"
+
     def __getattr__(self, name: str) -> Tensor | nn.Module:
         try:
             return super().__getattr__(name)
         except AttributeError:
             if name in _OF_CAMERAS or (not name.startswith("_") and hasattr(Camera, name)):
-                raise AttributeError(f"Rig: {name} is a camera's, and this is a Rig, {way_to_cameras(self)}") from None
+                raise AttributeError(
+                    f"Rig: {name} is a camera's, and this is a Rig, {self._way_to_cameras()}"
+                ) from None
             raise
 
     def __getitem__(self, name: str) -> Camera:

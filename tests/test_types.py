@@ -96,7 +96,7 @@ def test_what_users_write_runs(tmp_path):
     try:
         typed_uses.own_model()
     finally:
-        del ct.MODELS[typed_uses.Quintic.key]
+        del ct.MODELS["typed_quintic"]
 
 
 def test_errors_on_the_pages_of_a_library_are_errors():

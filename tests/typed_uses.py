@@ -134,20 +134,20 @@ def augmentations(camera: ct.Camera) -> None:
         assert len(batch["image"]) == 2
 
 
-class Quintic(ct.Camera):
-    """A model of a user's own: r = theta (1 + k theta^4)."""
-
-    key = "typed_quintic"
-    distortion_names = ("k",)
-    default_count = 1
-
-    @staticmethod
-    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
-        return Equidistant(), Lens(Planar(Polynomial((torch.zeros_like(k[0]), k[0]))))
-
-
 def own_model() -> None:
     """It has what every camera has."""
+
+    class Quintic(ct.Camera):
+        """A model of a user's own: r = theta (1 + k theta^4)."""
+
+        key = "typed_quintic"
+        distortion_names = ("k",)
+        default_count = 1
+
+        @staticmethod
+        def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
+            return Equidistant(), Lens(Planar(Polynomial((torch.zeros_like(k[0]), k[0]))))
+
     camera = Quintic([280.0, 280, 320, 240], [0.01], image_size=(480, 640))
     assert_type(camera.resize(240, 320), Quintic)
     assert_type(camera.convert(ct.KannalaBrandt).camera, ct.KannalaBrandt)
