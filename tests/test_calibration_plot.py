@@ -178,7 +178,7 @@ def test_cameras_of_a_rig_are_where_they_are():
         dict.fromkeys("ab", camera), {"a": poses["$left\udc80"], "b": ct.Extrinsics([0.0] * 3, [0.0, 0.3, 0.0])}
     )
     assert "from the right" in plot.rig(above, axes()).get_title()
-    with pytest.raises(ValueError, match="cameras with extrinsics"):
+    with pytest.raises(ValueError, match="the cameras of a rig need extrinsics; got a rig of"):
         plot.rig(ct.Rig({"a": camera}), axes())
 
 
