@@ -72,7 +72,8 @@ def shown(run: Run) -> dict[str, Any]:
     results["points"] = [record for record in results["points"] if record["case"] in _POINTS]
     results["augment"] = [r for r in results["augment"] if r["quantity"] != "seconds" or _LOADER not in r["case"]]
     results["images"] = [record for record in results["images"] if _is_shown(record["case"], record["operation"])]
-    return {"machine": run["machine"], "arguments": run["arguments"], "results": results}
+    arguments = {name: value for name, value in run["arguments"].items() if name != "json"}  # where it was written
+    return {"machine": run["machine"], "arguments": arguments, "results": results}
 
 
 def _figures(run: Run, subject: str, quantity: str = "seconds") -> dict[tuple[str, str], dict[str, float]]:

@@ -1,4 +1,4 @@
-"""The galleries of the documentation: everything public has its place, its picture and its code there."""
+"""The galleries of the documentation: everything public has its place, its image and its code there."""
 
 import inspect
 import re
@@ -14,12 +14,12 @@ import camtorch as ct
 from camtorch.warp.dewarp import Projection
 
 DOCS = Path(__file__).parent.parent / "docs"
-LARGEST = 150_000  # bytes of a picture
+LARGEST = 150_000  # bytes of an image
 
 
 @pytest.fixture(scope="module")
 def pages():
-    """The module by which pictures are made from pages."""
+    """The module by which images are made from pages."""
     sys.path.insert(0, str(DOCS))
     try:
         from drawings import pages
@@ -32,17 +32,17 @@ def own_models():
     return {model.__name__: key for key, model in ct.MODELS.items() if model.__module__.startswith("camtorch.")}
 
 
-def check_picture(section, name):
+def check_image(section, name):
     assert f"(../images/{name})" in section
     assert 1000 < (DOCS / "images" / name).stat().st_size < LARGEST
 
 
-def test_every_model_has_its_place_and_picture(pages):
+def test_every_model_has_its_place_and_image(pages):
     found = pages.sections("models.md")
     assert sorted(found) == sorted(own_models())
     table = (DOCS / "models.md").read_text()
     for name, key in own_models().items():
-        check_picture(found[name], f"models/{key}.jpg")
+        check_image(found[name], f"models/{key}.jpg")
         assert f"| [`{name}`](gallery/models.md#{name.lower()}) | `{key}` |" in table
 
 
@@ -107,13 +107,13 @@ def _moves_samples(value):
     return isinstance(value, type) and issubclass(value, torch.nn.Module)
 
 
-def test_every_augmentation_has_its_place_and_picture(pages):
+def test_every_augmentation_has_its_place_and_image(pages):
     found = pages.sections("augmentations.md")
     assert {title.split()[0] for title in found} == augmentations()
     for section in found.values():
         assert "ct.augment." in pages.code(section)
         (name,) = re.findall(r"\(\.\./images/(augment/.*?)\)", section)
-        check_picture(section, name)
+        check_image(section, name)
 
 
 def test_every_option_of_cameras_is_shown(pages):
@@ -128,15 +128,15 @@ def test_every_plot_is_shown(pages):
     found = pages.sections("views.md")
     for section in found.values():
         (name,) = re.findall(r"\(\.\./images/(views/.*?)\)", section)
-        check_picture(section, name)
+        check_image(section, name)
     page = (DOCS / "gallery" / "views.md").read_text()
     assert [name for name in ct.plot.__all__ if f"ct.plot.{name}(" not in page] == []
     projections = get_args(Projection)
     assert [name for name in projections if f"{name}.jpg" not in page] == []
 
 
-def test_every_picture_is_small_and_shown():
+def test_every_image_is_small_and_shown():
     text = "".join(page.read_text() for page in (*DOCS.rglob("*.md"), DOCS.parent / "mkdocs.yml"))
-    for picture in filter(Path.is_file, (DOCS / "images").rglob("*")):
-        assert picture.relative_to(DOCS).as_posix() in text
-        assert picture.stat().st_size < 1.3 * LARGEST
+    for image in filter(Path.is_file, (DOCS / "images").rglob("*")):
+        assert image.relative_to(DOCS).as_posix() in text
+        assert image.stat().st_size < 1.3 * LARGEST

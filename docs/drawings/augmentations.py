@@ -1,4 +1,4 @@
-"""One picture for each augmentation: an image with its labels before and after."""
+"""One image for each augmentation: a sample with its labels before and after."""
 
 from __future__ import annotations
 
@@ -93,14 +93,14 @@ def several(before: dict[str, Any], after: dict[str, dict[str, Any]]) -> Image.I
 
 
 def main(names: list[str]) -> None:
-    """Make the pictures of all augmentations, or of some by the names of their files."""
+    """Make the images of all augmentations, or of some by the names of their files."""
     folder = IMAGES / "augment"
     folder.mkdir(exist_ok=True)
     before = sample()
     for title, text in sections("augmentations.md").items():
         file = re.search(r"\(\.\./images/augment/(.*?)\.jpg\)", text)
         if file is None:
-            raise ValueError(f"{title}: no picture")
+            raise ValueError(f"{title}: no image")
         if names and file[1] not in names:
             continue
         made: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""The pictures of the guides."""
+"""The images of the guides."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One picture for each camera model: a room, a cube of lines and the radius over the angle, through a calibration."""
+"""One image for each camera model: a room, a cube of lines and the radius over the angle, through a calibration."""
 
 from __future__ import annotations
 
@@ -151,8 +151,8 @@ def curve(ax: Axes, camera: ct.Camera) -> None:
     ax.set_facecolor(PAPER)
 
 
-def picture(camera: ct.Camera) -> Image.Image:
-    """The picture of one camera."""
+def image_of(camera: ct.Camera) -> Image.Image:
+    """The image of one camera."""
     height, width = PANEL
     total = height + STRIP + 3 * GAP
     small = fitted(camera, height, width)
@@ -187,12 +187,12 @@ def overview(made: dict[str, ct.Camera]) -> Image.Image:
 
 
 def main(names: list[str]) -> None:
-    """Make the pictures of all models, or of some."""
+    """Make the images of all models, or of some."""
     folder = IMAGES / "models"
     folder.mkdir(exist_ok=True)
     made = cameras()
     for camera in made.values():
         if not names or camera.key in names:
-            picture(camera).save(folder / f"{camera.key}.jpg", quality=80, optimize=True)
+            image_of(camera).save(folder / f"{camera.key}.jpg", quality=80, optimize=True)
     if not names or "all" in names:
         overview(made).save(folder / "all.jpg", quality=60, optimize=True)

@@ -1,4 +1,4 @@
-"""The galleries' pages, whose code makes their pictures."""
+"""The galleries' pages, whose code makes their images."""
 
 from __future__ import annotations
 

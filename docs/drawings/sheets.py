@@ -13,7 +13,7 @@ from torch import Tensor
 from camtorch._drawing import INK, PAPER, RIM, font, shown
 
 WIDTH, TILE, GAP = 960, (345, 460), 13
-"""Pixels: of a picture in the galleries, of an image at its most (height, width), between them."""
+"""Pixels: of an image in the galleries, of a part of it at its most (height, width), between them."""
 
 
 def put(sheet: Image.Image, tile: Image.Image, left: int, top: int) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of projections and of plots."""
+"""Images of projections and of plots."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def files(folder: Path) -> None:
 
 
 def main(names: list[str]) -> None:
-    """Make all pictures of the page, or some by the names of their files."""
+    """Make all images of the page, or some by the names of their files."""
     folder = IMAGES / "views"
     folder.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
