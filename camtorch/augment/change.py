@@ -183,10 +183,10 @@ class Change:
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
-        ours, theirs = (_intrinsics(cameras).cpu() for cameras in (self.target, camera))
+        ours, theirs = _intrinsics(self.target), _intrinsics(camera)
         if not (is_concrete(ours) and is_concrete(theirs)):
             return True
-        return ours.shape == theirs.shape and torch.allclose(ours.double(), theirs.double(), rtol=_ROUNDED)
+        return ours.shape == theirs.shape and torch.allclose(ours.double(), theirs.to(ours.device).double(), _ROUNDED)
 
     def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
         counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]
