@@ -17,7 +17,7 @@ from camtorch.mixed import Mixed, held, kind, remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shutter import Shutters
-from camtorch.warp.warp import EDGE_SAMPLES, Warp, along_edges, corners_of, in_order
+from camtorch.warp.warp import Warp, corners_of, in_order
 
 _ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
 Moved = TypeVar("Moved", Tensor, tuple[Tensor, Tensor])
@@ -360,7 +360,8 @@ class Change:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
-            on_image = camera.contains(along_edges(corners_of(rows), EDGE_SAMPLES)).any(-1)
+            limits = rows.new_tensor(size_of(camera)[::-1]) - 0.5
+            on_image = (rows[..., :2] <= limits).all(-1) & (rows[..., 2:] >= -0.5).all(-1)
             return rows, on_image & in_order(rows) & torch.isfinite(rows).all(-1)
 
         return self.each(boxes, lambda part, warp, rows: warp.transform_boxes(rows), stay)

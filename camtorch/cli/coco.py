@@ -21,10 +21,13 @@ from camtorch.augment.sample import KINDS, moves
 from camtorch.camera import Camera
 from camtorch.cli import rle
 from camtorch.cli.labels import LabelsError
+from camtorch.warp.warp import within
 
 Json = dict[str, Any]
 _STEP = 8.0  # pixels: between points of a polygon's edge that are moved
 _SAG = 0.1  # pixels by which a straight edge may miss the curve that it stands for
+_COARSE = 8  # pixels of the new image between those of which it is asked what they show
+_HALVINGS = 40  # of a way of some hundred pixels: what is left is a rounding error
 _LEAST = 0.01  # square pixels
 _FARTHEST = 1e6  # pixels
 _3D = ("gaze", "directions", "pitch_yaw", "points", "head_pose", "pose", "rvec", "tvec")
@@ -122,9 +125,10 @@ def moved(
     """The annotations of an image after a change of its camera; None for those of which nothing is seen any more.
 
     Of keypoints those off the image get 0, 0, 0, and `num_keypoints` counts the others. Polygons are moved with points
-    between their corners where edges get curved, and are clipped; runs are moved as masks. The box is that of what is
-    left of polygons or runs, else the one that encloses the moved box, clipped. The area is that of what is left, or
-    the old one's part of its box. `gaze`, `head_pose` and other fields in the camera's frame turn with it.
+    between their corners where edges get curved, end at the rim of what can be mapped, and are clipped; runs are moved
+    as masks. The box is that of what is left of polygons or runs, else the one that encloses the moved box, clipped.
+    The area is that of what is left, or the old one's part of its box. `gaze`, `head_pose` and other fields in the
+    camera's frame turn with it.
 
     Args:
         annotations: of one image.
@@ -148,7 +152,8 @@ def moved(
     on_image = on_image & source.contains(some)
     there = on_image | (everywhere != -1).any(-1)
     pieces = iter(zip(*(value.split(counts) for value in (everywhere, on_image, there)), strict=True))
-    of_points, of_edges = [next(pieces) for _ in points], list(pieces)
+    of_points = [next(pieces) for _ in points]
+    of_edges = _pulled_in(edges, [(places, there) for places, _, there in pieces], change)
     of_boxes = zip(*(value[0] for value in change.boxes(torch.stack(boxes)[None])), strict=True) if boxes else ()
     of_masks = change.labels(torch.stack(masks)[None])[0] if masks else ()
     iterators = iter(of_points), iter(of_edges), iter(of_boxes), iter(of_masks)
@@ -224,10 +229,7 @@ def _put(one: Json, part: _Parts, size: tuple[int, int], moved: tuple[Any, ...])
             old = float((part.box[2:] - part.box[:2]).prod())
             area = one["area"] * box[2] * box[3] / old if old and type(one.get("area")) in (int, float) else None
     if part.polygons:
-        clipped_polygons = []
-        for polygon in part.polygons:
-            places, _, there = next(of_edges)
-            clipped_polygons.append(_clipped(_thinned(polygon, places, there), width, height))
+        clipped_polygons = [_clipped(_thinned(one, *next(of_edges)), width, height) for one in part.polygons]
         kept = [polygon for polygon in clipped_polygons if _area(polygon) >= _LEAST]
         new["segmentation"] = [[_rounded(v + 0.5) for corner in polygon for v in corner] for polygon in kept]
         area = sum(map(_area, kept))
@@ -296,9 +298,45 @@ def _along(corners: Tensor) -> Tensor:
     return torch.cat([a + (b - a) * torch.arange(n, dtype=a.dtype)[:, None] / n for a, b, n in edges])
 
 
-def _thinned(corners: Tensor, places: Tensor, there: Tensor) -> list[tuple[float, float]]:
+def _pulled_in(
+    edges: Sequence[Tensor], moved: Sequence[tuple[Tensor, Tensor]], change: Change
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """(K, 2) places of the points of every polygon, (K,) which are their own, and which there are.
+
+    What has no place takes that of the point where one last exists on the way to the middle of what the new image
+    shows: an outline around all that can be mapped so becomes its rim.
+    """
+    result = [(places, own, own) for places, own in moved]
+    partly = [i for i, (_, own) in enumerate(moved) if not bool(own.all())]
+    if not partly:
+        return result
+    target = singles(change.target)[0] if isinstance(change.target, Camera) else change.target[0]
+    shown = change.inverse().points(target.pixel_grid()[::_COARSE, ::_COARSE].flatten(0, 1).double()[None])[0][0]
+    shown = shown[(shown != -1).any(-1)]
+    if not len(shown):
+        return result
+    middle = shown[(shown - shown.mean(0)).norm(dim=-1).argmin()]
+    for i in partly:
+        places, own = moved[i]
+        if not bool(own.any()) and not bool(within(edges[i], middle[None])):
+            continue  # all of it lies beyond what can be mapped
+        points = edges[i][~own]
+        inwards = middle - points
+        least, most = torch.zeros(len(points), 1).double(), torch.ones(len(points), 1).double()
+        for _ in range(_HALVINGS):
+            share = (least + most) / 2
+            mapped = (change.points((points + share * inwards)[None])[0][0] != -1).any(-1, keepdim=True)
+            least, most = torch.where(mapped, least, share), torch.where(mapped, share, most)
+        places = places.clone()
+        places[~own] = change.points((points + most * inwards)[None])[0][0].to(places)
+        result[i] = places, own, torch.ones_like(own)
+    return result
+
+
+def _thinned(corners: Tensor, places: Tensor, own: Tensor, there: Tensor) -> list[tuple[float, float]]:
     """What became of a polygon: its corners, and as many points between them as its edges are curved."""
     everywhere: list[tuple[float, float]] = list(zip(*places.T.tolist(), strict=True))
+    is_own: list[bool] = own.tolist()
     is_there: list[bool] = there.tolist()
     points: list[tuple[float, float]] = []
     first = 0
@@ -307,7 +345,7 @@ def _thinned(corners: Tensor, places: Tensor, there: Tensor) -> list[tuple[float
         if len(edge) == count:  # the last one, which closes it
             edge.append(everywhere[0])
         wanted = count
-        if count > 1 and all(is_there[first : first + count]) and is_there[(first + count) % len(is_there)]:
+        if count > 1 and all(is_own[first : first + count]) and is_own[(first + count) % len(is_own)]:
             wanted = min(count, max(1, math.ceil(math.sqrt(_sag(edge) / _SAG))))
         kept = sorted({round(j * count / wanted) for j in range(wanted)})
         points += [edge[j] for j in kept if is_there[first + j]]

@@ -281,12 +281,12 @@ class AffineWarp(MirrorWarp):
 
     # -- labels
 
-    def _move(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
         pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
         pixels = pixels if pixels.is_floating_point() else pixels.to(self.source.intrinsics.dtype)
         valid = torch.isfinite(pixels).all(-1)
         wide = torch.where(valid.unsqueeze(-1), pixels, 0.0).to(self.matrix.dtype)
-        matrix = self.matrix
+        matrix = inverted(self.matrix) if back else self.matrix
         if matrix.ndim == 3:
             matrix = matrix.reshape(-1, *[1] * (pixels.ndim - 2), 2, 3)
         moved = (matrix[..., :2] * wide.unsqueeze(-2)).sum(-1) + matrix[..., 2]

@@ -55,10 +55,13 @@ class SurfaceWarp(Warp):
         grid = to_positions(seen, mapped, self.source._size("Warp"))
         return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
 
-    def _move(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
-        rays, has_ray = self.source.unproject(pixels)
-        directions, met = self._to_target(rays)
-        seen, mapped = self.target.project(directions)
+    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
+        source, target, carried = self.source, self.target, self._to_target
+        if back:
+            source, target, carried = target, source, self._to_source
+        rays, has_ray = source.unproject(pixels)
+        directions, met = carried(rays)
+        seen, mapped = target.project(directions)
         valid = mapped & has_ray & met
         return torch.where(valid.unsqueeze(-1), seen, -1.0), valid
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, broadcast_shapes, check_devices, no_camera
 from camtorch._module import GeometryModule, Memo, is_constant, typed_as, with_values
-from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, set_aside
+from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, may_look, set_aside
 from camtorch.camera import Camera
 from camtorch.maps.formats import save_map
 from camtorch.maps.protocol import Options as MapOptions
@@ -51,7 +51,8 @@ def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     return camera
 
 
-EDGE_SAMPLES = 64  # per edge: one of 500 px bent to a radius of 300 px is then enclosed to 0.03 px
+_EDGE_SAMPLES = 64  # per edge: one of 500 px bent to a radius of 300 px is then enclosed to 0.03 px
+_LATTICE = 16  # steps across and down the target, between points that are looked for in what an outline encloses
 
 
 class Warp(GeometryModule):
@@ -432,10 +433,13 @@ class Warp(GeometryModule):
         moved, mapped = self._move(pixels)
         return moved, mapped & self.target.contains(moved)
 
-    def _move(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
-        source, target = self._seen_by
+    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
+        """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not."""
+        (source, target), rotation = self._seen_by, self.rotation
+        if back:
+            source, target, rotation = target, source, None if rotation is None else rotation.mT
         rays, has_ray = source.unproject(pixels)
-        moved, mapped = target.project(turn(self.rotation, rays, "pixels"))
+        moved, mapped = target.project(turn(rotation, rays, "pixels"))
         valid = mapped & has_ray
         return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
 
@@ -443,9 +447,11 @@ class Warp(GeometryModule):
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.
 
         Returns:
-            the boxes that enclose the moved outlines (curved: the edges are sampled), not clipped to the
-            image, and valid (B, *N) bool: some part of the outline lies on the target's image. A box
-            none of whose outline can be mapped, or with x2 < x1 or y2 < y1, is (-1, -1, -1, -1).
+            the boxes that enclose the moved outlines (curved: the edges are sampled), not clipped to the image, and
+            valid (B, *N) bool: some part of what the box encloses is on the target's image, if only its inside. Of an
+            outline only a part of which can be mapped, the box encloses that part and what the image shows of the
+            inside, found in steps of a sixteenth of the image. Without either, or with x2 < x1 or y2 < y1, it is
+            (-1, -1, -1, -1).
         """
         boxes = as_values(boxes, "boxes", "Warp", self.source.intrinsics.device)
         if boxes.ndim == 0 or boxes.shape[-1] != 4:
@@ -461,13 +467,36 @@ class Warp(GeometryModule):
         corners = as_coordinates(corners, "corners", 2, "Warp", self.source.intrinsics.device, "B, *N, K")
         if corners.ndim < 2:
             raise ValueError(f"Warp: corners must be (B, *N, K, 2); got shape {tuple(corners.shape)}")
-        moved, mapped = self._move(along_edges(corners, EDGE_SAMPLES))
-        mapped = mapped & torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
-        some = mapped.any(-1, keepdim=True)
+        finite = torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
+        moved, mapped = self._move(along_edges(corners, _EDGE_SAMPLES))
+        mapped = mapped & finite
         low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
         high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)
-        enclosing = torch.where(some, torch.cat((low, high), -1), -1.0)
-        return enclosing, (mapped & self.target.contains(moved)).any(-1)
+        some, valid = mapped.any(-1), (mapped & self.target.contains(moved)).any(-1)
+        whole = mapped.all(-1)
+        if not may_look(valid) or not bool((valid & whole).all()):
+            lattice, inside = self._inside(corners, moved)
+            inside = inside & finite
+            some, valid = some | inside.any(-1), valid | inside.any(-1)
+            inside = (inside & ~whole.unsqueeze(-1)).unsqueeze(-1)
+            low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
+            high = torch.maximum(high, torch.where(inside, lattice, -torch.inf).amax(-2))
+        return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
+
+    @torch.no_grad()
+    def _inside(self, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (N, 2) of a lattice from edge to edge of the target, and (B, *M, N): which show what polygons enclose.
+
+        They find what encloses the whole image, or such parts of it as show the source, and has no outline there.
+        """
+        height, width = self.target._size("Warp")
+        share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
+        lattice = torch.cartesian_prod(share * width, share * height) - 0.5
+        shown, seen = self._move(lattice.expand(*self.batch_shape, *lattice.shape), back=True)
+        if self.batch_shape:
+            lead = len(shown), *[1] * (corners.ndim - 3), len(lattice)
+            shown, seen = shown.reshape(*lead, 2), seen.reshape(lead)
+        return lattice, within(corners, shown) & seen
 
     def transform_rays(self, rays: Numbers) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay.
@@ -611,6 +640,18 @@ def along_edges(corners: Tensor, samples: int) -> Tensor:
     share = torch.linspace(0, 1, samples + 1, dtype=corners.dtype, device=corners.device)[:-1, None]
     start, end = corners.unsqueeze(-2), corners.roll(-1, -2).unsqueeze(-2)
     return (start + (end - start) * share).flatten(-3, -2)
+
+
+def within(corners: Tensor, points: Tensor) -> Tensor:
+    """(..., N) bool: whether points (..., N, 2) are inside closed polygons (..., K, 2), by the edges to their right."""
+    x, y = points.unsqueeze(-2).unbind(-1)
+    x1, y1 = corners.unsqueeze(-3).unbind(-1)
+    across, down = x1.roll(-1, -1) - x1, y1.roll(-1, -1) - y1
+    above = y1 <= y
+    crossed = above != above.roll(-1, -1)
+    to_the_right = ((x - x1) * down < across * (y - y1)) == (down > 0)
+    inside: Tensor = (crossed & to_the_right).sum(-1) % 2 == 1
+    return inside
 
 
 def outlines(boxes: Tensor, samples: int = 16) -> Tensor:
