@@ -129,6 +129,41 @@ def test_annotations_move_with_the_image(source, target, angles):
     assert np.allclose(rest["gaze"], change.rotation[0] @ torch.tensor([0.0, 0.0, -1.0]).double())
 
 
+FOLDED = ct.BrownConrady([45.0, 45.0, 48.0, 36.0], [-0.5, 0.1, 0.0, 0.0], image_size=SIZE).double()
+
+
+@pytest.mark.parametrize("source", [CAMERAS["pinhole"], FOLDED], ids=["all has a ray", "a circle has"])
+@pytest.mark.parametrize("box", [[8, 6, 80, 60], [-10, -10, 116, 92], [-10, 2, 60, 68], [2, 2, 90, 30]])
+def test_what_is_larger_than_the_image_is_on_it(source, box):
+    zoomed = ct.augment.RandomMount(zoom=(2, 2), yaw=(0, 0), pitch=(0, 0), roll=(20, 20))
+    change = zoomed.change(source.requires_grad_(False), zoomed.draw(1))
+    x, y, w, h = box
+    polygon = [x, y, x + w, y, x + w, y + h, x, y + h]
+    mask = torch.from_numpy(drawn(polygon).astype(np.uint8))[None, None]
+    # beyond the image, too, there is what has a ray: all that is shown comes from it
+    truth = (change.labels(mask)[0, 0] > 0).numpy()
+    boxed, outlined = coco.moved(
+        [
+            {"id": 1, "bbox": box, "keypoints": [48, 25, 2], "area": w * h},
+            {"id": 2, "bbox": box, "segmentation": [polygon], "area": w * h},
+        ],
+        change,
+    )
+    assert boxed["num_keypoints"] == 1
+    mine = np.any([drawn(one) for one in outlined["segmentation"]], axis=0)
+    assert (mine ^ truth).sum() <= 0.01 * truth.sum() + 25
+    rows, columns = np.nonzero(truth)
+    for one, margin in ((boxed, 7), (outlined, 2)):  # a box finds what has no outline in steps of a sixteenth
+        left, top, width, height = one["bbox"]
+        assert left <= columns.min() + margin
+        assert top <= rows.min() + margin
+        assert left + width >= columns.max() + 1 - margin
+        assert top + height >= rows.max() + 1 - margin
+    # what lies beyond all that has a ray is gone
+    beyond = [-90.0, -90.0, -60.0, -90.0, -60.0, -60.0, -90.0, -60.0]
+    assert coco.moved([{"id": 3, "bbox": [-90, -90, 30, 30], "segmentation": [beyond]}], change) == [None]
+
+
 def test_straight_edges_get_no_more_corners():
     change = fixed_change(CAMERAS["pinhole"], CAMERAS["pinhole"], (0, 0, 0))
     (same,) = coco.moved([{"id": 1, "segmentation": [POLYGON], "bbox": [20, 12, 50, 43]}], change)

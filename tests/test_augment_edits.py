@@ -794,3 +794,27 @@ def test_chains_compile():
     torch.testing.assert_close(out["keypoints"], expected["keypoints"], atol=1e-3, rtol=0)
     torch.testing.assert_close(out["gaze"], expected["gaze"])
     assert (out["image"] - expected["image"]).abs().mean() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["CenterCrop", "RandomCrop", "RandomResizedCrop"])
+def test_boxes_stay_where_any_of_their_mask_does(name):
+    torch.manual_seed(0)
+    edit = getattr(ct.augment, name)((112, 112))
+    corners = torch.rand(60, 2, 2) * torch.tensor([420.0, 340.0]) - 50
+    boxes = torch.cat((corners.amin(1), corners.amax(1) + 2), -1).round()
+    boxes[0] = torch.tensor([60.0, 40.0, 260.0, 200.0])
+    v, u = torch.meshgrid(torch.arange(240), torch.arange(320), indexing="ij")
+    low, high = boxes[:, :2, None, None], boxes[:, 2:, None, None]
+    masks = (u >= low[:, 0]) & (u <= high[:, 0]) & (v >= low[:, 1]) & (v <= high[:, 1])
+    out = edit(image=torch.zeros(60, 1, 240, 320), mask=masks, boxes=boxes[:, None])
+    shown = out["mask"].flatten(1).any(-1)
+    assert shown.any()
+    assert out["boxes_valid"][:, 0][shown].all()
+    # what has no pixel of the mask ends within one of the image's edge, or was nowhere on the image
+    left, top, right, bottom = out["boxes"][:, 0].unbind(-1)
+    near = (left < 114) & (top < 114) & (right > -2) & (bottom > -2)
+    assert not out["boxes_valid"][:, 0][~near].any()
+    # nor is a sample that stays asked otherwise
+    camera = ct.Pinhole([300.0, 300.0, 159.5, 119.5], image_size=(240, 320)).requires_grad_(False)
+    boxes = torch.stack((boxes[0] + 400, 100 * boxes[0] - 9000))
+    assert ct.augment.RandomMount(p=0.0, camera=camera)(boxes=boxes)["boxes_valid"].tolist() == [False, True]

@@ -130,6 +130,104 @@ def test_boxes_off_the_image_keep_their_place_and_say_so():
     assert moved[2].tolist() == [-1, -1, -1, -1]
 
 
+def lenses():
+    """By name; two have an image circle or a fold within the image."""
+    numbers = {
+        "kannala_brandt": ([20, 20.5, 32, 23], [0.02, -0.01, 0.004, -0.001]),
+        "small_circle": ([8, 8, 32, 23], [0.02, -0.01, 0.004, -0.001]),
+        "brown_conrady": ([35, 35, 31, 24], [-0.5, 0.1, 0.001, 0.002]),
+        "pinhole": ([40, 40, 31.5, 23.5], None),
+        "equirectangular": ([20, 20, 31.5, 23.5], None),
+    }
+    return {
+        name: ct.MODELS[name.replace("small_circle", "kannala_brandt")](
+            torch.tensor(intrinsics, dtype=torch.float64),
+            *([] if distortion is None else [torch.tensor(distortion, dtype=torch.float64)]),
+            image_size=SIZE,
+        ).requires_grad_(False)
+        for name, (intrinsics, distortion) in numbers.items()
+    }
+
+
+@pytest.mark.parametrize("target", lenses())
+@pytest.mark.parametrize("source", lenses())
+def test_a_box_is_on_the_image_if_a_ray_of_the_image_comes_back_inside(source, target):
+    generator = torch.Generator().manual_seed(len(source) * 100 + len(target))
+    whole, fine = lenses(), 4
+    for angles in ((0, 0, 0), (12, -8, 30), (70, 20, 100), (160, 40, 10)):
+        height, width, top, left = torch.randint(8, 40, (4,), generator=generator).tolist()
+        camera = whole[target].crop(top - 10, left - 10, height, width)
+        warp = ct.Warp(whole[source], camera, turn(*angles, torch.float64))
+        middles = torch.rand(40, 2, generator=generator, dtype=torch.float64) * 90 - 15
+        sides = 10 ** (0.3 + 2 * torch.rand(40, 2, generator=generator, dtype=torch.float64))
+        boxes = torch.cat((middles - sides / 2, middles + sides / 2), -1)
+        moved, valid = warp.transform_boxes(boxes)
+        # where four by four points of every pixel come from
+        grid = ct.Warp(warp.source, camera.resize(height * fine, width * fine), warp.rotation).grid()[0]
+        seen = (grid != -9).all(-1)
+        places = ((grid + 1) * grid.new_tensor([SIZE[1], SIZE[0]]) - 1) / 2
+
+        def inside(margin, boxes=boxes, places=places, seen=seen):
+            low, high = (boxes[:, None, None, :2] <= places + margin), (boxes[:, None, None, 2:] >= places - margin)
+            return (low & high).all(-1) & seen
+
+        shown = inside(0.0)
+        pixel = fine * torch.stack([(places - places.roll(1, dim)).abs().amax(-1) for dim in (0, 1)]).amax(0)[..., None]
+        # what is a pixel thick, and more, is found; what is found is there to a pixel
+        thick = -torch.nn.functional.max_pool2d(-shown.double(), 2 * fine + 1, 1, fine) > 0
+        assert bool(valid[thick.flatten(1).any(-1)].all())
+        if bool(seen.any()):
+            assert not bool(valid[~inside(pixel).flatten(1).any(-1)].any())
+        # of what its outline does not say the box knows to a step of the lattice
+        pixels = (camera.resize(height * fine, width * fine).pixel_grid() + 0.5) / fine - 0.5
+        step = torch.tensor([width, height]) / 16 + 1
+        rows = thick.flatten(1).any(-1) & warp.transform_points(boxes.unflatten(-1, (2, 2)))[1].all(-1)
+        for box, there in zip(moved[rows], thick[rows], strict=True):
+            assert bool((pixels[there] >= box[:2] - step).all() & (pixels[there] <= box[2:] + step).all())
+
+
+def test_boxes_around_the_whole_image_are_on_it():
+    camera = pinhole(dtype=torch.float64)
+    around, beside = [-900.0, -900.0, 900.0, 900.0], [-900.0, -900.0, 900.0, -700.0]
+    boxes = torch.tensor([around, beside, [900.0, -900.0, -900.0, 900.0], [-math.inf, -900.0, 900.0, 900.0]])
+    for rotation in (None, turn(roll=40, dtype=torch.float64)):
+        moved, valid = ct.Warp(camera, camera, rotation).transform_boxes(boxes)
+        assert valid.tolist() == [True, False, False, False]
+        assert bool((moved[0, :2] < -800).all() & (moved[0, 2:] > 800).all())
+    # turned by 45 degrees: across a corner, and with a box about it that touches the image while it does not
+    corner = torch.tensor([[-3.0, -3.0], [63.0, -3.0], [63.0, 50.0], [-3.0, 50.0]], dtype=torch.float64)
+    diamond = torch.tensor([[-20.0, 3.0], [3.0, -20.0], [-20.0, -43.0], [-43.0, -20.0]], dtype=torch.float64)
+    shifts = torch.tensor([[0.0, 0.0], [7.0, 7.0], [8.0, 8.0]], dtype=torch.float64)
+    polygons = torch.cat((corner[None], diamond + shifts[:, None]))
+    enclosing, valid = ct.Warp(camera, camera).enclose(polygons)
+    assert valid.tolist() == [True, False, False, True]
+    assert bool((enclosing[:, 2:] > 0).all())
+    # no part of the outline has a ray: the box is that of what the image shows
+    lens = lenses()["small_circle"]
+    boxes = torch.tensor([[-500.0, -500.0, 500.0, 500.0]] * 2, dtype=torch.float64, requires_grad=True)
+    moved, valid = ct.Warp(lens, pinhole(dtype=torch.float64)).transform_boxes(boxes)
+    assert valid.all()
+    torch.testing.assert_close(moved[0].detach(), torch.tensor([-0.5, -0.5, 63.5, 47.5], dtype=torch.float64))
+    moved.sum().backward()
+    assert bool((boxes.grad == 0).all())
+    assert not ct.Warp(lens, pinhole(dtype=torch.float64), turn(180, dtype=torch.float64)).transform_boxes(
+        [[-500.0, -500.0, 0.0, 500.0]]
+    )[1]
+
+
+def test_boxes_around_images_of_planes_and_of_moving_cameras_are_on_them():
+    camera = pinhole(dtype=torch.float64)
+    box = torch.tensor([[-300.0, -200.0, 300.0, 200.0], [-300.0, -200.0, -250.0, 200.0]], dtype=torch.float64)
+    near = ct.Extrinsics(torch.zeros(3, dtype=torch.float64), torch.tensor([0.1, 0.0, -0.5], dtype=torch.float64))
+    shutter = ct.RollingShutter(0.02, [0.3, 0.5, 0.1])
+    for warp in (
+        ct.PlaneWarp(camera, camera, near, [0.0, 0.0, 1.0], 2.0),
+        ct.Warp(camera, camera, shutter=shutter, target_shutter=shutter),
+    ):
+        assert warp.transform_boxes(box)[1].tolist() == [True, False]
+        assert warp.inverse().transform_boxes(box)[1].tolist() == [True, False]
+
+
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64, torch.bool])
 def test_labels_keep_dtype_and_values(dtype):
     warp = ct.Warp(fisheye(), pinhole(), turn(5), mode="nearest")

@@ -79,8 +79,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         - keypoints keep their count and order. ``keypoints_valid`` (B, N), an attribute, is which of those last moved
           lie on their new image. One without a place there becomes ``(-1, -1)``, and stays that, not valid, in
           whatever augmentations of camtorch follow.
-        - boxes become those that enclose their moved outlines, which are curved; they are not clipped. A box with no
-          part of its outline on the new image is invalid, which kornia exports as zeros.
+        - boxes become those that enclose their moved outlines, which are curved; they are not clipped. A box of which
+          no part, outline or inside, is on the new image is invalid, which kornia exports as zeros.
         - masks take the nearest value, the augmentation's `mask_fill` where nothing is seen, and never the colours and
           the light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft ones.
         - the warp is no matrix: ``transform_matrix`` is NaN, also of a container that holds the augmentation. ``last``

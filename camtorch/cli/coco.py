@@ -27,7 +27,7 @@ Json = dict[str, Any]
 _STEP = 8.0  # pixels: between points of a polygon's edge that are moved
 _SAG = 0.1  # pixels by which a straight edge may miss the curve that it stands for
 _COARSE = 8  # pixels of the new image between those of which it is asked what they show
-_HALVINGS = 40  # of a way of some hundred pixels: what is left is a rounding error
+_HALVINGS = 24  # of a way of some hundred pixels: 1e-4 of one are left
 _LEAST = 0.01  # square pixels
 _FARTHEST = 1e6  # pixels
 _3D = ("gaze", "directions", "pitch_yaw", "points", "head_pose", "pose", "rvec", "tvec")
@@ -316,20 +316,24 @@ def _pulled_in(
     if not len(shown):
         return result
     middle = shown[(shown - shown.mean(0)).norm(dim=-1).argmin()]
+    # what lies beyond all that can be mapped, and not around it, stays away
+    partly = [i for i in partly if bool(moved[i][1].any()) or bool(within(edges[i], middle[None]))]
+    if not partly:
+        return result
+    points = torch.cat([edges[i][~moved[i][1]] for i in partly])
+    least, most = torch.zeros(len(points), 1).double(), torch.ones(len(points), 1).double()
+
+    def at(share: Tensor) -> Tensor:
+        return change.points((points + share * (middle - points))[None])[0][0]
+
+    for _ in range(_HALVINGS):
+        share = (least + most) / 2
+        mapped = (at(share) != -1).any(-1, keepdim=True)
+        least, most = torch.where(mapped, least, share), torch.where(mapped, share, most)
+    found = iter(at(most).split([int((~moved[i][1]).sum()) for i in partly]))
     for i in partly:
         places, own = moved[i]
-        if not bool(own.any()) and not bool(within(edges[i], middle[None])):
-            continue  # all of it lies beyond what can be mapped
-        points = edges[i][~own]
-        inwards = middle - points
-        least, most = torch.zeros(len(points), 1).double(), torch.ones(len(points), 1).double()
-        for _ in range(_HALVINGS):
-            share = (least + most) / 2
-            mapped = (change.points((points + share * inwards)[None])[0][0] != -1).any(-1, keepdim=True)
-            least, most = torch.where(mapped, least, share), torch.where(mapped, share, most)
-        places = places.clone()
-        places[~own] = change.points((points + most * inwards)[None])[0][0].to(places)
-        result[i] = places, own, torch.ones_like(own)
+        result[i] = places.index_put((~own,), next(found).to(places)), own, torch.ones_like(own)
     return result
 
 
