@@ -60,7 +60,7 @@ def rectification(key: str, size: tuple[int, int], dtype: torch.dtype, device: t
     camera = cameras.camera(key, device, dtype, size=size).requires_grad_(False)
     extrinsics = ct.Extrinsics([0.01, -0.02, 0.015], [-0.1, 0.002, -0.001]).to(device).requires_grad_(False)
     focal = camera.intrinsics.detach().double().tolist()
-    wide = 2 * np.arctan(size[1] / 2 / focal[0])
+    wide = np.degrees(2 * np.arctan(size[1] / 2 / focal[0]))
     return ct.rectify(camera, camera, extrinsics, fov=float(wide), image_size=size, align="opencv")
 
 

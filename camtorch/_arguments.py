@@ -188,6 +188,30 @@ def as_part(value: Any, name: str, owner: str, kind: str = "part") -> float:
     return part
 
 
+def as_fov(value: Any, owner: str, most: float, means: str = "") -> float:
+    """A field of view in degrees: above 2 pi, and below `most`, or up to it where that is a whole turn.
+
+    Raises:
+        TypeError: no number. ValueError: another one; up to 2 pi the error says that it seems to be radians.
+    """
+    fov = as_number(value, "fov", owner)
+    if not (0 < fov < most or fov == most == 360):
+        upto = "up to" if most == 360 else "below"
+        raise ValueError(f"{owner}: fov must be in degrees, above 0 and {upto} {most:g}{means}; got {shown(value)}")
+    check_degrees(fov, value, owner)
+    return fov
+
+
+def check_degrees(least: float, fov: object, owner: str) -> None:
+    """Raise a ValueError if the least field of view of those given is up to 2 pi: then it seems to be in radians."""
+    if least <= 2 * math.pi * (1 + 1e-6):  # which float32 rounds up
+        raise ValueError(
+            f"{owner}: fov is in degrees; {fov} seems to be radians, of which {least:.4g} are {math.degrees(least):.4g} "
+            "degrees. A camera of so narrow a view is made from its focal lengths: ct.Pinhole([fx, fy, cx, cy]), or "
+            "from_matrix(K) of any model"
+        )
+
+
 def as_mapping(value: Any, name: str, owner: str, form: str) -> Mapping[Any, Any]:
     """A mapping, or what torch has instead of one; an empty one of None.
 

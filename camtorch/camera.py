@@ -25,6 +25,7 @@ from camtorch._arguments import (
     as_vectors,
     as_whole,
     broadcast_shapes,
+    check_degrees,
     is_predicted,
     shown,
 )
@@ -279,11 +280,8 @@ class Camera(BatchedModule):
         degrees = as_real(fov, "fov", owner).detach().double()
         if is_concrete(degrees) and not bool(((degrees > 0) & (degrees <= 360)).all()):
             raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
-        if is_concrete(degrees) and bool((degrees <= 2 * math.pi).any()):
-            raise ValueError(
-                f"{owner}: fov is in degrees; {degrees.tolist()} seems to be radians, which math.degrees() converts. A "
-                "lens as narrow as that has a focal length of width / 2 / tan(fov / 2), which makes its intrinsics"
-            )
+        if is_concrete(degrees) and degrees.numel():
+            check_degrees(float(degrees.min()), degrees.tolist(), owner)
         given = () if distortion is None else (as_real(distortion, "distortion", owner),)
         plane = cls(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
         degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
@@ -293,7 +291,7 @@ class Camera(BatchedModule):
         intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
         made = cls(intrinsics, *given, image_size=size)
         if is_concrete(reached) and not bool(reached.all()):
-            widest = made.field_of_view[..., AXES.index(axis)].rad2deg().flatten().tolist()
+            widest = made.fov[..., AXES.index(axis)].flatten().tolist()
             raise ValueError(
                 f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "
                 + ", ".join(f"{angle:.5g}" for angle in widest)
@@ -710,6 +708,11 @@ class Camera(BatchedModule):
             ValueError: the camera has no image size.
         """
         return field_of_view(self)
+
+    @property
+    def fov(self) -> Tensor:
+        """(*B, 3): `field_of_view` in degrees, the unit of every `fov` that camtorch is given."""
+        return self.field_of_view.rad2deg()
 
     def explain(self, points: Numbers) -> list[str]:
         """Why points have no pixel, in words; for a person, and slow.

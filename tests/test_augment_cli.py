@@ -225,6 +225,7 @@ def test_columns_leave_little_empty():
         (["--seed", "-1"], "--seed must be 0 or more"),
         (["--seed", str(1 << 64)], "--seed must be 0 or more"),
         (["--min-filled", "90"], "--min-filled must be 0 to 1; got 90"),
+        (["--fov", "2.1"], "2.1 seems to be radians"),
         (["--fov", "sources"], "--fov: 'sources' is neither a number nor LOW,HIGH"),
         (["--size", "8"], "'8' is not WIDTHxHEIGHT"),
         (["--yaw", "left"], "--yaw: 'left' is neither a number nor LOW,HIGH"),

@@ -60,7 +60,7 @@ def test_dewarp_writes_what_dewarp_makes(folder, capsys):
         "100.0 % of it is filled and shows 23 % of the photograph\n"
     )
     image = torch.from_numpy(np.array(opened("in.png"))).permute(2, 0, 1)[None]
-    expected = ct.Dewarp(camera(), fov=torch.pi / 2, image_size=(60, 80))(image)[0].permute(1, 2, 0)
+    expected = ct.Dewarp(camera(), fov=90, image_size=(60, 80))(image)[0].permute(1, 2, 0)
     assert np.array_equal(np.array(opened("out.png")), expected.numpy())
     assert [path.name for path in sorted(folder.iterdir())] == ["camera.yml", "in.png", "out.png"]
 
@@ -148,6 +148,7 @@ def test_an_exchanged_width_and_height_is_not_scaled(folder, capsys):
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "wide", "-o", "o.png"], "--fov: invalid float"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "180", "-o", "o.png"], "below 180 degrees"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "nan", "-o", "o.png"], "--fov must be above 0"),
+        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "2.1", "-o", "o.png"], "2.1 seems to be radians"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "0", "-o", "o.png"], "--fov must be above 0"),
         (["demo", "-o", "in.png"], "in.png: exists already"),
     ],

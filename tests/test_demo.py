@@ -47,7 +47,7 @@ def test_a_wrong_camera_would_be_noticed():
         wrong.distortion[:1] *= 0.7
     bends = []
     for camera in (lens.camera, wrong):
-        warp = dewarping.Dewarp(camera, fov=1.5, image_size=lens.size)
+        warp = dewarping.Dewarp(camera, fov=86, image_size=lens.size)
         view = (warp(source[None])[0], warp.target, torch.eye(3, dtype=torch.float64))
         bends.append(dewarping._bend(dewarping._edges(room.lines(), view)[0]))
     assert bends[1] > 3 * bends[0]

@@ -1,5 +1,7 @@
 """What people try first of edits, heads, losses and shutters: it works, or an error says what to do."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -28,8 +30,6 @@ def test_sizes_of_one_number_in_a_list_are_torchvisions():
     [
         (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90, which would be degrees"),
         (lambda: A.Rotate90((-90, 90)), ValueError, "degrees"),
-        (lambda: A.RandomLens("kannala_brandt", fov=(1.0, 2.0)), ValueError, "seems to be radians"),
-        (lambda: A.RandomCamera("real", fov=(1.0, 2.0)), ValueError, "seems to be radians"),
         (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
         (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples=2.5), TypeError, "samples must be a whole number"),
         (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples="8"), TypeError, "samples must be a whole number"),
@@ -115,3 +115,36 @@ def test_fields_with_longer_names_are_compiled():
     draw = flip.draw(2)
     step = torch.compile(lambda f: flip(**f, draw=draw)["gaze_left"], backend="eager", fullgraph=True)
     torch.testing.assert_close(step(fields), flip(**fields, draw=draw)["gaze_left"])
+
+
+STEREO = LENS, LENS, ct.Extrinsics([0.0] * 3, [-0.1, 0.0, 0.0])
+WIDE = {
+    **{f"{key}.from_fov": lambda fov, key=key: ct.MODELS[key].from_fov(fov, image_size=SIZE) for key in ct.MODELS},
+    "from_fov of a batch": lambda fov: ct.Pinhole.from_fov(torch.tensor([fov, 90.0]), image_size=SIZE),
+    "Dewarp": lambda fov: ct.Dewarp(LENS, fov=fov),
+    "a panorama": lambda fov: ct.Dewarp(LENS, fov=fov, projection="equirectangular"),
+    "rectify": lambda fov: ct.rectify(*STEREO, fov=fov),
+    "rectify, vertically": lambda fov: ct.rectify(*STEREO, fov=(90, fov)),
+    "ring": lambda fov: ct.views.ring(LENS, 3, fov=fov),
+    "RandomMount": lambda fov: A.RandomMount(fov=fov),
+    "RandomLens": lambda fov: A.RandomLens("kannala_brandt", fov=(fov, 90)),
+    "real": lambda fov: A.RandomCamera("real", fov=(fov, 100)),
+    "CameraHead": lambda fov: ct.CameraHead(8, "pinhole", image_size=SIZE, fov=(fov, 80)),
+}
+
+
+@pytest.mark.parametrize("door", WIDE)
+def test_a_field_of_view_is_in_degrees_at_every_door(door):
+    for radians in (1, 2.1, 2 * math.pi):
+        with pytest.raises(ValueError, match=f"fov is in degrees; .*radians.* {math.degrees(radians):.4g} degrees"):
+            WIDE[door](radians)
+    WIDE[door](6.5 if "Camera" not in door else 60)
+
+
+def test_a_camera_says_its_field_of_view_in_degrees():
+    assert LENS.fov[0].item() == pytest.approx(120)
+    cameras = ct.Pinhole.from_fov([60.0, 90.0], image_size=SIZE)
+    torch.testing.assert_close(cameras.fov, cameras.field_of_view.rad2deg())
+    assert cameras.fov.shape == (2, 3)
+    with pytest.raises(ValueError, match="image"):
+        ct.Pinhole([1.0, 1.0, 0.0, 0.0]).fov  # noqa: B018

@@ -38,7 +38,7 @@ def small():
 def partial():
     """A lens whose rays end within the image, on a wide target."""
     lens = ct.KannalaBrandt([60.0, 60, 127.5, 87.5], [-0.1, -0.1, -0.05, -0.02], image_size=(176, 256))
-    return ct.Dewarp(lens.double().requires_grad_(False), projection="equirectangular", fov=5.0, image_size=(160, 320))
+    return ct.Dewarp(lens.double().requires_grad_(False), projection="equirectangular", fov=286, image_size=(160, 320))
 
 
 def positions(warp):
@@ -223,7 +223,7 @@ def test_opencv_remaps_as_the_warp_does(tmp_path):
 @pytest.mark.parametrize("step", [8, 16])
 def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(step, tmp_path):
     """The panorama of 170 degrees, the hardest: an eighth of a pixel alone is off by 0.0884."""
-    warp = ct.Dewarp(fisheye(), projection="cylindrical", fov=math.radians(170))
+    warp = ct.Dewarp(fisheye(), projection="cylindrical", fov=170)
     format, most = ("ti_ldc", 0.09) if step == 8 else ("dw100", 0.15)
     assert warp.save(tmp_path / "map.bin", format).max_error <= most
 
@@ -231,7 +231,7 @@ def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(step, tmp_path
 @pytest.mark.slow
 @pytest.mark.parametrize("fov", [None, 100])
 def test_meshes_of_perspective_views_are_near(fov, tmp_path):
-    warp = ct.Dewarp(fisheye(), fov=fov and math.radians(fov))
+    warp = ct.Dewarp(fisheye(), fov=fov)
     assert warp.save(tmp_path / "map.bin", "ti_ldc").max_error <= 0.09
     assert warp.save(tmp_path / "map.bin", "dw100").max_error <= 0.15
     assert warp.save(tmp_path / "map.bin", "ti_ldc", step=16).max_error <= 0.15
@@ -261,7 +261,7 @@ def test_vertices_are_the_exact_positions_but_for_a_fraction(tmp_path):
 )
 def test_onnx_runtime_makes_the_same_images(mode, padding, fill, dtype, tmp_path):
     lens = partial().source.float()
-    warp = ct.Dewarp(lens, fov=2.6, image_size=(90, 160), mode=mode, padding_mode=padding, fill=fill, tolerance=0)
+    warp = ct.Dewarp(lens, fov=149, image_size=(90, 160), mode=mode, padding_mode=padding, fill=fill, tolerance=0)
     report = warp.save(tmp_path / "warp.onnx", dtype=None if dtype == "float32" else dtype)
     session = onnxruntime.InferenceSession(tmp_path / "warp.onnx", providers=["CPUExecutionProvider"])
     for batch in (1, 3):
@@ -680,6 +680,7 @@ def test_the_command_writes_a_map_and_measures_one(folder, capsys):
         ("", "-o OUT writes one, --check MAP measures one"),
         ("-o a.bin", "does not say the format"),
         ("-o camera.json --format obj", "would overwrite camera.json"),
+        ("-o a.npz --fov 2.1", "2.1 seems to be radians"),
         ("-o a.npz --fov 200", "--projection cylindrical goes to 360"),
         ("-o a.npz --target camera.json --size 10x10", "--size is for a dewarping"),
         ("-o camera --format dw100 --force", "camera.json: would overwrite"),

@@ -128,7 +128,7 @@ POSE = ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]).requires_grad_(False)
 DOWN = ct.Extrinsics.from_matrix(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2.0])
 ONE = ct.Rig({"a": CAMERA}, {"a": POSE})
 WARP = ct.Warp(CAMERA, BATCH[0])
-PAIR = ct.rectify(BATCH[0], BATCH[0], POSE, fov=1.0, image_size=SIZE)
+PAIR = ct.rectify(BATCH[0], BATCH[0], POSE, fov=57.3, image_size=SIZE)
 PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
 IMAGES, META = torch.zeros(2, 3, *SIZE), torch.zeros(5, 3, device="meta")
 LEAF = torch.ones((), requires_grad=True)
@@ -195,7 +195,11 @@ WRONG = [
     (lambda: ONE.camera_of(["a"]), ValueError, r"no camera and no image is called \['a'\]"),
     # views, stereo, planes
     (lambda: ct.views.ring(CAMERA, 3, fov="60"), TypeError, r"ring: fov must be a number; got '60'"),
-    (lambda: ct.views.ring(CAMERA, 3, fov=4.0), ValueError, r"ring: fov must be radians between 0 and pi; got 4.0"),
+    (
+        lambda: ct.views.ring(CAMERA, 3, fov=200),
+        ValueError,
+        r"ring: fov must be in degrees, above 0 and below 180; got 200",
+    ),
     (lambda: ct.views.cube(BATCH), ValueError, r"cube: takes one camera; got batch_shape=\(2,\)"),
     (lambda: ct.views.cube(CAMERA, 0), ValueError, r"cube: size must be at least 1; got 0"),
     (
@@ -227,7 +231,11 @@ WRONG = [
         r"RollingShutter: image_size must be two",
     ),
     (lambda: ct.rectify(GRID, GRID, POSE), ValueError, r"rectify: cameras and extrinsics may have one batch dim"),
-    (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(1, 1, 1)), ValueError, r"fov must be horizontal, or .*\(1, 1, 1\)"),
+    (
+        lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(60, 60, 60)),
+        ValueError,
+        r"fov must be horizontal, or .*\(60, 60, 60\)",
+    ),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, vertical="no"), TypeError, r"vertical must be True or False; got 'no'"),
     (lambda: PAIR.disparity_range(5, 1), ValueError, r"depths must be 0 < near < far; got near=5.0, far=1.0"),
     (lambda: PAIR.depth_range(5, 1), ValueError, r"disparities must be least < most; got least=5.0, most=1.0"),

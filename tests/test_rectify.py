@@ -198,7 +198,7 @@ def test_depth_and_disparity_ranges():
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64, torch.int64])
 def test_disparities_keep_the_dtype_of_points(dtype):
     camera, pose = ct.Pinhole.from_fov(90, image_size=(100, 100)), ct.Extrinsics([0.0] * 3, [-0.1, 0.0, 0.0])
-    disparity, valid = ct.rectify(camera, camera, pose, fov=1.5).disparity(torch.tensor([0, 0, 2], dtype=dtype))
+    disparity, valid = ct.rectify(camera, camera, pose, fov=86).disparity(torch.tensor([0, 0, 2], dtype=dtype))
     assert disparity.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
     assert valid
     assert disparity.item() > 1
@@ -239,12 +239,11 @@ def test_a_batch_of_rigs_goes_pair_by_pair():
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_field_of_view_and_size_are_as_asked(projection):
-    found = fisheyes(projection=projection, fov=math.radians(100), image_size=(300, 400))
+    found = fisheyes(projection=projection, fov=100, image_size=(300, 400))
     assert found.camera_left.image_size == (300, 400)
-    assert math.degrees(found.camera_left.field_of_view[0]) == pytest.approx(100, rel=1e-6)
-    both = fisheyes(projection=projection, fov=(1.5, 1.0))
-    angles = both.camera_left.field_of_view
-    assert angles[:2].tolist() == pytest.approx([1.5, 1.0], rel=0.01)
+    assert found.camera_left.fov[0].item() == pytest.approx(100, rel=1e-6)
+    both = fisheyes(projection=projection, fov=(86, 57))
+    assert both.camera_left.fov[:2].tolist() == pytest.approx([86, 57], rel=0.01)
 
 
 def test_bad_input_is_refused():
@@ -261,8 +260,8 @@ def test_bad_input_is_refused():
         ct.rectify(left, right, extrinsics, projection="fisheye")
     with pytest.raises(ValueError, match="image_size"):
         ct.rectify(ct.Pinhole([500.0, 500, 320, 240]), right, extrinsics)
-    with pytest.raises(ValueError, match="radians"):
-        ct.rectify(left, right, extrinsics, fov=90.0)
+    with pytest.raises(ValueError, match="fov must be in degrees, above 0 and below 180 for perspective; got 190"):
+        ct.rectify(left, right, extrinsics, fov=(90, 190))
     found = ct.rectify(left, right, extrinsics, image_size=(48, 64))
     with pytest.raises(ValueError, match="/ 16"):
         found.disparity_to_points(np.zeros((48, 64), np.int16))

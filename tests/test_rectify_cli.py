@@ -198,6 +198,7 @@ def test_deep_images_stay_deep(folder):
         (["--camera", "three.json", "--left-camera", "x"], "no camera is called 'x'; there are left, right, third"),
         (["--camera", "rig.json", "--left-camera", "left", "--right-camera", "left"], "are both 'left'"),
         (["--camera", "three.json", "--left-camera", "left", "--right-camera", "third"], "third has no pose"),
+        (["--camera", "rig.json", "--fov", "80,1.2"], "1.2 seems to be radians"),
         (["--camera", "rig.json", "--fov", "180"], "below 180 degrees, horizontal, for perspective; got 180"),
         (["--camera", "rig.json", "--projection", "latlon", "--fov", "170,360"], "below 360 degrees, vertical"),
         (["--camera", "rig.json", "--depth", "1", "2"], "--depth is for --disparity and --points"),

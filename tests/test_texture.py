@@ -186,7 +186,7 @@ def test_wide_lenses():
 @pytest.mark.parametrize(
     ("fov", "options", "says"),
     [
-        (math.pi / 2, {}, r"degrees; 1\.57.* radians.*math\.degrees"),
+        (math.pi / 2, {}, r"degrees; 1\.57.* radians.* 90 degrees"),
         (0, {}, "above 0"),
         (-60, {}, "above 0"),
         (361, {}, "up to 360"),

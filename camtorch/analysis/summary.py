@@ -9,7 +9,7 @@ import torch
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.camera import Camera
-from camtorch.projection.rays import field_of_view, followed, ideal, image_lattice
+from camtorch.projection.rays import followed, ideal, image_lattice
 
 _SIDE = 129  # of a lattice over the image
 _ANGLES, _AZIMUTHS = 3601, 32
@@ -25,7 +25,7 @@ class Summary:
     valid_angle: tuple[float, float]
     """Radians from the axis up to which rays are valid, on the azimuths where that is least and greatest."""
     fov: tuple[float, float, float] | None = None
-    """Radians: horizontal and vertical through the principal point, and on the wider diagonal of the image, from
+    """Degrees: horizontal and vertical through the principal point, and on the wider diagonal of the image, from
     outer edge to outer edge or as far as there are rays."""
     seen: float | None = None
     """The part of the image that has rays."""
@@ -50,7 +50,7 @@ class Summary:
             ("valid rays", f"up to {low:.1f} degrees from the axis" + (f", {high:.1f} in places" * (high > low + 0.1)))
         )
         if self.fov is not None and self.seen is not None and self.corners is not None:
-            wide, tall, across = (f"{math.degrees(angle):.1f}" for angle in self.fov)
+            wide, tall, across = (f"{angle:.1f}" for angle in self.fov)
             rows.append(("field of view", f"{wide} horizontal, {tall} vertical, {across} diagonal degrees"))
             rows.append(("has rays", f"{100 * self.seen:.4g} % of the image"))
             moves = [m if isinstance(m, str) else f"({m[0]:+.1f}, {m[1]:+.1f})" for m in self.corners]
@@ -76,7 +76,7 @@ def summarise(camera: Camera) -> Summary:
         raise ValueError(f"summary: camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
     result = Summary(camera, _valid_angle(camera))
     if camera.image_size is not None:
-        result.fov = tuple(field_of_view(camera).tolist())
+        result.fov = tuple(camera.fov.tolist())
         result.seen = float(camera.unproject(image_lattice(camera, _SIDE, _SIDE))[1].double().mean())
         result.corners = _corners(camera)
     return result

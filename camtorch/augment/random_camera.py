@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, broadcast_shapes
+from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees
 from camtorch._module import Memo, same
 from camtorch._tracing import in_graph, is_concrete
 from camtorch.augment.augmentation import Augmentation, Range, as_range
@@ -50,8 +50,8 @@ _ANGLES = 64
 class RandomCamera(Augmentation):
     """Another camera in the same place: turned, with another lens, cropped, and of another size.
 
-    Convention: ranges are (low, high), or a number x for x to either side of doing nothing. Degrees, because people
-    think of mounts and lenses in degrees; everything else in camtorch is in radians.
+    Convention: ranges are (low, high), or a number x for x to either side of doing nothing. Angles are in
+    degrees, as every `fov` in camtorch; other angles in camtorch are in radians.
 
     Args:
         like: whose lens the new camera has. None: the sample's own camera. A Camera, whose numbers are copied and do
@@ -158,10 +158,8 @@ class RandomCamera(Augmentation):
         self.ranges: dict[str, Range] = {
             n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None
         }
-        if "fov" in self.ranges and self.ranges["fov"].high <= 2 * math.pi:
-            raise ValueError(
-                f"{self._name}: fov is in degrees; {fov!r} seems to be radians, which math.degrees() converts"
-            )
+        if "fov" in self.ranges:
+            check_degrees(self.ranges["fov"].low, fov, self._name)
         if ("rates" in self.ranges) != bool({"readout", "exposure"} & set(self.ranges)):
             raise ValueError(
                 f"{self._name}: rates, in degrees per second, show by a readout or an exposure, in seconds, and those "

@@ -377,7 +377,7 @@ def _numbers(shots: _Shots) -> list[tuple[str, str, str, str]]:
     calibration, seen = shots.calibration, shots.seen
     camera = calibration.camera
     corners, outliers = int(seen.seen.sum()), int((seen.seen & ~seen.inliers).sum())
-    wide, tall, _ = np.degrees(camera.field_of_view.numpy(force=True))
+    wide, tall, _ = camera.fov.numpy(force=True)
     values = calibration.uncertainty(image_lattice(camera, 25, 33).double(), math.inf).numpy(force=True)
     values = values[np.isfinite(values)]
     clean = float(np.sqrt((seen.lengths[seen.seen & seen.inliers] ** 2).mean())) if corners > outliers else math.nan

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import glob
-import math
 import os
 from collections.abc import Collection
 from pathlib import Path
@@ -136,7 +135,7 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
     images.write(output, images.from_tensor(result), orientation=orientation)
     height, width = result.shape[-2:]
     fx, fy, cx, cy = warp.target.intrinsics.tolist()
-    degrees = math.degrees(float(warp.target.field_of_view[0]))
+    degrees = float(warp.target.fov[0])
     print(
         f"{output}: {camera.key} dewarped to {arguments.projection}, {degrees:.1f} degrees "
         f"wide, {width}x{height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}; {100 * filled:.1f} % of it is "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ class Dewarping:
     rescale: bool
     projection: Projection
     fov: float | None
-    """Radians."""
+    """Degrees."""
     image_size: tuple[int, int] | None
     encoder: videos.Encoder
     _warps: dict[tuple[int, int], tuple[Dewarp, dict[str, Any]]] = field(default_factory=dict)
@@ -88,6 +87,6 @@ def _facts(warp: Dewarp) -> dict[str, Any]:
         "width": warp.target.width,
         "height": warp.target.height,
         "intrinsics": warp.target.intrinsics.tolist(),
-        "degrees": math.degrees(float(warp.target.field_of_view[0])),
+        "degrees": float(warp.target.fov[0]),
         "filled": float(warp.valid_mask().double().mean()),
     }

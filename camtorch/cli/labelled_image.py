@@ -193,4 +193,4 @@ def _mount_angles(rotation: Tensor) -> tuple[float, float, float]:
 
 def _degrees(camera: Camera) -> float:
     """The horizontal field of view."""
-    return math.degrees(float(camera.field_of_view[0]))
+    return float(camera.fov[0])

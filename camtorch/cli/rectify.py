@@ -143,11 +143,13 @@ def _check_depth(arguments: argparse.Namespace) -> None:
 
 
 def _fov(arguments: argparse.Namespace) -> float | tuple[float, float] | None:
-    """In radians.
+    """In degrees.
 
     Raises:
         ValueError: angles that the projection does not reach.
     """
+    from camtorch._arguments import check_degrees
+
     if arguments.fov is None:
         return None
     angles = arguments.fov if isinstance(arguments.fov, tuple) else (arguments.fov,)
@@ -161,8 +163,8 @@ def _fov(arguments: argparse.Namespace) -> float | tuple[float, float] | None:
                 f"--fov must be above 0 and below {most} degrees, {side}, for {arguments.projection}; got {angle:g}"
                 f"{hint}"
             )
-    radians = [math.radians(angle) for angle in angles]
-    return radians[0] if len(radians) == 1 else (radians[0], radians[1])
+        check_degrees(angle, f"{angle:g}", "--fov")
+    return arguments.fov  # type: ignore[no-any-return]
 
 
 def _check_targets(arguments: argparse.Namespace) -> None:
@@ -229,7 +231,7 @@ def _write_cameras(folder: Path, rig: Rig, rectification: Rectification) -> None
 def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: tuple[float, float, float]) -> None:
     camera = rectification.camera_left
     fx, fy, cx, cy = camera.intrinsics.tolist()
-    across, down = (math.degrees(angle) for angle in camera.field_of_view[:2].tolist())
+    across, down = camera.fov[:2].tolist()
     lines = "columns" if rectification.vertical else "rows"
     left, right, both = (100 * part for part in parts)
     print(

@@ -107,7 +107,7 @@ def lenses(height: int = 640) -> list[DemoCamera]:
 def study(lens: DemoCamera, samples: int = 6) -> Study:
     """Render, dewarp and measure one lens: `samples` rays per pixel of the source, twice as many of the truth."""
     to_camera = _rotation(lens.pitch, lens.roll)
-    warp = Dewarp(lens.camera, fov=math.radians(lens.degrees), image_size=lens.size, rotation=to_camera.T)
+    warp = Dewarp(lens.camera, fov=lens.degrees, image_size=lens.size, rotation=to_camera.T)
     source = room.render(warp.source, to_camera, samples=samples)
     direct = room.render(warp.target, samples=2 * samples)
     dewarped = warp(source[None])[0]

@@ -203,7 +203,7 @@ def drawing(result: Result, shows: int = 6) -> Image.Image:
             camera = (None, result.found, result.truth)[row]
             image = result.images[i]
             if camera is not None:
-                image = Dewarp(camera[i], fov=1.2, image_size=SIZE)(image[None])[0]
+                image = Dewarp(camera[i], fov=69, image_size=SIZE)(image[None])[0]
             sheet.put(shown(image, height, width), (left + column * (width + MARGIN), top))
     at, top = left + shows * (width + MARGIN) + 2 * MARGIN, 84
     marks = Marks(side, side)

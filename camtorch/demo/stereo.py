@@ -109,8 +109,7 @@ def study(
         fov: (horizontal, vertical) degrees.
         image_size: of the rectified images.
     """
-    angles = math.radians(fov[0]), math.radians(fov[1])
-    found = rectify(seen.camera, seen.camera, seen.extrinsics, projection=projection, fov=angles, image_size=image_size)
+    found = rectify(seen.camera, seen.camera, seen.extrinsics, projection=projection, fov=fov, image_size=image_size)
     left, right = (image[0] for image in found(*(image[None] for image in seen.images)))
     least, most = found.disparity_range(_NEAREST)
     disparity, known = match(found, left, right, least, most)

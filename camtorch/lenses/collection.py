@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -82,7 +81,7 @@ class Lens:
         height, width = self.image_size
         parts = [f"{width}x{height}"]
         if self._exists:
-            parts.append(f"{math.degrees(float(self.camera().field_of_view[0])):.3g} degrees wide")
+            parts.append(f"{float(self.camera().fov[0]):.3g} degrees wide")
         parts.append(f"rms {self.rms:.2g} px")
         if self.readout_ms:
             parts.append(f"readout {self.readout_ms:g} ms")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns, shown
+from camtorch._arguments import check_degrees, columns, shown
 from camtorch.networks.limits import BEYOND
 from camtorch.projection.rays import focal_for
 
@@ -156,8 +156,7 @@ def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | No
         raise TypeError(f"{owner}: fov must be the least and the greatest, as (40, 120); got {shown(fov)}") from None
     if not 0 < low <= high <= 360:
         raise ValueError(f"{owner}: fov must be degrees, from the least to the greatest; got {fov!r}")
-    if high <= 2 * math.pi:
-        raise ValueError(f"{owner}: fov is in degrees; {fov!r} seems to be radians, which math.degrees() converts")
+    check_degrees(low, fov, owner)
     return low, high
 
 

@@ -15,6 +15,7 @@ from camtorch._arguments import (
     as_batch,
     as_coordinates,
     as_flag,
+    as_fov,
     as_image_size,
     as_number,
     as_points,
@@ -369,7 +370,7 @@ def rectify(
         right: the second one.
         extrinsics: right from left, `p_right = R p_left + t`, as OpenCV's stereoCalibrate gives R and T.
         projection: "perspective" up to 120 degrees; "latlon" and "cylindrical", panoramas about the baseline, for more.
-        fov: radians, horizontal, or (horizontal, vertical), of the rectified images, about their axis.
+        fov: degrees, horizontal, or (horizontal, vertical), of the rectified images, about their axis.
         image_size: (height, width) of the rectified images.
         vertical: for cameras that stand above each other: columns correspond, not rows.
         align: "mean" for the mean of both optical axes, orthogonal to the baseline; "opencv" halves the rotation
@@ -377,7 +378,8 @@ def rectify(
 
     Raises:
         ValueError: cameras at one place, or that look along the baseline or away from each other; a projection or
-            alignment that does not exist, a fov out of range, cameras without image_size. TypeError: no cameras.
+            alignment that does not exist, a fov out of range or up to 2 pi, as in radians, cameras without image_size.
+        TypeError: no cameras.
     """
     owner = "rectify"
     left, right = as_sized(left, "left", owner), as_sized(right, "right", owner)
@@ -537,14 +539,12 @@ def _half(
     """
     angles = fov if isinstance(fov, (tuple, list)) else (fov,)
     if len(angles) not in (1, 2):
-        raise ValueError(f"{owner}: fov must be horizontal, or (horizontal, vertical) radians; got {fov!r}")
+        raise ValueError(f"{owner}: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
     half = usual.clone()
     for i, angle in enumerate(angles):
         is_along = (i == 1) == vertical
-        most = 2 * math.pi if not is_along and projection != "perspective" else math.pi
-        angle = as_number(angle, "fov", owner)
-        if not 0 < angle < most:
-            raise ValueError(f"{owner}: fov must be radians between 0 and {most:.4g} for {projection}; got {fov!r}")
+        most = 360 if not is_along and projection != "perspective" else 180
+        angle = math.radians(as_fov(angle, owner, most, f" for {projection}"))
         straight = projection == "perspective" or (projection == "cylindrical" and is_along)
         half[..., i] = math.tan(angle / 2) if straight else angle / 2
     return half

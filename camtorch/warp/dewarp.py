@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_image_size, as_number
+from camtorch._arguments import as_fov, as_image_size
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import image_lattice
@@ -37,7 +37,7 @@ class Dewarp(Warp):
         camera: the camera of the given images, with image_size; with a batch dim the target gets one as well.
         projection: "perspective" (straight lines stay straight; up to about 120 degrees), "cylindrical" (vertical lines
             do, for wide views) or "equirectangular" (everything).
-        fov: horizontal field of view of the target in radians, centred on its axis. By default the target shows
+        fov: horizontal field of view of the target in degrees, centred on its axis. By default the target shows
             what the image's middle row and column show, and never more than 120 degrees in perspective.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
@@ -47,7 +47,8 @@ class Dewarp(Warp):
     lens folds inside the image or sees past 90 degrees.
 
     Raises:
-        ValueError: an unknown projection, a fov outside (0, pi) for perspective or (0, 2 pi], and as `Warp`.
+        ValueError: an unknown projection, a fov that is not below 180 degrees for perspective, or up to 360, one up to
+            2 pi, which seems to be in radians, and as `Warp`.
     """
 
     def __init__(
@@ -74,7 +75,10 @@ class Dewarp(Warp):
         with torch.no_grad():
             if fov is not None:
                 height, width = size
-                focal = camera.intrinsics.new_tensor(width / _plane_width(projection, fov))
+                most = 180 if projection == "perspective" else 360
+                angle = math.radians(as_fov(fov, "Dewarp", most, f" for {projection}"))
+                plane_width = 2 * math.tan(angle / 2) if projection == "perspective" else angle
+                focal = camera.intrinsics.new_tensor(width / plane_width)
                 centre = camera.intrinsics.new_tensor([(width - 1) / 2, (height - 1) / 2])
                 intrinsics = torch.cat((focal.expand(2), centre))
             else:
@@ -91,16 +95,6 @@ class Dewarp(Warp):
             tolerance=tolerance,
             shutter=shutter,
         )
-
-
-def _plane_width(projection: str, fov: float) -> float:
-    widest = math.pi if projection == "perspective" else 2 * math.pi
-    fov = as_number(fov, "fov", "Dewarp")
-    if not (1e-6 < fov < widest or fov == widest == 2 * math.pi):
-        raise ValueError(
-            f"Dewarp: fov must be in radians, between 0 and {widest:.4g} for a {projection} target; got {fov!r}"
-        )
-    return 2 * math.tan(fov / 2) if projection == "perspective" else fov
 
 
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:

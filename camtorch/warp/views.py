@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_number, as_whole, shown
+from camtorch._arguments import as_fov, as_number, as_whole, shown
 from camtorch._module import GeometryModule, typed_as
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
@@ -161,7 +161,7 @@ def ring(
     Args:
         camera: of the wide images, with image_size.
         count: of the views.
-        fov: radians, of a view; by default a quarter more than the step from one to the next.
+        fov: degrees, of a view; by default a quarter more than the step from one to the next.
         size: pixels along the sides of a view; as fine in its middle as the image at the axis by default.
         pitch: degrees that all look up.
         mode: as `Warp` takes it.
@@ -172,9 +172,8 @@ def ring(
     count, pitch = as_whole(count, "count", "ring", least=1), as_number(pitch, "pitch", "ring")
     seen = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max())
     step = seen / count
-    wide = min(_OVERLAP * step, math.radians(150)) if fov is None else as_number(fov, "fov", "ring")
-    if not 0 < wide < math.pi:
-        raise ValueError(f"ring: fov must be radians between 0 and pi; got {fov}")
+    widest = math.radians(150)
+    wide = min(_OVERLAP * step, widest) if fov is None else math.radians(as_fov(fov, "ring", 180))
     yaws = torch.rad2deg((torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * step)
     rotations = mount_rotation(yaws, torch.full_like(yaws, pitch), torch.zeros_like(yaws))
     size = _size(camera, size, wide, "ring")

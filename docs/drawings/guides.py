@@ -42,7 +42,7 @@ def overview(columns: int = 4) -> Image.Image:
     """A fisheye image, dewarped, and as other cameras would have seen it."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
     fisheye = rendered(driver(lens.double().requires_grad_(False)))
-    straight = moved(fisheye, ct.Dewarp(fisheye.camera, fov=1.75, image_size=(480, 640)))
+    straight = moved(fisheye, ct.Dewarp(fisheye.camera, fov=100, image_size=(480, 640)))
     mount = {"yaw": 12, "pitch": 8, "roll": 20}
     new = ct.augment.RandomCamera("dms90", **mount, fov="source", min_filled=0.98, image_size=(480, 640))
     sample = {"keypoints": fisheye.labels.keypoints.expand(2, -1, -1), "camera": fisheye.camera}
@@ -69,7 +69,7 @@ def lenses() -> Image.Image:
     names = "Laowa 7.5mm Panasonic G7", "GoPro HERO9 wide", "DJI Osmo Action", "Sony ZV-E10 16mm", "iPhone 13 pro"
     for name in (*names, "Pixel 6"):
         camera = ct.lenses.find(name, image_size=(1080, 1920)).float().resize(225, 400)
-        degrees = float(camera.field_of_view[0].rad2deg())
+        degrees = float(camera.fov[0])
         panels.append((ct.Warp(source, camera, antialias=True)(image)[0], f"{name}: {degrees:.0f} degrees"))
     return tiles(panels, 3)
 
@@ -171,7 +171,7 @@ def maps() -> Image.Image:
     """What meshes of a fisheye are off by: on the source, and over the target."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
     fisheye = rendered(driver(lens.double().requires_grad_(False)))
-    warp = ct.Dewarp(fisheye.camera, projection="cylindrical", fov=2.9, image_size=(480, 640))
+    warp = ct.Dewarp(fisheye.camera, projection="cylindrical", fov=166, image_size=(480, 640))
     images = [image[0].permute(1, 2, 0) for image in (fisheye.image[None], warp(fisheye.image[None]))]
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/map.bin"
@@ -212,8 +212,8 @@ def dewarp() -> Image.Image:
     options = {"image_size": size, "antialias": True}
     warps = {
         "a fisheye of 190 degrees": ct.Warp(lens, lens.resize(*size), antialias=True),
-        "perspective, 100 degrees": ct.Dewarp(lens, fov=1.75, **options),
-        "cylindrical, 180 degrees": ct.Dewarp(lens, projection="cylindrical", fov=3.14, **options),
+        "perspective, 100 degrees": ct.Dewarp(lens, fov=100, **options),
+        "cylindrical, 180 degrees": ct.Dewarp(lens, projection="cylindrical", fov=180, **options),
         "equirectangular": ct.Dewarp(lens, projection="equirectangular", **options),
     }
     return tiles([(warp(image)[0], title) for title, warp in warps.items()], 2)
