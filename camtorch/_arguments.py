@@ -206,7 +206,7 @@ def check_degrees(least: float, fov: object, owner: str) -> None:
     """Raise a ValueError if the least field of view of those given is up to 2 pi: then it seems to be in radians."""
     if least <= 2 * math.pi * (1 + 1e-6):  # which float32 rounds up
         raise ValueError(
-            f"{owner}: fov is in degrees; {fov} seems to be radians, of which {least:.4g} are {math.degrees(least):.4g} "
+            f"{owner}: fov is in degrees; {fov} seems to be radians: {least:.4g} are {math.degrees(least):.4g} "
             "degrees. A camera of so narrow a view is made from its focal lengths: ct.Pinhole([fx, fy, cx, cy]), or "
             "from_matrix(K) of any model"
         )

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 import warnings
 
 import kornia.augmentation as K  # noqa: N812
@@ -79,7 +80,7 @@ MAKERS = {
     "crop": lambda **options: RandomCamera("tumvi", crop=(0.3, 1.0), **options),
     "mount": lambda **options: RandomMount(yaw=30, pitch=20, roll=45, **options),
     "away": lambda **options: RandomMount(yaw=(60, 80), pitch=(-40, 40), **options),
-    "lens": lambda **options: RandomLens("kannala_brandt", fov=(120, 160), **options),
+    "lens": lambda **options: RandomLens("kannala_brandt", fov=(60, 160), **options),
     "own": lambda **options: RandomLens(focal=(0.4, 1.0), **options),
 }
 
@@ -166,6 +167,54 @@ def test_what_cannot_be_filled_is_said():
     augmentation(image=torch.rand(4, 1, 120, 40))
     with pytest.raises(ValueError, match=r"RandomMount: min_filled must be a part in \[0, 1\]; got 90"):
         RandomMount(min_filled=90)
+
+
+# -- a field of view that was asked for and not made
+
+
+@pytest.fixture
+def untold(monkeypatch):
+    monkeypatch.setattr("camtorch.augment.random_camera._told", set())
+
+
+ASKED = {
+    "a model": lambda **options: RandomLens("kannala_brandt", fov=120, **options),
+    "a preset": lambda **options: RandomCamera("dms130", fov=(110, 130), **options),
+    "real": lambda **options: RandomLens("real", fov=(110, 150), **options),
+    "own": lambda **options: RandomMount(fov=(110, 120), yaw=0, pitch=0, **options),
+}
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_a_field_of_view_that_is_not_made_is_told_once(untold, name):
+    options = {"camera": pinhole(60), "min_filled": 0.9}
+    least = 110 if name != "a model" else 120
+    says = rf"asked for fov={least} degrees at least, an image is (\d+) wide: min_filled=0.9 .* 60 degrees wide"
+    with pytest.warns(UserWarning, match=says) as told:
+        made = ASKED[name](**options)(keypoints=torch.rand(8, 5, 2))["camera"].fov[:, 0]
+    assert made.max() < 0.9 * least
+    assert abs(int(re.search(r"(\d+) wide: ", str(told[0].message))[1]) - made.min()) < 1
+    ASKED[name](**options)(keypoints=torch.rand(8, 5, 2))  # warnings are errors here
+
+
+def test_front_ends_tell_of_it_too(untold):
+    aug = ct.augment.kornia.RandomLens(pinhole(60), "kannala_brandt", fov=120, min_filled=0.9)
+    with pytest.warns(UserWarning, match="asked for fov=120"):
+        aug(torch.rand(2, 3, *SIZE))
+
+
+@pytest.mark.parametrize(
+    "augmentation",
+    [
+        RandomLens("kannala_brandt", fov="source", min_filled=0.9),  # asks for nothing
+        RandomLens("kannala_brandt", fov=(60, 160), min_filled=0.9),  # 60 is not too much
+        RandomCamera("dms130", min_filled=0.9),
+        RandomMount(fov=60, zoom=(2, 3), yaw=0, pitch=0, min_filled=0.9),  # narrow, as asked
+        RandomLens("kannala_brandt", fov=120, min_filled=0),
+    ],
+)
+def test_what_was_made_or_not_asked_for_is_not_told(untold, augmentation):
+    augmentation(keypoints=torch.rand(8, 5, 2), camera=pinhole(65))
 
 
 # -- fov="source"

@@ -383,6 +383,7 @@ class Augmentation(SampleTransform):
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_too_few(found, self.min_filled)
+            self._tell_of_zoom(source, target, factor, found)
         warp = self._warp(source, target, rotation, self._shutter(values))
         return Part(rows, warp, source, *self._seen_through(warp, values))
 
@@ -420,6 +421,9 @@ class Augmentation(SampleTransform):
             "axis of the new one",
             stacklevel=2,
         )
+
+    def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
+        """What `min_filled` made of a target: the factors (*B,) on its focal lengths, and the parts (*B,) filled."""
 
     def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""

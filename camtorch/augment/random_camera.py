@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, ClassVar, Literal
@@ -42,6 +43,8 @@ _FOCAL, _CENTRE, _DISTORTION, _CROP = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02)
 _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05)
 _USUAL = _FOCAL, _CENTRE, _DISTORTION, _CROP, _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION
 _SIDE = 9
+_LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
+_told: set[tuple[object, ...]] = set()
 _EDGE_SAMPLES = 32
 _AZIMUTHS = 128
 _ANGLES = 64
@@ -200,6 +203,31 @@ class RandomCamera(Augmentation):
             natural = vignetting(warp.target, values["cos4"])
             light = natural if light is None else light * natural
         return shades, light
+
+    def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
+        """Warn, once a process, if `min_filled` zoomed to less than the least field of view that was asked for.
+
+        Where zoom, focal or crop were drawn to narrow the image so far, it was asked for that.
+        """
+        asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
+        share = self.min_filled or 0.0
+        key = self._name, asked, share
+        if asked is None or not is_concrete(factor) or key in _told or not bool((factor > 1).any()):
+            return
+        made = _across(target)
+        least = torch.minimum(_across(scaled(target, 1 / factor)), torch.full_like(made, asked))
+        # what cannot be filled at all has a warning of its own
+        less = (made < _LESS * least) & (factor > 1) & (found >= share)
+        if not bool(less.any()):
+            return
+        _told.add(key)
+        warnings.warn(
+            f"{self._name}: asked for fov={asked:g} degrees at least, an image is {float(made[less].min()):.0f} wide: "
+            f"min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
+            f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more where the new one looks. fov='source' "
+            "asks for what it has; with min_filled=0 the rest stays empty",
+            stacklevel=2,
+        )
 
     def _shutter(self, values: Mapping[str, Tensor]) -> RollingShutter | None:
         if "rates" not in values:
@@ -370,6 +398,16 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
         f"{owner}: like must be a Camera, 'real', a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
         f"got {like!r}" + (f". Did you mean {close[0]!r}?" if close else "")
     )
+
+
+def _across(camera: Camera) -> Tensor:
+    """(*B,) degrees between the left and the right edge of the image, at the height of the principal point."""
+    cy = camera.intrinsics[..., 3].detach()
+    u = torch.stack((torch.full_like(cy, -0.5), torch.full_like(cy, size_of(camera)[1] - 0.5)), -1)
+    pixels = torch.stack((u, cy[..., None].expand_as(u)), -1)
+    with torch.no_grad():
+        rays = camera.unproject(pixels.expand(*camera.batch_shape, 2, 2))[0]
+    return torch.atan2(rays[..., 0].abs(), rays[..., 2]).sum(-1).rad2deg()
 
 
 def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
