@@ -18,7 +18,36 @@ def test_real_lenses_fill_most_of_the_image(key, name, projection):
     assert torch.isfinite(dewarp.target.intrinsics).all()
     assert not any(p.requires_grad for p in dewarp.target.parameters())
     assert dewarp.target.image_size == dewarp.source.image_size
-    assert dewarp.valid_mask().double().mean() > 0.5
+    mask = dewarp.valid_mask()
+    assert mask.double().mean() > 0.5
+    if projection != "perspective":  # as wide as the lens: neither side is empty
+        if abs(dewarp.source.cy - 37) < 2:  # else the middle row is not that of the principal point
+            assert dewarp.target.fov[0].item() == pytest.approx(dewarp.source.fov[0].item(), rel=0.01)
+        assert mask[..., 1:-1].any(-2).all()
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS[1:])
+@pytest.mark.parametrize("roll", [0.0, 90.0])
+def test_a_panorama_is_as_wide_as_a_lens_that_ends_within_the_image(projection, roll):
+    camera = ct.KannalaBrandt([214.6, 214.6, 319.5, 239.5], [-0.1163], image_size=(480, 640))  # folds at 97 degrees
+    rotation = ct.augment.mount_rotation(*torch.tensor([0.0, 0.0, roll]))
+    dewarp = ct.Dewarp(camera, projection=projection, rotation=rotation)
+    expected = camera.fov[1 if roll else 0].item()
+    assert expected == pytest.approx(178.7 if roll else 194, rel=0.01)
+    assert dewarp.target.fov[0].item() == pytest.approx(expected, rel=0.01)
+    assert dewarp.valid_mask().double().mean() > 0.97
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS[1:])
+@pytest.mark.parametrize("angles", [(0, 0, 0), (60, 0, 0), (0, 40, 0), (0, 0, 90)])
+def test_a_whole_turn_stays_whole(projection, angles):
+    rotation = ct.augment.mount_rotation(*torch.tensor(angles, dtype=torch.float64))
+    for camera in (
+        ct.Equirectangular.from_fov(360, image_size=(60, 120)),
+        ct.KannalaBrandt([40 / math.pi, 40 / math.pi, 39.5, 39.5], [0.0], image_size=(80, 80)),
+    ):
+        target = ct.Dewarp(camera, projection=projection, rotation=rotation.float()).target
+        assert target.fov[0].item() == pytest.approx(360, rel=1e-6)
 
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
@@ -29,10 +58,13 @@ def test_opencv_issue_23961(projection):
     camera = ct.KannalaBrandt.from_matrix(matrix, lens, image_size=(1200, 1900), ignore_skew=True)
     dewarp = ct.Dewarp(camera, projection=projection)
     mask = dewarp.valid_mask()[0, 0]
-    assert 0.3 < mask.double().mean() < 0.8  # the disc that the lens sees, on black
+    if projection == "perspective":
+        assert 0.3 < mask.double().mean() < 0.8  # the disc that the lens sees, on black
+    else:
+        assert mask.double().mean() > 0.8  # from its left to its right
     assert 300 < float(dewarp.target.intrinsics[0]) < 3000
     assert torch.isfinite(dewarp(torch.ones(1, 1, 1200, 1900))).all()
-    # the whole disc is shown: nothing that the lens sees lies on the target's top or bottom edge's far side
+    # no row is empty, and in perspective nothing that the lens sees lies beyond the target's top or bottom edge
     assert mask[600, 950]
     assert mask[1:-1].any(1).all()
 
@@ -45,7 +77,7 @@ def test_a_lens_of_220_degrees(projection):
     width = 640 / float(dewarp.target.intrinsics[0])
     # 120 degrees in perspective; the others show all that the lens sees
     expected = 2 * math.tan(math.radians(60)) if projection == "perspective" else math.radians(220)
-    assert width == pytest.approx(expected, rel=0.2)
+    assert width == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -106,9 +106,12 @@ def followed(camera: Camera, angles: Tensor, azimuths: int) -> tuple[Tensor, Ten
     return pixels, valid.long().cumprod(-2).bool()
 
 
-def _between(low: Tensor, high: Tensor) -> Tensor:
-    """(..., 33): from low to high, (..., 1) each."""
-    return low + (high - low) * torch.linspace(0, 1, 33).to(low)
+def around_ends(share: Tensor, valid: Tensor) -> Tensor:
+    """(..., 66): finer steps around the first and the last of ascending shares (..., n) of a line that are valid."""
+    first, last = valid.long().argmax(-1, True), share.shape[-1] - 1 - valid.flip(-1).long().argmax(-1, True)
+    around = [share.gather(-1, i.clamp(0, share.shape[-1] - 1)) for i in (first - 1, first, last, last + 1)]
+    steps = torch.linspace(0, 1, 33).to(share)
+    return torch.cat([low + (high - low) * steps for low, high in (around[:2], around[2:])], -1)
 
 
 @torch.no_grad()
@@ -134,9 +137,7 @@ def field_of_view(camera: Camera) -> Tensor:
         angles = torch.atan2(torch.hypot(x, y).copysign(forward), z)
         least = torch.minimum(least, torch.where(valid, angles, torch.inf).amin(-1))
         most = torch.maximum(most, torch.where(valid, angles, -torch.inf).amax(-1))
-        first, last = valid.long().argmax(-1, True), share.shape[-1] - 1 - valid.flip(-1).long().argmax(-1, True)
-        around = [share.gather(-1, i.clamp(0, share.shape[-1] - 1)) for i in (first - 1, first, last, last + 1)]
-        share = torch.cat((_between(*around[:2]), _between(*around[2:])), -1)
+        share = around_ends(share, valid)
     wide, tall, *diagonals = (most - least).clamp(min=0).to(start.dtype).unbind(-1)
     return torch.stack((wide, tall, torch.maximum(*diagonals)), -1)
 

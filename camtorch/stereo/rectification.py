@@ -30,8 +30,8 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.filestorage import Value, write
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
-from camtorch.projection.rays import image_lattice
 from camtorch.rotations import rotation_matrix
+from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.warp import Warp, as_sized
 
 Projection = Literal["perspective", "latlon", "cylindrical"]
@@ -467,25 +467,9 @@ class _View(NamedTuple):
 
 
 def _seen(view: _View, plane: Camera, limit: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and greatest (*B, 2) of what the middle row and column of an image show, on the plane of a projection.
-
-    Its corners would have a wide lens fill a panorama with what hardly any pixel shows.
-    """
-    camera, axes = view.camera, []
-    lines = image_lattice(camera, 3, _LINE)[1], image_lattice(camera, _LINE, 3)[:, 1]
-    for line in lines:
-        rays, has_ray = camera.unproject(line.expand(*camera.batch_shape, -1, -1))
-        points, valid = plane.project(rays.double() @ view.rotation.mT)
-        # what is beyond the limits shows that there is something up to them
-        axes.append((torch.maximum(torch.minimum(points, limit), -limit), valid & has_ray))
-    # the one that lies rather across than down counts across; the other one, past a pole, would come back there
-    (row, of_row), (column, of_column) = axes
-    near = slice(_LINE // 2 - 1, _LINE // 2 + 2)
-    turned = [(p[..., near, :][..., -1, :] - p[..., near, :][..., 0, :]).abs() for p in (row, column)]
-    lies = turned[0][..., :1] * turned[1][..., 1:] >= turned[0][..., 1:] * turned[1][..., :1]
-    swapped = ~lies[..., None]
-    across = torch.where(swapped, column, row)[..., 0], torch.where(swapped[..., 0], of_column, of_row)
-    down = torch.where(swapped, row, column)[..., 1], torch.where(swapped[..., 0], of_row, of_column)
+    """Least and greatest (*B, 2) of what the middle row and column of an image show, on the plane of a projection."""
+    lines = middle_lines(view.camera, view.rotation, plane, limit, _LINE)
+    across, down = ((points[..., axis], valid) for axis, (points, valid) in enumerate(lines))
     low = torch.stack([torch.where(valid, p, torch.inf).amin(-1) for p, valid in (across, down)], -1)
     high = torch.stack([torch.where(valid, p, -torch.inf).amax(-1) for p, valid in (across, down)], -1)
     return low, high

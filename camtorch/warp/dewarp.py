@@ -9,11 +9,11 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_fov, as_image_size
+from camtorch._arguments import as_fov, as_image_size, broadcast_shapes
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, Pinhole
-from camtorch.projection.rays import image_lattice
-from camtorch.rotations import as_rotation, turn
+from camtorch.projection.rays import around_ends, image_lattice
+from camtorch.rotations import as_rotation
 from camtorch.warp.sampling import Fill, Mode, PaddingMode
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp, as_sized
@@ -28,6 +28,7 @@ _PROJECTIONS: dict[str, tuple[type[Pinhole | Cylindrical | Equirectangular], flo
     "equirectangular": (Equirectangular, 2 * math.pi, math.pi),
 }
 _LINE_SAMPLES = 257
+_SEAM = 1e-3  # radians beside it
 
 
 class Dewarp(Warp):
@@ -38,7 +39,9 @@ class Dewarp(Warp):
         projection: "perspective" (straight lines stay straight; up to about 120 degrees), "cylindrical" (vertical lines
             do, for wide views) or "equirectangular" (everything).
         fov: horizontal field of view of the target in degrees, centred on its axis. By default the target shows
-            what the image's middle row and column show, and never more than 120 degrees in perspective.
+            what the image's middle row and column show, and never more than 120 degrees in perspective. A panorama is
+            then as wide as the middle row, so that it has no empty sides, and a whole turn where that is one; for how
+            far it shows up and down its image_size has the say.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
         mode, padding_mode, fill, antialias, tolerance, shutter: as `Warp` takes them.
@@ -98,32 +101,77 @@ class Dewarp(Warp):
 
 
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:
-    """(*B, 4): the target that shows what the middle row and column of the camera's image show."""
+    """(*B, 4): the target that shows what the middle row and column of the camera's image show; see `Dewarp`."""
     model, widest, tallest = _PROJECTIONS[projection]
-    row = image_lattice(camera, 3, _LINE_SAMPLES)[1]
-    column = image_lattice(camera, _LINE_SAMPLES, 3)[:, 1]
-    pixels = torch.cat((row, column)).expand(*camera.batch_shape, -1, -1)
-    rays, has_ray = camera.unproject(pixels)
-    if rotation is not None:
-        while rays.ndim - 2 < rotation.ndim - 2:
-            rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-    plane, shown = model(camera.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0])).project(turn(rotation, rays, "rays"))
-    shown = (shown & has_ray).unsqueeze(-1)
-    limit = plane.new_tensor([widest, tallest]) / 2
-    plane = torch.maximum(torch.minimum(plane, limit), -limit)
-    if projection != "perspective":
-        # over a pole the longitude jumps: across counts what the row shows, up and down what the column does
-        is_row = torch.arange(2 * _LINE_SAMPLES, device=plane.device).unsqueeze(-1) < _LINE_SAMPLES
-        shown = shown & torch.cat((is_row, ~is_row), -1)
-    shown = shown.expand(plane.shape)
+    plane = model(camera.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0]))
+    limit = plane.intrinsics.new_tensor([widest, tallest]) / 2
+    target = limit.new_tensor([size[1], size[0]])
+    (across, of_across), (down, of_down) = middle_lines(camera, rotation, plane, limit, _LINE_SAMPLES)
+    if projection == "perspective":  # either line counts both ways
+        points, shown = torch.cat((across, down), -2), torch.cat((of_across, of_down), -1)
+        shown = shown.unsqueeze(-1).expand(points.shape)
+    else:  # over a pole the longitude jumps
+        points = torch.stack((across[..., 0], down[..., 1]), -1)
+        shown = torch.stack((of_across, of_down), -1)
     # a lens that shows nothing in this direction gets a quarter turn straight ahead
     some = shown.any(-2)
-    low = torch.where(some, torch.where(shown, plane, torch.inf).amin(-2), -1.0)
-    high = torch.where(some, torch.where(shown, plane, -torch.inf).amax(-2), 1.0)
+    low = torch.where(some, torch.where(shown, points, torch.inf).amin(-2), -1.0)
+    high = torch.where(some, torch.where(shown, points, -torch.inf).amax(-2), 1.0)
+    if projection != "perspective":
+        whole = _sees_backward(camera, rotation)
+        ends = torch.stack((whole, torch.zeros_like(whole)), -1)
+        low, high = torch.where(ends, -limit, low), torch.where(ends, limit, high)
     extent = torch.maximum(high - low, 1e-3 * limit)
-    target = plane.new_tensor([size[1], size[0]])
-    # all that is shown fits in, unless that takes a wider image than the widest
-    sides = slice(None) if projection == "perspective" else slice(1)
-    focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit))[sides].amax(-1)).unsqueeze(-1)
+    if projection == "perspective":  # all that is shown fits in, unless that takes a wider image than the widest
+        focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit)).amax(-1)).unsqueeze(-1)
+    else:
+        focal = (target / extent)[..., :1]
     centre = (target - 1) / 2 - focal * (low + high) / 2
     return torch.cat((focal, focal, centre), -1)
+
+
+def _sees_backward(camera: Camera, rotation: Tensor | None) -> Tensor:
+    """(*B,) bool: the image shows what is on both sides of the seam of a panorama, which is then a whole turn."""
+    rays = camera.intrinsics.new_tensor([[-_SEAM, 0.0, -1.0], [_SEAM, 0.0, -1.0]])
+    rays = rays if rotation is None else rays @ rotation.to(rays.dtype)
+    batch = broadcast_shapes(camera.batch_shape, rays.shape[:-2])
+    pixels, valid = camera.project(rays.expand(*batch, 2, 3))
+    return (valid & camera.contains(pixels)).all(-1)
+
+
+def middle_lines(
+    camera: Camera, rotation: Tensor | None, plane: Camera, limit: Tensor, samples: int
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """The middle row and column of an image on the plane of a projection: first the line that lies rather across.
+
+    Corners would have a wide lens fill a panorama with what hardly any pixel shows.
+
+    Args:
+        camera: of the image.
+        rotation: (3, 3) or (B, 3, 3), to the camera of the plane.
+        plane: of focal length 1 and principal point 0.
+        limit: (2,), beyond which the plane is cut: what is beyond it shows that there is something up to it.
+        samples: along a line; more stand at its ends.
+
+    Returns:
+        Points (*B, N, 2) and whether they are shown (*B, N) bool, for each line.
+    """
+    found = []
+    for line in (image_lattice(camera, 3, 3)[1], image_lattice(camera, 3, 3)[:, 1]):
+        start, along = line[0], line[2] - line[0]
+        share = torch.linspace(0, 1, samples).to(start).expand(*camera.batch_shape, samples)
+        every = []
+        for _ in range(4):  # all of it, then what lies around its ends: where a lens folds, angles change fast
+            rays, has_ray = camera.unproject(start + share[..., None] * along)
+            rays = rays.to(plane.intrinsics.dtype)
+            points, valid = plane.project(rays if rotation is None else rays @ rotation.mT.to(rays.dtype))
+            every.append((torch.maximum(torch.minimum(points, limit), -limit), valid & has_ray))
+            share = around_ends(share, has_ray)
+        found.append((torch.cat([p for p, _ in every], -2), torch.cat([v for _, v in every], -1)))
+    (row, of_row), (column, of_column) = found
+    near = slice(samples // 2 - 1, samples // 2 + 2)
+    turned = [(p[..., near, :][..., -1, :] - p[..., near, :][..., 0, :]).abs() for p in (row, column)]
+    swapped = turned[0][..., :1] * turned[1][..., 1:] < turned[0][..., 1:] * turned[1][..., :1]
+    across = torch.where(swapped[..., None], column, row), torch.where(swapped, of_column, of_row)
+    down = torch.where(swapped[..., None], row, column), torch.where(swapped, of_row, of_column)
+    return across, down
