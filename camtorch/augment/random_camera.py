@@ -70,7 +70,9 @@ class RandomCamera(Augmentation):
         fov: horizontal field of view of the new camera in degrees, from one outer edge of the image to the other if
             the axis is in the middle. None: that of the lens, whatever the size of the image. "source": as much of
             that as the images fill, all of the new image as long as nothing else is drawn: the focal lengths are
-            scaled up to that. A turn then still leaves a rim empty, which `min_filled` takes away.
+            scaled up to that. A turn then still leaves a rim empty, which `min_filled` takes away. Where `min_filled`
+            leaves less than 0.9 of the least number given here, one warning a process says so; the new camera's `fov`
+            is what came.
         focal: factor on the focal lengths, for lenses made alike.
         centre: how far the principal point moves, as a part of the image's width and height.
         distortion: by what part of the distance from the centre to the corner all coefficients together may move
