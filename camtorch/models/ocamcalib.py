@@ -15,6 +15,7 @@ from camtorch.camera import Camera
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Stage
 from camtorch.optics.lens import StageAt
 from camtorch.optics.radial import RadialFactor, total
+from camtorch.optics.special import first_root
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -26,6 +27,10 @@ class AngleOfAllPowers(AnglePerRadius):
     def __init__(self, coefficients: Sequence[Tensor]):
         super().__init__(coefficients)
         self.ahead: RadialFactor = RadiusPolynomial(coefficients)
+
+    def closed_fold(self) -> Tensor:
+        """The first root of D - r D', to which d(theta)/dr is in proportion."""
+        return first_root(*(-i * c for i, c in enumerate(self.parameters)))
 
 
 class Shear(Stage):

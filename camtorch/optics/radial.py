@@ -15,7 +15,7 @@ from camtorch._portable import leading, plus
 from camtorch._threads import ALONE, undivided
 from camtorch._tracing import is_exporting, register
 from camtorch.optics.derivatives import derivatives_of, vjp_of
-from camtorch.optics.special import angle_per_radius, root
+from camtorch.optics.special import angle_per_radius, first_root, root
 
 FACTORS: dict[str, type[RadialFactor]] = {}
 """Every class of radial factors by its full name: operators take no classes."""
@@ -66,6 +66,13 @@ class RadialFactor:
         """The radius at which the orientation is lost, in the shape of a parameter; None if it is to be looked for."""
         return None
 
+    def closed_fold(self) -> Tensor | None:
+        """The same of coefficients in float64 whose values are known, infinite where it is not lost.
+
+        None where it has no closed form.
+        """
+        return None
+
     def orientation(self, radius: Tensor) -> Tensor:
         """Positive where the factor is defined, not turned over, and the distorted radius ascends."""
         t = radius * radius
@@ -101,6 +108,10 @@ class Polynomial(RadialFactor):
             elif i > 1:
                 taylor[i] = math.factorial(i) * x
         return tuple(taylor)
+
+    def closed_fold(self) -> Tensor:
+        """The first root of d(radius R)/d(radius)."""
+        return first_root(*((2 * i + 3) * c for i, c in enumerate(self.parameters))).sqrt()
 
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
@@ -138,6 +149,16 @@ class Rational(RadialFactor):
         """Positive before the pole."""
         return self.denominator(t)
 
+    def closed_fold(self) -> Tensor:
+        """The first root of N D + 2 t (N' D - N D'), the numerator of d(radius R)/d(radius), or of D."""
+        n: tuple[Any, ...] = (1.0, *self.numerator.parameters)
+        d: tuple[Any, ...] = (1.0, *self.denominator.parameters)
+        products: list[Any] = [0.0] * (len(n) + len(d) - 1)
+        for i, above in enumerate(n):
+            for j, below in enumerate(d):
+                products[i + j] = products[i + j] + (1 + 2 * (i - j)) * above * below
+        return torch.minimum(first_root(*products[1:]), first_root(*self.denominator.parameters)).sqrt()
+
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient."""
         weight = weight / self.denominator(t)
@@ -172,6 +193,10 @@ class RadiusPolynomial(RadialFactor):
             return factor, slope
         return factor, slope, (by_radius[1] - 2 * slope) / (4 * radius * radius)
 
+    def closed_fold(self) -> Tensor:
+        """The first root of d(radius R)/d(radius)."""
+        return first_root(*((i + 2) * c for i, c in enumerate(self.parameters)))
+
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""
         return self.of_radius.vjp(root(t), weight)
@@ -200,6 +225,10 @@ class AnglePerRadius(RadialFactor):
             return factor, slope
         by_radius = (-bends[0] - 2 * t * bends[1] - by_radius * (1 + 2 * ahead * bends[0])) / square
         return factor, slope, (by_radius - 3 * slope) / twice
+
+    def closed_fold(self) -> Tensor:
+        """The first root of D - 2 t D', to which d(theta)/d(radius) is in proportion."""
+        return first_root(*(-(2 * i + 1) * c for i, c in enumerate(self.parameters))).sqrt()
 
     def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
         """The sums over the points of dR/dc weight, for each coefficient c."""

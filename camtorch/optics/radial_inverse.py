@@ -22,7 +22,7 @@ from camtorch._portable import (
     running_max,
     times,
 )
-from camtorch._tracing import may_look
+from camtorch._tracing import is_concrete, may_look
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.optics.radial import FACTORS
 
@@ -33,6 +33,7 @@ RADII = 1024
 """At how many radii a factor is followed to its fold."""
 _PARTS = 256  # of the interval in which a fold is looked for; twice, then the secant
 _NODES = 1024  # of the table of an inverse
+_LIMITING = 4  # steps of Newton's method towards the radius of the largest image, as at most nearly all need
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 # Steps of Newton's method that most points need, by whether they can be counted while they are made
 _STEPS = {torch.float32: 1, torch.float64: 2}
@@ -84,6 +85,19 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
     """
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
+    # of numbers that are not known, or that another runtime is to compute with, it is looked for
+    known = radii.dtype == torch.float64 and is_concrete(radii) and not for_elsewhere()
+    if known and (fold := radial.closed_fold()) is not None:
+        fold = fold.clamp(max=end)
+        for _ in range(_LIMITING):
+            # the image ascends, so that its largest is the last; on logarithmic axes it is nearly straight out there
+            factor, slope = radial.derivatives(fold * fold, 1)
+            excess = fold * factor / most
+            if bool((excess <= 1).all()):
+                break
+            degree = 1 + 2 * fold * fold * slope / factor
+            fold = torch.where(excess > 1, fold * excess ** (-1 / degree), fold)
+        return fold
 
     def orientation(radius: Tensor) -> Tensor:
         found, image = radial.orientation(radius), radius * radial(radius * radius)

@@ -10,6 +10,7 @@ multiplied by t in the derivative by a point. With order 1 they are used as they
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -125,3 +126,36 @@ def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
 def tanc_root(t: Tensor) -> Tensor:
     """tan(angle) / angle of t = angle^2."""
     return _blend(t, _TANC, lambda angle: torch.tan(angle) / angle)
+
+
+def first_root(*coefficients: Tensor) -> Tensor:
+    """The smallest t > 0 at which 1 + c0 t + c1 t^2 + ... turns negative; infinite where it does not, 0 for no numbers.
+
+    coefficients: float64, with values, of which no graph is kept. The roots of the reversed polynomial are the
+    eigenvalues of its companion matrix, which asks for no division by a highest coefficient that may be zero. They part
+    the axis into intervals of one sign each; at the root before the first negative one Newton's method finds the last
+    bits. By NumPy: for so few numbers its functions take a fraction of the time of torch's.
+    """
+    first = coefficients[0]
+    c = np.stack(np.broadcast_arrays(*(w.detach().cpu().numpy() for w in coefficients)), -1)
+    known = np.isfinite(c).all(-1, keepdims=True)
+    c = np.where(known, c, 0.0)
+    degree = c.shape[-1]
+    companion = np.zeros((*c.shape, degree))
+    companion[..., range(1, degree), range(degree - 1)] = 1
+    companion[..., 0, :] = -c
+    powers, terms = np.arange(degree + 1), np.concatenate((np.ones_like(c[..., :1]), c), -1)
+    with np.errstate(all="ignore"):  # what is infinite or no number stands for no root
+        roots = 1 / np.linalg.eigvals(companion)
+        # of a pair that is not real an end of an interval does no harm
+        roots = np.sort(np.where(roots.real > 0, roots.real, np.inf), -1)
+        ends = np.concatenate(((roots[..., :-1] + roots[..., 1:]) / 2, 2 * roots[..., -1:]), -1)
+        ends = np.where(np.isfinite(ends), ends, 2 * roots)
+        negative = ((terms[..., None, :] * ends[..., None] ** powers).sum(-1) < 0) & np.isfinite(ends)
+        t = np.take_along_axis(roots, negative.argmax(-1, keepdims=True), -1)
+        for _ in range(2):
+            value = (terms * t**powers).sum(-1, keepdims=True)
+            step = value / (c * powers[1:] * t ** powers[:-1]).sum(-1, keepdims=True)
+            t = np.where(np.abs(step) < 0.1 * t, t - step, t)
+        t = np.where(known, np.where(negative.any(-1, keepdims=True), t, np.inf), 0.0)
+    return torch.from_numpy(t[..., 0]).to(first.device)
