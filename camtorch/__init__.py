@@ -1,15 +1,10 @@
 """Cameras as layers for PyTorch: learnable camera models, exact in both directions, and every warp between them."""
 
 import importlib
-import importlib.util
 import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from importlib.machinery import ModuleSpec
-    from types import ModuleType
-
     from camtorch._public import *  # noqa: F403 (the list is there)
     from camtorch._public import __all__ as __all__
     from camtorch.models import *  # noqa: F403
@@ -39,32 +34,5 @@ def __dir__() -> list[str]:
     return [*sys.modules[__name__].__all__, *(name for name in globals() if name.startswith("__"))]
 
 
-class _AfterTorch:
-    """A finder that loads camtorch once torch is there: `torch.export.load` reads programs of camtorch's operators."""
-
-    @classmethod
-    def find_spec(
-        cls, name: str, path: "Sequence[str] | None" = None, target: "ModuleType | None" = None, /
-    ) -> "ModuleSpec | None":
-        """The spec of torch, of nothing else; what it executes has camtorch after it."""
-        if name != "torch":
-            return None
-        sys.meta_path.remove(cls)
-        spec = importlib.util.find_spec(name)
-        if spec is not None and spec.loader is not None:
-            execute = spec.loader.exec_module
-
-            def execute_and_load(module: "ModuleType") -> None:
-                execute(module)
-                # whoever imports a part of camtorch, and torch by it, has what that part registers
-                if not any(loaded.startswith("camtorch.") for loaded in sys.modules):
-                    _load()
-
-            spec.loader.exec_module = execute_and_load  # type: ignore[method-assign]
-        return spec
-
-
-if "torch" in sys.modules:
+if "torch" in sys.modules:  # what `torch.export.load` reads may have camtorch's operators
     _load()
-else:
-    sys.meta_path.insert(0, _AfterTorch)

@@ -51,7 +51,9 @@ print("loaded:", sorted(heavy & set(sys.modules)))
 def test_names_come_at_first_use():
     code = """
 import sys
+finders = list(sys.meta_path)
 import camtorch as ct
+assert sys.meta_path == finders
 assert "torch" not in sys.modules
 assert set(ct.__all__) <= set(dir(ct))
 for name in ct.__all__:
@@ -93,7 +95,7 @@ def test_a_pickled_camera_needs_no_import(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("imports", ["import camtorch\nimport torch", "import torch\nimport camtorch"])
+@pytest.mark.parametrize("imports", ["from camtorch import Camera\nimport torch", "import torch\nimport camtorch"])
 def test_exported_programs_load(tmp_path, imports):
     camera = ct.KannalaBrandt([300.0, 300, 320, 240], [0.02, -0.01, 0.003, -0.001]).requires_grad_(False)
 
