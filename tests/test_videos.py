@@ -18,7 +18,7 @@ from test_folders import TRIALS, outputs
 from videos import read_video, write_video
 
 import camtorch as ct
-from camtorch.cli.videos import FORMATS
+from camtorch.cli import videos
 
 av = pytest.importorskip("av")
 WORDS = ["dewarp", "in.mkv", "--camera", "camera.yml", "-o", "out.mkv"]
@@ -79,6 +79,19 @@ def test_what_shows_nothing_is_black(folder):
     assert [colour[0] for colour in colours] == [128, 128]
 
 
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("pixels", sorted(filter(videos._PLANAR.fullmatch, av.video.format.names)))
+def test_what_shows_nothing_is_black_in_every_format(pixels, full):
+    frame = av.VideoFrame(96, 64, pixels)
+    frame.pts, frame.time_base, frame.color_range = 0, Fraction(1, 30), 2 if full else 1
+    warp = ct.Warp(camera(), ct.Equirectangular.from_fov(360, image_size=(64, 96)))
+    made = videos._Frames(warp, frame)(frame)
+    assert made.reformat(format="rgb24").to_ndarray()[0, 0].tolist() == [0, 0, 0]
+    brightness = videos._planes(made)[0].of(made)[0, 0, 0]
+    limited = pixels.startswith(("yuv4", "yuva", "nv")) and not full
+    assert brightness == (16 << (frame.format.components[0].bits - 8) if limited else 0)
+
+
 def test_a_quarter_of_a_chroma_pixel(folder):
     # the camera of an image without distortion: colours of half the resolution stay where they are, at either side
     Path("level.yml").write_text("K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]")
@@ -119,7 +132,7 @@ def test_gray_keeps_its_range(folder):
 
 
 @pytest.mark.parametrize(
-    "pixels", ["bgr0", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gray", "yuv422p", "yuv420p10le"))]
+    "pixels", ["bgr0", "yuv444p", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gray", "yuv422p", "yuv420p10le"))]
 )
 def test_pixels(folder, pixels):
     Path("level.yml").write_text("K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]")
@@ -218,7 +231,7 @@ def test_quality(folder):
 
 
 def test_known_suffixes_have_a_format():
-    for name in FORMATS.values():
+    for name in videos.FORMATS.values():
         assert av.format.ContainerFormat(name, "w").is_output
 
 

@@ -233,7 +233,8 @@ def _planes(frame: Any) -> list[_Plane]:
         own = [component for component in components if component.plane == index]
         first = own[0]
         black = 0 if is_full or first.is_alpha or not is_yuv else 16 << (first.bits - 8)
-        fill = 1 << (first.bits - 1) if first.is_chroma else black
+        # PyAV's is_chroma is False for chroma of the full resolution
+        fill = 1 << (first.bits - 1) if is_yuv and first.index in (1, 2) else black
         dtype = np.uint8 if first.bits <= 8 else np.uint16
         planes.append(_Plane(index, len(own), first.height, first.width, dtype, fill))
     return planes
