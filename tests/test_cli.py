@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 import camtorch as ct
+from camtorch.cli import images
 from camtorch.cli.main import main
 
 FILES = Path(__file__).parent / "files"
@@ -271,14 +272,58 @@ def test_kinds_of_image(folder, mode):
         assert np.abs(np.asarray(out).astype(int) - np.asarray(expected).astype(int)).max() <= 1
 
 
-def test_exif_orientation_stays_as_it_is(folder):
+@pytest.mark.parametrize(("mode", "clear"), [("L", 7), ("1", 0), ("RGB", (7, 7, 7))])
+def test_transparency_by_a_colour_stays(folder, mode, clear):
+    image = Image.new(mode, (96, 64), clear)
+    image.paste(1 if mode == "1" else 200 if mode == "L" else (200, 9, 9), (48, 0, 96, 64))
+    image.save("clear.png", transparency=clear)
+    Path("level.yml").write_text("K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]")
+    command("dewarp", "clear.png", "--camera", "level.yml", "-o", "out.png")
+    out = opened("out.png")
+    assert out.mode == ("LA" if mode in "L1" else "RGBA")
+    assert [out.getpixel((x, 32))[-1] for x in (10, 80)] == [0, 255]
+
+
+def tagged(path, orientation, **options):
+    """in.png with an Exif orientation."""
     exif = Image.Exif()
-    exif[0x0112] = 6
-    opened("in.png").save("turned.jpg", exif=exif)
-    command("dewarp", "turned.jpg", "--camera", "camera.yml", "-o", "out.jpg")
-    out = opened("out.jpg")
-    assert out.size == (96, 64)
-    assert out.getexif()[0x0112] == 6
+    exif[0x0112] = orientation
+    opened("in.png").save(path, exif=exif, **options)
+
+
+def orientation_of(path):
+    with Image.open(path) as image:  # before it is loaded: Pillow turns TIFFs then, and forgets the tag
+        return image.getexif().get(0x0112)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [(".png", {}), (".webp", {"lossless": True}), (".tif", {}), (".tif", {"compression": "jpeg"})],
+)
+def test_images_are_taken_as_they_are_stored(folder, suffix, options, orientation):
+    tagged(f"turned{suffix}", orientation, **options)
+    opened("in.png").save(f"upright{suffix}", **options)
+    for name in ("turned", "upright"):
+        command("dewarp", f"{name}{suffix}", "--camera", "camera.yml", "-o", f"new/{name}.png")
+    assert np.array_equal(np.array(opened("new/turned.png")), np.array(opened("new/upright.png")))
+    assert orientation_of("new/turned.png") == orientation
+    assert images.size_of(Path(f"turned{suffix}")) == (64, 96)
+
+
+# without colours, without a writer, or deprecated
+_LEFT_OUT = ("BLP", "BUFR", "EPS", "GRIB", "HDF5", "ICNS", "ICO", "IM", "MSP", "PALM", "PDF", "WMF", "XBM")
+
+
+@pytest.mark.parametrize(
+    "suffix",
+    {kind: s for s, kind in Image.registered_extensions().items() if kind in {*Image.SAVE} - {*_LEFT_OUT}}.values(),
+)
+def test_the_exif_orientation_stays_or_its_loss_is_said(folder, capsys, suffix):
+    tagged("turned.jpg", 3)
+    command("dewarp", "turned.jpg", "--camera", "camera.yml", "-o", f"out{suffix}")
+    lost = f"note: turned.jpg is to be shown turned by its Exif orientation, which is lost: {suffix} files hold none\n"
+    assert (orientation_of(f"out{suffix}") == 3) != (lost in capsys.readouterr().err)
 
 
 def test_runs_as_a_module():

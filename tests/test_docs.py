@@ -134,6 +134,14 @@ def test_a_command_runs(page, line, lines, folder, capsys):
         assert main(words) == 0, f"{page}:{line}: {text}\n{capsys.readouterr().err}"
 
 
+def test_photographs_are_read_as_they_are_stored():
+    """`cv2.imread` alone turns them by their Exif orientation, which calibrations do not know."""
+    texts = [*PAGES, *(path for place in ("docs", "camtorch") for path in (ROOT / place).rglob("*.[ip]*y*"))]
+    calls = [call for path in texts for call in re.findall(r"imread\([^()]*\)", path.read_text(errors="ignore"))]
+    assert len(calls) >= 4
+    assert [call for call in calls if "IMREAD_IGNORE_ORIENTATION" not in call] == []
+
+
 def test_every_public_name_has_a_place_in_the_reference():
     reference = "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
     missing = []

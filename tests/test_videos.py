@@ -132,7 +132,8 @@ def test_gray_keeps_its_range(folder):
 
 
 @pytest.mark.parametrize(
-    "pixels", ["bgr0", "yuv444p", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gray", "yuv422p", "yuv420p10le"))]
+    "pixels",
+    ["bgr0", "yuv444p", *(pytest.param(p, marks=pytest.mark.slow) for p in ("gray", "yuv422p", "yuv420p10le"))],
 )
 def test_pixels(folder, pixels):
     Path("level.yml").write_text("K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]")

@@ -19,6 +19,7 @@ from torch import Tensor
 
 import camtorch.plot as plot
 from camtorch._arguments import check_path
+from camtorch._photographs import load_stored, stored_size
 from camtorch.calibration.calibrate import Calibration
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.svg import Plots, palette
@@ -555,15 +556,12 @@ def _reduced(image: Any, size: tuple[int, int], name: str) -> Image.Image:
 
     if isinstance(image, (str, bytes, os.PathLike)):
         with Image.open(os.fsdecode(image)) as opened:
-            _check_size(opened, size, name)
+            _check_size(stored_size(opened), size, name)
             opened.draft(None, (_PHOTOGRAPH, _PHOTOGRAPH))
-            opened.load()
-            image = opened
-    elif not isinstance(image, Image.Image):
-        image = _from_array(image)
-        _check_size(image, size, name)
+            image = load_stored(opened)
     else:
-        _check_size(image, size, name)
+        image = image if isinstance(image, Image.Image) else _from_array(image)
+        _check_size((image.height, image.width), size, name)
     if image.mode.startswith(("I", "F")):  # deep grey
         values = np.asarray(image, np.float64)
         image = Image.fromarray((255 * values / max(values.max(), 1e-9)).clip(0, 255).astype(np.uint8))
@@ -583,9 +581,9 @@ def _from_array(image: Any) -> Image.Image:
     return Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
 
 
-def _check_size(image: Image.Image, size: tuple[int, int], name: str) -> None:
-    if image.size != size[::-1]:
+def _check_size(image: tuple[int, int], camera: tuple[int, int], name: str) -> None:
+    if image != camera:
         raise ValueError(
-            f"write_report: the image {name!r} has {image.width} x {image.height} pixels, and those of the camera have "
-            f"{size[1]} x {size[0]}"
+            f"write_report: the image {name!r} has {image[1]} x {image[0]} pixels, and those of the camera have "
+            f"{camera[1]} x {camera[0]}"
         )

@@ -84,7 +84,8 @@ class Augmenting:
                 result["annotations"].append(entries[1])
             else:
                 new, labels = _labelled(image, camera, move, key, entry)
-            images.write(target, images.from_tensor(new), orientation=orientation, synced=False)
+            made = images.from_tensor(new)
+            images.write(target, made, orientation=orientation, tell=listener.note, synced=False)
             if not item.labels:
                 _write(item.outputs[self.copies + copy], labels)
         return result

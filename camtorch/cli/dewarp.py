@@ -132,7 +132,8 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
         del image
         lattice = (camera.resize(64, 64).pixel_grid() + 0.5) * torch.tensor([columns / 64, rows / 64]) - 0.5
         shown = float(warp.transform_points(lattice)[1].double().mean())
-    images.write(output, images.from_tensor(result), orientation=orientation)
+    made = images.from_tensor(result)
+    images.write(output, made, orientation=orientation, tell=lambda text: note(f"{source} {text}"))
     height, width = result.shape[-2:]
     fx, fy, cx, cy = warp.target.intrinsics.tolist()
     degrees = float(warp.target.fov[0])

@@ -65,7 +65,8 @@ class Dewarping:
         warp, told = self._warp(source, (rows, columns))
         with torch.no_grad():
             result = warp(image[None])[0]
-        images.write(target, images.from_tensor(result), orientation=orientation, synced=False)
+        made = images.from_tensor(result)
+        images.write(target, made, orientation=orientation, tell=listener.note, synced=False)
         return told
 
     def _warp(self, source: Path, size: tuple[int, int]) -> tuple[Dewarp, dict[str, Any]]:

@@ -12,13 +12,14 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from camtorch._photographs import ORIENTATION, load_stored, stored_size
 from camtorch.cli import targets
 from camtorch.cli.terminal import note
 from camtorch.io.writing import replacing
 
-_ORIENTATION = 0x0112  # the Exif tag
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 _DEEPEST = 65535
+_KEEP_ORIENTATION = ("AVIF", "JPEG", "MPO", "PNG", "TIFF", "WEBP")
 _OTHER_SIZES = ("ICO", "ICNS")  # formats that hold an image in sizes of their own
 
 
@@ -43,15 +44,18 @@ def read(path: Path, tell: Callable[[str], None] = note) -> tuple[Tensor, int | 
         with warnings.catch_warnings():
             # of a large photograph, which is what the user named
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(path)
-        with image:
-            count, cut = getattr(image, "n_frames", 1), _is_cut(image)
-            image.load()
+            opened = Image.open(path)
+        with opened:
+            count, cut = getattr(opened, "n_frames", 1), _is_cut(opened)
+            orientation = opened.getexif().get(ORIENTATION)
+            image = load_stored(opened)
             if count > 1:
                 tell(f"{path} holds {count} images; only the first is taken")
             if cut:
                 tell(f"{path} has 16 bits a colour; only the upper 8 are read")
-            return _pixels(path, image), image.getexif().get(_ORIENTATION)
+            if image.mode in _DEEP and "transparency" in image.info:
+                tell(f"{path} is grey of 16 bits with transparency, which is not read")
+            return _pixels(path, image), orientation
     except FileNotFoundError:
         raise ImageFileError(f"{path}: no such file") from None
     except UnidentifiedImageError:
@@ -71,7 +75,7 @@ def size_of(path: Path) -> tuple[int, int] | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as image:
-                return image.height, image.width
+                return stored_size(image)
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
         return None
 
@@ -98,9 +102,10 @@ def _pixels(path: Path, image: Image.Image) -> Tensor:
         if low < 0 or high > _DEEPEST:
             raise ImageFileError(f"{path}: pixels from {low} to {high}; 8-bit and 16-bit images can be read")
         return torch.from_numpy(deep.astype(np.uint16))[None]
-    if image.mode not in ("L", "LA", "RGB", "RGBA"):
-        clear = "transparency" in image.info or image.mode in ("PA", "RGBa", "La")
-        image = image.convert("L" if image.mode == "1" else "RGBA" if clear else "RGB")
+    clear = "transparency" in image.info or image.mode in ("PA", "RGBa", "La")
+    if clear or image.mode not in ("L", "LA", "RGB", "RGBA"):
+        colours = "L" if image.mode in ("1", "L", "La") else "RGB"
+        image = image.convert(colours + "A" if clear else colours)
     pixels = torch.from_numpy(np.array(image))
     return pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)
 
@@ -138,22 +143,34 @@ def from_tensor(image: Tensor) -> Image.Image:
     return Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
 
 
-def write(path: Path, image: Image.Image, *, orientation: int | None = None, synced: bool = True) -> None:
+def write(
+    path: Path,
+    image: Image.Image,
+    *,
+    orientation: int | None = None,
+    tell: Callable[[str], None] = note,
+    synced: bool = True,
+) -> None:
     """Write a Pillow image, whole or not at all; folders that lack are made; `synced` as of `replacing`.
+
+    Where the file type does not hold the Exif orientation of the image it was made of, `tell` gets that this is lost.
 
     Raises:
         ImageFileError: the file type does not take such pixels, or the disk does not take the file.
     """
+    kind = Image.registered_extensions()[path.suffix.lower()]
     options: dict[str, Any] = {"quality": 95}
     if orientation is not None:
         options["exif"] = Image.Exif()
-        options["exif"][_ORIENTATION] = orientation
+        options["exif"][ORIENTATION] = orientation
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, synced=synced) as (file,):
-            image.save(file, Image.registered_extensions()[path.suffix.lower()], **options)
+            image.save(file, kind, **options)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         if isinstance(error, OSError) and "cannot write mode" in str(error):
             reason = f"{path.suffix} files hold no image of mode {image.mode}; .png does"
         raise ImageFileError(f"{path}: {reason}") from None
+    if orientation not in (None, 1) and kind not in _KEEP_ORIENTATION:
+        tell(f"is to be shown turned by its Exif orientation, which is lost: {path.suffix} files hold none")
