@@ -23,7 +23,7 @@ WORDS = ["dewarp", "in", "--camera", "camera.yml", "-o", "out/"]
 def folder(tmp_path, monkeypatch):
     """The current folder, with images of one camera in folders."""
     monkeypatch.chdir(tmp_path)
-    for name in ("RANK", "WORLD_SIZE", "SLURM_PROCID", "SLURM_NTASKS"):
+    for name in ("TORCHELASTIC_RUN_ID", "RANK", "WORLD_SIZE", "SLURM_STEP_ID", "SLURM_PROCID", "SLURM_NTASKS"):
         monkeypatch.delenv(name, raising=False)
     Path("camera.yml").write_text(FISHEYE + MATRIX)
     write_images({"1.png": "RGB", "2.jpg": "RGB", "deep/1.png": "L", "deep/er/3.tif": "I;16", "deep/4.webp": "RGBA"})
@@ -156,12 +156,17 @@ def test_two_shards_are_one_run(folder, capsys, monkeypatch):
     command(*WORDS, "--jobs", 1, expect=1)
     whole = outputs()
     capsys.readouterr()
-    for names in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS")):
-        place = names[0].lower()
-        monkeypatch.setenv(names[1], "2")
+    by_torchrun, by_srun = (
+        ("RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID"),
+        ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_STEP_ID"),
+    )
+    for names in (by_torchrun, by_srun, ()):
+        place = names[0].lower() if names else "option"
         for rank in (0, 1):
-            monkeypatch.setenv(names[0], str(rank))
-            command(*WORDS[:-1], place, "--jobs", 1, expect=1 if rank == 0 else 0)  # who tells of the circle
+            for name, value in zip(names, (rank, 2, 0), strict=False):
+                monkeypatch.setenv(name, str(value))
+            shard = [] if names else ["--shard", f"{rank + 1}/2"]
+            command(*WORDS[:-1], place, "--jobs", 1, *shard, expect=1 if rank == 0 else 0)  # who tells of the circle
         assert outputs(place) == whole
         told = capsys.readouterr()
         assert f"{place}, shard 2 of 2: 4 of 4 files made" in told.out
@@ -170,6 +175,22 @@ def test_two_shards_are_one_run(folder, capsys, monkeypatch):
             monkeypatch.delenv(name)
         command(*WORDS[:-1], place, "--jobs", 1, "--resume", expect=1)
         assert "0 of 10 files made" in capsys.readouterr().out
+
+
+def test_ranks_left_over_in_a_shell_ask_for_nothing(folder, capsys, monkeypatch):
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    Path("bare.yml").write_text(MATRIX)
+    command("dewarp", "in", "--camera", "bare.yml", "-o", "out", "--jobs", 1)  # which warns of its model as well
+    told = capsys.readouterr()
+    assert "out: 5 of 5 files made" in told.out
+    last = told.err.splitlines()[-1]
+    assert last.startswith("camtorch: note: RANK=0 WORLD_SIZE=4 is set, but not by torchrun or srun")
+    assert last.endswith("--shard 1/4 makes the first of four parts")
+    command(*WORDS, "--jobs", 1, "--shard", "4/4", "--force")
+    told = capsys.readouterr()
+    assert "out, shard 4 of 4: 1 of 1 files made" in told.out
+    assert told.err == ""
 
 
 def test_a_camera_without_size_is_of_the_first_image(folder, capsys):
@@ -221,8 +242,10 @@ def refused_suffix(capsys, suffix):
         (["dewarp", "in", "--camera", "camera.yml", "-o", "in"], "would overwrite in/1.png, which is read"),
         (["dewarp", "in/1.png", "in/deep/1.png", "--camera", "camera.yml", "-o", "out"], "would both be written to"),
         ([*WORDS, "--jobs", "0"], "'0' is not 1 to 1024 processes"),
+        ([*WORDS, "--shard", "0/4"], "'0/4' is not I/N, the I-th of N parts"),
         ([*WORDS, "--suffix", "png"], "'png' is no suffix, as .png is"),
         (["dewarp", "in/1.png", "--camera", "camera.yml", "-o", "o.png", "--resume"], "--resume is for folders"),
+        (["dewarp", "in/1.png", "--camera", "camera.yml", "-o", "o.png", "--shard", "1/2"], "--shard is for folders"),
     ],
 )
 def test_errors_before_the_work(folder, capsys, words, text):

@@ -115,18 +115,20 @@ def test_outputs_that_would_be_lost(folder):
 
 # -- shards
 
+TORCHRUN, SRUN = {"TORCHELASTIC_RUN_ID": "none"}, {"SLURM_JOB_ID": "7", "SLURM_STEP_ID": "0"}
+
 
 @pytest.mark.parametrize(
     ("environment", "shard"),
     [
         ({}, Shard()),
-        ({"WORLD_SIZE": "1"}, Shard()),
-        ({"RANK": "1", "WORLD_SIZE": "3", "LOCAL_WORLD_SIZE": "2"}, Shard(1, 3, 2)),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard(0, 4)),
-        ({"SLURM_NTASKS": "4"}, Shard()),
+        ({"RANK": "0", "WORLD_SIZE": "4"}, Shard()),  # left over in a shell
+        (TORCHRUN | {"RANK": "1", "WORLD_SIZE": "3", "LOCAL_WORLD_SIZE": "2"}, Shard(1, 3, 2)),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard()),
         ({"SLURM_JOB_ID": "7", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard()),  # a script that sbatch runs
-        ({"SLURM_JOB_ID": "7", "SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard(0, 4)),
-        ({"RANK": "0", "WORLD_SIZE": "2", "SLURM_PROCID": "3", "SLURM_NTASKS": "4"}, Shard(0, 2)),
+        (SRUN | {"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard(0, 4)),
+        (SRUN | {"SLURM_PROCID": "2", "SLURM_NTASKS": "4", "RANK": "0", "WORLD_SIZE": "2"}, Shard(2, 4)),
+        (TORCHRUN | SRUN | {"RANK": "0", "WORLD_SIZE": "2", "SLURM_PROCID": "3", "SLURM_NTASKS": "4"}, Shard(0, 2)),
     ],
 )
 def test_shards(environment, shard):
@@ -134,12 +136,29 @@ def test_shards(environment, shard):
 
 
 @pytest.mark.parametrize(
-    "environment",
-    [{"WORLD_SIZE": "2"}, {"RANK": "2", "WORLD_SIZE": "2"}, {"RANK": "-1", "WORLD_SIZE": "2"}, {"RANK": "0"}],
+    "numbers",
+    [{}, {"WORLD_SIZE": "2"}, {"RANK": "2", "WORLD_SIZE": "2"}, {"RANK": "-1", "WORLD_SIZE": "2"}, {"RANK": "0"}],
 )
-def test_shards_that_are_none(environment):
+def test_shards_that_are_none(numbers):
     with pytest.raises(ValueError, match="which shard"):
-        Shard.of_environment(environment)
+        Shard.of_environment(TORCHRUN | numbers)
+
+
+@pytest.mark.parametrize(
+    ("environment", "text"),
+    [
+        ({}, ""),
+        ({"WORLD_SIZE": "1"}, ""),
+        ({"RANK": "0", "WORLD_SIZE": "1"}, ""),
+        ({"RANK": "0", "WORLD_SIZE": "4"}, "RANK=0 WORLD_SIZE=4"),
+        ({"WORLD_SIZE": "2"}, "RANK= WORLD_SIZE=2"),
+        ({"RANK": "3"}, "RANK=3 WORLD_SIZE="),
+        (TORCHRUN | {"RANK": "0", "WORLD_SIZE": "4"}, ""),
+        (SRUN | {"RANK": "0", "WORLD_SIZE": "4"}, ""),
+    ],
+)
+def test_what_looks_like_a_shard_and_nobody_asked_for(environment, text):
+    assert Shard.unmarked(environment) == text
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])

@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print("\n".join(labelled_image.presets()))
         return 0
-    of_datasets = ("jobs", "resume", "dry_run", "copies")
+    of_datasets = ("jobs", "resume", "shard", "dry_run", "copies")
     for name in ("n", "labels") if arguments.dataset is not None else of_datasets:
         if getattr(arguments, name):
             option = "-n" if name == "n" else f"--{name.replace('_', '-')}"

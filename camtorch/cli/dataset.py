@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     if folder is None or not folder.is_dir():
         raise ValueError(f"--dataset: which images? camtorch augment FOLDER --dataset LABELS; got {folder}")
     output = many.output_folder(None if arguments.output is None else str(arguments.output))
-    shard = items.Shard.of_environment()
+    shard = many.shard_of(arguments)
     data = None if source.is_dir() else coco.read(source)
     faults: list[tuple[Path, str]] = []
     if data is None:

@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     is_pattern = glob.has_magic(words[0]) and not os.path.lexists(words[0])
     if len(words) > 1 or os.path.isdir(words[0]) or is_pattern or into_folder:
         return _many(arguments)
-    for name in ("resume", "suffix"):
+    for name in ("resume", "shard", "suffix"):
         if getattr(arguments, name):
             raise ValueError(f"--{name} is for folders: -o OUT/, with a slash, puts the new one into one")
     source = Path(words[0])
@@ -187,7 +187,7 @@ def _many(arguments: argparse.Namespace) -> int:
 
     known = inputs.IMAGES | set(videos.FORMATS)
     _check_no_calibration(arguments, known)
-    output, shard = many.output_folder(arguments.output), items.Shard.of_environment()
+    output, shard = many.output_folder(arguments.output), many.shard_of(arguments)
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
         raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
     found = inputs.find(arguments.image, known, output)

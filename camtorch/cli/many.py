@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -31,6 +32,16 @@ def output_folder(text: str | None) -> Path:
     return path
 
 
+def shard_of(arguments: argparse.Namespace) -> Shard:
+    """Which part of the files this process makes: what --shard says, or else torchrun or srun.
+
+    Raises:
+        ValueError: see `Shard.of_environment`.
+    """
+    shard: Shard = arguments.shard or Shard.of_environment()
+    return shard
+
+
 def carry_out(
     items: Sequence[Item],
     faults: Sequence[tuple[Path, str]],
@@ -49,7 +60,7 @@ def carry_out(
         faults: what there is to report beside.
         work: makes one.
         manifest: of this shard; not yet open.
-        arguments: with `jobs`, `resume`, `dry_run` and `force`.
+        arguments: with `jobs`, `resume`, `shard`, `dry_run` and `force`.
         doing: what goes on, as "dewarping".
         units: of `Item.size`, in the plural.
         told: what more is to be said of what was made; if anything, it begins with a comma.
@@ -91,6 +102,13 @@ def carry_out(
     if failed:
         parts.append(f"{len(failed)} failed")
     print(f"{manifest.folder}{part}: {'; '.join(parts)}")
+    unmarked = "" if arguments.shard else Shard.unmarked()
+    if unmarked:  # the command says warnings last
+        warnings.warn(
+            f"{unmarked} is set, but not by torchrun or srun, and was not heeded: all files were asked for; --shard "
+            "1/4 makes the first of four parts",
+            stacklevel=2,
+        )
     return (1 if failed else 0), report
 
 

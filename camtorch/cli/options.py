@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from camtorch.jobs.items import Shard
+
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
 
@@ -169,6 +171,12 @@ def add_jobs(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group.add_argument(
         "--resume", action="store_true", help="go on where a run was broken off; what is done and unchanged is kept"
     )
+    group.add_argument(
+        "--shard",
+        type=_parse_shard,
+        metavar="I/N",
+        help="only the I-th of N parts, as 1/4; processes of torchrun and srun know theirs",
+    )
     group.add_argument("--dry-run", action="store_true", help="print what would be done")
     return group
 
@@ -177,6 +185,13 @@ def _parse_jobs(text: str) -> int:
     if not (text.isascii() and text.isdigit() and 0 < int(text) <= _MOST_JOBS):
         raise argparse.ArgumentTypeError(f"{text!r} is not 1 to {_MOST_JOBS} processes")
     return int(text)
+
+
+def _parse_shard(text: str) -> Shard:
+    place, _, count = text.partition("/")
+    if not all(part.isascii() and part.isdigit() for part in (place, count)) or not 0 < int(place) <= int(count):
+        raise argparse.ArgumentTypeError(f"{text!r} is not I/N, the I-th of N parts, from 1/N to N/N")
+    return Shard(int(place) - 1, int(count))
 
 
 def parse_suffix(text: str) -> str:

@@ -90,21 +90,18 @@ class Shard:
 
     @classmethod
     def of_environment(cls, environment: Mapping[str, str] | None = None) -> Shard:
-        """By RANK, WORLD_SIZE and LOCAL_WORLD_SIZE as torchrun sets them, else by what srun sets for a step.
+        """That of a process which torchrun or srun started, by what they set; else all items. See `unmarked`.
 
         Raises:
-            ValueError: one without the other, or no numbers that fit.
+            ValueError: what they set is missing, or no numbers that fit.
         """
         known = os.environ if environment is None else environment
-        for rank, count, local in (
-            ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"),
-            ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NTASKS_PER_NODE"),
+        for mark, rank, count, local in (
+            ("TORCHELASTIC_RUN_ID", "RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"),
+            # a script that sbatch runs has no step: SLURM_NTASKS is what was asked for, and nobody else works
+            ("SLURM_STEP_ID", "SLURM_PROCID", "SLURM_NTASKS", "SLURM_NTASKS_PER_NODE"),
         ):
-            if rank == "SLURM_PROCID" and known.get("SLURM_JOB_ID", "") and not known.get("SLURM_STEP_ID", ""):
-                continue  # a script that sbatch runs: SLURM_NTASKS is what was asked for, and nobody else works
-            if known.get(rank, "") == "":
-                if rank == "RANK" and known.get(count, "") not in ("", "1"):
-                    raise ValueError(f"{count} is {known[count]!r}, but {rank} is not set: which shard is this?")
+            if known.get(mark, "") == "":
                 continue
             values = [known.get(name, "") for name in (rank, count)]
             if not all(value.isascii() and value.isdigit() for value in values) or int(values[0]) >= int(values[1]):
@@ -112,6 +109,15 @@ class Shard:
             here = known.get(local, "")
             return cls(int(values[0]), int(values[1]), max(1, int(here)) if here.isdigit() else 1)
         return cls()
+
+    @staticmethod
+    def unmarked(environment: Mapping[str, str] | None = None) -> str:
+        """RANK and WORLD_SIZE where they name a shard, but not by torchrun: they may be left over; else empty."""
+        known = os.environ if environment is None else environment
+        rank, count = known.get("RANK", ""), known.get("WORLD_SIZE", "")
+        is_whole = rank in ("", "0") and count in ("", "1")
+        is_marked = any(known.get(mark, "") for mark in ("TORCHELASTIC_RUN_ID", "SLURM_STEP_ID"))
+        return "" if is_whole or is_marked else f"RANK={rank} WORLD_SIZE={count}"
 
     def of(self, items: Sequence[T]) -> Sequence[T]:
         """Its part of all items."""
