@@ -73,6 +73,29 @@ def test_words_find_a_lens_as_people_write_them(words):
     assert camera.image_size == (2160, 3840)
 
 
+@pytest.mark.parametrize(
+    ("body", "written"),
+    [
+        ("Sony a7sIII", ["Sony A7S III", "A7SIII", "sony a7s 3", "A7S3", "A7S Mark III", "a 7s iii", "ILCE-7SM3"]),
+        ("Sony a7rV", ["Sony A7R V", "a7r5", "ILCE-7RM5"]),
+        ("Sony a7III", ["Sony A7 III", "sony a7 3", "a7 mark iii"]),
+        ("Sony RX100V", ["RX100 V", "rx100m5", "RX100 Mark V"]),
+        ("Sony ZV-E10", ["zve10", "ZV E10", "zv-e 10"]),
+        ("Canon 5D4", ["Canon 5D Mark IV", "canon 5dIV", "5d mark 4"]),
+        ("Nikon z62", ["Nikon Z6 II", "nikon z6ii", "NIKON Z 6_2"]),
+        ("Fujifilm X-T4", ["Fujifilm X-T4", "xt4", "X T4"]),
+        ("GoPro HERO9 Black", ["go pro hero 9", "GoPro HERO9", "gopro9"]),
+        ("GoPro HERO11 Black", ["gopro11", "GoPro 11", "gopro hero11black"]),
+        ("DJI OsmoPocket3", ["DJI Osmo Pocket 3", "osmo-pocket 3"]),
+    ],
+)
+def test_spaces_and_the_writing_of_generations_do_not_count(body, written):
+    plain = body.casefold().replace(" ", "").replace("-", "")
+    for words in written:
+        names = [lens.name.casefold().replace(" ", "").replace("-", "") for lens in ct.lenses.search(words)[:1]]
+        assert [name[: len(plain)] for name in names] == [plain], (words, names)
+
+
 def test_the_best_match_has_the_fewest_other_words_then_the_smallest_error():
     found = ct.lenses.search("GoPro HERO9 wide")
     names = [len(lens.name.split()) for lens in found[:3]]

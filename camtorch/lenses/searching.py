@@ -14,6 +14,10 @@ from camtorch.lenses.collection import Lens, entries
 from camtorch.models import KannalaBrandt
 
 _WORD = re.compile(r"\d+(?:\.\d+)?|[^\W\d_]+")  # "HERO9", "Hero 9" and "hero-9" are the same two
+_ROMAN = {"ii": "2", "iii": "3", "iv": "4", "v": "5", "vi": "6", "vii": "7"}
+_GENERATION = re.compile(r" (?P<stem>[^\W\d_]??)(?P<roman>ii|iii|iv|v|vi|vii)(?= )")
+_JOINED = re.compile(r"([^\W\d_]{4,})(?=\d)")
+_MARK = re.compile(r" ([^\W\d_]?)(?:m|mk|mark) (?=[2-7] )")
 _NUMBER = re.compile(r"\d+")
 _ASPECT = 0.01  # the part by which aspect ratios may differ, as sizes are rounded
 _SHOWN = 8
@@ -22,9 +26,9 @@ _SHOWN = 8
 def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[Lens]:
     """The lenses whose names have all of these words, best first; all lenses if there are none.
 
-    Case, spaces and signs do not count, nor does the order of words. The last letters of a word may be missing, and
-    words that no name has are taken for the most similar one of the same numbers. Best are those with the fewest other
-    words; then those that are neither stretched nor reprojected by the camera; then those of the smallest reprojection
+    Case, spaces and signs do not count, nor does the order of words, and "A7S III", "A7S3", "A7S Mark III" and
+    "ILCE-7SM3" are the same. The last letters of a word may be missing, and words that no name has are taken for the
+    most similar one of the same numbers. Best are those with the fewest other words; then those that are neither stretched nor reprojected by the camera; then those of the smallest reprojection
     error.
 
     Args:
@@ -34,7 +38,11 @@ def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[
     """
     size = as_image_size(image_size, "lenses.search")
     terms = _terms(words, "search")
-    found = list(entries()) if not terms else _matching(terms) or _matching([_nearest(term) for term in terms])
+    found = list(entries()) if not terms else _matching(terms)
+    if not found:
+        found = _matching(_terms(_JOINED.sub(r"\1 ", " ".join(terms)), "search"))  # "gopro11"
+    if not found:
+        found = _matching([_nearest(term) for term in terms])
     if size is None:
         return found
     alike = [lens for lens in found if abs(lens.image_size[1] * size[0] / (lens.image_size[0] * size[1]) - 1) < _ASPECT]
@@ -91,12 +99,25 @@ def _terms(words: str, function: str) -> list[str]:
     return [term for term in ("".join(_words_of(part)) for part in words.split()) if term]
 
 
+def _numbered(words: list[str]) -> list[str]:
+    """Words with generations as numbers: a7SIII, A7S3, ILCE-7SM3 and A7S Mark III are all a 7 s 3."""
+    line = f" {' '.join(words)} ".replace(" ilce ", " a ")
+    line = _GENERATION.sub(lambda found: f" {found['stem']} {_ROMAN[found['roman']]}", line)
+    return _MARK.sub(r" \1 ", " ".join(line.split()).join("  ")).split()
+
+
 @cache
-def _names() -> tuple[list[str], list[int]]:
-    """Of every entry, the words of its name, and of its size, between spaces; and how many the name has."""
+def _names() -> tuple[list[str], list[str], list[int]]:
+    """Of every entry, the words of its name, and of its size, between spaces; the same `_numbered`; and how many words
+    the name has.
+    """
     words = [_words_of(lens.name) for lens in entries()]
-    sizes = (f"{lens.image_size[1]} x {lens.image_size[0]}" for lens in entries())
-    return [f" {' '.join(name)} {size} " for name, size in zip(words, sizes, strict=True)], [len(w) for w in words]
+    sizes = [f"{lens.image_size[1]} x {lens.image_size[0]}" for lens in entries()]
+    lines, numbered = (
+        [f" {' '.join(name)} {size} " for name, size in zip(of, sizes, strict=True)]
+        for of in (words, map(_numbered, words))
+    )
+    return lines, numbered, [len(name) for name in words]
 
 
 @cache
@@ -114,16 +135,35 @@ def _pattern(term: str) -> re.Pattern[str]:
 
 
 def _matching(terms: list[str]) -> list[Lens]:
-    """Lenses with all of the terms, best first."""
-    patterns = [_pattern(term) for term in terms]
+    """Lenses with all of the terms, best first. Terms in a row may be one word of a name: "A7S III" is "a7sIII"."""
+    runs = {}
+    for i, j in ((i, i + n) for n in (1, 2, 3) for i in range(len(terms) - n + 1)):
+        part, numbered = terms[i:j], _numbered(_words_of(" ".join(terms[i:j])))
+        if all(len(b) == 1 or not (a[-1] + b[0]).isdigit() for a, b in itertools.pairwise(part)):  # "9 48mm" is no 948
+            other = _pattern("".join(numbered)) if any(word in _ROMAN.values() for word in numbered) else None
+            runs[i, j] = _pattern("".join(part)), other
+    generations = [
+        run
+        for i, term in enumerate(terms)
+        if (term in _ROMAN or term in _ROMAN.values())
+        and (run := (i - 1 - (terms[i - 1] in ("m", "mk", "mark")), i + 1)) in runs
+    ]
     count, ranked = sum(len(_words_of(term)) for term in terms), []
-    for lens, line, length in zip(entries(), *_names(), strict=True):
-        hits = [pattern.search(line) for pattern in patterns]
-        if all(hits):
-            cut = sum(bool(hit and hit.lastindex) for hit in hits)
-            ranked.append((cut, length - count, not lens.is_optical, lens.rms, lens))
-    ranked.sort(key=lambda entry: entry[:4])
-    return [entry[4] for entry in ranked]
+    for lens, line, numbered, length in zip(entries(), *_names(), strict=True):
+
+        def found(run: tuple[int, int], line: str = line, numbered: str = numbered) -> re.Match[str] | None:
+            pattern, other = runs[run]
+            return pattern.search(line) or (other.search(numbered) if other else None)
+
+        whole, cut = set[int](), set[int]()
+        for i, j in runs:
+            if not whole.issuperset(range(i, j)) and (hit := found((i, j))):
+                (cut if hit.lastindex else whole).update(range(i, j))
+        if len(whole | cut) == len(terms):
+            apart = sum(not found(run) for run in generations)  # "A7 3" is rather an a7III than an a7RIII
+            ranked.append((len(terms) - len(whole), apart, length - count, not lens.is_optical, lens.rms, lens))
+    ranked.sort(key=lambda entry: entry[:5])
+    return [entry[5] for entry in ranked]
 
 
 def _nearest(term: str) -> str:
@@ -137,7 +177,7 @@ def _nearest(term: str) -> str:
 
 def _most_alike(terms: list[str]) -> list[Lens]:
     """The lenses with the most of the terms, or of what is most like them."""
-    patterns, (names, lengths) = [_pattern(_nearest(term)) for term in terms], _names()
+    patterns, (names, _, lengths) = [_pattern(_nearest(term)) for term in terms], _names()
     counts = [sum(bool(pattern.search(line)) for pattern in patterns) for line in names]
     most = max(counts)
     alike = [i for i, count in enumerate(counts) if count == most > 0]
