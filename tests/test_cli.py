@@ -326,6 +326,31 @@ def test_the_exif_orientation_stays_or_its_loss_is_said(folder, capsys, suffix):
     assert (orientation_of(f"out{suffix}") == 3) != (lost in capsys.readouterr().err)
 
 
+@pytest.mark.parametrize("degrees", [70, 120, 200])
+def test_a_guessed_field_of_view(folder, capsys, degrees):
+    model = ct.Pinhole if degrees == 70 else ct.KannalaBrandt
+    guess = model.from_fov(degrees, image_size=(64, 96)).double()
+    ct.save(guess, "guess.json")
+    command("dewarp", "in.png", "--guess-fov", degrees, "-o", "guessed.png")
+    told = capsys.readouterr().err
+    assert told.startswith(f"camtorch: note: {degrees} degrees wide is a guess: {guess.key}, 96x64, focal length ")
+    command("dewarp", "in.png", "--camera", "guess.json", "-o", "known.png")
+    command("dewarp", "in.png", "--guess-fov", degrees, "-o", "folder/")
+    for name in ("guessed.png", "folder/in.png"):
+        assert np.array_equal(np.array(opened(name)), np.array(opened("known.png")))
+    command("dewarp", "in.png", "--guess-fov", degrees, "--model", "equisolid", "-o", "other.png")
+    assert "equisolid" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("degrees", "text"),
+    [("2.1", "2.1 seems to be radians: 120.3 degrees"), ("6.28", "seems to be radians"), ("0", "'0' is no field of"),
+     ("361", "'361' is no field of view in degrees, as 120"), ("wide", "'wide' is no field of view")],
+)  # fmt: skip
+def test_guesses_that_are_none(folder, capsys, degrees, text):
+    assert text in refused(capsys, "dewarp", "in.png", "--guess-fov", degrees)
+
+
 def test_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "camtorch", "--version"], capture_output=True, text=True, check=True)
     torch_version = importlib.metadata.version("torch")  # without a build's name, which some versions of torch add

@@ -8,14 +8,17 @@ from pathlib import Path
 
 from camtorch import lenses
 from camtorch.camera import Camera
-from camtorch.cli.options import LENS
+from camtorch.cli.options import GUESS, LENS
 from camtorch.cli.terminal import note
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, opencv
+from camtorch.models import MODELS
 from camtorch.rig import Rig
 
 _ASPECT = 0.01
 """The part by which the aspect ratios of a camera and an image may differ, as sizes are rounded."""
+_WIDE = 100
+"""Degrees, horizontally, from which on lenses are rather fisheyes."""
 
 
 def read_rig(
@@ -29,7 +32,8 @@ def read_rig(
     """The cameras of a file.
 
     Args:
-        path: a file of any format, or `LENS` and the name of a real lens.
+        path: a file of any format; `LENS` and the name of a real lens, best one of the aspect ratio of `size`; or
+            `GUESS` and a field of view of images of `size`.
         name: the only camera wanted.
         model: a key of `camtorch.MODELS`, for OpenCV's files, which may not say it.
         size: (height, width), for cameras whose file does not say it.
@@ -40,7 +44,9 @@ def read_rig(
             file that says its own, or none for one that leaves it open and has to say it.
     """
     if str(path).startswith(LENS):
-        return _of_lens(str(path).removeprefix(LENS))
+        return _of_lens(str(path).removeprefix(LENS), size)
+    if str(path).startswith(GUESS):
+        return _guessed(str(path).removeprefix(GUESS), model, size)
     rig = load(path) if model is None else _of_model(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
         raise ValueError(
@@ -59,11 +65,25 @@ def read_rig(
     return rig
 
 
-def _of_lens(words: str) -> Rig:
-    found = lenses.search(words)
-    camera = lenses.find(words)
+def _of_lens(words: str, size: tuple[int, int] | None) -> Rig:
+    try:
+        lenses.find(words)
+    except ValueError as error:
+        raise ValueError(f"{error}; on images so does --guess-fov DEGREES") from None
+    found = (size and lenses.search(words, image_size=size)) or lenses.search(words)
     others = f", the best of {len(found)} that camtorch lenses lists" if len(found) > 1 else ""
     note(f"{words}: {found[0]!r}{others}")
+    return Rig({"camera": found[0].camera()})
+
+
+def _guessed(fov: str, model: str | None, size: tuple[int, int] | None) -> Rig:
+    if size is None:
+        raise ValueError(f"{GUESS}{fov}: a field of view is one of an image, and of what size is not known here")
+    key = model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt")
+    if key not in MODELS:
+        raise ValueError(f"--model {key}: there is no such model; there are {', '.join(MODELS)}")
+    camera = MODELS[key].from_fov(float(fov), image_size=size).double().requires_grad_(False)
+    note(f"{fov} degrees wide is a guess: {key}, {_shown(size)}, focal length {float(camera.intrinsics[0]):.6g}")
     return Rig({"camera": camera})
 
 
@@ -125,27 +145,33 @@ def read_camera_of(image: Path, size: tuple[int, int], arguments: argparse.Names
 
 def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
     """As `read_camera_of`, and the camera's pose, None where its file has none."""
-    rig, name, camera = _unfitted(image, arguments)
+    rig, name, camera = _unfitted(image, size, arguments)
     return fitting(camera, arguments.camera, image, size, arguments.rescale), rig.extrinsics.get(name)
 
 
-def read_unfitted(image: Path, arguments: argparse.Namespace) -> Camera:
-    """The camera that took an image, whatever size that has, by the options of `add_photograph`; see `fitting`.
+def read_unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Namespace) -> Camera:
+    """The camera that took an image, perhaps for another size, by the options of `add_photograph`; see `fitting`.
+
+    Args:
+        image: which names the trouble.
+        size: (height, width) by which a lens is chosen, or guessed; None: not known.
+        arguments: the options.
 
     Raises:
         ValueError: as `read_camera`; no file is given.
     """
-    return _unfitted(image, arguments)[2]
+    return _unfitted(image, size, arguments)[2]
 
 
-def _unfitted(image: Path, arguments: argparse.Namespace) -> tuple[Rig, str, Camera]:
+def _unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Namespace) -> tuple[Rig, str, Camera]:
     path: Path | None = arguments.camera
     if path is None:
         raise ValueError(
             f"{image}: which camera took it? --camera FILE, its calibration, says so, or --lens NAME: an image alone "
-            "does not tell"
+            "does not tell; --guess-fov DEGREES guesses"
         )
-    rig = read_rig(path, arguments.name, arguments.from_model)
+    is_file = not str(path).startswith((LENS, GUESS))
+    rig = read_rig(path, arguments.name, arguments.from_model, None if is_file else size)
     name, camera = _only(path, rig)
     return rig, name, _single(path, name, camera)
 

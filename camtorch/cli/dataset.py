@@ -90,12 +90,11 @@ def _camera(arguments: argparse.Namespace, everything: Sequence[Labelled]) -> An
         if needless:
             raise ValueError(f"--{needless[0].replace('_', '-')} needs --camera FILE")
         return None
-    camera = cameras.read_unfitted(everything[0].inputs[0], arguments)
-    if camera.image_size is None:
-        for item in everything:
-            size = images.size_of(item.inputs[0])
-            if size is not None:
-                return cameras.fitting(camera, arguments.camera, item.inputs[0], size, rescale=False)
+    sized = ((item.inputs[0], images.size_of(item.inputs[0])) for item in everything)
+    first, size = next((pair for pair in sized if pair[1]), (everything[0].inputs[0], None))
+    camera = cameras.read_unfitted(first, size, arguments)
+    if camera.image_size is None and size is not None:
+        camera = cameras.fitting(camera, arguments.camera, first, size, rescale=False)
     return camera
 
 

@@ -247,13 +247,11 @@ def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
     from camtorch.cli import cameras, images, videos
     from camtorch.cli.dewarping import Dewarping
 
-    camera = cameras.read_unfitted(sources[0] if sources else Path(arguments.image[0]), arguments)
-    if camera.image_size is None:
-        for source in sources:
-            size = (videos if videos.is_video(source) else images).size_of(source)
-            if size is not None:
-                camera = cameras.fitting(camera, arguments.camera, source, size, rescale=False)
-                break
+    sized = ((one, (videos if videos.is_video(one) else images).size_of(one)) for one in sources)
+    first, size = next((pair for pair in sized if pair[1]), (sources[0] if sources else Path(arguments.image[0]), None))
+    camera = cameras.read_unfitted(first, size, arguments)
+    if camera.image_size is None and size is not None:
+        camera = cameras.fitting(camera, arguments.camera, first, size, rescale=False)
     encoder = videos.Encoder(arguments.codec, arguments.crf)
     if any(map(videos.is_video, sources)):
         encoder.check()

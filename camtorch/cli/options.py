@@ -59,15 +59,42 @@ def parse_lens(text: str) -> Path:
     return parse_path(LENS + text)
 
 
+GUESS = "guess:"
+"""What a guessed horizontal field of view in degrees begins with, in the place of a calibration file."""
+
+
+def _parse_guess(text: str) -> Path:
+    try:
+        degrees = float(text)
+    except ValueError:
+        degrees = math.nan
+    if 0 < degrees <= 2 * math.pi:
+        raise argparse.ArgumentTypeError(
+            f"{text} seems to be radians: {math.degrees(degrees):.4g} degrees; it takes degrees"
+        )
+    if not 0 < degrees <= 360:
+        raise argparse.ArgumentTypeError(f"{text!r} is no field of view in degrees, as 120")
+    return Path(GUESS + text)
+
+
 def add_photograph(command: argparse.ArgumentParser) -> None:
     """The calibration of an image."""
-    command.add_argument("--camera", type=parse_path, metavar="FILE", help="its calibration, of any format")
-    command.add_argument(
+    which = command.add_mutually_exclusive_group()
+    which.add_argument("--camera", type=parse_path, metavar="FILE", help="its calibration, of any format")
+    which.add_argument(
         "--lens",
         type=parse_lens,
         dest="camera",
         metavar="NAME",
         help="instead of a calibration, a real lens by its name: camtorch lenses lists them",
+    )
+    which.add_argument(
+        "--guess-fov",
+        type=_parse_guess,
+        dest="camera",
+        metavar="DEGREES",
+        help="instead of a calibration, a guess: a camera of this horizontal field of view, pinhole below 100 degrees, "
+        "equidistant kannala_brandt from there on, or what --model says",
     )
     _add_from_model(command, "--model")
     command.add_argument("--name", help="which camera, in a file with several")

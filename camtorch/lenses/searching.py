@@ -21,6 +21,7 @@ _MARK = re.compile(r" ([^\W\d_]?)(?:m|mk|mark) (?=[2-7] )")
 _NUMBER = re.compile(r"\d+")
 _ASPECT = 0.01  # the part by which aspect ratios may differ, as sizes are rounded
 _SHOWN = 8
+_GUESS = "KannalaBrandt.from_fov(degrees, image_size=...) guesses a camera"
 
 
 def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[Lens]:
@@ -28,8 +29,8 @@ def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[
 
     Case, spaces and signs do not count, nor does the order of words, and "A7S III", "A7S3", "A7S Mark III" and
     "ILCE-7SM3" are the same. The last letters of a word may be missing, and words that no name has are taken for the
-    most similar one of the same numbers. Best are those with the fewest other words; then those that are neither stretched nor reprojected by the camera; then those of the smallest reprojection
-    error.
+    most similar one of the same numbers. Best are those with the fewest other words; then those that are neither
+    stretched nor reprojected by the camera; then those of the smallest reprojection error.
 
     Args:
         words: of brand, camera, lens and setting, or a size: "GoPro HERO9 wide", "Laowa 7.5mm 3840x2160".
@@ -68,7 +69,7 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
     if not found:
         near = _most_alike(terms)
         what = f"; the nearest are {_listed(near)}" if near else ""
-        raise ValueError(f"lenses.find: no lens is called {words!r}{what}")
+        raise ValueError(f"lenses.find: no lens is called {words!r}{what}. {_GUESS}")
     size = as_image_size(image_size, "lenses.find")
     if size is None:
         return found[0].camera()
@@ -77,7 +78,7 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
         sizes = sorted({lens.image_size for lens in found})
         raise ValueError(
             f"lenses.find: {words!r} was not calibrated for images of the aspect ratio of {size}, but (height, width) "
-            f"{', '.join(map(str, sizes[:_SHOWN]))}; camera.crop takes a part of one"
+            f"{', '.join(map(str, sizes[:_SHOWN]))}; camera.crop takes a part of one. {_GUESS}"
         )
     camera = fitting[0].camera()
     return camera if camera.image_size == size else camera.resize(*size)
