@@ -261,7 +261,6 @@ def test_errors_are_one_line_and_leave_nothing(folder, capsys, words, text):
         ("[" * 100_000, "no JSON"),
         ("[[1, 2]]", "must be an object"),
         ("null", "it is null"),
-        ('{"landmarks": [[1, 2]]}', '"landmarks" is not known; known are "keypoints"'),
         ('{"keypoints": 3}', "keypoints: must be [[x, y], ...]; it is a number"),
         ('{"keypoints": {"a": 1}}', "it is an object"),
         ('{"keypoints": [[1, 2], 3]}', "keypoints[1]: must be a list of 2 numbers; it is a number"),
@@ -274,8 +273,8 @@ def test_errors_are_one_line_and_leave_nothing(folder, capsys, words, text):
         ('{"keypoints": [[1, 1' + 999 * "0" + "]]}", "keypoints[0]: 1000"),
         ('{"keypoints": [[1, 1' + 9999 * "0" + "]]}", "labels.json: "),
         ('{"boxes": [[1, 2, 3, 4], [9, 2, 3, 4]]}', "boxes[1]: x1 <= x2 and y1 <= y2 must hold; got [9, 2, 3, 4]"),
-        ('{"gaze": [0, 0, 1]}', "gaze needs gaze_from, [x, y], beside it"),
-        ('{"gaze_from": [3, 4]}', "gaze_from needs gaze, [x, y, z], beside it"),
+        ('{"boxes": [[1, 2, 3, 4]], "boxes_valid": true}', "boxes_valid: must be a list, true or false for each"),
+        ('{"camera": {"model": "none"}}', "labels.json: states the camera, and so does --camera"),
         ('{"gaze": [0, 0, 0], "gaze_from": [3, 4]}', "gaze: a direction has a length"),
         ('{"gaze": [0, 0, 1], "gaze_from": [9000, 4]}', "gaze_from: the camera has no ray at [9000, 4]"),
         (" " * (1 << 21), "larger than 1 MiB"),
@@ -289,6 +288,30 @@ def test_bad_labels_are_named(folder, capsys, content, text):
     assert text in error
     assert error.count("\n") == 1
     assert not Path("augment.png").exists()
+
+
+def test_a_photograph_without_labels_has_none_to_report(folder, capsys):
+    augment(*PHOTO[: PHOTO.index("--labels")], "-n", 2)
+    told = capsys.readouterr().out
+    assert told.count("filled") == 2
+    assert not any(word in told for word in ("points", "boxes", "labels"))
+
+
+def test_the_labels_of_a_data_set_are_those_of_an_image(folder, capsys):
+    for name, content in {"gaze": [0, 0, -1], "head_pose": np.eye(4).tolist(), "name": "a"}.items():
+        Path("images").mkdir(exist_ok=True)
+        Path("images/in.png").write_bytes(Path("in.png").read_bytes())
+        Path("images/in.json").write_text(json.dumps({"keypoints": [[20, 30], [60, 20]], name: content}))
+        augment("images", "--dataset", "images", "--camera", "camera.yml", "-o", f"new-{name}", "--jobs", 1)
+        capsys.readouterr()
+        augment("in.png", "--labels", "images/in.json", "--camera", "camera.yml", "-n", 1, "-o", f"{name}.png")
+        told = capsys.readouterr()
+        assert f'note: images/in.json: not shown: "{name}"' in told.err
+        assert " of 2 points" in told.out
+        # what a data set is written with states its camera, and what of it is valid
+        new = json.loads(Path(f"new-{name}/in.json").read_text())
+        augment(f"new-{name}/in.png", "--labels", f"new-{name}/in.json", "-n", 1, "-o", f"{name}-again.png")
+        assert f" of {sum(new['keypoints_valid'])} points" in capsys.readouterr().out
 
 
 def test_empty_labels_are_no_labels(folder, capsys):

@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
         "--labels",
         type=parse_path,
         metavar="FILE",
-        help="of IMAGE: JSON of keypoints, boxes, gaze, gaze_from, in pixels",
+        help="of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera",
     )
     command.add_argument("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
     command.add_argument("--list", action="store_true", help="print the presets, and nothing else")
@@ -150,7 +150,8 @@ def _sheet(arguments: argparse.Namespace) -> None:
         )
     title = f"One image, {sheet.counted(arguments.n, 'other camera')}"
     images.write(arguments.output, sheet.drawing(shown, title, labelled_image.origin(lens, before)))
-    print(f"{arguments.output}: the image before, and as each of them sees it, with what became of the labels")
+    told = "" if before.is_made_up else ", with what became of the labels"
+    print(f"{arguments.output}: the image before, and as each of them sees it{told}")
 
 
 def _photograph(arguments: argparse.Namespace) -> LabelledImage:
@@ -159,7 +160,16 @@ def _photograph(arguments: argparse.Namespace) -> LabelledImage:
 
     image, orientation = images.read(arguments.image)
     height, width = image.shape[-2:]
-    camera = cameras.read_camera_of(arguments.image, (height, width), arguments)
+    parts = None if arguments.labels is None else labels.entries_of(arguments.labels).get("camera")
+    if parts is None:
+        camera = cameras.read_camera_of(arguments.image, (height, width), arguments)
+    elif arguments.camera is None:
+        try:
+            camera = cameras.stated(parts, (height, width))
+        except ValueError as error:
+            raise ValueError(f"{arguments.image}: {error}") from None
+    else:
+        raise ValueError(f"{arguments.labels}: states the camera, and so does --camera; leave that out")
     if orientation not in (None, 1):
         note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
     known = None if arguments.labels is None else labels.read(arguments.labels, camera)

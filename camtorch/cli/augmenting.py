@@ -14,7 +14,6 @@ from camtorch.augment import RandomCamera
 from camtorch.augment.change import singles
 from camtorch.camera import Camera
 from camtorch.cli import cameras, coco, images
-from camtorch.data.columns import camera_of
 from camtorch.data.samples import MapSamples
 from camtorch.data.seeded import generator
 from camtorch.io.writing import replacing
@@ -97,13 +96,7 @@ class Augmenting:
             return cameras.fitting(self.camera, self.path, path, size, self.rescale)
         if self.camera is not None:
             raise ValueError(f"its labels state its camera, and so does --camera {self.path}; leave that out")
-        try:
-            camera = camera_of({"image_size": size, **stated}, "camera")
-        except (ValueError, TypeError, KeyError) as error:
-            raise ValueError(f"the camera of its labels: {error}") from None
-        if camera.image_size != size:
-            raise ValueError(f"it is {size}, height and width, and the camera of its labels {camera.image_size}")
-        return camera
+        return cameras.stated(stated, size)
 
     def _augmentation(self, camera: Camera) -> tuple[RandomCamera, MapSamples]:
         """For images of a camera, which mostly is the same one, and for such with labels."""

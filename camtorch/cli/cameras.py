@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import warnings
 from pathlib import Path
+from typing import Any
 
 from camtorch import lenses
 from camtorch.camera import Camera
 from camtorch.cli.options import GUESS, LENS
 from camtorch.cli.terminal import note
+from camtorch.data.columns import camera_of
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, opencv
 from camtorch.models import MODELS
@@ -174,6 +176,21 @@ def _unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Nam
     rig = read_rig(path, arguments.name, arguments.from_model, None if is_file else size)
     name, camera = _only(path, rig)
     return rig, name, _single(path, name, camera)
+
+
+def stated(parts: Any, size: tuple[int, int]) -> Camera:
+    """The camera that the labels of an image of that (height, width) state.
+
+    Raises:
+        ValueError: it is none, or for another size.
+    """
+    try:
+        camera = camera_of({"image_size": size, **parts}, "camera")
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"the camera of its labels: {error}") from None
+    if camera.image_size != size:
+        raise ValueError(f"it is {size}, height and width, and the camera of its labels {camera.image_size}")
+    return camera
 
 
 def read_pair(

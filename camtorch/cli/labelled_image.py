@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -39,6 +39,8 @@ class LabelledImage:
     """The part of the image that shows something."""
     note: str = ""
     """The caption, and more, in one line."""
+    is_made_up: bool = False
+    """Whether the labels are a lattice that only shows how the image is bent."""
 
 
 # -- what to augment
@@ -53,6 +55,7 @@ def rendered(example: Example) -> LabelledImage:
 @torch.no_grad()
 def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str) -> LabelledImage:
     """An image, (C, H, W) as `images.read` has it; without labels, with a lattice of dots and a box."""
+    is_made_up = labels is None
     if labels is None:
         height, width = camera.height, camera.width
         steps = [(torch.arange(n, dtype=torch.float64) + 0.5) * side / n - 0.5 for n, side in ((7, height), (9, width))]
@@ -60,7 +63,7 @@ def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str)
         box = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]], dtype=torch.float64) - 0.5
         none = torch.zeros(0, 3, dtype=torch.float64)
         labels = Labels(torch.stack([x, y], -1).flatten(0, 1), box, none, none)
-    return _before(_in_colour(image), camera, labels, title)
+    return replace(_before(_in_colour(image), camera, labels, title), is_made_up=is_made_up)
 
 
 def _in_colour(image: Tensor) -> Tensor:
@@ -141,7 +144,7 @@ def augmented(
         filled = float(moved["image_valid"].double().mean())
         lens = f"{like or camera.key}, {_degrees(camera):.0f}° wide"
         inside = [f"{int(v.sum())} of {len(v)} {n}" for n, v in zip(("points", "boxes"), valid, strict=True) if len(v)]
-        told = [*angles, lens, f"{100 * filled:.0f} % filled", *inside]
+        told = [*angles, lens, f"{100 * filled:.0f} % filled", *([] if before.is_made_up else inside)]
         yield LabelledImage(
             moved["image"],
             camera,

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
+from camtorch.cli.terminal import note
 
 _LARGEST_FILE = 1 << 20
 _FARTHEST = 1e6
@@ -41,12 +42,11 @@ class Labels:
     """(K, 3) unit directions."""
 
 
-def read(path: str | Path, camera: Camera) -> Labels:
-    """The labels of an image of `camera`: an object of keypoints, boxes, gaze and gaze_from, each optional.
+def entries_of(path: str | Path) -> dict[str, Any]:
+    """What the file of an image says, as `camtorch.data.MapSamples` takes it: fields, and perhaps the camera.
 
     Raises:
-        LabelsError: no JSON, another structure, other names, numbers that are none, a box whose corners are swapped,
-            a gaze of no direction, or from a pixel that has no ray.
+        LabelsError: no JSON, or no object.
     """
     with Path(path).open("rb") as file:
         content = file.read(_LARGEST_FILE + 1)
@@ -58,18 +58,36 @@ def read(path: str | Path, camera: Camera) -> Labels:
         raise LabelsError(f"{path}: no JSON: {error}") from None
     if not isinstance(entries, dict):
         raise LabelsError(f"{path}: must be an object, {{{_known()}}}; it is {_kind(entries)}")
-    other = [name for name in entries if name not in _SHAPES]
-    if other:
-        raise LabelsError(f"{path}: {_short(other[0])} is not known; known are {_known()}")
-    values = {name: _numbers(f"{path}: {name}", name, entry) for name, entry in entries.items()}
+    return entries
+
+
+def read(path: str | Path, camera: Camera) -> Labels:
+    """Keypoints, boxes, and gaze with gaze_from, of an image of `camera`, as far as the file has them, and but for
+    those that it says are not valid. A note names what else it has.
+
+    Raises:
+        LabelsError: as `entries_of`; numbers that are none, a box whose corners are swapped, a gaze of no direction,
+            or from a pixel that has no ray.
+    """
+    entries = entries_of(path)
+    values = {name: _numbers(f"{path}: {name}", name, entries[name]) for name in _SHAPES if name in entries}
     for i, (x1, y1, x2, y2) in enumerate(values.get("boxes", ())):
         if x1 > x2 or y1 > y2:
             raise LabelsError(f"{path}: boxes[{i}]: x1 <= x2 and y1 <= y2 must hold; got {entries['boxes'][i]}")
-    if ("gaze" in values) != ("gaze_from" in values):
-        there, lacks = ("gaze", "gaze_from") if "gaze" in values else ("gaze_from", "gaze")
-        raise LabelsError(f"{path}: {there} needs {lacks}, {_SHAPES[lacks][1]}, beside it")
+    lone = {"gaze", "gaze_from"} if len({"gaze", "gaze_from"} & set(values)) == 1 else set()
+    silent = {*_SHAPES, *(f"{name}_valid" for name in _SHAPES), "camera", "rotation"} - lone
+    other = [name for name in entries if name not in silent]
+    if other:
+        why = "; a gaze needs gaze_from, the pixel of its eyes" if lone else ""
+        note(f"{path}: not shown: {', '.join(map(_short, other))}{why}")
+    for name in ("keypoints", "boxes"):
+        valid = entries.get(f"{name}_valid")
+        if name in values and valid is not None:
+            if not isinstance(valid, list) or len(valid) != len(values[name]):
+                raise LabelsError(f"{path}: {name}_valid: must be a list, true or false for each of {name}")
+            values[name] = [row for row, seen in zip(values[name], valid, strict=True) if seen]
     eyes = gaze = torch.zeros(0, 3, dtype=torch.float64)
-    if "gaze" in values:
+    if "gaze" in values and not lone and entries.get("gaze_valid", True) and entries.get("gaze_from_valid", True):
         gaze = _tensor(values["gaze"], 3)
         if not gaze.norm() > 1e-6:
             raise LabelsError(f"{path}: gaze: a direction has a length; got {entries['gaze']}")

@@ -29,7 +29,8 @@ def drawing(images: Sequence[LabelledImage], title: str, origin: str) -> Image.I
     head = 66 + 24 * len(lines) + 14
     rows = -(-(len(images) - 1 + span * span) // columns)
     sheet = Sheet(width, head + rows * lot[0], title)
-    _legend(sheet, images[0], width - MARGIN, 26)
+    if not images[0].is_made_up:
+        _legend(sheet, images[0], width - MARGIN, 26)
     for i, line in enumerate(lines):
         sheet.text((MARGIN, 64 + 24 * i), line, size=MIDDLE, colour=GREY)
     places = [(row, column) for row in range(rows) for column in range(columns) if row >= span or column >= span]
