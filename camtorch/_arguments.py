@@ -126,6 +126,10 @@ def shown(value: object) -> str:
     return f"{value!r:.60}"
 
 
+GUESS_CAMERA = "KannalaBrandt.from_fov(degrees, image_size=...) guesses a camera"
+"""For errors where there is none."""
+
+
 def no_camera(value: object) -> str:
     """What was passed instead of a camera, for an error: of a rig and of a file with the way to theirs."""
     if hasattr(type(value), "_way_to_cameras"):  # a Rig, whose module needs this one

@@ -18,7 +18,7 @@ import torch
 from albumentations.core.type_definitions import Targets
 from torch import Tensor
 
-from camtorch._arguments import no_camera
+from camtorch._arguments import GUESS_CAMERA, no_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change, copied, singles, size_of
 from camtorch.augment.numpy import as_array, as_tensor
@@ -121,7 +121,8 @@ class Transform(A.DualTransform):
             return Unknown.of(np.shape(known)[:2])
         if not isinstance(camera, Camera):
             raise ValueError(
-                f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation; got {camera!r}"
+                f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation; got {camera!r}. "
+                f"{GUESS_CAMERA}"
             )
         if camera.image_size is None or camera.batch_shape:
             raise ValueError(

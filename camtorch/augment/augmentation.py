@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_flag, as_mapping, as_number, as_part, as_whole, shown
+from camtorch._arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, shown
 from camtorch._module import typed_as
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete, may_look
@@ -296,7 +296,8 @@ class Augmentation(SampleTransform):
         """What a draw does to images of `camera` (the augmentation's own if None): a pure function of both."""
         camera = self.camera if camera is None else camera
         if camera is None:
-            raise ValueError(f"{self._name}: no camera; give one here, in the sample, or as {self._name}(camera=...)")
+            how = f"give one here, in the sample, or as {self._name}(camera=...)"
+            raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
         return self._change(camera, self._checked_draw(draw))
 
     def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch._arguments import as_coordinates, as_flag, as_mapping, as_number, no_camera
+from camtorch._arguments import GUESS_CAMERA, as_coordinates, as_flag, as_mapping, as_number, no_camera
 from camtorch.augment.change import Change, alone, copied, on_device, singles
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
@@ -302,7 +302,7 @@ class SampleTransform(nn.Module):
         """The camera of a sample that has none, nor the augmentation."""
         how = f"give one as sample['camera'] or {self._name}(camera=...)"
         if self.needs_camera:
-            raise ValueError(f"{self._name}: no camera; {how}")
+            raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
         for name, (found, value) in named.items():
             first = value[0] if isinstance(value, list) and value else value
             if found == "image" and isinstance(first, Tensor) and first.shape[-1] <= 4 < first.shape[-3:][0]:

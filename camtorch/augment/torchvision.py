@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import no_camera
+from camtorch._arguments import GUESS_CAMERA, no_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change, singles
 from camtorch.augment.numpy import as_array, as_tensor
@@ -114,7 +114,9 @@ class Transform(v2.Transform):
             size = next((size for one in flat_inputs if (size := _size(one)) is not None), None)
             camera = None if size is None else Unknown.of(size)
         if camera is None:
-            raise ValueError(f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation")
+            raise ValueError(
+                f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation. {GUESS_CAMERA}"
+            )
         if camera.image_size is None or camera.batch_shape:
             raise ValueError(
                 f"{_OWNER}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} "

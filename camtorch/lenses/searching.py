@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Sequence
 from functools import cache
 
-from camtorch._arguments import as_image_size
+from camtorch._arguments import GUESS_CAMERA, as_image_size
 from camtorch.lenses.collection import Lens, entries
 from camtorch.models import KannalaBrandt
 
@@ -21,7 +21,6 @@ _MARK = re.compile(r" ([^\W\d_]?)(?:m|mk|mark) (?=[2-7] )")
 _NUMBER = re.compile(r"\d+")
 _ASPECT = 0.01  # the part by which aspect ratios may differ, as sizes are rounded
 _SHOWN = 8
-_GUESS = "KannalaBrandt.from_fov(degrees, image_size=...) guesses a camera"
 
 
 def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[Lens]:
@@ -69,7 +68,7 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
     if not found:
         near = _most_alike(terms)
         what = f"; the nearest are {_listed(near)}" if near else ""
-        raise ValueError(f"lenses.find: no lens is called {words!r}{what}. {_GUESS}")
+        raise ValueError(f"lenses.find: no lens is called {words!r}{what}. {GUESS_CAMERA}")
     size = as_image_size(image_size, "lenses.find")
     if size is None:
         return found[0].camera()
@@ -78,7 +77,7 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
         sizes = sorted({lens.image_size for lens in found})
         raise ValueError(
             f"lenses.find: {words!r} was not calibrated for images of the aspect ratio of {size}, but (height, width) "
-            f"{', '.join(map(str, sizes[:_SHOWN]))}; camera.crop takes a part of one. {_GUESS}"
+            f"{', '.join(map(str, sizes[:_SHOWN]))}; camera.crop takes a part of one. {GUESS_CAMERA}"
         )
     camera = fitting[0].camera()
     return camera if camera.image_size == size else camera.resize(*size)
@@ -150,11 +149,11 @@ def _matching(terms: list[str]) -> list[Lens]:
         and (run := (i - 1 - (terms[i - 1] in ("m", "mk", "mark")), i + 1)) in runs
     ]
     count, ranked = sum(len(_words_of(term)) for term in terms), []
-    for lens, line, numbered, length in zip(entries(), *_names(), strict=True):
+    for lens, line, digits, length in zip(entries(), *_names(), strict=True):
 
-        def found(run: tuple[int, int], line: str = line, numbered: str = numbered) -> re.Match[str] | None:
+        def found(run: tuple[int, int], line: str = line, digits: str = digits) -> re.Match[str] | None:
             pattern, other = runs[run]
-            return pattern.search(line) or (other.search(numbered) if other else None)
+            return pattern.search(line) or (other.search(digits) if other else None)
 
         whole, cut = set[int](), set[int]()
         for i, j in runs:
