@@ -7,6 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
+"""The dtypes of the same bits that torch flips and gathers: it does no unsigned ones of more than a byte."""
+
 
 def wide_dtype(dtype: torch.dtype) -> torch.dtype:
     """The dtype to compute in: every value, a class id too, is exact in it, up to 2^53."""

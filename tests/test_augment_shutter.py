@@ -1,5 +1,7 @@
 """Augmentations whose new camera turns while it takes its image, and whose lens darkens the rim."""
 
+import copy
+
 import pytest
 import torch
 
@@ -92,9 +94,10 @@ def test_natural_vignetting_is_of_the_true_angle(fov):
     rays, valid = lens.rays()
     light = ct.vignetting(lens)
     assert light.shape == (1, 1, 240, 320)
-    cosine = rays[..., 2].clamp(min=0.1)
-    assert (light[0, 0] - cosine**4)[valid].abs().max() < 1e-3
-    assert (light[0, 0] / cosine**4 - 1)[valid & (rays[..., 2] > 0.2)].abs().max() < 0.01
+    cosine = torch.where(valid, rays[..., 2], 0.1).clamp(min=0.1)
+    torch.testing.assert_close(light[0, 0], cosine**4, rtol=1e-14, atol=0)
+    # in float32 the cosine is interpolated, to 0.0001
+    assert (ct.vignetting(copy.deepcopy(lens).float())[0, 0] ** 0.25 - cosine).abs().max() < 1.1e-4
     # on and off again is nothing, and so is the power 0
     image = torch.rand(2, 3, 240, 320, dtype=torch.float64)
     assert torch.allclose(image * light * ct.vignetting(lens, -1.0), image, atol=1e-12)

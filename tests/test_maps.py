@@ -700,5 +700,19 @@ def test_masks_stay_bool_and_large_integers_whole(tmp_path):
     found = ct.load_map(tmp_path / "map.npz")
     mask = torch.arange(64).reshape(1, 1, 8, 8) % 3 == 0
     assert found(mask).equal(mask)
-    labels = torch.full((1, 1, 8, 8), 2**24 + 1, dtype=torch.int32)
-    assert found(labels, mode="nearest").equal(labels)
+    for dtype in (torch.uint8, torch.uint16, torch.int32, torch.int64, torch.uint64):
+        top = torch.iinfo(dtype).max
+        labels = torch.tensor([top - i for i in range(64)], dtype=dtype).reshape(1, 1, 8, 8)
+        assert found(labels, mode="nearest").equal(labels)
+
+
+@pytest.mark.parametrize("mode", ["nearest", "bilinear", "bicubic"])
+@pytest.mark.parametrize("padding_mode", ["zeros", "border", "reflection"])
+def test_positions_beyond_every_float32_are_finite(mode, padding_mode):
+    far = torch.tensor([1e300, -1e300, 1e30, -1e39, 3e9, torch.inf, -torch.inf, torch.nan], dtype=torch.float64)
+    places = torch.stack(torch.meshgrid(far, torch.cat((far, torch.arange(9).double())), indexing="xy"), -1)
+    found = ct.LookupMap(places, (8, 9), "test", {})
+    for images in (torch.rand(1, 2, 8, 9), torch.rand(1, 2, 8, 9).double(), torch.ones(1, 2, 8, 9, dtype=torch.int32)):
+        result = found(images, mode, padding_mode)
+        assert result.double().isfinite().all()
+        assert padding_mode != "zeros" or not result[~found.valid_mask().expand_as(result)].any()

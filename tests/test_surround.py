@@ -1,6 +1,7 @@
 """Several cameras in one image, and one wide image as several pinhole ones: seamless, and back again."""
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -140,6 +141,57 @@ def test_a_ring_of_views_and_back():
     assert (again - image)[middle].abs().max() < 0.01
     labels = (255 * views(image)).round().to(torch.uint8)
     assert views.back(labels)[0].dtype == torch.uint8
+
+
+@cache
+def wholes(mode="nearest"):
+    """What makes one image of several: their count, their size, how, and the weights of each (N, H, W)."""
+    camera, rig = wide((120, 160)), car()
+    views = ct.views.cube(camera, mode=mode), ct.views.ring(camera, 3, mode=mode)
+    made = [(len(v), v.view.image_size, v.back, v.weights()) for v in views]
+    around = ct.surround(rig, x=(-4, 4), y=(-5, 5), resolution=0.1, mode=mode)
+    weights = torch.stack(list(around.weights().values()))[:, 0, 0]
+    return [*made, (4, (360, 480), lambda images: around(images.unbind(1)), weights)]
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.uint64, torch.int64, torch.float32])
+def test_the_label_of_the_heaviest_view_wins(dtype):
+    for count, size, back, weights in wholes():
+        if dtype == torch.bool:
+            labels = [i % 2 == 0 for i in range(count)]
+        else:  # in 64 bits neighbours that are one float64
+            top = torch.iinfo(dtype).max if not dtype.is_floating_point else 2**24
+            labels = [top - i for i in range(count)]
+        of_each = torch.stack([torch.full((1, 1, *size), label, dtype=dtype) for label in labels], 1)
+        result, valid = back(of_each)
+        assert result.dtype == dtype
+        expected = torch.tensor(labels, dtype=dtype)[weights.argmax(0)]
+        assert torch.equal(result[valid], expected[valid[0, 0]])
+        assert valid.any()
+        assert not result[~valid].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+@pytest.mark.parametrize("mode", ["bilinear", "nearest"])
+def test_the_largest_integers_do_not_wrap_around(mode, dtype):
+    top = torch.iinfo(dtype).max
+    for count, size, back, _ in wholes(mode):
+        result, valid = back(torch.full((1, count, 1, *size), top, dtype=dtype))
+        # what the largest integer loses as a float64, and weights in float32
+        assert int(result[valid].min()) >= top - (top * 1e-6 if mode == "bilinear" else 0)
+
+
+@pytest.mark.parametrize("bad", [math.inf, math.nan])
+@pytest.mark.parametrize("mode", ["bilinear", "nearest"])
+def test_a_view_without_weight_has_no_part(mode, bad):
+    for count, size, back, weights in wholes(mode):
+        images = torch.rand(1, count, 1, *size, generator=torch.Generator().manual_seed(0)).double()
+        expected = back(images)[0][0, 0]
+        images[:, 1] = bad
+        result = back(images)[0][0, 0]
+        free = weights[1] == 0
+        assert torch.equal(result[free], expected[free])
+        assert not result[weights.argmax(0) == 1].isfinite().any()
 
 
 def test_bad_rigs_and_targets_are_refused():

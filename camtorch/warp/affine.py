@@ -10,7 +10,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values, broadcast_shapes
-from camtorch._dtypes import narrow, widen
+from camtorch._dtypes import SIGNED, narrow, widen
 from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
@@ -22,7 +22,6 @@ SHRINKS = 1.5
 """From this many pixels of the image to one of the result on, edits antialias by themselves."""
 _MOST = 8  # times that an image is halved
 _PLAIN = (torch.uint8, torch.float32, torch.float64)  # that torch interpolates as they are
-_SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
 _WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
 _NEARLY = 1e-6  # and those of the way back
 
@@ -202,7 +201,7 @@ class AffineWarp(MirrorWarp):
                 view = view.mT
             dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
             if dims:  # torch flips none of those without a sign
-                signed = _SIGNED.get(view.dtype, view.dtype)
+                signed = SIGNED.get(view.dtype, view.dtype)
                 view = view.view(signed).flip(dims).view(view.dtype)
             # of the first pixel of the view
             left -= (view.shape[-1] - 1) * (a + b < 0)

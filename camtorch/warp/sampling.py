@@ -12,7 +12,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._arguments import as_flag, as_number, shown
-from camtorch._dtypes import narrow, wide_dtype, widen
+from camtorch._dtypes import SIGNED, narrow, wide_dtype, widen
 from camtorch._threads import as_cores_are_free, thread_count
 from camtorch._tracing import converted, in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
@@ -33,7 +33,6 @@ _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
 _TILE = 512  # pixels along the sides of what is then sampled at a time
 _TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth
 _FLOATING = {4: torch.float32, 8: torch.float64}
-_SIGNED = {4: torch.int32, 8: torch.int64}  # torch gathers no wide unsigned integers
 
 
 def render(
@@ -117,6 +116,33 @@ def _natively(
     # in "zeros" positions far outside say that there is none
     mapped = None if padding_mode == "zeros" else where.mapped
     sampler.sample(images, result, mode, padding_mode, values, grid=positions, mapped=mapped)
+    return result
+
+
+def blended(parts: Iterable[Tensor], weights: Iterable[Tensor], mode: Mode) -> Tensor:
+    """Images in one: their weighted mean, or with "nearest" each pixel of the image that weighs most there.
+
+    Where an image has no weight it has no part, whatever it holds; where none has any, pixels are 0.
+
+    Args:
+        parts: (B, C, H, W) of one dtype; B may be 1 for some.
+        weights: of each, not negative, broadcast against it; those of a pixel add up to 1.
+        mode: see `sample`.
+
+    Returns:
+        (B, C, H, W), with "nearest" of the same dtype, else as of `widen`.
+    """
+    result: Tensor | None = None
+    most: Tensor | float = 0.0
+    for part, weight in zip(parts, weights, strict=True):
+        if mode == "nearest":
+            before = part.new_zeros(()) if result is None else result
+            result, most = torch.where(weight > most, part, before), weight.clamp(min=most)
+        else:
+            wide = widen(part)
+            share = torch.where(weight > 0, wide * weight.to(wide.dtype), 0.0)
+            result = share if result is None else result + share
+    assert result is not None
     return result
 
 
@@ -412,7 +438,7 @@ def _pick(images: Tensor, where: Sampling, padding_mode: PaddingMode, fill: tupl
     u, v, inside = _nearest(where.grid, images.shape[-2:], padding_mode)
     seen = inside if padding_mode == "zeros" else where.mapped
     index = torch.where(inside, v.long() * images.shape[-1] + u.long(), 0).flatten(1).unsqueeze(1)
-    pixels = images.view(_SIGNED[images.dtype.itemsize]).flatten(2)
+    pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
     picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
     return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
 

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
 from camtorch._arguments import as_number, is_list
+from camtorch._dtypes import narrow
 from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
 from camtorch.rotations import rotation_matrix
 from camtorch.warp.plane import BirdsEye
-from camtorch.warp.sampling import Mode
+from camtorch.warp.sampling import Mode, blended
 from camtorch.warp.surface import SurfaceWarp, turned
 from camtorch.warp.warp import Warp, as_sized
 
@@ -110,7 +111,9 @@ class Surround(GeometryModule):
                 image_size.
 
         Returns:
-            (B, C, H', W') of the dtype of the images, integers rounded, and valid (1, 1, H', W') bool.
+            (B, C, H', W') of the dtype of the images, and valid (1, 1, H', W') bool. Images are averaged by their
+            weights, and integers rounded; with mode="nearest" a pixel is that of the camera with the largest weight, as
+            labels have no mean.
 
         Raises:
             ValueError: other names, or another number of images.
@@ -129,19 +132,12 @@ class Surround(GeometryModule):
         if len(set(counts.values()) - {1}) > 1:
             raise ValueError(f"Surround: images must be as many of each camera; got {counts}")
         weights = self._weights()
-        dtype = images[0].dtype
-        result: Tensor | None = None
-        for warp, weight, image in zip(self._warps, weights, images, strict=True):
-            made = warp(image)
-            made = made if made.dtype.is_floating_point else made.float()
-            part = made * weight.to(made.dtype)
-            result = part if result is None else result + part
-        assert result is not None
+        dtype, mode = images[0].dtype, self._warps[0].mode
+        parts = (warp(image) for warp, image in zip(self._warps, images, strict=True))
+        result = narrow(blended(parts, weights, mode), dtype)
         valid = torch.stack(weights).sum(0) > 0
-        result = torch.where(valid, result, self.fill)
-        if not dtype.is_floating_point:
-            result = result.round().clamp(torch.iinfo(dtype).min, torch.iinfo(dtype).max)
-        return result.to(dtype), valid
+        fill = narrow(torch.tensor(self.fill, dtype=torch.float64), dtype).to(result.device)
+        return torch.where(valid, result, fill), valid
 
     if TYPE_CHECKING:
 

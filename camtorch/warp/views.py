@@ -10,12 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import as_fov, as_number, as_whole, shown
+from camtorch._dtypes import narrow, widen
 from camtorch._module import GeometryModule, typed_as
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.rotations import mount_rotation
-from camtorch.warp.sampling import Mode
+from camtorch.warp.sampling import Mode, blended
 from camtorch.warp.warp import Warp, as_sized
 
 __all__ = ["FACES", "Views", "cube", "ring"]
@@ -38,13 +39,14 @@ class Views(GeometryModule):
         view: the pinhole camera of every view.
         rotations: (N, 3, 3), `ray_view = R ray_camera`.
         names: of the views.
-        mode: as `Warp` takes it.
+        mode: as `Warp` takes it; "nearest" for labels, there and back.
     """
 
     rotations: Tensor
     camera: Camera
     view: Pinhole
     names: tuple[str, ...]
+    mode: Mode
     warps: nn.ModuleList
     backs: nn.ModuleList
 
@@ -53,6 +55,7 @@ class Views(GeometryModule):
     ):
         super().__init__()
         self.camera, self.view, self.names = as_sized(camera, "camera", "Views"), view, names
+        self.mode = mode
         self.register_buffer("rotations", rotations, persistent=False)
         self.warps = nn.ModuleList([Warp(camera, view, rotation, mode=mode) for rotation in rotations])
         self.backs = nn.ModuleList(
@@ -106,7 +109,9 @@ class Views(GeometryModule):
             views: (B, N, C, S, S).
 
         Returns:
-            (B, C, H, W) of the same dtype, integers rounded, and valid (1, 1, H, W) bool: some view shows the pixel.
+            (B, C, H, W) of the same dtype, and valid (1, 1, H, W) bool: some view shows the pixel. Views are averaged
+            by their weights, and integers rounded; with mode="nearest" a pixel is that of the view with the largest
+            weight, as labels have no mean.
 
         Raises:
             ValueError: another shape.
@@ -117,16 +122,10 @@ class Views(GeometryModule):
                 f"Views: views must be a tensor (B, {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"
             )
         weights = self.weights()
-        result = None
-        for i, warp in enumerate(self.backs):
-            image = views[:, i] if views.dtype.is_floating_point else views[:, i].float()
-            part = warp(image) * weights[i].to(image.dtype)
-            result = part if result is None else result + part
-        assert result is not None
+        images = views if self.mode == "nearest" else widen(views)
+        parts = (warp(images[:, i]) for i, warp in enumerate(self.backs))
         valid = (weights.sum(0) > 0)[None, None]
-        if not views.dtype.is_floating_point:
-            result = result.round()
-        return result.to(views.dtype), valid
+        return narrow(blended(parts, weights, self.mode), views.dtype), valid
 
     def extra_repr(self) -> str:
         """The views."""
