@@ -15,7 +15,7 @@ from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, render
+from camtorch.warp.sampling import Fill, Mode, PaddingMode, joined, render
 from camtorch.warp.warp import Warp
 
 SHRINKS = 1.5
@@ -87,6 +87,8 @@ class MirrorWarp(Warp):
     ) -> Tensor:
         """Sampled from images that torch's antialiased interpolation halved so many times, for each camera."""
         result = self._empty(images, self._count(images))
+        if where.seam is not None:
+            images, where = joined(images, where, 4 << max(halvings))
         images = images.expand(len(result), -1, -1, -1)
         halvings = halvings * (len(result) // len(halvings))
         for k in sorted(set(halvings)):
@@ -299,11 +301,15 @@ def _halvings(where: Sampling | Lattice, size: tuple[int, int]) -> list[int]:
     planes = where.nodes if isinstance(where, Lattice) else where.grid.detach().movedim(-1, 1)
     planes = planes[:, :, ::every, ::every]
     seen = (planes.abs() <= 1).all(1)
-    planes = planes * planes.new_tensor([size[1] / 2, size[0] / 2])[:, None, None]
+    grid, planes = planes, planes * planes.new_tensor([size[1] / 2, size[0] / 2])[:, None, None]
     total, count = planes.new_zeros(len(planes)), planes.new_zeros(len(planes))
     for dim in (-1, -2):
         n = planes.shape[dim] - 1
-        steps = torch.hypot(*planes.diff(dim=dim).unbind(1))
+        steps = planes.diff(dim=dim)
+        if where.seam is None:
+            steps = torch.hypot(*steps.unbind(1))
+        else:
+            steps = where.seam.distance(steps.movedim(1, -1), grid.narrow(dim, 0, n).movedim(1, -1), size)
         both = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n)
         total, count = total + (steps * both).sum((1, 2)), count + both.sum((1, 2))
     scale = total / (count.clamp(min=1) * apart * every)

@@ -16,6 +16,7 @@ from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is
 from camtorch.camera import Camera
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
 from camtorch.rotations import turn
+from camtorch.warp.panorama import Seam, seam_of, seen_by
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
@@ -45,15 +46,22 @@ class Sampling(NamedTuple):
     """(B or 1, h, W') bool: the pixel has a ray, and the source maps it."""
     scale: Tensor | None
     """(B or 1, h, W'): see `local_scale`; None where nobody asks for it."""
+    seam: Seam | None = None
+    """Which edges of the source's image meet."""
 
     def cameras(self, rows: slice | Tensor) -> Sampling:
         """Of these cameras of the batch."""
-        return Sampling(self.grid[rows], self.mapped[rows], None if self.scale is None else self.scale[rows])
+        scale = None if self.scale is None else self.scale[rows]
+        return Sampling(self.grid[rows], self.mapped[rows], scale, self.seam)
 
     def part(self, down: slice, across: slice = slice(None)) -> Sampling:
         """Of these rows and columns of the target."""
         scale = None if self.scale is None else self.scale[:, down, across]
-        return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale)
+        return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale, self.seam)
+
+    def on(self, scale: Tensor, shift: Tensor) -> Sampling:
+        """On images that are longer beyond the seam: positions times `scale` (2,), plus `shift` (2,)."""
+        return self._replace(grid=self.grid * scale.to(self.grid) + shift.to(self.grid), seam=None)
 
 
 class Lattice:
@@ -67,6 +75,7 @@ class Lattice:
         cells: (B, n, m) int32: `EMPTY`, `CUBIC`, or the cell's place in `exact`.
         exact: (2, K, 8, 8), positions, NaN where none is mapped.
         size: (h, w) of the target.
+        seam: which edges of the source's image meet.
     """
 
     nodes: Tensor
@@ -74,12 +83,19 @@ class Lattice:
     exact: Tensor
     size: tuple[int, int]
 
-    def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]):
-        self.nodes, self.cells, self.exact, self.size = nodes, cells, exact, size
+    seam: Seam | None
+
+    def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int], seam: Seam | None = None):
+        self.nodes, self.cells, self.exact, self.size, self.seam = nodes, cells, exact, size, seam
 
     def cameras(self, rows: slice | Tensor) -> Lattice:
         """Of these cameras of the batch."""
-        return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size)
+        return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size, self.seam)
+
+    def on(self, scale: Tensor, shift: Tensor) -> Lattice:
+        """See `Sampling.on`."""
+        a, b = (values.to(self.nodes)[:, None, None] for values in (scale, shift))
+        return Lattice(self.nodes * a + b, self.cells, self.exact * a[..., None] + b[..., None], self.size)
 
     @property
     def single(self) -> Lattice:
@@ -89,7 +105,7 @@ class Lattice:
 
     @cached_property
     def _narrowed(self) -> Lattice:
-        return Lattice(self.nodes.float(), self.cells, self.exact.float(), self.size)
+        return Lattice(self.nodes.float(), self.cells, self.exact.float(), self.size, self.seam)
 
     @cached_property
     def pixels(self) -> Sampling:
@@ -108,7 +124,7 @@ class Lattice:
             known = ~exact[:, 0].isnan()
             blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
             seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
-        return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
+        return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None, self.seam)
 
 
 @as_cores_are_free
@@ -139,7 +155,7 @@ def locate(
             if lattice is not None:
                 return lattice
             tolerance = 0.0
-        return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None)
+        return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None, seam_of(source))
     # the scale is that between neighbours
     around = range(max(rows.start - 1, 0), min(rows.stop + 1, target._size("Warp")[0]))
     where = scaled(source, *tabulate(source, target, rotation, tolerance, around, padding))
@@ -148,7 +164,8 @@ def locate(
 
 def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
     """Positions with the scale by which antialiasing goes."""
-    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size("Warp")))
+    seam = seam_of(source)
+    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size("Warp"), seam), seam)
 
 
 @as_cores_are_free
@@ -219,7 +236,7 @@ def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: 
     rays, has_ray = target.unproject(pixels)
     if rays.ndim == 3:
         rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-    seen, mapped = source.project(turn(None if rotation is None else rotation.mT, rays, "rays"))
+    seen, mapped = seen_by(source, turn(None if rotation is None else rotation.mT, rays, "rays"))
     del rays
     mapped = mapped & has_ray
     return to_positions(seen, mapped, source._size("Warp")), mapped
@@ -243,23 +260,26 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.where(mapped, torch.stack(planes), OUTSIDE).movedim(0, -1)
 
 
-def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
+def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int], seam: Seam | None) -> Tensor:
     """(B, H', W'): how many source pixels lie between neighbours of the target, in the direction with more of them.
 
     Args:
         grid: (B, H', W', 2), sampling positions.
         mapped: (B, H', W') bool: there is such a position.
         size: (height, width) of the source.
+        seam: of the source.
     """
     half = grid.new_tensor([size[1] / 2, size[0] / 2])
     scale = grid.new_zeros(grid.shape[:-1])
     for dim in (1, 2):
         n = grid.shape[dim] - 1
-        step = ((grid.narrow(dim, 1, n) - grid.narrow(dim, 0, n)) * half).norm(dim=-1)
+        here = grid.narrow(dim, 0, n)
+        step = (grid.narrow(dim, 1, n) - here) * half
+        step = step.norm(dim=-1) if seam is None else seam.distance(step, here, size)
         step = step * (mapped.narrow(dim, 1, n) & mapped.narrow(dim, 0, n))
         for start in (0, 1):
-            here = scale.narrow(dim, start, n)
-            here.copy_(torch.maximum(here, step))
+            part = scale.narrow(dim, start, n)
+            part.copy_(torch.maximum(part, step))
     return scale
 
 
@@ -299,7 +319,7 @@ def on_lattice(
         classes = classify(probed._replace(nodes=lattice.float()))
     cells, most = classes or _classified(probed)
     if not most:
-        return Lattice(lattice, cells, like.new_empty(2, 0, STEP, STEP), (height, width))
+        return Lattice(lattice, cells, like.new_empty(2, 0, STEP, STEP), (height, width), seam_of(source))
     todo = cells == TODO
     smooth = todo & _smooth(lattice, mapped_nodes, size, tolerance)
     if not bool(rim.all()):  # at the rim of the target the nodes do not tell all
@@ -313,7 +333,7 @@ def on_lattice(
         first = known.shape[1]
         cells[camera, i, j] = torch.arange(first, first + len(camera), dtype=cells.dtype, device=cells.device)
         known = torch.cat((known, _quintic(lattice, camera, i, j)), 1)
-    return Lattice(lattice, cells, known, (height, width))
+    return Lattice(lattice, cells, known, (height, width), seam_of(source))
 
 
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:

@@ -15,6 +15,7 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.rotations import rotate_planes, rotation_matrix
 from camtorch.warp.grid import Sampling, to_positions
+from camtorch.warp.panorama import seam_of, seen_by
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
 from camtorch.warp.warp import as_sized
 
@@ -81,6 +82,7 @@ class Reproject(GeometryModule):
             raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
         self.batch_shape = batch
         self._memo = Memo()
+        seam_of(source)  # while its values may be looked at: traced code asks for it too
 
     def forward(
         self,
@@ -137,8 +139,10 @@ class Reproject(GeometryModule):
         plain = steps == 1 and may_look(seen) and not in_graph(seen)
         mode: Mode = "nearest" if plain and bool((seen == seen.round())[valid].all()) else self.mode
         positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), size)
-        valid = valid & (positions.detach().abs() <= 1).all(-1).view(valid.shape)
-        where = Sampling(positions, valid.flatten(1, 2), None)
+        seam = seam_of(self.source)
+        inner = positions.detach() if seam is None else seam.drawn_in(positions.detach())
+        valid = valid & (inner.abs() <= 1).all(-1).view(valid.shape)
+        where = Sampling(positions, valid.flatten(1, 2), None, seam)
         result = render(images, where, mode, self.padding_mode, self.fill)
         valid = valid.expand(max(rows, len(result)), *valid.shape[1:])[:, None]
         if steps == 1:
@@ -170,7 +174,7 @@ class Reproject(GeometryModule):
         points = torch.stack(planes, -1)
         if self.source.batch_shape and len(points) != len(self.source.intrinsics):
             points = points.expand(len(self.source.intrinsics), *points.shape[1:])
-        pixels, mapped = self.source.project(points)
+        pixels, mapped = seen_by(self.source, points)
         far = points[..., 2] if kind == "z" else torch.linalg.vector_norm(points.detach(), dim=-1)
         return _snapped(pixels), mapped & good, far
 

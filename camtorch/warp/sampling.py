@@ -61,6 +61,8 @@ def render(
         (B, C, h, W') of the dtype of the images. Half precision is sampled in float32; integers are rounded and stay
         in their range, bool is true from one half on; the nearest integers are those of the image.
     """
+    if where.seam is not None:
+        images, where = joined(images, where, _margin(images, where, mode))
     dtype = images.dtype
     cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
     count = images.shape[0] if cameras == 1 else cameras
@@ -75,6 +77,29 @@ def render(
         result = _by_torch(images, where, mode, padding_mode, fill, kept)
         result = _laid_as(images, result) if out is None else out.copy_(result)
     return result
+
+
+def joined(images: Tensor, where: Sampling | Lattice, margin: int) -> tuple[Tensor, Sampling | Lattice]:
+    """Images (B, C, H, W) with `margin` pixels more beyond edges that meet, and where these are sampled."""
+    seam = where.seam
+    if seam is None:
+        return images, where
+    ends = seam.margins(images, margin)
+    sides = images.shape[-1], images.shape[-2]
+    longer = [side + first + last for side, (first, last) in zip(sides, ends, strict=True)]
+    scale = torch.tensor([side / more for side, more in zip(sides, longer, strict=True)], dtype=torch.float64)
+    shift = torch.tensor(
+        [(first - last) / more for (first, last), more in zip(ends, longer, strict=True)], dtype=torch.float64
+    )
+    return seam.around(images, margin), where.on(scale, shift)
+
+
+def _margin(images: Tensor, where: Sampling | Lattice, mode: Mode) -> int:
+    """Pixels beyond the edges that have a part in what is sampled, and one for what is lost in rounding."""
+    if isinstance(where, Lattice) or where.scale is None or mode == "nearest":
+        return _REACH[mode] + 1
+    # at the last level as far as a sample reaches, and as far again for its own filter
+    return 2 * _REACH[mode] << _level_count(where.scale.clamp(min=1).log2(), images)
 
 
 def _laid_as(images: Tensor, result: Tensor) -> Tensor:
@@ -304,9 +329,7 @@ def _minified(
         padding_mode: see `sample`.
     """
     level = scale.clamp(min=1).log2().unsqueeze(1)
-    last = min(levels.images.shape[-2:]).bit_length() - 1
-    wanted = int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS
-    for n in range(min(wanted, last)):
+    for n in range(_level_count(level, levels.images)):
         levels = levels.half
         smaller = sample(levels.images, grid, mode, padding_mode, levels.finite)
         share = (level - n).clamp(0, 1).to(result)
@@ -314,6 +337,12 @@ def _minified(
         blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
         result = torch.where(share > 0, blended, result)
     return result
+
+
+def _level_count(level: Tensor, images: Tensor) -> int:
+    """How often images are halved for samples at these levels."""
+    last = min(images.shape[-2:]).bit_length() - 1
+    return min(int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS, last)
 
 
 def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers
 from camtorch.rotations import rotate_planes
-from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, scaled, to_positions
+from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, to_positions
+from camtorch.warp.panorama import seen_by
 from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp
 
@@ -50,10 +51,10 @@ class SurfaceWarp(Warp):
         count = self.source.batch_shape.numel()
         if self.source.batch_shape and len(directions) == 1:
             directions = directions.expand(count, *directions.shape[1:])
-        seen, mapped = self.source.project(directions)
+        seen, mapped = seen_by(self.source, directions)
         mapped = mapped & has_ray & met
         grid = to_positions(seen, mapped, self.source._size("Warp"))
-        return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
+        return self._with_scale(grid, mapped)
 
     def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
         source, target, carried = self.source, self.target, self._to_target

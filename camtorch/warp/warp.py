@@ -22,6 +22,7 @@ from camtorch.native.sampler import empty
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, locate, scaled, tabulate
+from camtorch.warp.panorama import seam_of
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -140,6 +141,7 @@ class Warp(GeometryModule):
         self.batch_shape = torch.Size(batch)
         self._memos, self._pinned = {padding: Memo() for padding in PADDINGS}, None
         self._constants = Memo()
+        seam_of(source)  # while its values may be looked at: traced code asks for it too
 
     @property
     def tolerance(self) -> float:
@@ -305,6 +307,7 @@ class Warp(GeometryModule):
     def _on_image(self, where: Sampling | Lattice) -> Tensor:
         where = where.pixels if isinstance(where, Lattice) else where
         grid = where.grid.detach()
+        grid = grid if where.seam is None else where.seam.drawn_in(grid)
         pixels = (grid + 1) * grid.new_tensor(self.source._size("Warp")[::-1]) / 2 - 0.5
         return (where.mapped & self.source.contains(pixels)).unsqueeze(1)
 
@@ -324,7 +327,9 @@ class Warp(GeometryModule):
         return self._with_scale(*tabulate(*self._seen_by, self.rotation))
 
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
-        return scaled(self.source, grid, mapped) if self.antialias else Sampling(grid, mapped, None)
+        if self.antialias:
+            return scaled(self.source, grid, mapped)
+        return Sampling(grid, mapped, None, seam_of(self.source))
 
     def _reach(self, padding: PaddingMode | None) -> PaddingMode:
         """The padding that positions are for which serve the warp's own, and this one."""
@@ -350,10 +355,10 @@ class Warp(GeometryModule):
 
         def whole() -> Sampling:
             where = self._kept(inputs, padding)
-            grid, mapped, scale = where.pixels if isinstance(where, Lattice) else where
+            where = where.pixels if isinstance(where, Lattice) else where
             # a constant has memory of its own
-            grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in (grid, mapped))
-            return Sampling(grid, mapped, scale)
+            own = (t.detach().clone(memory_format=torch.contiguous_format) for t in (where.grid, where.mapped))
+            return where._replace(grid=next(own), mapped=next(own))
 
         with set_aside() if self._pinned is not None else with_values(self):
             inputs = self._inputs()
