@@ -2,7 +2,7 @@
 
 The input "images" (batch, channels, H, W) of float32 or uint8, of any batch and any number of channels; the output
 "warped" (batch, channels, H', W') of the same type. Positions, mode, padding and fill are the warp's own, so images are
-too; align_corners is 0. By the extra `onnx`.
+too, but for a panorama of a whole turn, which GridSample ends at its edges; align_corners is 0. By the extra `onnx`.
 """
 
 from __future__ import annotations

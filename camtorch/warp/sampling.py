@@ -91,7 +91,7 @@ def joined(images: Tensor, where: Sampling | Lattice, margin: int) -> tuple[Tens
     shift = torch.tensor(
         [(first - last) / more for (first, last), more in zip(ends, longer, strict=True)], dtype=torch.float64
     )
-    return seam.around(images, margin), where.on(scale, shift)
+    return _laid_as(images, seam.around(images, margin)), where.on(scale, shift)
 
 
 def _margin(images: Tensor, where: Sampling | Lattice, mode: Mode) -> int:

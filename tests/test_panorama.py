@@ -1,0 +1,195 @@
+"""Panoramas of a whole turn: what is sampled across their seam and at their poles is what lies around there."""
+
+import math
+
+import pytest
+import torch
+
+import camtorch as ct
+from camtorch.rotations import mount_rotation
+from camtorch.warp.affine import MirrorWarp
+
+WIDE, TALL = 256, 128
+
+
+def whole(key, dtype=torch.float64, centre=(WIDE - 1) / 2, size=(TALL, WIDE), learns=False):
+    """A panorama that goes round in 256 pixels, across or down."""
+    focal = WIDE / 2 / math.pi
+    numbers = [focal, focal, centre, (size[0] - 1) / 2]
+    if key in ("latlon", "transverse_cylindrical"):
+        numbers, size = [focal, focal, numbers[3], numbers[2]], size[::-1]
+    camera = ct.MODELS[key](torch.tensor(numbers, dtype=dtype), image_size=size)
+    return camera.requires_grad_(learns)
+
+
+def scene(rays):
+    directions = torch.tensor([[0.8, 0.2, 0.4], [0.1, 0.9, -0.5], [-0.3, 0.5, 0.7]], dtype=rays.dtype)
+    return 0.5 + 0.3 * torch.sin(2 * rays @ directions).mean(-1)
+
+
+def image_of(camera):
+    """What a panorama shows of the scene; written here, as a model gives no rays beyond half a turn."""
+    fx, fy, cx, cy = camera.intrinsics.detach().double()
+    u, v = camera.pixel_grid().double().unbind(-1)
+    a, b = (u - cx) / fx, (v - cy) / fy
+    rays = {
+        "equirectangular": lambda: (a.sin() * b.cos(), b.sin(), a.cos() * b.cos()),
+        "cylindrical": lambda: (a.sin(), b, a.cos()),
+        "latlon": lambda: (a.sin(), b.sin() * a.cos(), b.cos() * a.cos()),
+        "transverse_cylindrical": lambda: (a, b.sin(), b.cos()),
+    }[camera.key]()
+    return scene(torch.nn.functional.normalize(torch.stack(rays, -1), dim=-1))[None, None].to(camera.intrinsics.dtype)
+
+
+def off(result, target, rotation, valid):
+    """How far an image of the target is from the scene, at most."""
+    rays = target.rays()[0].detach() @ rotation.to(target.intrinsics)
+    return float(((result.detach() - scene(rays)).abs() * valid).max())
+
+
+# in a pixel the scene changes by 0.015 at most; interpolation misses it by an eighth of its second difference, bicubic
+# interpolation, which is no cubic's with a = -3/4, by more
+MOST = {"bilinear": 2e-4, "nearest": 0.01, "bicubic": 2e-3}
+
+
+@pytest.mark.parametrize("mode", MOST)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("key", "centre"),
+    [
+        ("equirectangular", 127.5),
+        ("equirectangular", 0.25),
+        ("latlon", 127.5),
+        ("cylindrical", 127.5),
+        ("transverse_cylindrical", 127.5),
+    ],
+)
+def test_a_cube_of_a_panorama_shows_the_scene(key, centre, dtype, mode):
+    camera = whole(key, dtype, centre)
+    image = image_of(camera)
+    # of an odd size, faces look straight at the poles and along the seam
+    for size in (40, 41):
+        faces = ct.views.cube(camera, size, mode=mode)
+        made, valid = faces(image), faces.valid_masks()
+        # a cylinder ends up and down
+        assert valid.all() or "cylindrical" in key
+        shown = torch.stack([off_edge(warp, camera) for warp in faces], 1)
+        for i, rotation in enumerate(faces.rotations):
+            assert off(made[:, i], faces.view, rotation, (valid & shown)[:, i]) < MOST[mode]
+        if "cylindrical" not in key and mode != "nearest":
+            again, seen = faces.back(made)
+            assert seen.all() or centre != 127.5
+            assert float(((again - image).abs() * seen).max()) < 4e-3
+
+
+def off_edge(warp, camera):
+    """Which pixels lie two pixels away from edges that do not meet."""
+    if "cylindrical" not in camera.key:
+        return warp.valid_mask()
+    return warp.grid()[..., 1 if camera.key == "cylindrical" else 0].abs()[:, None] < 1 - 4 / TALL
+
+
+@pytest.mark.parametrize("learns", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_shrinks_is_averaged_across_the_seam_and_not_along_it(dtype, learns):
+    camera = whole("equirectangular", dtype, learns=learns)
+    target = ct.Pinhole.from_fov(90, image_size=(17, 17)).to(dtype).requires_grad_(False)
+    noise = 0.3 * (torch.rand(1, 1, TALL, WIDE, generator=torch.Generator().manual_seed(0), dtype=dtype) - 0.5)
+    for yaw, pitch in ((180, 0), (0, 90), (180, -60)):
+        rotation = mount_rotation(*torch.tensor([yaw, pitch, 10.0], dtype=dtype))
+        for mode in ("bilinear", "bicubic"):
+            warp = ct.Warp(camera, target, rotation, antialias=True, mode=mode)
+            assert warp.valid_mask().all()
+            # a pixel averages four or so, and sees the scene a little blurred
+            assert off(warp(image_of(camera)), target, rotation, 1.0) < 0.01
+            assert warp(noise).std() > 0.01
+
+
+def test_images_that_are_halved_first_are_so_across_the_seam():
+    camera, rotation = whole("equirectangular", torch.float32), mount_rotation(*torch.tensor([100.0, 50, 10]))
+    target = camera.resize(20, 40)
+    # as `augment.Compose` makes it of a mount and a smaller size
+    warp = MirrorWarp(camera, target, rotation, antialias=None)
+    assert warp(image_of(camera)).std() > 0.05
+    assert off(warp(image_of(camera)), target, rotation, 1.0) < 0.01
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint16, torch.int32, torch.int64, torch.uint64, torch.float16])
+def test_the_nearest_label_across_the_seam_is_exact(dtype):
+    camera = whole("equirectangular")
+    labels = torch.arange(TALL * WIDE).view(1, 1, TALL, WIDE)
+    if dtype == torch.bool:
+        labels = labels % 3 == 0
+    elif dtype.is_floating_point:
+        labels = (labels % 2048).to(dtype)
+    else:
+        labels = torch.tensor([torch.iinfo(dtype).max - i for i in range(TALL * WIDE)], dtype=dtype).view(labels.shape)
+    warp = ct.Warp(camera, camera, mount_rotation(*torch.tensor([90.0, 0, 0]).double()), mode="nearest")
+    assert torch.equal(warp(labels), torch.cat((labels[..., WIDE // 4 :], labels[..., : WIDE // 4]), -1))
+
+
+def test_every_way_to_make_the_images_agrees():
+    camera = whole("equirectangular", torch.float32)
+    target = ct.Pinhole.from_fov(100, image_size=(80, 96)).requires_grad_(False)
+    rotation = mount_rotation(*torch.tensor([170.0, 50, 20]))
+    image = torch.cat([image_of(camera)] * 3, 1)
+    warp = ct.Warp(camera, target, rotation)
+    expected = warp(image)
+    assert off(expected[:, :1], target, rotation, 1.0) < 2e-4
+    made = {
+        "channels last": warp(image.contiguous(memory_format=torch.channels_last)),
+        "pinned": ct.Warp(camera, target, rotation).pin()(image),
+        "exact": ct.Warp(camera, target, rotation, tolerance=0)(image),
+        "compiled": torch.compile(warp, fullgraph=True, backend="eager")(image),
+        "mapped": torch.func.vmap(lambda one: warp(one[None])[0])(image),
+        "exported": torch.export.export(warp, (image,)).module()(image),
+        "strips": torch.cat([part for _, part, _ in warp.strips(image, rows=13)], 2),
+        "learning": ct.Warp(whole("equirectangular", torch.float32, learns=True), target, rotation)(image),
+        "at infinity": ct.Reproject(camera, target, ct.Extrinsics.from_matrix(rotation.mT, torch.zeros(3)))(
+            image, torch.ones(1, 1, 80, 96)
+        )[0],
+    }
+    learning = ct.Warp(whole("equirectangular", torch.float32, learns=True), target, rotation)
+    made["compiled while it learns"] = torch.compile(learning, fullgraph=True, backend="eager")(image)
+    for how, result in made.items():
+        # an image is as smooth as a thousandth of a pixel, and a float32 is as fine
+        assert (result - expected).abs().max() < 1e-4, how
+    assert made["channels last"].is_contiguous(memory_format=torch.channels_last)
+    assert warp.valid_mask().all()
+
+
+def test_the_ground_below_a_panorama_has_no_hole():
+    camera = whole("equirectangular")
+    level = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()
+    pose = ct.Extrinsics.from_matrix(level, -level @ torch.tensor([0, 0, 1.0]).double()).requires_grad_(False)
+    above = ct.BirdsEye(camera, pose, x=(-2.5, 2.5), y=(-2.5, 2.5), resolution=1.0 / 9)
+    points = torch.cat((above.grid_points, -torch.ones(45, 45, 1).double()), -1)
+    rays = torch.nn.functional.normalize(points, dim=-1) @ level.mT
+    assert above.valid_mask().all()
+    assert (above(image_of(camera))[0, 0] - scene(rays)).abs().max() < 2e-4
+
+
+def test_gradients_pass_the_seam_and_the_poles():
+    camera = whole("equirectangular", learns=True)
+    target = ct.Pinhole.from_fov(60, image_size=(5, 5)).double().requires_grad_(False)
+    image = image_of(camera).requires_grad_()
+    for yaw, pitch in ((180.0, 0.0), (0.0, 90.0)):
+        result = ct.Warp(camera, target, mount_rotation(*torch.tensor([yaw, pitch, 0]).double()))(image)
+        for gradient in torch.autograd.grad(result.sum(), (image, camera.intrinsics)):
+            assert gradient.isfinite().all()
+            assert gradient.any()
+
+
+@pytest.mark.parametrize("missing", [1.0, 40.0])
+def test_less_than_a_whole_turn_ends_at_its_edges(missing):
+    focal = (WIDE + missing) / 2 / math.pi
+    camera = ct.Equirectangular([focal, focal, (WIDE - 1) / 2, (TALL - 1) / 2], image_size=(TALL, WIDE)).double()
+    camera.requires_grad_(False)
+    target = ct.Pinhole.from_fov(40, image_size=(64, 64)).double().requires_grad_(False)
+    behind = ct.Warp(camera, target, mount_rotation(*torch.tensor([180.0, 0, 0]).double()))
+    assert not behind.valid_mask().all()
+    assert (behind(torch.ones(1, 1, TALL, WIDE).double())[0, 0, 32] < 0.999).any()
+    # and one that becomes a whole turn is one
+    camera.intrinsics[:2] = WIDE / 2 / math.pi
+    assert behind.valid_mask().all()
+    torch.testing.assert_close(behind(torch.ones(1, 1, TALL, WIDE).double()), torch.ones(1, 1, 64, 64).double())
