@@ -81,9 +81,9 @@ class Warp(GeometryModule):
             the rotation are then those of the middle of the readout.
         target_shutter: the one by which the images to make are taken: put on.
 
-    The image of a panorama of a whole turn (`Equirectangular` and `Cylindrical`, or `LatLon` and `TransverseCylindrical`
-    from top to bottom; to 0.05 pixels, and in a batch all of them) goes on beyond its seam and its poles. That takes a
-    slightly larger copy of it. It ends at its edges behind a `shutter` or in a `Mixed` of several models.
+    The image of a panorama of a whole turn goes on beyond its seam and its poles: of an `Equirectangular` or
+    `Cylindrical` source as wide as 2 pi, or a `LatLon` or `TransverseCylindrical` one as tall, to 0.05 pixels, all of a
+    batch. That takes a slightly larger copy of it. Behind a `shutter`, or in a `Mixed`, it ends at its edges.
 
     The sampling grid is kept while nothing that it depends on can learn or has changed.
 
