@@ -263,7 +263,7 @@ def test_pixels_without_a_ray_are_black_in_every_padding_mode():
     # the target looks half behind the source, which sees the front alone
     for padding_mode in ("zeros", "border", "reflection"):
         warp = ct.Warp(pinhole(), fisheye(), turn(100), padding_mode=padding_mode).requires_grad_(False)
-        _, mapped, _ = warp._sampling()
+        mapped = warp._sampling().mapped
         assert (~mapped).any()
         assert mapped.any()
         warped = warp(torch.ones(1, 1, *SIZE))
