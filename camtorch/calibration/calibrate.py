@@ -15,9 +15,9 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_number, as_whole, shown
 from camtorch._threads import on_one_thread
-from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Sight, State, adjust
-from camtorch.calibration.observations import Layout, Observations, Points, as_observations
-from camtorch.calibration.start import other_poses, poses_for, start_from_nothing
+from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Sight, State, adjust
+from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
+from camtorch.calibration.start import other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import Spread, noise_under, spread, uncertainty
 from camtorch.calibration.verdict import check_determined, verdict, warnings
 from camtorch.camera import Camera
@@ -31,6 +31,9 @@ _MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
 _SECOND_LOOKS = 3  # at the poses
+_SAME_COST = 1e-7  # the relative difference of two costs, of one optimum
+_AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
+_APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, of two optima
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ class Calibration:
     """What `calibrate` found, and how far it can be trusted.
 
     Units are pixels, and for poses those of the object points. The pose of a view is `extrinsics[i]`; views without a
-    corner have none, see `views`.
+    corner have none, nor have those that are equal to others, see `views`.
     """
 
     camera: Camera
@@ -137,8 +140,8 @@ class Calibration:
     """The standard deviation of a coordinate of a pixel: sqrt(sum of squares / (2 N - parameters)). With a robust loss
     that of the inliers."""
     residuals: Any
-    """Projected minus observed, in the shape or the list form of the image points; NaN where nothing was seen, and
-    where a camera that did not converge has no pixel for what was."""
+    """Projected minus observed, in the shape or the list form of the image points; NaN where nothing was seen, in
+    views left out, and where a camera that did not converge has no pixel for what was seen."""
     inliers: Any
     """Bool, in the same form: the residual is shorter than max(3 loss_scale, 3 sigma of the inliers)."""
     parameter_names: tuple[str, ...]
@@ -152,6 +155,9 @@ class Calibration:
     image_size: tuple[int, int]
     views: tuple[int, ...]
     """The numbers of the views that have poses, of those that were passed."""
+    copies: tuple[int, ...]
+    """The numbers of the views that show another one again: equal ones are left out, nearly equal ones widen the
+    uncertainties until they count as one."""
     object_points: Any = field(repr=False)
     image_points: Any = field(repr=False)
     observations: Observations = field(repr=False)
@@ -162,6 +168,9 @@ class Calibration:
     """The robust loss, if there was one."""
     index: int = field(default=0, repr=False)
     """Which of the cameras that were adjusted together it is."""
+    twins: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
+    """The parameters of other optima that fit as well, to within the noise: of such a camera projections are known
+    where corners were seen, and its parameters are not. Double spheres have them."""
 
     @property
     def covariance(self) -> Tensor:
@@ -269,10 +278,13 @@ def calibrate(
     free = Free((asked.free.to(seen.pixels.device),), (False,), bend=bend)
     told = None if progress is None else lambda number, cost: progress(number, float(cost))
     adjusted = adjusted_alone(centred, asked, first, free, layout.image_size, loss, loss_scale, progress=told)
+    adjusted, others = other_optima(centred, asked, adjusted, free, layout.image_size, loss, loss_scale)
     check_determined(adjusted, [asked.kind], [asked.names], [sight_of(centred, asked)], [owner])
     free_parameters = free_count(adjusted, [seen.seen])
     noise = noise_of(adjusted.residuals[0][0], seen.seen, adjusted.valid[0][0], loss, loss_scale, free_parameters)
+    (layout,), noise = counted_once([seen], adjusted, [layout], noise)
     result = result_of(adjusted, 0, asked, seen, middle, layout, noise, (object_points, image_points))
+    result.twins = twins_of(result, others)
     if not result.converged:
         python_warnings.warn(
             f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its warnings",
@@ -331,6 +343,52 @@ def adjusted_alone(
     return adjusted
 
 
+def other_optima(
+    seen: Observations,
+    asked: Model,
+    adjusted: Adjusted,
+    free: Free,
+    image_size: tuple[int, int],
+    loss: str | None,
+    loss_scale: float,
+) -> tuple[Adjusted, Adjusted | None]:
+    """The best of an optimum and of those in other basins of the model, and the others; None where it has but one."""
+    starts = other_cameras(adjusted.state, free, seen, asked.kind, image_size)
+    if starts is None:
+        return adjusted, None
+    sight = sight_of(seen, asked)
+    others = adjust([sight], starts, free, loss=loss, loss_scale=loss_scale)
+    best = others.cost.argmin()[None]
+    if bool(others.cost[best] < (1 - _SAME_COST) * adjusted.cost):
+        found = others.state
+        boards, parameters = Poses(*(t[best] for t in found.boards)), found.parameters[0]
+        state = adjusted.state._replace(parameters=(parameters[best],), boards=boards, bend=found.bend[best])
+        # the one before is one of the others now
+        others = others._replace(
+            state=found._replace(parameters=(torch.cat((parameters, adjusted.state.parameters[0])),)),
+            cost=torch.cat((others.cost, adjusted.cost)),
+            converged=torch.cat((others.converged, adjusted.converged)),
+        )
+        adjusted = adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=STEPS)
+    return adjusted, others
+
+
+def twins_of(found: Calibration, others: Adjusted | None) -> tuple[tuple[float, ...], ...]:
+    """The parameters of optima that the noise does not tell from the one found, and that are apart from it."""
+    if others is None or not found.converged:
+        return ()
+    parameters, cost = others.state.parameters[0], others.cost
+    twins = [found.spread.parameters[0]]
+    for row in cost.argsort().tolist():
+        if not bool(others.converged[row]) or float(cost[row] - found.adjusted.cost[0]) > _AS_GOOD * found.sigma**2:
+            continue
+        if all(
+            bool(((parameters[row] - p).abs() > _APART * found.std + _SAME * p.abs().clamp(min=1)).any()) for p in twins
+        ):
+            twins.append(parameters[row])
+    return tuple(tuple(p.tolist()) for p in twins[1:])
+
+
 class Noise(NamedTuple):
     """Of the corners: the inliers, bool (V, N), sigma, and what makes the covariance; px per coordinate.
 
@@ -367,6 +425,19 @@ def noise_of(residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, l
     if loss is None:
         return Noise(inliers, whole, whole, loss)
     return Noise(inliers, sigma, noise_under(loss, loss_scale, [residuals], [seen & valid], free), loss)
+
+
+def counted_once(
+    seen: Sequence[Observations], adjusted: Adjusted, layouts: Sequence[Layout], noise: Noise
+) -> tuple[list[Layout], Noise]:
+    """With the views named that repeat others, and a noise as if there were so many less views of each."""
+    again = repeats(seen, [r[0] for r in adjusted.residuals])
+    total = len(seen[0].seen)
+    named = [
+        layout._replace(copies=tuple(sorted({*layout.copies, *layout.views[again[one.seen[again].any(-1)]].tolist()})))
+        for layout, one in zip(layouts, seen, strict=True)
+    ]
+    return named, noise._replace(spread=noise.spread * math.sqrt(total / (total - len(again))))
 
 
 def _sigma_of(lengths: Tensor, free: int) -> Tensor:
@@ -425,6 +496,7 @@ def result_of(
         bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
         image_size=layout.image_size,
         views=tuple(layout.views.tolist()),
+        copies=layout.copies,
         object_points=passed[0],
         image_points=passed[1],
         observations=seen,

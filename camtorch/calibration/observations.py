@@ -27,6 +27,8 @@ _FEW_OUTSIDE, _FEW_LEFT = 0.02, 0.2  # of all corners, of which so few are left 
 _MOST_OF_A_VIEW = 0.5
 _NOWHERE = 10.0  # times the longer side: no corner at all, not even an outlier
 _SAME_PIXEL = 3  # corners of a view at one pixel
+_SAME_ERRORS = 0.1  # the squared distance of two views over their squared residuals: 1 where noise is independent
+_SAME_NOISE = 0.1  # px, the distance of two views that saving a file anew may make
 _NAMED = 8  # views, in a message
 
 
@@ -62,6 +64,8 @@ class Layout(NamedTuple):
     """(V, N) of the observations."""
     image_size: tuple[int, int]
     """(height, width)."""
+    copies: tuple[int, ...]
+    """The numbers of the views, of those that were passed, that are no new evidence: see `_kept` and `repeats`."""
 
     def restore(self, values: Tensor) -> Any:
         """Results of the observations in the form of the image points, NaN (of bool: False) where nothing was seen.
@@ -97,7 +101,7 @@ def as_observations(
 
     Returns:
         The views that have corners, detached, float64, on the device of the image points; and the form to bring
-        results back into.
+        results back into. Views with the same corners as an earlier one are left out.
 
     Warns:
         UserWarning: a view has no corner, and is left out.
@@ -112,8 +116,8 @@ def as_observations(
     given = _Given("image_points", "image_size", _image_views(image_points, "image_points", owner), size)
     board, (one,) = _together(object_points, [given], owner)
     _check_sight(board, one, owner)
-    kept = _kept(one.seen, owner)
-    return _observations(board, one, kept), _layout(board, one, kept)
+    kept, copies = _kept([one], owner)
+    return _observations(board, one, kept), _layout(board, one, kept, copies)
 
 
 def as_rig_observations(
@@ -155,9 +159,35 @@ def as_rig_observations(
     for one in cameras:
         _check_sight(board, one, owner)
     _check_links(names, torch.stack([one.seen.any(-1) for one in cameras]), owner)
-    kept = _kept(torch.cat([one.seen for one in cameras], -1), owner)
+    kept, copies = _kept(cameras, owner)
     observations = {name: _observations(board, one, kept) for name, one in zip(names, cameras, strict=True)}
-    return observations, {name: _layout(board, one, kept) for name, one in zip(names, cameras, strict=True)}
+    return observations, {name: _layout(board, one, kept, copies) for name, one in zip(names, cameras, strict=True)}
+
+
+def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
+    """The rows of views that show another one again, its errors included: a file saved anew, a frame that stands still.
+
+    Where the noise of two views is independent, corners differ by at least as much as both are wrong by; in such a pair
+    they differ by less than a third of that. Images taken one after the other from a tripod have noise of their own.
+
+    Args:
+        cameras: what each saw of the same views.
+        residuals: of each, (V, N, 2).
+
+    Returns:
+        (R,) all but the first of each group that is alike.
+    """
+    seen = torch.cat([one.seen for one in cameras], -1)
+    pixels = torch.cat([one.pixels for one in cameras], 1)
+    size = (torch.cat(list(residuals), 1).square().sum(-1) * seen).sum(-1)
+    order = pixels.sum((1, 2)).argsort(stable=True)  # where those that are alike are neighbours
+    before, after = order[:-1], order[1:]
+    apart = (pixels[after] - pixels[before]).square().sum((1, 2))
+    alike = (seen[after] == seen[before]).all(-1) & (apart <= _SAME_ERRORS * (size[after] + size[before]))
+    alike &= apart <= _SAME_NOISE**2 * seen[after].sum(-1)
+    group = torch.nn.functional.pad((~alike).cumsum(0), (1, 0))
+    first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")
+    return order[first[group] != order].sort().values
 
 
 # -- forms
@@ -211,10 +241,11 @@ def _observations(board: _Board, sight: _Sight, kept: Tensor) -> Observations:
     return Observations(points.contiguous(), pixels, sight.seen[kept])
 
 
-def _layout(board: _Board, sight: _Sight, kept: Tensor) -> Layout:
+def _layout(board: _Board, sight: _Sight, kept: Tensor, copies: Sequence[int]) -> Layout:
     counts = board.counts * (len(sight.pixels) if len(board.counts) == 1 else 1)
     shapes = tuple((n,) if s is None else s for n, s in zip(counts, sight.given.views.shapes, strict=True))
-    return Layout(shapes, sight.given.views.stacked, kept, sight.seen[kept], sight.given.image_size)
+    size, has = sight.given.image_size, sight.seen.any(-1).tolist()
+    return Layout(shapes, sight.given.views.stacked, kept, sight.seen[kept], size, tuple(i for i in copies if has[i]))
 
 
 def _together(object_points: Points, given: list[_Given], owner: str) -> tuple[_Board, list[_Sight]]:
@@ -510,12 +541,26 @@ def _check_links(names: list[str], sees: Tensor, owner: str) -> None:
         )
 
 
-def _kept(seen: Tensor, owner: str) -> Tensor:
-    """The numbers of the views with corners, seen (V, N) of any."""
-    has = seen.any(-1)
+def _kept(sights: Sequence[_Sight], owner: str) -> tuple[Tensor, list[int]]:
+    """The numbers of the views with corners, and of those left out that have the same ones as an earlier view.
+
+    A copy has the same corners in all cameras, in any order: noise makes those of no two photographs equal.
+    """
+    has = torch.stack([sight.seen.any(-1) for sight in sights]).any(0)
     if not bool(has.all()):
         warnings.warn(f"{owner}: left out, as nothing was seen{_in(~has)}", UserWarning, stacklevel=5)
-    return has.nonzero()[:, 0]
+    parts = []
+    for sight in sights:
+        ordered = torch.where(sight.seen[..., None], sight.pixels, torch.inf) + 0.0  # no -0
+        for axis in (1, 0):
+            index = ordered[..., axis].argsort(dim=-1, stable=True)
+            ordered = torch.take_along_dim(ordered, index[..., None], 1)
+        parts.append(ordered.flatten(1))
+    views: dict[bytes, int] = {}
+    first = [views.setdefault(row.tobytes(), i) for i, row in enumerate(torch.cat(parts, 1).cpu().numpy())]
+    kept = [i for i in has.nonzero()[:, 0].tolist() if first[i] == i]
+    copies = [i for i in has.nonzero()[:, 0].tolist() if first[i] != i]
+    return torch.tensor(kept, device=has.device), copies
 
 
 def _repeated(rows: Tensor, seen: Tensor, times: int) -> Tensor:

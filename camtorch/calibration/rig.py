@@ -20,6 +20,7 @@ from camtorch.calibration.calibrate import (
     adjusted_alone,
     as_model,
     as_options,
+    counted_once,
     first_state,
     free_count,
     middle_of,
@@ -59,7 +60,7 @@ class RigCalibration:
     bend: tuple[float, float]
     """As in `Calibration`."""
     views: tuple[int, ...]
-    """The numbers of the views that some camera saw, of those that were passed."""
+    """The numbers of the views that some camera saw, of those that were passed, without copies of others."""
     adjusted: Adjusted = field(repr=False)
 
     @property
@@ -184,6 +185,8 @@ def calibrate_rig(
     owners = [f"{owner}: {name}" for name in names]
     check_determined(adjusted, [a.kind for a in asked], [a.names for a in asked], sights, owners)
     noise = noise_of(residuals, used, valid, loss, loss_scale, parameters)
+    named, noise = counted_once(list(seen.values()), adjusted, list(layouts.values()), noise)
+    layouts = dict(zip(names, named, strict=True))
     each = noise.inliers.split([len(s.seen) for s in seen.values()])
     cameras = {
         name: result_of(

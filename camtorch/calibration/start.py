@@ -151,6 +151,25 @@ def other_poses(state: State, observations: Observations, model: type[Camera], i
     )
 
 
+def other_cameras(
+    state: State, free: Free, observations: Observations, model: type[Camera], image_size: tuple[int, int]
+) -> State | None:
+    """An optimum, B = 1, begun anew all along the valley of the model, see `_ALONG`; None where it has none."""
+    parameters, learns = state.parameters[0], free.parameters[0]
+    count = parameters.shape[-1] - 4
+    names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
+    along, _ = _ALONG.get(model.key, ("", ()))
+    if not along or not bool(learns[names.index(along)]):
+        return None
+    fixed = [name for name, is_free in zip(names, learns.tolist(), strict=True) if not is_free]
+    found = _fitted(
+        _Lens(model, parameters, state.boards, _LEAST_SCALE), observations, model, count, image_size, fixed
+    ).parameters
+    found = torch.where(learns.to(found.device), found, parameters)
+    boards = Poses(*(t.expand(len(found), *t.shape[1:]) for t in state.boards))
+    return _state(found, boards)._replace(bend=state.bend.expand(len(found), 2))
+
+
 class _Lens(NamedTuple):
     """Cameras of a model, parameters (B, 4 + n), with poses (B, V) of the boards."""
 

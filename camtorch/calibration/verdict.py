@@ -36,6 +36,8 @@ _GAIN = 0.02  # of the sum of squares, for which a model may have more parameter
 _USUAL_NOISE = 0.1  # px
 _OPEN = 0.02  # of the corners' extent: the uncertainty of projections that are not determined
 _OPEN_COEFFICIENT = 0.1  # standard deviation
+_MISFIT = 3.0  # px, the median residual of views that no camera fits
+_MOST_OF_A_VIEW = 0.8  # of its corners
 _NAMED = 6  # views, in a sentence
 
 _ROWS, _COLUMNS = ("top", "", "bottom"), ("left", "", "right")
@@ -324,7 +326,16 @@ def _noise(survey: Survey) -> Iterator[str]:
 
 
 def _views(survey: Survey) -> Iterator[str]:
-    count = int(survey.seen.any(-1).sum())
+    calibration = survey.calibration
+    if calibration.copies:
+        some, rest = calibration.copies[:_NAMED], len(calibration.copies) - _NAMED
+        more, many = f" and {rest} more" * (rest > 0), len(calibration.copies) > 1
+        yield (
+            f"View{'s' * many} {', '.join(map(str, some))}{more} show{'s' * (not many)} another view again, its errors "
+            "too, as a copy of a file does: they count once. Take new photographs instead"
+        )
+    copies = [calibration.views.index(view) for view in calibration.copies if view in calibration.views]
+    count = int(survey.seen.any(-1).sum()) - int(survey.seen[copies].any(-1).sum())
     if count < _FEW_VIEWS:
         views = "view" if count == 1 else "views"
         yield (
@@ -343,6 +354,21 @@ def _parallel(survey: Survey) -> Iterator[str]:
         )
     elif loose > _LOOSE_FOCAL:
         yield (f"The focal length is {known}. Take views in which the board is near and tilted, and fills the image")
+
+
+def _twins(survey: Survey) -> Iterator[str]:
+    calibration = survey.calibration
+    if calibration.twins:
+        names = [0, *range(4, len(calibration.parameter_names))]
+        found, *others = (
+            ", ".join(f"{calibration.parameter_names[i]} {values[i]:.4g}" for i in names)
+            for values in (survey.parameters.tolist(), *calibration.twins)
+        )
+        yield (
+            f"The parameters are not known, though projections are where corners were seen: {'; '.join(others)} "
+            f"fit{'s' * (len(others) == 1)} as well as {found}. Use the camera as a whole and compare no parameters, "
+            "or take a model without this ambiguity, as eucm or kannala_brandt"
+        )
 
 
 def _centre(survey: Survey) -> Iterator[str]:
@@ -461,6 +487,15 @@ def _outliers(survey: Survey) -> Iterator[str]:
         robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
         what = "corners are outliers" if count > 1 else "corners is an outlier"
         yield f"{count} of {total} {what}{concentrated}{robust}. Look at the views"
+    (lost,) = (bad.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero(as_tuple=True)
+    if len(lost) and calibration.loss:
+        numbers = ", ".join(str(calibration.views[i]) for i in lost[:_NAMED].tolist())
+        rest = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+        yield (
+            f"Nearly all corners of view{'s' * (len(lost) > 1)} {numbers}{rest} are outliers, as where they are "
+            "numbered in another order: a robust loss bears corners that are wrong here and there, and such a view "
+            f"makes all parameters look less certain than they are. Leave {'them' if len(lost) > 1 else 'it'} out"
+        )
 
 
 def _bad_views(survey: Survey) -> Iterator[str]:
@@ -484,6 +519,7 @@ _FINDERS: tuple[Callable[[Survey], Iterator[str]], ...] = (
     _bad_views,
     _views,
     _parallel,
+    _twins,
     _centre,
     _coverage,
     _angles,
@@ -598,10 +634,11 @@ def check_determined(
     sights: Sequence[Sight],
     owners: Sequence[str],
 ) -> None:
-    """Refuse a problem in which the single view of a camera leaves it open.
+    """Refuse a problem in which the views of a camera leave it open, as those of boards that are all parallel do.
 
     It is open where corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
-    fiftieth of the extent of the corners. More views that leave it open are what warnings are for.
+    fiftieth of the extent of the corners: a matter of where the boards were, which corners without noise cannot hide.
+    Several views that no camera fits are wrong, not open, and what warnings are for.
 
     Args:
         adjusted: one problem, at its optimum.
@@ -617,7 +654,9 @@ def check_determined(
         noise = adjusted.cost.new_full((1,), _USUAL_NOISE)
         found = spread(adjusted, model, c, noise)
         seen = sight.weights[0] > 0
-        if int(seen.any(-1).sum()) > 1:
+        views = int(seen.any(-1).sum())
+        misfit = torch.linalg.vector_norm(adjusted.residuals[c][0], dim=-1)[seen].median()
+        if views > 1 and float(misfit) > _MISFIT:
             continue
         pixels = sight.pixels[0][seen]
         pixels = pixels[:: max(1, len(pixels) // 512)][None]
@@ -632,8 +671,10 @@ def check_determined(
         open_ones = [name for name, is_open in zip(of, (std > limits).tolist(), strict=True) if is_open]
         free = [name for name, size in zip(of, std.tolist(), strict=True) if size > 0]
         hold = [name for name in free if name not in ("fx", "fy")] or free
+        what = "a single view of this board leaves" if views == 1 else f"these {views} views leave"
+        why = "" if views == 1 else ", as boards that are all nearly parallel do"
         raise ValueError(
-            f"{owner}: a single view of this board leaves {_listed(open_ones or free)} undetermined. Take 10 to 20 "
+            f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 "
             f"views in which the board is tilted by 30 to 45 degrees to all sides, or hold parameters: {_fixed(hold)}"
         )
 
