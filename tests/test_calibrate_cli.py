@@ -134,6 +134,18 @@ def test_corners_of_another_tool_need_no_image(capsys):
     assert_near(found_camera(), fisheye(), 0.5)
 
 
+def test_files_that_are_copies_are_named(capsys):
+    corners = corners_of()
+    corners.images += [replace(corners.images[i], path=Path(f"copy{i}.png"), view=f"copy{i}") for i in (2, 5)]
+    write_corners(corners, "corners.json")
+    calibrate("--corners", "corners.json", "--model", "kannala_brandt", "-o", "camera.yml")
+    captured = capsys.readouterr()
+    assert "10 of 10 images" in captured.out
+    assert "8 views" in captured.out
+    words = "show another view again, its errors too, as a copy of a file does: they count once"
+    assert f"Views copy2.png, copy5.png {words}" in " ".join(captured.err.split())
+
+
 def test_corners_are_read_as_they_were_written():
     corners = corners_of(board=AprilGrid(4, 3, 0.05), hash="abc")
     corners.images[2].pixels[:] = np.nan

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from boards import chessboard
+from boards import chessboard, seen_by
 
 import camtorch as ct
 from camtorch.rotations import rotation_matrix, rotation_vector
@@ -167,6 +167,38 @@ def test_names_that_no_camera_has_are_refused():
     pixels, _, _ = seen(views=10)
     with pytest.raises(ValueError, match="middle"):
         calibrated(pixels, fixed={"middle": "all"})
+
+
+def test_views_are_copies_where_all_cameras_saw_the_same():
+    pixels, *_ = seen(views=12)
+    some = list(MODELS)[:2]
+    again = {name: torch.cat((p, p[:3])) for name, p in pixels.items()}
+    again[some[1]][13] += 0.3 * torch.randn(
+        again[some[1]][13].shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    found = calibrated(again, {name: MODELS[name] for name in some})
+    assert found.views == (*range(12), 13)
+    assert {copy for camera in found.cameras.values() for copy in camera.copies} <= {12, 14}
+    assert any("show another view again" in text or "shows another view again" in text for text in found.warnings)
+
+
+@pytest.mark.slow
+def test_double_spheres_of_a_rig_have_twins():
+    lens = ct.DoubleSphere([200.0, 200, 320, 240], [-0.18, 0.59], image_size=(480, 640))
+    corners, rotations, translations = seen_by(lens, 10, noise=0.2)
+    with torch.no_grad():
+        moved = corners.object_points @ rotations.mT + translations[:, None] - torch.tensor([0.02, 0, 0]).double()
+        pixels, valid = lens.double().project(moved)
+    pixels = pixels + 0.2 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    pixels[~(valid & lens.contains(pixels))] = torch.nan
+    found = ct.calibrate_rig(
+        {"left": "double_sphere", "right": "double_sphere"},
+        corners.object_points,
+        {"left": corners.image_points, "right": pixels},
+        image_sizes=dict.fromkeys(("left", "right"), (480, 640)),
+    )
+    named = [text.split(":")[0] for text in found.warnings if "The parameters are not known, though" in text]
+    assert named == ["left", "right"]
 
 
 @pytest.mark.slow

@@ -68,6 +68,11 @@ class State(NamedTuple):
     boards: Poses
     bend: Tensor
 
+    def of(self, rows: Tensor) -> State:
+        """Those of some problems, given by numbers."""
+        mounts, boards = (Poses(*(t[rows] for t in poses)) for poses in (self.mounts, self.boards))
+        return State(tuple(p[rows] for p in self.parameters), mounts, boards, self.bend[rows])
+
 
 class Free(NamedTuple):
     """What learns.

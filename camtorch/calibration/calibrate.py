@@ -278,13 +278,14 @@ def calibrate(
     free = Free((asked.free.to(seen.pixels.device),), (False,), bend=bend)
     told = None if progress is None else lambda number, cost: progress(number, float(cost))
     adjusted = adjusted_alone(centred, asked, first, free, layout.image_size, loss, loss_scale, progress=told)
-    adjusted, others = other_optima(centred, asked, adjusted, free, layout.image_size, loss, loss_scale)
-    check_determined(adjusted, [asked.kind], [asked.names], [sight_of(centred, asked)], [owner])
+    sights = [sight_of(centred, asked)]
+    adjusted, optima = other_optima(0, centred, asked, sights, adjusted, free, layout.image_size, loss, loss_scale)
+    check_determined(adjusted, [asked.kind], [asked.names], sights, [owner])
     free_parameters = free_count(adjusted, [seen.seen])
     noise = noise_of(adjusted.residuals[0][0], seen.seen, adjusted.valid[0][0], loss, loss_scale, free_parameters)
     (layout,), noise = counted_once([seen], adjusted, [layout], noise)
     result = result_of(adjusted, 0, asked, seen, middle, layout, noise, (object_points, image_points))
-    result.twins = twins_of(result, others)
+    result.twins = twins_of(result, optima)
     if not result.converged:
         python_warnings.warn(
             f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its warnings",
@@ -343,49 +344,69 @@ def adjusted_alone(
     return adjusted
 
 
+class Optima(NamedTuple):
+    """Where searches ended: the parameters (S, 4 + n) of one camera, the costs and whether they converged, (S,)."""
+
+    parameters: Tensor
+    cost: Tensor
+    converged: Tensor
+
+
 def other_optima(
+    camera: int,
     seen: Observations,
     asked: Model,
+    sights: Sequence[Sight],
     adjusted: Adjusted,
     free: Free,
     image_size: tuple[int, int],
     loss: str | None,
     loss_scale: float,
-) -> tuple[Adjusted, Adjusted | None]:
-    """The best of an optimum and of those in other basins of the model, and the others; None where it has but one."""
-    starts = other_cameras(adjusted.state, free, seen, asked.kind, image_size)
+) -> tuple[Adjusted, Optima | None]:
+    """The best of an optimum and of those in other basins of a camera's model, and all; None where it has but one.
+
+    Args:
+        camera: which of the cameras of the problem it is.
+        seen: what it saw.
+        asked: its model.
+        sights: what all cameras saw.
+        adjusted: the optimum.
+        free: what learns.
+        image_size: (height, width).
+        loss: as `calibrate` takes it.
+        loss_scale: px.
+    """
+    state = adjusted.state
+    rotations, translations = (t[:, camera, None] for t in state.mounts)
+    boards = Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
+    starts = other_cameras(
+        state.parameters[camera], free.parameters[camera].cpu(), boards, seen, asked.kind, image_size
+    )
     if starts is None:
         return adjusted, None
-    sight = sight_of(seen, asked)
-    others = adjust([sight], starts, free, loss=loss, loss_scale=loss_scale)
+    first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
+    parameters = tuple(starts if c == camera else p for c, p in enumerate(first.parameters))
+    others = adjust(sights, first._replace(parameters=parameters), free, loss=loss, loss_scale=loss_scale)
+    ends = (
+        (others.state.parameters[camera], state.parameters[camera]),
+        (others.cost, adjusted.cost),
+        (others.converged, adjusted.converged),
+    )
     best = others.cost.argmin()[None]
     if bool(others.cost[best] < (1 - _SAME_COST) * adjusted.cost):
-        found = others.state
-        boards, parameters = Poses(*(t[best] for t in found.boards)), found.parameters[0]
-        state = adjusted.state._replace(parameters=(parameters[best],), boards=boards, bend=found.bend[best])
-        # the one before is one of the others now
-        others = others._replace(
-            state=found._replace(parameters=(torch.cat((parameters, adjusted.state.parameters[0])),)),
-            cost=torch.cat((others.cost, adjusted.cost)),
-            converged=torch.cat((others.converged, adjusted.converged)),
-        )
-        adjusted = adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=STEPS)
-    return adjusted, others
+        adjusted = adjust(sights, others.state.of(best), free, loss=loss, loss_scale=loss_scale, steps=STEPS)
+    return adjusted, Optima(*map(torch.cat, ends))
 
 
-def twins_of(found: Calibration, others: Adjusted | None) -> tuple[tuple[float, ...], ...]:
+def twins_of(found: Calibration, optima: Optima | None) -> tuple[tuple[float, ...], ...]:
     """The parameters of optima that the noise does not tell from the one found, and that are apart from it."""
-    if others is None or not found.converged:
+    if optima is None or not found.converged:
         return ()
-    parameters, cost = others.state.parameters[0], others.cost
+    as_good = optima.converged & (optima.cost - found.adjusted.cost[0] <= _AS_GOOD * found.sigma**2)
     twins = [found.spread.parameters[0]]
-    for row in cost.argsort().tolist():
-        if not bool(others.converged[row]) or float(cost[row] - found.adjusted.cost[0]) > _AS_GOOD * found.sigma**2:
-            continue
-        if all(
-            bool(((parameters[row] - p).abs() > _APART * found.std + _SAME * p.abs().clamp(min=1)).any()) for p in twins
-        ):
-            twins.append(parameters[row])
+    for new in optima.parameters[as_good][optima.cost[as_good].argsort()]:
+        if all(bool(((new - p).abs() > _APART * found.std + _SAME * p.abs().clamp(min=1)).any()) for p in twins):
+            twins.append(new)
     return tuple(tuple(p.tolist()) for p in twins[1:])
 
 

@@ -25,8 +25,10 @@ from camtorch.calibration.calibrate import (
     free_count,
     middle_of,
     noise_of,
+    other_optima,
     result_of,
     sight_of,
+    twins_of,
 )
 from camtorch.calibration.observations import Observations, Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
@@ -174,6 +176,10 @@ def calibrate_rig(
     first = _joined(names, sights, alone, free, owner)
     told = None if progress is None else lambda number, cost: progress(number, float(cost))
     adjusted = adjust(sights, first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
+    optima = []
+    for c, (m, s, layout) in enumerate(zip(asked, centred, layouts.values(), strict=True)):
+        adjusted, found = other_optima(c, s, m, sights, adjusted, free, layout.image_size, loss, loss_scale)
+        optima.append(found)
     parameters = free_count(adjusted, [s.seen for s in seen.values()])
     residuals, valid, used = (
         torch.cat(parts)
@@ -201,6 +207,8 @@ def calibrate_rig(
         )
         for c, name in enumerate(names)
     }
+    for camera, ends in zip(cameras.values(), optima, strict=True):
+        camera.twins = twins_of(camera, ends)
     lengths = torch.where(used, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
     rotations, translations = (t[0] for t in adjusted.state.boards)
     mounts = {

@@ -103,8 +103,7 @@ def start_from_nothing(
     sight, free = _sight(model, observations), _free(model, count, fixed)
     state = _state(lens.parameters, boards)
     found = adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
-    row = found.cost.argmin()[None]
-    return _state(found.state.parameters[0][row], Poses(*(t[row] for t in found.state.boards)))
+    return found.state.of(found.cost.argmin()[None])
 
 
 def poses_for(
@@ -152,22 +151,32 @@ def other_poses(state: State, observations: Observations, model: type[Camera], i
 
 
 def other_cameras(
-    state: State, free: Free, observations: Observations, model: type[Camera], image_size: tuple[int, int]
-) -> State | None:
-    """An optimum, B = 1, begun anew all along the valley of the model, see `_ALONG`; None where it has none."""
-    parameters, learns = state.parameters[0], free.parameters[0]
+    parameters: Tensor,
+    learns: Tensor,
+    boards: Poses,
+    observations: Observations,
+    model: type[Camera],
+    image_size: tuple[int, int],
+) -> Tensor | None:
+    """(S, 4 + n) nearly the same camera all along the valley of its model, see `_ALONG`; None where it has none.
+
+    Args:
+        parameters: (1, 4 + n) at an optimum.
+        learns: (4 + n,) bool.
+        boards: (1, V), in the frame of the camera.
+        observations: what it saw.
+        model: of the camera.
+        image_size: (height, width).
+    """
     count = parameters.shape[-1] - 4
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
     along, _ = _ALONG.get(model.key, ("", ()))
     if not along or not bool(learns[names.index(along)]):
         return None
     fixed = [name for name, is_free in zip(names, learns.tolist(), strict=True) if not is_free]
-    found = _fitted(
-        _Lens(model, parameters, state.boards, _LEAST_SCALE), observations, model, count, image_size, fixed
-    ).parameters
-    found = torch.where(learns.to(found.device), found, parameters)
-    boards = Poses(*(t.expand(len(found), *t.shape[1:]) for t in state.boards))
-    return _state(found, boards)._replace(bend=state.bend.expand(len(found), 2))
+    lens = _Lens(model, parameters, boards, _LEAST_SCALE)
+    found = _fitted(lens, observations, model, count, image_size, fixed).parameters
+    return torch.where(learns.to(found.device), found, parameters)
 
 
 class _Lens(NamedTuple):
