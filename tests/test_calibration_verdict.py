@@ -1,5 +1,6 @@
 """What a calibration says of itself: warnings where data do not carry it, none where they do, and a verdict."""
 
+import contextlib
 import math
 import re
 
@@ -245,7 +246,10 @@ def test_planes_across_the_axis(count, noise):
 
 def test_one_pose_given_twice_is_one_view():
     board, pixels = views(narrow(), *all_over(1, tilt=0.0), noise=0.0)
-    with pytest.raises(ValueError, match=r"a single view of this board leaves .*fx.* undetermined"):
+    with (
+        pytest.warns(UserWarning, match="left out, as the corners are those of another view in view 1"),
+        pytest.raises(ValueError, match=r"a single view of this board leaves .*fx.* undetermined"),
+    ):
         ct.calibrate("pinhole", board, pixels.repeat(2, 1, 1), image_size=SIZE)
 
 
@@ -260,7 +264,9 @@ def test_copies_of_views_count_once(how):
     order = torch.arange(len(board)).flip(0) if how == "in another order" else torch.arange(len(board))
     image_points = [*pixels[:4], *again[:, order]]
     object_points = [board] * 4 + [board[order]] * len(again)
-    result = ct.calibrate("pinhole", object_points, image_points, image_size=SIZE)
+    said = contextlib.nullcontext() if how == "saved again" else pytest.warns(UserWarning, match="in views 4, 5, 6")
+    with said:
+        result = ct.calibrate("pinhole", object_points, image_points, image_size=SIZE)
     assert result.copies == tuple(range(4, 16))
     # saved again they widen what all views say alike
     torch.testing.assert_close(result.std, alone.std, rtol=0.05 if how == "saved again" else 1e-9, atol=0)

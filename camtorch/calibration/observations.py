@@ -101,10 +101,10 @@ def as_observations(
 
     Returns:
         The views that have corners, detached, float64, on the device of the image points; and the form to bring
-        results back into. Views with the same corners as an earlier one are left out.
+        results back into.
 
     Warns:
-        UserWarning: a view has no corner, and is left out.
+        UserWarning: a view has no corner, or those of an earlier one, and is left out.
 
     Raises:
         ValueError: shapes and numbers that do not fit, views of too few corners, corners on a line, corners twice,
@@ -138,7 +138,7 @@ def as_rig_observations(
         owner: the name of the function that asks, for messages.
 
     Warns:
-        UserWarning: no camera sees the board of a view, and it is left out.
+        UserWarning: no camera sees the board of a view, or all see the corners of an earlier one: it is left out.
 
     Raises:
         ValueError: what `as_observations` refuses; names that differ; a camera that sees nothing; cameras that no
@@ -560,6 +560,10 @@ def _kept(sights: Sequence[_Sight], owner: str) -> tuple[Tensor, list[int]]:
     first = [views.setdefault(row.tobytes(), i) for i, row in enumerate(torch.cat(parts, 1).cpu().numpy())]
     kept = [i for i in has.nonzero()[:, 0].tolist() if first[i] == i]
     copies = [i for i in has.nonzero()[:, 0].tolist() if first[i] != i]
+    if copies:
+        mask = torch.zeros_like(has)
+        mask[copies] = True
+        warnings.warn(f"{owner}: left out, as the corners are those of another view{_in(mask)}", stacklevel=5)
     return torch.tensor(kept, device=has.device), copies
 
 
