@@ -31,7 +31,6 @@ _MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
 _SECOND_LOOKS = 3  # at the poses
-_SAME_COST = 1e-7  # the relative difference of two costs, of one optimum
 _AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
 _APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, of two optima
 
@@ -363,7 +362,7 @@ def other_optima(
     loss: str | None,
     loss_scale: float,
 ) -> tuple[Adjusted, Optima | None]:
-    """The best of an optimum and of those in other basins of a camera's model, and all; None where it has but one.
+    """An optimum, or a better one in another basin of a camera's model, and all; None where it has but one.
 
     Args:
         camera: which of the cameras of the problem it is.
@@ -393,7 +392,8 @@ def other_optima(
         (others.converged, adjusted.converged),
     )
     best = others.cost.argmin()[None]
-    if bool(others.cost[best] < (1 - _SAME_COST) * adjusted.cost):
+    variance = adjusted.cost / (2 * sum(int((sight.weights > 0).sum()) for sight in sights))
+    if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # one as good is no reason to leave the first
         adjusted = adjust(sights, others.state.of(best), free, loss=loss, loss_scale=loss_scale, steps=STEPS)
     return adjusted, Optima(*map(torch.cat, ends))
 
