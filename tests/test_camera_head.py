@@ -174,6 +174,22 @@ def test_gradients_do_not_vanish_far_out():
     assert (numbers.grad.abs() > 1e-3).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("key", [k for k in QUICK if k != "pinhole"])
+def test_all_numbers_make_finite_cameras_and_gradients(key, dtype):
+    layer = head(key).to(dtype)
+    count = 2000 if key in ("double_sphere", "mei") else 200
+    ordinary = torch.randn(count, len(layer.names), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    large = [size * ordinary[:16].sign() for size in (1e3, 1e4, 1e5, 1e6, 1e9, 1e30)]
+    for part in torch.cat((ordinary, 10 * ordinary[:50], *large)).to(dtype).split(500):
+        numbers = part.clone().requires_grad_()
+        camera = layer.camera(numbers)
+        assert bool(all_have_rays(camera, 3, 3).all())
+        (gradient,) = torch.autograd.grad(camera.intrinsics.sum() + camera.distortion.sum(), numbers)
+        for found in (camera.intrinsics, camera.distortion, gradient):
+            assert bool(torch.isfinite(found).all())
+
+
 @pytest.mark.slow
 def test_it_learns_a_camera_from_its_rays():
     truth = ct.KannalaBrandt([300.0, 300.0, 330.0, 230.0], [-0.05, 0.02, -0.01, 0.002], image_size=SIZE)

@@ -137,7 +137,7 @@ class CanonicalCamera(SampleTransform):
         sample = self._given(sample, fields)
         sample.pop("scale", None)
         if self.scales == "depth":
-            named, batched, count, camera = self._batch(sample)
+            named, batched, count, camera = self._batch(sample, predicted=True)
             return self._scaled(sample, named, batched, 1 / self._scale_of_each(camera, count))
         source = sample.pop("source_camera", None)
         if source is None:
@@ -147,7 +147,7 @@ class CanonicalCamera(SampleTransform):
         target = change.target
         if isinstance(source, Camera) and isinstance(target, Camera) and not source.batch_shape:
             target = alone(target)  # a batch dim would say that the sample has one
-        named, batched, count, _ = self._batch({**sample, "camera": target})
+        named, batched, count, _ = self._batch({**sample, "camera": target}, predicted=True)
         change = change if change.count == count else self._change(source, count)
         return self._resized(sample, named, batched, change.inverse())
 

@@ -213,6 +213,9 @@ class CameraHead(GeometryModule):
         gauge = size / limits.along(moves / size.clamp(min=1e-12), disc.exp())
         return moves * torch.rsqrt(1 + gauge * gauge)
 
+    def _model_name(self) -> str:
+        return self.model.__name__
+
     def extra_repr(self) -> str:
         """The model, the images and the names of the numbers."""
         return f"{self.model.__name__}, image_size={self.image_size}, numbers=({' '.join(self.names)})"

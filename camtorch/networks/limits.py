@@ -22,7 +22,7 @@ _LEAST, _MOST = 0.05, 4.0  # the slope of a lens, and how far out it sends point
 _FLATTEST, _STEEPEST = 0.25, 20.0  # the same of charts: angle by radius
 _KEPT = 0.02  # of the way from the lens given to where a formula ends
 _AZIMUTHS = 32
-_AT_AXIS = 0.02
+_AT_AXIS = 1e-6  # of the radius; further out a chart of a large xi or alpha may have no rays
 _FIRST, _LAST, _GRID = 1e-3, 1e3, 32
 _ROUNDS, _PARTS = 5, 8
 _STEP = 1e-6
@@ -135,6 +135,8 @@ class Limits:
             slope = (ahead - behind) / (2 * step)
             ends &= slope < 0
         # the implicit function: where the margin would change, the end moves until it does not
+        # where none was found it is that of the lens given, as elsewhere there need not be a formula to derive
+        direction = torch.where(ends, direction, 0.0)
         margin = self._at(times, direction, radius, self._profile(self._start(direction), radius.unsqueeze(-2)))
         moved = (margin - margin.detach()) / torch.where(ends, slope, 1.0)
         return times - torch.where(ends, moved, 0.0)
