@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._tracing import in_graph, is_concrete
+from camtorch._tracing import in_graph, is_concrete, may_look
 
 Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
@@ -240,6 +240,35 @@ def check_path(path: Any, owner: str) -> None:
     """Raise a TypeError for what is no path."""
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"{owner}: path must name a file; got {shown(path)}")
+
+
+def check_boxes(boxes: Tensor, name: str, owner: str) -> None:
+    """Raise a ValueError for plain boxes (..., 4) with x2 < x1 or y2 < y1, as x, y, width, height mostly have it."""
+    if not may_look(boxes) or boxes.requires_grad:
+        return
+    turned = (boxes[..., 2:] < boxes[..., :2]).any(-1)
+    if bool(turned.any()):
+        index = turned.nonzero()[0].tolist()
+        place = f"[{', '.join(map(str, index))}]" if index else ""
+        raise ValueError(
+            f"{owner}: {name} must be x1, y1, x2, y2 (xyxy), with x1 <= x2 and y1 <= y2; got {name}{place} = "
+            f"{boxes[tuple(index)].tolist()}. Boxes x, y, width, height go in as x, y, x + width, y + height"
+        )
+
+
+def check_radians(vectors: Tensor, name: str, owner: str) -> None:
+    """Raise a ValueError for plain rotation vectors (..., 3) of more than two turns, which are degrees.
+
+    A turn is the longest that there is a use for; one that an optimiser moved may be somewhat longer.
+    """
+    if not may_look(vectors) or isinstance(vectors, nn.Parameter) or in_graph(vectors):
+        return
+    if bool((vectors.square().sum(-1) > (4 * math.pi) ** 2).any()):
+        longest = torch.linalg.vector_norm(vectors.double(), dim=-1).nan_to_num(0.0).amax().item()
+        raise ValueError(
+            f"{owner}: {name} holds rotation vectors, axis times angle in radians; an angle of {longest:.4g} seems to "
+            "be degrees, which torch.deg2rad() or math.radians() converts"
+        )
 
 
 def check_devices(owner: str, **tensors: Tensor) -> None:

@@ -78,7 +78,22 @@ class GeometryModule(nn.Module):
                 parameter.requires_grad = False
         return self
 
+    def _model_name(self) -> str:
+        """What its numbers are those of: a state of another one is refused. Empty: its keys tell."""
+        return ""
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self._model_name() and hasattr(destination, "_metadata"):
+            destination._metadata[prefix[:-1]]["model"] = self._model_name()
+
     def _load_from_state_dict(self, *arguments: Any) -> None:
+        _, prefix, metadata, *_, errors = arguments
+        mine, its = self._model_name(), metadata.get("model")
+        if mine and its not in (None, mine):
+            where = f" {prefix[:-1]}" if prefix else ""
+            errors.append(f"the state{where} is of {its}, and the module of {mine}")
+            return
         super()._load_from_state_dict(*arguments)
         # what has no values is in no state_dict, and follows what was assigned in the place of meta tensors
         for name, buffer in self._buffers.items():

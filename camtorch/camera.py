@@ -52,6 +52,9 @@ if TYPE_CHECKING:
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
+_OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
+_CENTRED = 0.1  # of the image's sides: how far from its middle principal points usually lie
+
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 
 _ELSEWHERE = {
@@ -186,7 +189,10 @@ class Camera(BatchedModule):
         if defined is not None and _is_given(distortion) and not bool((defined > 0).all()):
             raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
         self.distortion_names = names
-        self.image_size = as_image_size(image_size, owner)
+        self.image_size = size = as_image_size(image_size, owner)
+        plain = not (isinstance(intrinsics, nn.Parameter) or in_graph(intrinsics))
+        if plain and size is not None and _is_given(intrinsics):
+            _warn_of_order(intrinsics, size, owner)
         self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
         self._warned = is_predicted(intrinsics) or is_predicted(distortion)
         self.hold("intrinsics", intrinsics, (*batch, 4))
@@ -211,7 +217,8 @@ class Camera(BatchedModule):
 
         Raises:
             ValueError: not such a matrix, or a skew that is not zero and not to be ignored; a column (n, 1) of
-                coefficients beside a batch of matrices.
+                coefficients beside a batch of matrices; 5, 8, 12 or 14 coefficients, which are those of OpenCV's
+                calibrateCamera, for a fisheye.
         """
         K = as_real(K, "K", cls.__name__)  # noqa: N806
         if K.shape[-2:] != (3, 3):
@@ -243,6 +250,13 @@ class Camera(BatchedModule):
             raise ValueError(
                 f"{cls.__name__}: distortion {tuple(distortion.shape)} beside K {tuple(K.shape)} leaves a doubt"
                 + cls._column_hint(distortion)
+            )
+        count = distortion.shape[-1] if distortion.ndim else 0
+        if count in _OF_CALIBRATE_CAMERA and (cls.names_of(count) or ())[:3] == ("k1", "k2", "k3"):
+            raise ValueError(
+                f"{cls.__name__}: distortion has {count} coefficients, as those of OpenCV's calibrateCamera, k1 k2 p1 "
+                f"p2 k3 ..., which are a BrownConrady's; those of its fisheye are 4. {cls.__name__}(intrinsics, "
+                "distortion) takes any number of k1 k2 k3 ..."
             )
         return cls(intrinsics, distortion, image_size=image_size)
 
@@ -384,6 +398,10 @@ class Camera(BatchedModule):
     def defined(k: Sequence[Tensor]) -> Tensor | None:
         """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
         return None
+
+    def _model_name(self) -> str:
+        # a class that adds methods alone is of the model that it is made from
+        return next(cls.__name__ for cls in type(self).__mro__ if "optics" in cls.__dict__)
 
     @classmethod
     def counts_text(cls) -> str:
@@ -974,6 +992,33 @@ def _is_plain(inputs: Sequence[Tensor]) -> bool:
 def _is_given(values: Tensor) -> bool:
     """Whether the values may be looked at, and bad ones are refused."""
     return is_concrete(values) and not is_predicted(values)
+
+
+def _warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
+    """Warn of numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
+    fx, fy, cx, cy = intrinsics.unbind(-1)
+    if bool((_off_centre(cx, cy, size) <= _CENTRED).any()):
+        return
+    said = f"{owner}: the principal point of fx, fy, cx, cy = {intrinsics.flatten()[:4].tolist()} "
+    cut_out = "A camera whose image was cut out of another one comes from camera.crop"
+    if bool((_off_centre(cx, cy, size[::-1]) <= _CENTRED).all()):
+        warnings.warn(
+            f"{said}is the middle of an image of {size[::-1]}, not of image_size={size}, which is (height, width), as "
+            f"image.shape, and not OpenCV's (width, height). {cut_out}",
+            stacklevel=3,
+        )
+    elif bool(((_off_centre(fy, cy, size) <= _CENTRED) & ((fx - cx).abs() <= _CENTRED * fx)).all()):
+        warnings.warn(
+            f"{said}is far from the middle of images of {size}, which it would be if they were fx, cx, fy, cy. Both "
+            f"focal lengths come first. {cut_out}",
+            stacklevel=3,
+        )
+
+
+def _off_centre(cx: Tensor, cy: Tensor, size: tuple[int, int]) -> Tensor:
+    """How far a point is from the middle of an image, the larger one of the parts of its height and width."""
+    across, down = ((c - (side - 1) / 2).abs() / side for c, side in zip((cx, cy), size[::-1], strict=True))
+    return torch.maximum(across, down)
 
 
 def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, int], tuple[int, int, int]], ...]:

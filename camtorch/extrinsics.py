@@ -16,6 +16,7 @@ from camtorch._arguments import (
     as_vectors,
     broadcast_shapes,
     check_devices,
+    check_radians,
     columns,
 )
 from camtorch._module import BatchedModule, typed_as
@@ -40,7 +41,8 @@ class Extrinsics(BatchedModule):
     zero rotation as well.
 
     Raises:
-        ValueError: another shape, matrices that are no rotations, batch dims that do not fit, NaN or infinite values.
+        ValueError: another shape, plain rotation vectors of more than two turns, which seem to be degrees, matrices
+            that are no rotations, batch dims that do not fit, NaN or infinite values.
         TypeError: values that are not numbers.
     """
 
@@ -56,6 +58,7 @@ class Extrinsics(BatchedModule):
         rotation = as_vectors(rotation, "rotation", "Extrinsics")
         if undecided and _are_matrices(rotation, translation):
             rotation = rotation_vector(rotation)
+        check_radians(rotation, "rotation", "Extrinsics")
         shape = (*as_batch("Extrinsics", rotation=rotation.shape, translation=translation.shape), 3)
         self.hold("rotation", rotation, shape)
         self.hold("translation", translation, shape)
@@ -125,7 +128,9 @@ class Extrinsics(BatchedModule):
 
     def inverse(self) -> Extrinsics:
         """World from camera."""
-        return Extrinsics(-self.rotation.unsqueeze(-1), self.position).freeze_like(self)
+        # what learnt may be of any length
+        rotation = -self.rotation.expand(*self.batch_shape, 3)
+        return self.with_tensors(rotation=rotation, translation=self.position).freeze_like(self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""

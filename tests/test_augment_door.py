@@ -172,7 +172,11 @@ def test_labels_that_are_no_numbers_are_invalid_and_finite(camera):
 
 
 def test_the_sample_that_is_given_stays_as_it_is(camera):
-    batch = {"keypoints": torch.rand(2, 5, 2), "boxes": torch.rand(2, 1, 4), "head_pose": torch.eye(4).repeat(2, 1, 1)}
+    batch = {
+        "keypoints": torch.rand(2, 5, 2),
+        "boxes": torch.rand(2, 1, 4).sort().values,
+        "head_pose": torch.eye(4).repeat(2, 1, 1),
+    }
     before = {name: value.clone() for name, value in batch.items()}
     RandomMount(camera=camera)(batch)
     assert batch.keys() == before.keys()
@@ -193,3 +197,34 @@ def test_outlines_follow_what_a_box_cannot(camera):
         outlines(torch.zeros(3))
     with pytest.raises(ValueError, match="samples must be at least 1; got 0"):
         outlines(box, 0)
+
+
+@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("boxes", [[5.0, 5.0, 9.0, 9.0], [20.0, 15.0, 8.0, 6.0]], r"boxes.*xyxy.*\[20.0, 15.0, 8.0, 6.0\].*x \+ width"),
+        ("head_pose", torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])).tolist(), "head_pose.*rotation.*det R = .-1.0"),
+        ("head_pose", (2 * torch.eye(4)).tolist(), "head_pose must hold rotation matrices"),
+        ("pitch_yaw", [10.0, -20.0], "pitch_yaw must be radians.*got 10, -20.*deg2rad"),
+        ("rvec", [0.0, 90.0, 0.0], "rvec.*radians; an angle of 90 seems to be degrees"),
+    ],
+)
+def test_labels_in_another_form_are_refused_by_their_name(camera, field, value, said, listed):
+    value = torch.tensor(value)
+    sample = {field: [value, value] if listed else value}
+    with pytest.raises(
+        ValueError, match=said.replace(field, rf"{field}\[0\]", 1) if listed else f"RandomMount: {said}"
+    ):
+        RandomMount(yaw=5, camera=camera)(sample)
+
+
+def test_labels_that_are_missing_or_just_within_are_taken(camera):
+    sample = {
+        "boxes": torch.tensor([[3.0, 3.0, 3.0, 3.0], [math.nan] * 4, [-1.0] * 4]),
+        "pitch_yaw": torch.tensor([math.pi / 2, -math.pi]).bfloat16(),
+        "head_pose": ct.Extrinsics([0.3, -0.2, 0.5], [0.0, 0.0, 1.0]).matrix().detach().bfloat16(),
+        "rvec": torch.tensor([0.0, 2 * math.pi, 0.0]),
+    }
+    RandomMount(yaw=5, camera=camera)(sample)
+    RandomMount(yaw=5, camera=camera)(head_pose=torch.full((4, 4), math.nan))

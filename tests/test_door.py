@@ -235,6 +235,48 @@ def test_what_is_no_flag(no):
         ct.augment.HorizontalFlip(same_on_batch=no)
 
 
+@pytest.mark.parametrize("count", [5, 8, 12, 14])
+@pytest.mark.parametrize("model", [ct.KannalaBrandt, ct.Equisolid])
+def test_a_fisheye_takes_no_coefficients_of_calibrate_camera_beside_a_matrix(model, count):
+    for D in (np.zeros((1, count)), np.zeros(count), np.zeros((2, 1, count))):  # noqa: N806
+        K = np.eye(3) if D.ndim < 3 else np.stack([np.eye(3)] * 2)  # noqa: N806
+        with refuses(ValueError, f"{count} coefficients", "calibrateCamera", "BrownConrady"):
+            model.from_matrix(K, D)
+        assert ct.BrownConrady.from_matrix(K, D).distortion.shape[-1] == count
+    assert model(np.ones(4), np.zeros(count)).distortion.shape == (count,)
+    assert model.from_matrix(np.eye(3), np.zeros(6)).distortion.shape == (6,)
+
+
+WIDE, SWAPPED = (480, 640), (640, 480)
+as_passed = pytest.mark.parametrize("as_passed", [list, np.array, torch.tensor, lambda v: torch.tensor([v, v])])
+
+
+@as_passed
+def test_a_size_and_numbers_in_another_order_are_told(as_passed):
+    good = [500.0, 501.0, 315.0, 243.0]
+    ct.Pinhole(as_passed(good), image_size=WIDE)
+    with pytest.warns(UserWarning, match=r"image_size=\(640, 480\), which is \(height, width\).*camera.crop"):
+        ct.Pinhole(as_passed(good), image_size=SWAPPED)
+    with pytest.warns(UserWarning, match=r"fx, cx, fy, cy. Both focal lengths come first"):
+        ct.KannalaBrandt(as_passed([500.0, 315.0, 501.0, 243.0]), image_size=WIDE)
+
+
+def test_what_is_off_centre_for_a_reason_is_not_warned_of(tmp_path):
+    camera = ct.Pinhole([500.0, 500.0, 319.5, 239.5], image_size=WIDE)
+    portrait = camera.crop(0, 0, 640, 480)  # whose centre is where that of the whole image is
+    ct.save(portrait, tmp_path / "camera.json")
+    kept = [ct.load(tmp_path / "camera.json").camera, portrait.convert(ct.BrownConrady).camera, camera.rot90().rot90()]
+    ct.save(portrait, tmp_path / "camera.yml", format="opencv")
+    kept += [ct.load(tmp_path / "camera.yml").camera, portrait.hflip()]
+    assert kept[0].image_size == (640, 480)
+    ct.augment.RandomMount(yaw=(1, 1), camera=portrait)(image=torch.zeros(3, 640, 480))
+    ct.Dewarp(portrait)
+    for numbers in ([500.0, 501.0, 700.0, 239.5], [500.0, 250.0, 319.5, 239.5], [800.0, 400.0, 10.0, 479.0]):
+        ct.Pinhole(numbers, image_size=WIDE)
+    ct.Pinhole(torch.tensor([500.0, 500.0, 319.5, 239.5], requires_grad=True), image_size=SWAPPED)
+    ct.Pinhole([500.0, 500.0, 255.0, 240.0], image_size=(512, 480))
+
+
 class Options(UserList):
     """A list of files of options, which is none of Python's."""
 

@@ -150,3 +150,21 @@ def test_what_comes_of_a_frozen_pose_is_frozen():
     for derived in (frozen.position, *frozen.inverse().parameters(), *frozen.compose(frozen).parameters()):
         assert not derived.requires_grad
     assert pose(ROTATIONS["some"]).position.requires_grad
+
+
+def test_degrees_are_refused_and_what_learnt_is_not(tmp_path):
+    for degrees in ([0, 90, 0], torch.tensor([[0.1, 0.2, 0.3], [0.0, -30.0, 0.0]]), [[[0.0], [45.0], [0.0]]]):
+        with pytest.raises(
+            ValueError, match=r"Extrinsics: rotation holds.*radians; an angle of .* seems to be degrees"
+        ):
+            ct.Extrinsics(degrees, [0.0, 0.0, 0.0])
+    ct.Extrinsics([0.0, 2 * math.pi, 0.0], [0.0, 0.0, 0.0])
+    pose = ct.Extrinsics([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
+    with torch.no_grad():
+        pose.rotation += 20
+    for one in (pose, copy.deepcopy(pose).requires_grad_(False)):
+        torch.testing.assert_close(one.inverse().matrix() @ one.matrix(), torch.eye(4), atol=1e-5, rtol=0)
+        assert one.inverse().rotation.requires_grad == one.rotation.requires_grad
+        one.compose(one)
+    ct.save(ct.Rig({"a": ct.Pinhole.from_fov(90, image_size=(48, 64))}, {"a": pose}), tmp_path / "rig.json")
+    assert torch.equal(ct.load(tmp_path / "rig.json").extrinsics["a"].rotation, pose.rotation.double())

@@ -175,6 +175,37 @@ def test_copies_of_a_predicted_camera_have_the_values(key):
         assert_same(again.project(fan(40)), camera.project(fan(40)))
 
 
+def test_a_state_knows_its_model(tmp_path):
+    numbers, lens = [300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0]
+    mine, other = (kind(numbers, lens, image_size=(480, 640)) for kind in (ct.KannalaBrandt, ct.BrownConrady))
+    heads = [ct.CameraHead(4, kind, image_size=(480, 640), count=4) for kind in (ct.KannalaBrandt, ct.BrownConrady)]
+    pairs = [
+        (mine, other),
+        (nn.Sequential(mine), nn.Sequential(other)),
+        (ct.Mixed([mine, other]), ct.Mixed([other, mine])),
+        (ct.Warp(mine, ct.Pinhole(numbers, image_size=(480, 640))), ct.Warp(other, mine)),
+        (nn.DataParallel(mine), nn.DataParallel(other)),
+        heads,
+    ]
+    for source, target in pairs:
+        torch.save(source.state_dict(), tmp_path / "state.pt")
+        for state in (copy.deepcopy(source.state_dict()), torch.load(tmp_path / "state.pt", weights_only=True)):
+            assert copy.deepcopy(source).load_state_dict(state)
+            before = copy.deepcopy(target.state_dict())
+            with pytest.raises(RuntimeError, match=r"is of KannalaBrandt, and the module of BrownConrady"):
+                target.load_state_dict(state, strict=False)
+            if target is other:
+                assert torch.equal(other.distortion, before["distortion"])
+    other.load_state_dict(dict(mine.state_dict()))  # of safetensors, and of 0.2.0, which do not say
+    assert torch.equal(other.distortion, mine.distortion)
+
+    class Named(ct.KannalaBrandt):
+        pass
+
+    Named(numbers, lens).load_state_dict(mine.state_dict())
+    assert set(mine.state_dict()) == {"intrinsics", "distortion"}
+
+
 @every_model
 def test_state_dict_is_strict(key):
     camera = spread(key)

@@ -112,13 +112,20 @@ def test_boxes_with_their_corners_out_of_order_are_invalid():
     boxes = torch.tensor([[30.0, 20.0, 8.0, 25.0], [3.0, 20.0, 8.0, 5.0], [30.0, 20.0, 8.0, 5.0]])
     fine = torch.tensor([[3.0, 5.0, 3.0, 9.0], [3.0, 5.0, 8.0, 5.0], [3.0, 5.0, 3.0, 5.0], [3.0, 5.0, 8.0, 9.0]])
     camera = ct.Pinhole([30.0, 30.0, 19.5, 14.5], image_size=(30, 40))
-    moved, valid = ct.Warp(camera, camera).transform_boxes(torch.cat((boxes, fine)))
+    with pytest.raises(ValueError, match=r"Warp: boxes must be x1, y1, x2, y2.*boxes\[0\] = \[30.*x \+ width"):
+        ct.Warp(camera, camera).transform_boxes(torch.cat((boxes, fine)))
+    with torch.no_grad():  # a network's may be bad
+        moved, valid = ct.Warp(camera, camera).transform_boxes(torch.cat((boxes, fine)))
     assert valid.tolist() == [False] * 3 + [True] * 4
     assert (moved[:3] == -1).all()
     torch.testing.assert_close(moved[3:], fine)
     for p in (0.0, 1.0):
         augmentation = ct.augment.RandomMount(yaw=(0, 0), pitch=(0, 0), roll=(0, 0), p=p, camera=camera)
-        assert torch.equal(augmentation(boxes=torch.cat((boxes, fine)))["boxes_valid"], valid)
+        with pytest.raises(ValueError, match=r"boxes\[0\] = \[30.*x \+ width"):
+            augmentation(boxes=torch.cat((boxes, fine)))
+        assert augmentation(boxes=fine)["boxes_valid"].all()
+        with torch.no_grad():
+            assert torch.equal(augmentation.inverse(boxes=torch.cat((boxes, fine)))["boxes_valid"], valid)
 
 
 def test_boxes_off_the_image_keep_their_place_and_say_so():

@@ -510,7 +510,7 @@ class Augmentation(SampleTransform):
                 "the sample is of another call, whose draw= and the camera= before it are wanted"
             )
         change = change.inverse()
-        named, batched, count, _ = self._batch({**sample, "camera": change.source})
+        named, batched, count, _ = self._batch({**sample, "camera": change.source}, predicted=True)
         if count != change.count:
             raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
         return self._moved(sample, named, batched, change)

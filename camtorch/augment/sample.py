@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar, cast
@@ -12,12 +13,22 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch._arguments import GUESS_CAMERA, as_coordinates, as_flag, as_mapping, as_number, no_camera
+from camtorch._arguments import (
+    GUESS_CAMERA,
+    as_coordinates,
+    as_flag,
+    as_mapping,
+    as_number,
+    check_boxes,
+    check_radians,
+    no_camera,
+)
+from camtorch._tracing import may_look
 from camtorch.augment.change import Change, alone, copied, on_device, singles
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
-from camtorch.rotations import rotation_matrix, rotation_vector
+from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -123,6 +134,7 @@ def _rotation(change: Change, rotation: Tensor, options: Mapping[str, float]) ->
 
 
 _MANY = 16
+_ROUNDING = 0.01
 _RAYS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays)
 _POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose)
 KINDS = {
@@ -226,6 +238,28 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
     if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
         raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
+
+
+def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
+    """Raise a ValueError for plain labels in another form than that of their kind; what is NaN is in none."""
+    if kind == "boxes":
+        check_boxes(value, name, owner)
+    elif kind == "rvec":
+        check_radians(value, name, owner)
+    elif kind in ("head_pose", "pose") and may_look(value) and not value.requires_grad:
+        rotations = value[..., :3, :3]
+        wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
+        if bool(wrong.any()):
+            check_rotation(rotations[wrong][:1], name, owner)
+    elif kind == "pitch_yaw" and may_look(value) and not value.requires_grad:
+        # with room for the rounding of half precision
+        beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * (1 + _ROUNDING)
+        if bool(beyond.any()):
+            pitch, yaw = value[beyond.any(-1)][0].tolist()
+            raise ValueError(
+                f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "
+                "Degrees are converted by torch.deg2rad() or math.radians()"
+            )
 
 
 def is_batch(named: Named, camera: object) -> bool:
@@ -341,8 +375,11 @@ class SampleTransform(nn.Module):
                 named[name] = (found, value)
         return named
 
-    def _batch(self, sample: Sample) -> tuple[Named, bool, int, Camera | list[Camera]]:
-        """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras."""
+    def _batch(self, sample: Sample, predicted: bool = False) -> tuple[Named, bool, int, Camera | list[Camera]]:
+        """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras.
+
+        predicted: whether it may hold what networks made, whose values may be bad.
+        """
         camera: Any = sample.get("camera")
         camera = self.camera if camera is None else camera
         named = self._sorted(sample)
@@ -356,9 +393,13 @@ class SampleTransform(nn.Module):
                 items = [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
                 for i, item in enumerate(items):
                     check(found, f"{name}[{i}]", item, False, self._name)
+                    if not predicted:
+                        check_values(found, f"{name}[{i}]", item, self._name)
                 value = items
             else:
                 check(found, name, value, batched, self._name)
+                if not predicted:
+                    check_values(found, name, value, self._name)
                 value = value if batched else value.unsqueeze(0)
             named[name], counts[name] = (found, value), len(value)
             count = next(iter(counts.values()))

@@ -95,6 +95,7 @@ def convert(
     def build(parameters: Tensor) -> CameraT:
         intrinsics, distortion = parameters[..., :4], parameters[..., 4:]
         # models without coefficients take no argument for them
+        intrinsics = nn.Parameter(intrinsics.clone())
         arguments = (intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)
         return model(*arguments, image_size=image_size, **options).double()
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch._arguments import broadcast_shapes
 from camtorch.camera import Camera
@@ -46,11 +46,17 @@ def parse(record: Record) -> Rig:
         _same_batch(entry, rotation, translation)
         for key, values in (("rotation", rotation), ("translation", translation)):
             poses.check_near(entry[key], values.flatten().tolist())
-        extrinsics[name] = rotation[..., None], translation  # columns are no matrices
+        extrinsics[name] = rotation, translation
     if extrinsics and extrinsics.keys() == images.keys() and all(t.ndim == 1 for _, t in extrinsics.values()):
-        batch = Extrinsics(*map(torch.stack, zip(*extrinsics.values(), strict=True)))
+        batch = _pose(*map(torch.stack, zip(*extrinsics.values(), strict=True)))
         return Rig(cameras, (list(extrinsics), batch), images=images)
-    return Rig(cameras, {name: Extrinsics(*vectors) for name, vectors in extrinsics.items()}, images=images)
+    return Rig(cameras, {name: _pose(*vectors) for name, vectors in extrinsics.items()}, images=images)
+
+
+def _pose(rotation: Tensor, translation: Tensor) -> Extrinsics:
+    """Of vectors that are no matrices, and of any length, as they learnt."""
+    pose = Extrinsics(torch.zeros_like(rotation[..., None]), translation)
+    return pose.with_tensors(rotation=rotation.expand(pose.rotation.shape), translation=pose.translation)
 
 
 def _camera(record: Record) -> Camera:
@@ -68,7 +74,7 @@ def _camera(record: Record) -> Camera:
         size = (height, width)
     _same_batch(record, *arguments)
     try:
-        return kind(*arguments, image_size=size)
+        return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # what was cut out may be off centre
     except (ValueError, TypeError) as error:
         return record.fail(error)
 

@@ -25,10 +25,13 @@ def pose(record: Record, rotation: Vector, translation: Vector) -> Extrinsics:
     """Extrinsics in float64.
 
     Raises:
-        CameraFileError: numbers too large to compute with.
+        CameraFileError: numbers too large to compute with, a rotation in degrees.
     """
     check_near(record, (*rotation, *translation))
-    return Extrinsics(*(torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation)))
+    try:
+        return Extrinsics(*(torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation)))
+    except ValueError as error:
+        return record.fail(error)
 
 
 def check_near(record: Record, values: Vector) -> None:

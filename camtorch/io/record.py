@@ -10,6 +10,7 @@ from itertools import islice
 from typing import Any, NoReturn
 
 import torch
+from torch import nn
 
 from camtorch.camera import Camera
 from camtorch.io._errors import CameraFileError
@@ -179,7 +180,7 @@ class Record:
                 )
             arguments.append(torch.tensor(distortion, dtype=torch.float64))
         try:
-            return kind(*arguments, image_size=size)
+            return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # cut out, it may be off centre
         except CameraFileError:
             raise
         except (ValueError, TypeError) as error:

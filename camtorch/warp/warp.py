@@ -11,7 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, broadcast_shapes, check_devices, no_camera
+from camtorch._arguments import (
+    Numbers,
+    as_coordinates,
+    as_values,
+    as_whole,
+    broadcast_shapes,
+    check_boxes,
+    check_devices,
+    is_predicted,
+    no_camera,
+)
 from camtorch._module import GeometryModule, Memo, is_constant, typed_as, with_values
 from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, may_look, set_aside
 from camtorch.camera import Camera
@@ -461,12 +471,18 @@ class Warp(GeometryModule):
             outline only a part of which can be mapped, the box encloses that part and what the image shows of the
             inside, found in steps of a sixteenth of the image. Without either, or with x2 < x1 or y2 < y1, it is
             (-1, -1, -1, -1).
+
+        Raises:
+            ValueError: x2 < x1 or y2 < y1 in plain boxes, which seem to be x, y, width, height; not in those that a
+                network predicted, in a graph or under `torch.no_grad`.
         """
         boxes = as_values(boxes, "boxes", "Warp", self.source.intrinsics.device)
         if boxes.ndim == 0 or boxes.shape[-1] != 4:
             raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
         if not boxes.is_floating_point():
             boxes = boxes.to(self.source.intrinsics.dtype)
+        if not is_predicted(boxes):
+            check_boxes(boxes, "boxes", "Warp")
         enclosing, valid = self.enclose(corners_of(boxes))
         ordered = in_order(boxes)
         return torch.where(ordered.unsqueeze(-1), enclosing, -1.0), valid & ordered
