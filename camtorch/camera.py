@@ -53,7 +53,8 @@ MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
-_CENTRED = 0.1  # of the image's sides: how far from its middle principal points usually lie
+_CENTRED, _NEAR = 0.1, 0.05
+"""Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
 
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 
@@ -256,7 +257,7 @@ class Camera(BatchedModule):
             raise ValueError(
                 f"{cls.__name__}: distortion has {count} coefficients, as those of OpenCV's calibrateCamera, k1 k2 p1 "
                 f"p2 k3 ..., which are a BrownConrady's; those of its fisheye are 4. {cls.__name__}(intrinsics, "
-                "distortion) takes any number of k1 k2 k3 ..."
+                "distortion) takes any number"
             )
         return cls(intrinsics, distortion, image_size=image_size)
 
@@ -999,20 +1000,24 @@ def _warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> Non
     fx, fy, cx, cy = intrinsics.unbind(-1)
     if bool((_off_centre(cx, cy, size) <= _CENTRED).any()):
         return
-    said = f"{owner}: the principal point of fx, fy, cx, cy = {intrinsics.flatten()[:4].tolist()} "
-    cut_out = "A camera whose image was cut out of another one comes from camera.crop"
-    if bool((_off_centre(cx, cy, size[::-1]) <= _CENTRED).all()):
+    given = f"fx, fy, cx, cy = {intrinsics.flatten()[:4].tolist()}"
+    cut_out = "The camera of a part of an image comes from camera.crop"
+    if bool((_off_centre(cx, cy, size[::-1]) <= _NEAR).all()):
         warnings.warn(
-            f"{said}is the middle of an image of {size[::-1]}, not of image_size={size}, which is (height, width), as "
-            f"image.shape, and not OpenCV's (width, height). {cut_out}",
+            f"{owner}: image_size={size} is (height, width), as image.shape, and the principal point of {given} is the "
+            f"middle of {size[::-1]}. OpenCV's (width, height) goes in turned round. {cut_out}",
             stacklevel=3,
         )
-    elif bool(((_off_centre(fy, cy, size) <= _CENTRED) & ((fx - cx).abs() <= _CENTRED * fx)).all()):
+    elif bool(((_off_centre(fy, cy, size) <= _NEAR) & (_apart(fx, cx) <= _NEAR) & (_apart(fx, fy) > _CENTRED)).all()):
         warnings.warn(
-            f"{said}is far from the middle of images of {size}, which it would be if they were fx, cx, fy, cy. Both "
-            f"focal lengths come first. {cut_out}",
+            f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
+            f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
             stacklevel=3,
         )
+
+
+def _apart(a: Tensor, b: Tensor) -> Tensor:
+    return (b - a).abs() / a
 
 
 def _off_centre(cx: Tensor, cy: Tensor, size: tuple[int, int]) -> Tensor:

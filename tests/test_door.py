@@ -255,9 +255,9 @@ as_passed = pytest.mark.parametrize("as_passed", [list, np.array, torch.tensor, 
 def test_a_size_and_numbers_in_another_order_are_told(as_passed):
     good = [500.0, 501.0, 315.0, 243.0]
     ct.Pinhole(as_passed(good), image_size=WIDE)
-    with pytest.warns(UserWarning, match=r"image_size=\(640, 480\), which is \(height, width\).*camera.crop"):
+    with pytest.warns(UserWarning, match=r"image_size=\(640, 480\) is \(height, width\).*camera.crop"):
         ct.Pinhole(as_passed(good), image_size=SWAPPED)
-    with pytest.warns(UserWarning, match=r"fx, cx, fy, cy. Both focal lengths come first"):
+    with pytest.warns(UserWarning, match=r"fx, cx, fy, cy; both focal lengths come first"):
         ct.KannalaBrandt(as_passed([500.0, 315.0, 501.0, 243.0]), image_size=WIDE)
 
 

@@ -71,7 +71,7 @@ class Lens:
                 "lenses.search, is_optical says which"
             )
         made = KannalaBrandt(
-            torch.tensor(self.intrinsics, dtype=torch.float64),
+            torch.nn.Parameter(torch.tensor(self.intrinsics, dtype=torch.float64)),  # a few are off centre
             torch.tensor(self.distortion, dtype=torch.float64),
             image_size=self.image_size,
         )
