@@ -180,7 +180,8 @@ def test_all_numbers_make_finite_cameras_and_gradients(key, dtype):
     layer = head(key).to(dtype)
     count = 2000 if key in ("double_sphere", "mei") else 200
     ordinary = torch.randn(count, len(layer.names), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    large = [size * ordinary[:16].sign() for size in (1e3, 1e4, 1e5, 1e6, 1e9, 1e30)]
+    large = [size * ordinary[:128] for size in (1e4, 1e6)]
+    large += [size * ordinary[:16].sign() for size in (1e3, 1e4, 1e5, 1e6, 1e9, 1e30)]
     for part in torch.cat((ordinary, 10 * ordinary[:50], *large)).to(dtype).split(500):
         numbers = part.clone().requires_grad_()
         camera = layer.camera(numbers)

@@ -21,9 +21,10 @@ _NODES = 48  # of Chebyshev: what a polynomial of t = radius^2 is between them i
 _LEAST, _MOST = 0.05, 4.0  # the slope of a lens, and how far out it sends points, compared with the lens given
 _FLATTEST, _STEEPEST = 0.25, 20.0  # the same of charts: angle by radius
 _KEPT = 0.02  # of the way from the lens given to where a formula ends
-_AZIMUTHS = 32
+_AZIMUTHS = 360  # a shear near its end has its least in a narrow sector
 _AT_AXIS = 1e-6  # of the radius; further out a chart of a large xi or alpha may have no rays
 _FIRST, _LAST, _GRID = 1e-3, 1e3, 32
+_NEARER = 3
 _ROUNDS, _PARTS = 5, 8
 _STEP = 1e-6
 
@@ -154,7 +155,11 @@ class Limits:
     def _end(self, direction: Tensor, radius: Tensor, given: Profile) -> Planes2:
         """(C, 1): where the margin is lost first, and bool: whether it is."""
         share = torch.linspace(0, 1, _GRID, dtype=direction.dtype, device=direction.device)
-        times = (_FIRST * (_LAST / _FIRST) ** share).expand(len(direction), -1)
+        nearest = torch.full_like(direction[:, :1], _FIRST)
+        for _ in range(_NEARER):  # where a coefficient does next to nothing, 1 is far out in that of others
+            inside = self._at(nearest, direction, radius, given) > 0
+            nearest = torch.where(inside, nearest, nearest * (_FIRST / _LAST))
+        times = nearest * (_LAST / _FIRST) ** share
         low, ends = torch.zeros_like(times[:, :1]), None
         parts = torch.arange(1, _PARTS + 1, dtype=direction.dtype, device=direction.device) / _PARTS
         for _ in range(_ROUNDS):
