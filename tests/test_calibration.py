@@ -5,7 +5,8 @@ import math
 
 import pytest
 import torch
-from boards import STEREO, chessboard, opencv_left, ov_plane, stereo
+from boards import STEREO, chessboard, opencv_left, ov_plane, seen_by, stereo
+from cameras import KEYS, one, slow_unless
 from torch.testing import assert_close
 
 import camtorch as ct
@@ -231,6 +232,37 @@ def test_every_fisheye_model_starts_from_nothing(model, best):
     assert found.converged
     assert found.rms <= best
     assert calibrate(test, model=found.camera, fixed="all").rms <= 1.01 * best
+
+
+# their parameters can be exchanged for others: a turn about the axis of a panorama for its principal point
+FREE_TO_TURN = {"cylindrical", "equirectangular", "latlon", "transverse_cylindrical", "ocamcalib", "tabulated"}
+
+
+@pytest.mark.parametrize("form", ["float64", "float32", "float32 poses"])
+@pytest.mark.parametrize("key", slow_unless({"pinhole", "kannala_brandt", "equirectangular"}.__contains__, KEYS))
+def test_corners_without_noise_have_an_optimum(key, form):
+    """Whatever their last bits: where rounding hides what is left to gain, the search has ended."""
+    lens = one(key)
+    corners, rotations, translations = seen_by(lens, 10, columns=7, rows=6, square=0.03, seed=3)
+    pixels, dtype = corners.image_points, torch.float32 if form == "float32" else torch.float64
+    if form == "float32 poses":  # their rotations are none to the last digits, and no camera fits them exactly
+        points = corners.object_points @ rotations.float().double().mT + translations[:, None]
+        pixels = torch.where(pixels.isnan(), torch.nan, lens.project(points)[0].detach())
+    ulps = torch.randint(-2, 3, pixels.shape, generator=torch.Generator().manual_seed(0))
+    pixels = (pixels.to(dtype) * (1 + ulps * torch.finfo(dtype).eps)).to(dtype)
+    corners = corners._replace(image_points=pixels)
+    found = calibrate(corners, model=key, count=lens.distortion.shape[-1] or None)
+    assert found.converged
+    # four last bits, or what single precision does to a rotation
+    largest = float(pixels[~pixels.isnan()].abs().amax())
+    assert found.rms < 4 * torch.finfo(torch.float64 if form == "float64" else torch.float32).eps * largest + 1e-11
+    if key not in FREE_TO_TURN:
+        truth = torch.cat((lens.intrinsics, lens.distortion)).detach()
+        # no noise has a spread, and what float32 does to a rotation is the same for all corners of a view
+        precise = {"float64": 1e-9, "float32": 1e-9, "float32 poses": 2e-6}[form] * truth.abs().amax()
+        assert bool(((values(found) - truth).abs() <= precise + 6 * found.std).all())
+    said = " ".join(found.warnings)
+    assert not any(words in said for words in ("did not end", "pattern", "worse than", "outlier", "does not quite fit"))
 
 
 @slow

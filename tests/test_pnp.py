@@ -65,6 +65,19 @@ def test_exact_pixels_give_the_pose(fov, kind):
         torch.testing.assert_close(found[right, :3, 3], t[right], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["planar", "space"])
+def test_pixels_that_are_nearly_exact_have_an_optimum(kind):
+    """Where rounding hides what is left to gain, the search has ended."""
+    camera = lens(60).resize(9600, 12800)
+    target, _, _, pixels = scenes(lens(60), 60, 100, 10, kind)
+    target, pixels = target.repeat(13, 1, 1), (10 * pixels + 4.5).repeat(13, 1, 1)
+    noise = torch.logspace(-12, -6, 13, dtype=torch.float64).repeat_interleave(100)[:, None, None]
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(2)).double()
+    pose = ct.solve_pnp(camera, target, pixels)
+    assert pose.valid.all()
+    assert bool((pose.rms < 5 * noise[:, 0, 0] + 1e-9).all())
+
+
 def attempts(camera, fov, count, points, kind, noise, seed):
     """Whether noisy pixels are explained at least as well as by the true pose."""
     target, rotation, t, pixels = scenes(camera, fov, count, points, kind, seed)

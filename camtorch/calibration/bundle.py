@@ -16,7 +16,7 @@ from camtorch.camera import Camera, from_values
 from camtorch.convert.least_squares import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
-from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise
+from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
 from camtorch.rotations import rotation_matrix
 
 LOSSES = ("huber", "cauchy")
@@ -213,6 +213,7 @@ class Bundle:
     columns: tuple[tuple[int, int], ...]
     width: int
     unknowns: int
+    rounding: Tensor
     low: Tensor
     high: Tensor
     is_bounded: bool
@@ -225,6 +226,7 @@ class Bundle:
             for s in sights
         ]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
+        self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
         # a camera that does not learn, and is that of all problems, sees them in one row
         self.are_shared = [
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)

@@ -30,6 +30,7 @@ CANDIDATES: tuple[tuple[str, int], ...] = (
 )
 """Models that are tried, with their numbers of coefficients."""
 _FOLDS = 5
+_NOTHING = 1e-6  # px: errors up to here are rounding
 _WORSE = 0.01
 """The part by which an error may be larger without a reason to take more coefficients."""
 _MUCH_WORSE = 0.05
@@ -177,7 +178,7 @@ def _chosen(trials: list[Trial], fitted: list[Trial]) -> Selection:
     def as_good(trial: Trial) -> bool:
         more = trial.errors - least.errors
         noise = float(more.std()) / math.sqrt(len(more))
-        worse = trial.held_out / max(least.held_out, 1e-300) - 1
+        worse = trial.held_out / max(least.held_out, _NOTHING) - 1
         return worse <= _WORSE or (worse <= _MUCH_WORSE and float(more.mean()) <= noise)
 
     best = min(filter(as_good, fitted), key=lambda trial: trial.count)  # of as many the first, which is better known

@@ -108,6 +108,11 @@ class Survey:
         """(M, 2) all that were seen."""
         return self.calibration.observations.pixels[self.seen]
 
+    @property
+    def rounding(self) -> float:
+        """px: residuals up to here say nothing, for corners and poses often come in float32."""
+        return torch.finfo(torch.float32).eps * float(self.corners.abs().amax())
+
     @cached_property
     def points(self) -> Tensor:
         """(V, N, 3) those of the boards in the camera's frame."""
@@ -446,6 +451,8 @@ def _needless(survey: Survey) -> Iterator[str]:
 
 def _pattern(survey: Survey) -> Iterator[str]:
     calibration = survey.calibration
+    if calibration.rms <= survey.rounding:
+        return
     bend, more = survey.gains
     share = pattern_share(survey)
     least = max(_GAIN, (_CERTAIN * calibration.sigma) ** 2 / max(float(calibration.adjusted.cost[0]), 1e-300))
@@ -501,7 +508,7 @@ def _outliers(survey: Survey) -> Iterator[str]:
 def _bad_views(survey: Survey) -> Iterator[str]:
     rms = survey.view_rms
     usual = float(rms[~rms.isnan()].median())
-    (bad,) = (rms > max(_WORSE_VIEW * usual, 1e-9)).nonzero(as_tuple=True)
+    (bad,) = (rms > max(_WORSE_VIEW * usual, survey.rounding)).nonzero(as_tuple=True)
     if len(bad) and len(rms) >= _FEW_VIEWS:
         numbers = [str(survey.calibration.views[i]) for i in bad[:_NAMED].tolist()]
         rest = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""

@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch._arguments import columns
 from camtorch.least_squares.equations import Equations, System, padded
 from camtorch.least_squares.jacobians import SensorPoints, sensor_jacobians, to_sensor
-from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, minimise
+from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, minimise, rounding_of
 from camtorch.projection.rays import slopes_at_axis
 
 if TYPE_CHECKING:
@@ -145,6 +145,7 @@ class _Fit:
 
     def __init__(self, camera: Camera, observations: Observations, low: Tensor, high: Tensor):
         self.camera, self.observations, self.low, self.high = camera, observations, low, high
+        self.rounding = rounding_of(observations.pixels, observations.weights.square())
         (self.free,) = (low < high).any(0).nonzero(as_tuple=True)
 
     def cost(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:

@@ -26,6 +26,7 @@ class Equations(NamedTuple):
         return self.view[..., -1].square().sum((-1, -2)) + self.shared[:, :-1, -1].square().sum(-1)
 
 
+_NOTHING = 1e-20  # of the squares of a column: what rounding leaves of one that is a sum of others
 _FIRM = 1e-4  # of the largest singular value: what is less belongs to unknowns that the data hardly determine
 
 
@@ -37,6 +38,10 @@ class System:
 
     def __init__(self, equations: Equations, width: int, held: Tensor):
         self.width = width
+        if equations.shared.shape[-1] > 1:
+            # what the unknowns of the views do as well, as a turn about the axis of a panorama does, is left to them
+            own = equations.shared[:, :-1, :-1].square().sum(-2)
+            held = held | (own < _NOTHING * (own + equations.view[..., width:-1].square().sum((1, 2))))
         if bool(held.any()):
             keep = torch.nn.functional.pad(~held, (width, 1), value=True)
             equations = Equations(

@@ -37,6 +37,9 @@ class System(Protocol):
 class Problem(Protocol):
     """Sums of squares to be made small, B of them; rows (R,) says which of them are meant."""
 
+    rounding: Tensor
+    """(B,) the sums of squares of what rounding does to the residuals, see `rounding_of`."""
+
     def cost(self, state: State, rows: Tensor) -> Tensor:
         """(R,); infinite where a state cannot be."""
         ...
@@ -58,6 +61,19 @@ class Minimum(NamedTuple):
     converged: Tensor
 
 
+def rounding_of(pixels: Tensor, weights: Tensor) -> Tensor:
+    """(B,) the weighted sums of squares of the rounding of pixels: eps of the dtype times the largest coordinate.
+
+    The projections of all models are rounded by 0.2 to 0.4 of that, root mean square.
+
+    Args:
+        pixels: (B, ..., 2), those that residuals are to.
+        weights: (B, ...) of the squares, 0 where a pixel does not count.
+    """
+    largest = torch.where(weights > 0, pixels.abs().amax(-1), 0.0).flatten(1).amax(-1)
+    return (torch.finfo(pixels.dtype).eps * largest).square() * weights.flatten(1).sum(-1)
+
+
 def minimise(
     problem: Problem,
     state: State,
@@ -72,6 +88,9 @@ def minimise(
     """The states of least cost near those given.
 
     No problem depends on another: those that have settled are left alone, so that each goes the way it would go alone.
+
+    A step that promises less than rounding does to a cost cannot be judged by the cost: it is the last one, and taken
+    unless the cost grows by more than that.
 
     Args:
         problem: B of them.
@@ -105,9 +124,11 @@ def minimise(
         new = problem.moved(old, step, rows)
         after = problem.cost(new, rows)
         kept = (before - after) / promised.clamp(min=torch.finfo(cost.dtype).tiny)
-        # where nothing is left to gain, rounding decides which of the two is less
-        last = system.decrement <= tolerance[rows] * before
-        better = (after < before) | (last & (after <= before * (1 + 1e-12)))
+        # sum((r + d)^2) - sum(r^2) is at most this, for residuals r and their rounding d
+        rounding = 2 * (before * problem.rounding[rows]).sqrt() + problem.rounding[rows]
+        enough = torch.maximum(tolerance[rows] * before, rounding)
+        last = system.decrement <= enough
+        better = (after < before) | (last & (after <= before + torch.maximum(rounding, 1e-12 * before)))
         stuck = ~better & ((weight >= MOST_DAMPING) | last)
         for whole, part in zip(state, new, strict=True):
             whole[rows[better]] = part[better]
@@ -117,7 +138,7 @@ def minimise(
         growth[rows] = torch.where(better, 4.0, growth[rows] * 2).clamp(max=64.0)
         settled = last | (cost[rows] <= tiny[rows])
         if bool(stuck.any()):
-            settled = settled | stuck & (system.firm_decrement <= tolerance[rows] * before)
+            settled = settled | stuck & (system.firm_decrement <= enough)
         converged[rows] = settled
         going[rows] = ~(settled | stuck)
         if progress is not None:
