@@ -1,6 +1,8 @@
 """From photographs on the command line to a camera's file."""
 
 import json
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -194,6 +196,26 @@ def test_a_wrong_size_of_the_board_is_named(photographs, capsys):
     missed = ImageCorners(photographs / "view1.png", (480, 640), np.full((40, 2), np.nan), "no board found")
     with pytest.raises(ValueError, match=r"in 1 of 2 images.* shows one of 9x6 inner corners: --board 9x6"):
         searching.usable_views(replace(corners, images=[*corners.images, missed]))
+
+
+@pytest.mark.slow
+def test_the_size_that_is_named_calibrates(photographs, capsys):
+    """Of some photographs the board that was asked for would be found a part smaller, too: the whole is named."""
+    calibrate(photographs, "--board", "8x5", "-o", "camera.json", expect=2)
+    named = re.search(r"view\d.png and \d more show one of \d+x\d+ .* --board (\S+)$", capsys.readouterr().err.strip())
+    assert named[1] == "9x6"
+    calibrate(photographs, "--board", named[1], "--model", "kannala_brandt", "--fixed", "k3,k4", "-o", "camera.json")
+
+
+def test_what_a_report_needs_is_asked_before_the_work(capsys, monkeypatch):
+    write_corners(corners_of(), "corners.json")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    words = "--corners", "corners.json", "--report", "report.html", "-o", "camera.yml"
+    calibrate(*words, expect=2)
+    captured = capsys.readouterr()
+    assert "pip install 'camtorch[plot]'" in captured.err
+    assert captured.out == ""
+    assert sorted(path.name for path in Path().iterdir()) == ["corners.json"]
 
 
 def two_cameras(board):

@@ -1,5 +1,6 @@
 """From a video of a board to a camera's file, on the command line."""
 
+import sys
 from fractions import Fraction
 
 import cv2
@@ -56,6 +57,11 @@ def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatc
     monkeypatch.setattr(frames, "detect", None)
     assert main([*words, "-o", "again.yml"]) == 0
     assert (ct.load("again.yml").camera.intrinsics == ct.load("camera.yml").camera.intrinsics).all()
+    # but the frames are shown in a report, for which they are read before the work
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert main([*words, "--report", "report.html", "-o", "third.yml"]) == 2
+    assert "pip install 'camtorch[video]'" in capsys.readouterr().err
+    assert not (tmp_path / "third.yml").exists()
 
 
 def test_frames_are_read_for_the_report(filmed):

@@ -75,6 +75,21 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
     return Detection(pixels)
 
 
+def largest_chessboard(image: NDArray[Any]) -> Chessboard | None:
+    """The largest chessboard that an image shows, its longer side first, whatever its number of corners.
+
+    Of a board that is hard to see it may be a part: `detect` says whether it is found by that size.
+
+    Args:
+        image: as `detect` takes it.
+    """
+    cv2 = opencv("finding boards in images")
+    least = (Chessboard.least, Chessboard.least)
+    flags = _flags(cv2) | cv2.CALIB_CB_LARGER
+    found, _, corners = cv2.findChessboardCornersSBWithMeta(_shrunk(cv2, _as_grey8(image)), least, flags)
+    return Chessboard(max(corners.shape), min(corners.shape)) if found else None
+
+
 def _as_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Of deep images the range that they use."""
     if image.dtype == np.uint8:
@@ -89,13 +104,8 @@ def _as_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _chessboard(cv2: Any, board: Chessboard, grey: NDArray[np.uint8]) -> Pixels | None:
-    size, shrunk = (board.columns, board.rows), math.sqrt(grey.size / _PIXELS)
-    small = grey
-    if shrunk > 1:
-        height, width = (round(side / shrunk) for side in grey.shape)
-        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(small, size, flags=flags)
+    size, small = (board.columns, board.rows), _shrunk(cv2, grey)
+    found, corners = cv2.findChessboardCornersSB(small, size, flags=_flags(cv2))
     if not found:  # of blurred or unevenly lit boards the older method finds some
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
         found, corners = cv2.findChessboardCorners(small, size, flags=flags)
@@ -104,6 +114,21 @@ def _chessboard(cv2: Any, board: Chessboard, grey: NDArray[np.uint8]) -> Pixels 
     scale = np.array([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
     pixels = (corners.reshape(-1, 2).astype(np.float64) + 0.5) * scale - 0.5
     return _moved_by_gradients(cv2, board, grey, _ordered(board, grey, pixels))
+
+
+def _flags(cv2: Any) -> int:
+    flags: int = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    return flags
+
+
+def _shrunk(cv2: Any, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image that chessboards are searched for in."""
+    shrunk = math.sqrt(grey.size / _PIXELS)
+    if shrunk <= 1:
+        return grey
+    height, width = (round(side / shrunk) for side in grey.shape)
+    small: np.ndarray = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    return small
 
 
 def _moved_by_gradients(cv2: Any, board: Chessboard, grey: NDArray[np.uint8], pixels: Pixels) -> Pixels:

@@ -88,6 +88,10 @@ def run(arguments: argparse.Namespace) -> None:
             targets.check(path, force=arguments.force, inputs=given if path.exists() else ())
     if arguments.corners is not None and not arguments.corners.exists():
         targets.check(arguments.corners, force=False)
+    if arguments.report is not None:
+        from camtorch.plot.axes import require_matplotlib
+
+        require_matplotlib()
     format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
     board = read_board(arguments, 1.0) if arguments.board is not None else None
     corners = found_corners(
@@ -104,6 +108,7 @@ def run(arguments: argparse.Namespace) -> None:
     views, size_of = usable_views(corners)
     words = "its points" if corners.board is None else corners.board.words(unit)
     _tell_found(words, views, corners.images, size_of)
+    photographs = _photographs(views) if arguments.report is not None else {}
     found: Calibration | RigCalibration
     if list(size_of) == [""]:
         found = _calibrated(arguments, corners.points, views, size_of[""], candidates)
@@ -113,7 +118,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.bend:
         across, down = (f"{1000 * bend:.3g} mm" if unit == "m" else f"{bend:.3g}" for bend in found.bend)
         print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
-    _write(arguments, found, views, format)
+    _write(arguments, found, views, photographs, format)
 
 
 def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
@@ -381,8 +386,20 @@ def _tell_mounts(found: RigCalibration, unit: str) -> None:
     print(f"rig: rms {found.rms:.4g} px per point, sigma {found.sigma:.4g} px per coordinate, {len(found.views)} views")
 
 
+def _photographs(views: Views) -> dict[Path, Path | NDArray[np.uint8]]:
+    """What a report shows of the views: by the path of each that is there, its file, or the frame of a video."""
+    from camtorch.cli import frames
+
+    paths = [image.path for of_view in views.values() for image in of_view.values()]
+    return {**{path: path for path in paths if path.exists()}, **frames.read(paths)}
+
+
 def _write(
-    arguments: argparse.Namespace, found: Calibration | RigCalibration, views: Views, format: str | None
+    arguments: argparse.Namespace,
+    found: Calibration | RigCalibration,
+    views: Views,
+    photographs: Mapping[Path, Path | NDArray[np.uint8]],
+    format: str | None,
 ) -> None:
     from camtorch.calibration.rig import RigCalibration
     from camtorch.io import formats
@@ -394,19 +411,12 @@ def _write(
     if arguments.report is None:
         return
     from camtorch.calibration.report import write_report
-    from camtorch.cli import frames
 
     arguments.report.parent.mkdir(parents=True, exist_ok=True)
 
-    paths = [image.path for of_view in views.values() for image in of_view.values()]
-    there: dict[Path, Path | NDArray[np.uint8]] = {
-        **{path: path for path in paths if path.exists()},
-        **frames.read(paths),
-    }
-
     def images_of(name: str) -> list[Path | NDArray[np.uint8] | None]:
         images = (of_view.get(name) for of_view in views.values())
-        return [None if image is None else there.get(image.path) for image in images]
+        return [None if image is None else photographs.get(image.path) for image in images]
 
     def names_of(name: str) -> list[str]:
         return [of_view[name].path.name if name in of_view else view for view, of_view in views.items()]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from camtorch.calibration.boards import Board, Chessboard
 from camtorch.calibration.corners import Corners, ImageCorners, read_corners, write_corners
-from camtorch.calibration.detection import NOT_FOUND, detect
+from camtorch.calibration.detection import NOT_FOUND, detect, largest_chessboard
 from camtorch.cli import frames, images, videos
 from camtorch.cli.gathering import together
 from camtorch.cli.terminal import note, progress
@@ -200,12 +200,14 @@ def _advice(corners: Corners) -> str:
     if not isinstance(board, Chessboard):
         return ""
     unseen = [image for image in corners.images if image.image_size and not image.seen and image.path.exists()]
-    searched = unseen[:_TRIED_ANEW]
-    for more in (-1, 1):
-        columns, rows = board.columns + more, board.rows + more
-        if min(columns, rows) < Chessboard.least or (some and more < 0):  # a smaller one may be a part of this one
+    greys = {image.path: read_grey(image.path) for image in unseen[:_TRIED_ANEW]}
+    sizes = Counter(filter(None, map(largest_chessboard, greys.values())))
+    # of one image that shows a part of the board, another one shows the whole
+    for other, _ in sorted(sizes.items(), key=lambda size: (size[1], size[0].columns * size[0].rows), reverse=True):
+        showing = [path for path, grey in greys.items() if not detect(other, grey).reason]
+        if other.looks_like(board) or len(showing) < min(2, len(greys)):
             continue
-        for image in searched:
-            if not detect(Chessboard(columns, rows), read_grey(image.path)).reason:
-                return f"; {image.path} shows one of {columns}x{rows} inner corners: --board {columns}x{rows}"
+        size = f"{other.columns}x{other.rows}"
+        others = f" and {len(showing) - 1} more show" if len(showing) > 1 else " shows"
+        return f"; {showing[0]}{others} one of {size} inner corners: --board {size}"
     return "" if some else f"; does it have {board.columns}x{board.rows} inner corners, where four squares meet?"

@@ -34,7 +34,10 @@ def run(arguments: argparse.Namespace) -> None:
 
     path, output, against = arguments.input, arguments.output, arguments.against
     if output is not None:
+        from camtorch.plot.axes import require_matplotlib
+
         images.check_target(output, force=arguments.force, inputs=(path, against))
+        require_matplotlib()
     cameras = read_rig(path, arguments.name, arguments.from_model, arguments.size).cameras
     single = output is not None or against is not None
     if single and len(cameras) > 1:
@@ -65,14 +68,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
     import numpy as np
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
     from camtorch import plot
     from camtorch.cli import images
 
-    figure = plot.portrait(camera, other, title=title)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # after `portrait` said what to install
-
-    canvas = FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(plot.portrait(camera, other, title=title))
     canvas.draw()
     images.write(path, Image.fromarray(np.array(canvas.buffer_rgba())[..., :3]))
