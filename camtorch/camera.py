@@ -31,7 +31,7 @@ from camtorch._arguments import (
 )
 from camtorch._module import BatchedModule, Memo, is_constant, typed_as, with_values
 from camtorch._portable import for_elsewhere
-from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, is_concrete, is_exporting, keeps_graph
+from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, in_jit_trace, is_concrete, is_exporting, keeps_graph
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
@@ -513,6 +513,12 @@ class Camera(BatchedModule):
         intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
         inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or self._cameras
         if _is_plain(inputs):
+            if in_jit_trace() and torch.onnx.is_in_onnx_export():
+                raise RuntimeError(
+                    f"{type(self).__name__}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
+                    "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
+                    "requires_grad_(False) and called once before the export"
+                )
             learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
             keeps = learns and torch.is_grad_enabled()
             cameras = cameras_of(intrinsics, distortion)

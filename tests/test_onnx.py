@@ -1,5 +1,6 @@
 """Exported programs run elsewhere: in ONNX Runtime, and in a process without camtorch, with the same results."""
 
+import io
 import logging
 import os
 import re
@@ -237,6 +238,48 @@ def test_a_batch_of_cameras_of_any_size():
         expected, is_valid = ct.KannalaBrandt(values[:n], k[:n]).unproject(pixels[:n, 3:])
         assert torch.equal(valid, is_valid)
         torch.testing.assert_close(rays, expected.detach(), atol=1e-5, rtol=0)
+
+
+# -- what records the calls of one run
+
+
+def legacy_onnx(module, inputs, file):
+    torch.onnx.export(module, inputs, file, dynamo=False)
+    session = onnxruntime.InferenceSession(file.getvalue())
+    name = session.get_inputs()[0].name
+    return lambda values: torch.from_numpy(session.run(None, {name: values.numpy()})[0])
+
+
+def traced(module, inputs, file):
+    torch.jit.save(torch.jit.trace(module, inputs), file)
+    return torch.jit.load(io.BytesIO(file.getvalue()))
+
+
+@pytest.mark.parametrize("record", [legacy_onnx, traced])
+@pytest.mark.filterwarnings("ignore")  # both are deprecated, and say which sizes become constants
+def test_a_recorded_run_holds_the_map_of_a_frozen_warp_and_no_camera(record):
+    warp = ct.Dewarp(fisheye())
+    network, images = nn.Sequential(warp, nn.ReLU()), smooth()
+    network(images)
+    with pytest.raises(RuntimeError, match=r"Warp: .* cannot record cameras that learn.*\(dynamo=True\)"):
+        record(network, (images,), io.BytesIO())
+    warp.requires_grad_(False)
+    expected = network(1 - images)
+    torch.testing.assert_close(record(network, (images,), io.BytesIO())(1 - images), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("method", ["project", "unproject", "rays"])
+@pytest.mark.filterwarnings("ignore")
+def test_the_exporter_of_recorded_runs_takes_no_camera(method):
+    class Network(nn.Module):
+        def forward(self, values):
+            camera = fisheye()
+            return camera.rays()[0] * values.sum() if method == "rays" else getattr(camera, method)(values)
+
+    with pytest.raises(
+        RuntimeError, match=r"KannalaBrandt: .*\(dynamo=False\) cannot record a camera; dynamo=True can"
+    ):
+        legacy_onnx(Network(), (torch.rand(5, 2 + (method == "project")),), io.BytesIO())
 
 
 # -- networks

@@ -472,6 +472,31 @@ def test_export_takes_any_batch_size():
     torch.testing.assert_close(exported(many), warp(many), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize(
+    "dim",
+    [torch.export.Dim("batch", min=1, max=4096), torch.export.Dim.AUTO],
+    ids=["named", "auto"],
+)
+def test_export_takes_any_number_of_cameras_that_are_inputs(dim, monkeypatch):
+    # as if the images were so large that few grids were kept, so that a comparison with it would bound the batch
+    monkeypatch.setattr("camtorch.warp.warp._MOST_KEPT", 10 * math.prod(SIZE))
+
+    class Seen(torch.nn.Module):
+        def forward(self, images, intrinsics):
+            source = ct.Pinhole(intrinsics, image_size=SIZE)
+            return ct.Warp(source, pinhole().requires_grad_(False), tolerance=0.0)(images)
+
+    def given(count):
+        images = smooth(dtype=torch.float32).expand(count, -1, -1, -1).contiguous()
+        return images, pinhole().intrinsics.detach() * (1 + 0.2 * torch.linspace(0, 1, count)[:, None])
+
+    exported = torch.export.export(Seen(), given(3), dynamic_shapes=({0: dim},) * 2).module()
+    for count in (1, 2, 8, 200):
+        expected = Seen()(*given(count)).detach()
+        # positions in float32 are rounded by 1e-5 px, and the image ends within one
+        torch.testing.assert_close(exported(*given(count)), expected, atol=1e-4, rtol=0)
+
+
 def test_a_transform_leaves_no_trace():
     warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
     images = smooth(dtype=torch.float32)

@@ -23,7 +23,16 @@ from camtorch._arguments import (
     no_camera,
 )
 from camtorch._module import GeometryModule, Memo, is_constant, typed_as, with_values
-from camtorch._tracing import in_graph, in_transform, is_concrete, is_exporting, keeps_graph, may_look, set_aside
+from camtorch._tracing import (
+    in_graph,
+    in_jit_trace,
+    in_transform,
+    is_concrete,
+    is_exporting,
+    keeps_graph,
+    may_look,
+    set_aside,
+)
 from camtorch.camera import Camera
 from camtorch.maps.formats import save_map
 from camtorch.maps.protocol import Options as MapOptions
@@ -338,6 +347,12 @@ class Warp(GeometryModule):
 
     def _learned(self) -> Sampling:
         """With a graph."""
+        if in_jit_trace():
+            raise RuntimeError(
+                "Warp: torch.jit.trace and torch.onnx.export(dynamo=False) cannot record cameras that learn; "
+                "torch.onnx.export(dynamo=True) and torch.export can. Or warp.requires_grad_(False), and one call "
+                "before, make its map a constant"
+            )
         return self._with_scale(*tabulate(*self._seen_by, self.rotation))
 
     def _with_scale(self, grid: Tensor, mapped: Tensor) -> Sampling:
@@ -420,7 +435,10 @@ class Warp(GeometryModule):
 
     def _is_long(self) -> bool:
         """Whether the grid is not to be made at once, nor kept."""
-        if self._pinned is not None or math.prod((*self.batch_shape, *self.target._size("Warp"))) <= _MOST_KEPT:
+        # compared first, sizes that a program leaves open would be bounded in it
+        if self._pinned is not None or torch.compiler.is_compiling():
+            return False
+        if math.prod((*self.batch_shape, *self.target._size("Warp"))) <= _MOST_KEPT:
             return False
         return not in_transform() and all(t.is_cpu and is_concrete(t) for t in self._inputs())
 
