@@ -617,6 +617,8 @@ class Camera(BatchedModule):
         self, memo: Memo, inputs: Sequence[Tensor], stride: int, compute: Callable[[], tuple[Tensor, ...]]
     ) -> tuple[Tensor, ...]:
         """A copy of results over the image, kept where nothing learns and they are not too long; or new ones."""
+        if torch.compiler.is_compiling():  # nothing is kept then, and a comparison would bound sizes that are left open
+            return compute()
         learns = torch.is_grad_enabled() and any(map(in_graph, inputs))
         count = (
             math.prod((*self.batch_shape, *self._size("pixel_grid")))

@@ -1,0 +1,27 @@
+#!/usr/bin/env bash
+# The oldest versions that pyproject.toml declares: the laws of the models, files and warps, in a fresh environment of
+# their own. Not a part of `run`: PyPI's torch for Linux brings gigabytes of CUDA, unless PIP_EXTRA_INDEX_URL names an
+# index of those for CPUs.
+#
+# `bash .ci/floor.sh [PYTHON [FOLDER]]`: python3.10 by default; FOLDER, for the environment, is kept and used again.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python=${1:-python3.10}
+if [ $# -gt 1 ]; then
+    environment=$2
+else
+    environment=$(mktemp -d)
+    trap 'rm -rf "$environment"' EXIT
+fi
+if [ ! -e "$environment/bin/pip" ]; then
+    "$python" -m venv "$environment"
+fi
+. "$environment/bin/activate"
+declared=$(sed -n '/^requires-python/s/.*>=\(.*\)"/\1/p' pyproject.toml)
+python -c "import sys; now = '.'.join(map(str, sys.version_info[:2])); now == '$declared' or print('this is Python', now, 'rather than $declared')"
+# "name>=1.2" in dependencies becomes name==1.2.*: the last repair of that version
+sed -n 's/^dependencies = \[\(.*\)\]$/\1/p' pyproject.toml | tr -d '" ' | tr ',' '\n' | sed 's/>=\(.*\)/==\1.*/' > "$environment/floor.txt"
+cat "$environment/floor.txt"
+pip install --quiet -r "$environment/floor.txt" pytest hypothesis hatchling
+pip install --quiet --no-deps --no-build-isolation -e .
+pytest tests/test_{laws,golden,models,new_models,module,extrinsics,rig,files,file_poses,saving,hostile_files,warp,dewarp}.py tests/test_augment_{kornia,door,edits}.py
