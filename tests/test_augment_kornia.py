@@ -665,7 +665,7 @@ def test_copies_and_pickles():
 def test_compiled_without_a_break(cls, p):
     torch.compiler.reset()
     aug = cls(camera(), p=p)
-    compiled = torch.compile(aug, fullgraph=True, backend="aot_eager")
+    compiled = torch.compile(aug, fullgraph=True, backend="eager")
     torch.manual_seed(15)
     drawn = compiled(images())
     torch.manual_seed(15)

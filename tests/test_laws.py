@@ -221,7 +221,8 @@ def test_derivatives_of_project(key, camera_of):
         return
     if key in NOT_ANALYTIC:
         inputs = (points[3:].detach().requires_grad_(), *inputs[1:])
-    assert gradgradcheck(project, inputs)
+    # along random directions: entry by entry it takes three times as long
+    assert gradgradcheck(project, inputs, fast_mode=True)
 
 
 @derivative_cameras
@@ -242,7 +243,7 @@ def test_derivatives_of_unproject(key, camera_of):
         return
     if key in NOT_ANALYTIC:
         inputs = (inputs[0][3:].detach().requires_grad_(), *inputs[1:])
-    assert gradgradcheck(unproject, inputs)
+    assert gradgradcheck(unproject, inputs, fast_mode=True)
 
 
 @every_model
