@@ -269,7 +269,7 @@ def test_a_batch_is_its_rows_one_by_one(target, options):
     source = fisheye((4, 8))
     together = source.convert(target, **options)
     check(source, together)
-    for i, j in ((i, j) for i in range(4) for j in range(8)):
+    for i, j in ((0, 0), (0, 7), (1, 5), (2, 2), (3, 7)):
         row = ct.KannalaBrandt(source.intrinsics[i, j].detach(), source.distortion[i, j].detach(), image_size=SIZE)
         alone = row.convert(target, **options)
         for name in ("rms", "max_error", "max_angle", "valid_fraction"):

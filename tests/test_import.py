@@ -68,10 +68,10 @@ assert not hasattr(ct, "Pinhole2") and not hasattr(ct, "_public2")
     "first",
     [
         "import camtorch as ct",
-        "from camtorch.camera import Camera",
         *(
             pytest.param(first, marks=pytest.mark.slow)
             for first in (
+                "from camtorch.camera import Camera",
                 "from camtorch.calibration.report import write_report",
                 "import camtorch.io as io",
                 "import torch",
@@ -124,15 +124,15 @@ print(function(torch.ones(3))[0].item())
     assert python(code) == "4.0\n"
 
 
-def test_output_that_nobody_reads_is_no_error():
+@pytest.mark.parametrize("unbuffered", ["", pytest.param("1", marks=pytest.mark.slow)])
+def test_output_that_nobody_reads_is_no_error(unbuffered):
     code = "from camtorch.cli.main import main; import sys; sys.exit(main(['augment', '--list']))"
-    for unbuffered in ("", "1"):
-        environment = ENVIRONMENT | {"PYTHONUNBUFFERED": unbuffered}
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes) as process:
-            process.stdout.close()
-            assert process.stderr.read() == b""
-        assert process.returncode == 141
+    environment = ENVIRONMENT | {"PYTHONUNBUFFERED": unbuffered}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
 
 
 INTERRUPTED = """

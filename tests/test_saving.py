@@ -374,7 +374,8 @@ def test_rig():
 
 
 def test_import_is_light():
-    code = "import sys, camtorch; print([m for m in ('yaml', 'xml.etree', 'cv2') if m in sys.modules])"
+    heavy = ("yaml", "xml.etree", "cv2", "kornia")
+    code = f"import sys, camtorch.augment; print([m for m in {heavy} if m in sys.modules])"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert json.loads(out.stdout.replace("'", '"')) == []
