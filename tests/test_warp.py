@@ -474,7 +474,7 @@ def test_export_takes_any_batch_size():
 
 @pytest.mark.parametrize(
     "dim",
-    [torch.export.Dim("batch", min=1, max=4096), torch.export.Dim.AUTO],
+    [torch.export.Dim("batch", min=1, max=4096), pytest.param(torch.export.Dim.AUTO, marks=pytest.mark.slow)],
     ids=["named", "auto"],
 )
 def test_export_takes_any_number_of_cameras_that_are_inputs(dim, monkeypatch):
