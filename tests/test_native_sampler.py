@@ -110,7 +110,8 @@ def compare(result, expected, mode, unsure, span):
         # of two samples next to one half either may be true
         assert (result != expected)[~unsure].count_nonzero() <= 0.01 * result.numel() + 2
     elif result.dtype.is_floating_point:
-        lost = 1e-5 * span + torch.finfo(result.dtype).eps * (result.dtype.itemsize < 4) * span
+        # positions of 160 px in float32 are some 1e-5 px off, in the sampler and in torch, on each kind of CPU others
+        lost = 2e-5 * span + torch.finfo(result.dtype).eps * (result.dtype.itemsize < 4) * span
         assert (result.double() - expected.double()).abs().max() <= lost
     else:
         # float32 and float64 hold no larger whole numbers side by side
