@@ -40,7 +40,7 @@ def test_a_face_goes_back_to_the_camera_it_came_from(camera):
     back = normalizer.inverse(normalizer(turned))
     for name in ("gaze", "keypoints", "rotation", "head_pose"):
         torch.testing.assert_close(back[name], turned[name], atol=2e-4, rtol=1e-5)
-    with pytest.raises(ValueError, match="the head's rotation must hold rotation matrices"):
+    with pytest.raises(ValueError, match="head_pose must hold rotation matrices"):
         normalizer(head_pose=2 * pose, camera=camera)
     with pytest.raises(TypeError, match="head_pose must be one tensor for all samples; got a list"):
         normalizer(head_pose=list(pose), camera=camera)

@@ -85,7 +85,7 @@ def test_seeds_decide():
 
 def test_a_batch_is_its_images_one_by_one():
     drivers = seeded(2)
-    intrinsics = torch.tensor([[40.0, 40, 19.5, 15.5], [60.0, 60, 15.5, 19.5]])
+    intrinsics = torch.tensor([[40.0, 40, 19.5, 15.5], [60.0, 60, 15.5, 13.5]])
     first, second, both = (
         ct.Pinhole(numbers, image_size=(32, 40)).requires_grad_(False) for numbers in (*intrinsics, intrinsics)
     )
