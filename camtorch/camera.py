@@ -192,7 +192,7 @@ class Camera(BatchedModule):
         self.distortion_names = names
         self.image_size = size = as_image_size(image_size, owner)
         plain = not (isinstance(intrinsics, nn.Parameter) or in_graph(intrinsics))
-        if plain and size is not None and _is_given(intrinsics):
+        if plain and size is not None and intrinsics.numel() and _is_given(intrinsics):
             _warn_of_order(intrinsics, size, owner)
         self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
         self._warned = is_predicted(intrinsics) or is_predicted(distortion)

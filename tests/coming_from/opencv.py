@@ -357,7 +357,7 @@ def field_of_view():
     middle[:2, 2] = 80.0, 60.0  # OpenCV takes the edges of the image to be at 0 and its width
     found = cv2.calibrationMatrixValues(middle, WH, 1.0, 1.0)
     camera = ct.Pinhole.from_matrix(K, image_size=SIZE)
-    np.testing.assert_allclose(camera.field_of_view[:2].rad2deg().detach().numpy(), found[:2], atol=1e-9)
+    np.testing.assert_allclose(camera.fov[:2].detach().numpy(), found[:2], atol=1e-9)
 
 
 @row("cv2.FileStorage")
