@@ -30,10 +30,26 @@ def rotation_matrix(rotation: Tensor) -> Tensor:
 
 
 def rotation_vector(matrix: Tensor) -> Tensor:
-    """(*B, 3, 3) rotation matrices to (*B, 3) rotation vectors with an angle up to pi."""
-    from kornia.geometry.conversions import rotation_matrix_to_axis_angle  # a third of a second: only when needed
+    """(*B, 3, 3) rotation matrices to (*B, 3) rotation vectors with an angle up to pi.
 
-    return rotation_matrix_to_axis_angle(matrix.reshape(-1, 3, 3)).reshape(matrix.shape[:-1])
+    Of the quaternion that a matrix stands for, the products with its largest component: Shepperd, "Quaternion from
+    rotation matrix", 1978. kornia's conversions, before its version 0.9, are off by 1e-9 and have NaN gradients at the
+    identity.
+    """
+    a, b, c, d, e, f, g, h, i = matrix.flatten(-2).unbind(-1)
+    x, y, z, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, g + c
+    squares = torch.stack((1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i), -1)
+    ww, xx, yy, zz = squares.unbind(-1)
+    products = torch.stack((ww, x, y, z, x, xx, xy, zx, y, xy, yy, yz, z, zx, yz, zz), -1).unflatten(-1, (4, 4))
+    largest = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    quaternion = products.gather(-2, largest).squeeze(-2)
+    w, axis = quaternion[..., :1].abs(), torch.where(quaternion[..., :1] < 0, -1.0, 1.0) * quaternion[..., 1:]
+    length2 = (axis * axis).sum(-1, keepdim=True)
+    turns = length2 > 0
+    length = torch.where(turns, length2, 1.0).sqrt()
+    # at the identity, where w is the largest, the limit; its square root would have no derivative there
+    vector: Tensor = axis * torch.where(turns, 2 * torch.atan2(length, w) / length, 2 / torch.where(turns, 1.0, w))
+    return vector
 
 
 def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

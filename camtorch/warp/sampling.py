@@ -573,7 +573,7 @@ class _Sample(torch.autograd.Function):
             {"bilinear": 0, "nearest": 1, "bicubic": 2}[ctx.mode],
             PADDINGS.index(ctx.padding_mode),
             False,
-            ctx.needs_input_grad[:2],
+            (True, True) if in_transform() else ctx.needs_input_grad[:2],  # torch 2.10 maps over both alone
         )
         return by_images, by_grid, None, None
 
