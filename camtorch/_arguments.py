@@ -246,7 +246,9 @@ def check_boxes(boxes: Tensor, name: str, owner: str) -> None:
     """Raise a ValueError for plain boxes (..., 4) with x2 < x1 or y2 < y1, as x, y, width, height mostly have it."""
     if not may_look(boxes) or boxes.requires_grad:
         return
-    turned = (boxes[..., 2:] < boxes[..., :2]).any(-1)
+    wide = boxes if boxes.is_floating_point() else boxes.double()
+    # not what rounding made of a box without extent
+    turned = (wide[..., 2:] < wide[..., :2] - 8 * torch.finfo(wide.dtype).eps * wide[..., :2].abs()).any(-1)
     if bool(turned.any()):
         index = turned.nonzero()[0].tolist()
         place = f"[{', '.join(map(str, index))}]" if index else ""
@@ -261,9 +263,9 @@ def check_radians(vectors: Tensor, name: str, owner: str) -> None:
 
     A turn is the longest that there is a use for; one that an optimiser moved may be somewhat longer.
     """
-    if not may_look(vectors) or isinstance(vectors, nn.Parameter) or in_graph(vectors):
+    if not may_look(vectors) or isinstance(vectors, nn.Parameter) or in_graph(vectors) or is_predicted(vectors):
         return
-    if bool((vectors.square().sum(-1) > (4 * math.pi) ** 2).any()):
+    if bool((vectors.square().sum(-1) > (4 * math.pi) ** 2 * (1 + 1e-6)).any()):
         longest = torch.linalg.vector_norm(vectors.double(), dim=-1).nan_to_num(0.0).amax().item()
         raise ValueError(
             f"{owner}: {name} holds rotation vectors, axis times angle in radians; an angle of {longest:.4g} seems to "

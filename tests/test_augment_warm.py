@@ -7,8 +7,8 @@ from test_warm_calls import entered
 import camtorch as ct
 
 # of all of camtorch: what a warp between two such cameras enters, and the augmentation's own
-# among them `_portable`, whose functions do here what torch's do, `_dtypes` where torch samples, and `warp/panorama`, which
-# says whether the source goes all the way round
+# among them `_portable`, whose functions do here what torch's do, `_dtypes` where torch samples, and `warp/panorama`,
+# which says whether the source goes all the way round
 MOST = {"webcam": 28, "dms130": 28, None: 22}
 OWN = 4
 

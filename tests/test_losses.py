@@ -102,7 +102,7 @@ def test_reprojection_is_in_pixels():
     found, valid = ct.losses.reprojection(predicted, target, reduction="none")
     assert bool(valid.all())
     assert found.shape == (2, 16, 16)
-    points = torch.randn(2, 20, 3, dtype=torch.float64) + torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    points = torch.rand(2, 20, 3, dtype=torch.float64) + torch.tensor([-0.5, -0.5, 2.0], dtype=torch.float64)
     pixels = target.project(points)[0]
     expected = (predicted.project(points)[0] - pixels).norm(dim=-1)
     torch.testing.assert_close(ct.losses.reprojection(predicted, target, points), expected.mean())

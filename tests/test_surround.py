@@ -215,3 +215,11 @@ def test_bad_rigs_and_targets_are_refused():
         ct.views.ring(camera, 0)
     with pytest.raises(ValueError, match="views must be"):
         ct.views.cube(camera).back(torch.rand(1, 5, 3, 4, 4))
+
+
+def test_views_give_no_label_that_is_in_no_image():
+    camera = ct.KannalaBrandt.from_fov(190, image_size=(100, 160)).requires_grad_(False)
+    views = ct.views.cube(camera, mode="nearest")
+    labels, valid = views.back(views(torch.randint(1, 5, (1, 1, 100, 160))))
+    assert valid.float().mean() > 0.99
+    assert (labels[valid] > 0).all()

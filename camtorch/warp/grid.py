@@ -16,7 +16,7 @@ from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is
 from camtorch.camera import Camera
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
 from camtorch.rotations import turn
-from camtorch.warp.panorama import Seam, seam_of, seen_by
+from camtorch.warp.panorama import Seam, rays_of, seam_of, seen_by
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
@@ -233,7 +233,7 @@ def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: 
     """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `Exact`."""
     if pixels.ndim == 3:
         pixels = pixels.expand(*target.batch_shape, *pixels.shape)
-    rays, has_ray = target.unproject(pixels)
+    rays, has_ray = rays_of(target, pixels)
     if rays.ndim == 3:
         rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
     seen, mapped = seen_by(source, turn(None if rotation is None else rotation.mT, rays, "rays"))

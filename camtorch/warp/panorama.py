@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch._arguments import Numbers, as_coordinates
 from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
@@ -15,7 +16,7 @@ from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCyli
 _NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals does by 0.03
 _SPHERES = Equirectangular, LatLon
 _DOWN = LatLon, TransverseCylindrical
-_PANORAMAS = Equirectangular, Cylindrical, *_DOWN
+PANORAMAS = Equirectangular, Cylindrical, *_DOWN
 
 
 class Seam(NamedTuple):
@@ -84,7 +85,7 @@ def seam_of(camera: Camera) -> Seam | None:
 
     While the values may not be looked at, it is what was found when they last could be.
     """
-    if not isinstance(camera, _PANORAMAS):
+    if not isinstance(camera, PANORAMAS):
         return None
     if is_concrete(camera.intrinsics):
         camera._seam = _found(camera)  # type: ignore[assignment]
@@ -127,3 +128,27 @@ def seen_by(source: Camera, rays: Tensor) -> tuple[Tensor, Tensor]:
     turns = ((planes[seam.axis].detach() + 0.5) / period).floor()
     planes[seam.axis] = planes[seam.axis] - turns * period
     return torch.stack(planes, -1), mapped
+
+
+def rays_of(target: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
+    """As `target.unproject`, of pixels (..., 2); a panorama of a whole turn has rays all the way round.
+
+    The model has them up to half a turn from its principal point, which may lie anywhere on such an image.
+    """
+    seam = seam_of(target)
+    if seam is None:
+        return target.unproject(pixels)
+    pixels = as_coordinates(pixels, "pixels", 2, "Warp", target.intrinsics.device, "B, *N")
+    period = target._size("Warp")[1 - seam.axis]
+    planes = list(pixels.unbind(-1))
+    numbers = target.intrinsics.detach()
+    numbers = numbers.reshape(*numbers.shape[:-1], *[1] * (pixels.ndim - numbers.ndim), 4)
+    nearly = 1 - 8 * torch.finfo(numbers.dtype).eps  # the ends themselves are rounded beyond them
+    for axis, angle in ((seam.axis, math.pi), (1 - seam.axis, math.pi / 2)):
+        offset, end = planes[axis] - numbers[..., 2 + axis], angle * nearly * numbers[..., axis]
+        if axis == seam.axis:
+            offset = offset - (offset.detach() / period).round() * period
+        elif not all(seam.poles):
+            continue
+        planes[axis] = numbers[..., 2 + axis] + torch.maximum(torch.minimum(offset, end), -end)
+    return target.unproject(torch.stack(planes, -1))

@@ -8,7 +8,7 @@ from torch import Tensor
 from camtorch._arguments import Numbers
 from camtorch.rotations import rotate_planes
 from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, to_positions
-from camtorch.warp.panorama import seen_by
+from camtorch.warp.panorama import rays_of, seen_by
 from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp
 
@@ -44,7 +44,7 @@ class SurfaceWarp(Warp):
 
     def _of_rows(self, rows: range) -> Sampling:
         pixels = pixels_of_rows(self.target, rows)
-        rays, has_ray = self.target.unproject(pixels.expand(*self.target.batch_shape, *pixels.shape))
+        rays, has_ray = rays_of(self.target, pixels.expand(*self.target.batch_shape, *pixels.shape))
         if rays.ndim == 3:
             rays, has_ray = rays[None], has_ray[None]
         directions, met = self._to_source(rays)
@@ -60,9 +60,9 @@ class SurfaceWarp(Warp):
         source, target, carried = self.source, self.target, self._to_target
         if back:
             source, target, carried = target, source, self._to_source
-        rays, has_ray = source.unproject(pixels)
+        rays, has_ray = rays_of(source, pixels)
         directions, met = carried(rays)
-        seen, mapped = target.project(directions)
+        seen, mapped = seen_by(target, directions)
         valid = mapped & has_ray & met
         return torch.where(valid.unsqueeze(-1), seen, -1.0), valid
 

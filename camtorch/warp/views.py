@@ -16,6 +16,7 @@ from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.rotations import mount_rotation
+from camtorch.warp.panorama import rays_of
 from camtorch.warp.sampling import Mode, blended
 from camtorch.warp.warp import Warp, as_sized
 
@@ -89,7 +90,7 @@ class Views(GeometryModule):
 
         It falls linearly to the border of a view.
         """
-        rays, has_ray = self.camera.rays()
+        rays, has_ray = rays_of(self.camera, self.camera.pixel_grid())
         height, width = self.view._size("Views")
         parts = []
         for rotation in self.rotations:
@@ -99,6 +100,9 @@ class Views(GeometryModule):
             near = valid & has_ray & (inner > -_HALF - _EDGE)
             parts.append(torch.where(near, (inner + _HALF).clamp(min=_EDGE), 0.0))
         whole = torch.stack(parts)
+        if self.mode == "nearest":  # what a view fills in at its rim is no label
+            masks = self.valid_masks()
+            whole = whole * torch.cat([warp(masks[:, i]) for i, warp in enumerate(self.backs)])[:, 0]
         total = whole.sum(0)
         return whole / torch.where(total > 0, total, 1.0)
 

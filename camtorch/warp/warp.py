@@ -41,7 +41,7 @@ from camtorch.native.sampler import empty
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, locate, scaled, tabulate
-from camtorch.warp.panorama import seam_of
+from camtorch.warp.panorama import PANORAMAS, rays_of, seam_of, seen_by
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -475,8 +475,8 @@ class Warp(GeometryModule):
         (source, target), rotation = self._seen_by, self.rotation
         if back:
             source, target, rotation = target, source, None if rotation is None else rotation.mT
-        rays, has_ray = source.unproject(pixels)
-        moved, mapped = target.project(turn(rotation, rays, "pixels"))
+        rays, has_ray = rays_of(source, pixels)
+        moved, mapped = seen_by(target, turn(rotation, rays, "pixels"))
         valid = mapped & has_ray
         return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
 
@@ -517,11 +517,13 @@ class Warp(GeometryModule):
         high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)
         some, valid = mapped.any(-1), (mapped & self.target.contains(moved)).any(-1)
         whole = mapped.all(-1)
-        if not may_look(valid) or not bool((valid & whole).all()):
+        # an outline about a direction that the target does not map is turned inside out
+        plain = valid & whole & (_area(corners) * _area(moved) > 0)
+        if not may_look(valid) or isinstance(self.target, PANORAMAS) or not bool(plain.all()):
             lattice, inside = self._inside(corners, moved)
             inside = inside & finite
             some, valid = some | inside.any(-1), valid | inside.any(-1)
-            inside = (inside & ~whole.unsqueeze(-1)).unsqueeze(-1)
+            inside = inside.unsqueeze(-1)
             low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
             high = torch.maximum(high, torch.where(inside, lattice, -torch.inf).amax(-2))
         return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
@@ -683,6 +685,12 @@ def along_edges(corners: Tensor, samples: int) -> Tensor:
     share = torch.linspace(0, 1, samples + 1, dtype=corners.dtype, device=corners.device)[:-1, None]
     start, end = corners.unsqueeze(-2), corners.roll(-1, -2).unsqueeze(-2)
     return (start + (end - start) * share).flatten(-3, -2)
+
+
+def _area(corners: Tensor) -> Tensor:
+    """(...): of polygons (..., K, 2), negative for those that go round the other way."""
+    (x, y), (next_x, next_y) = corners.unbind(-1), corners.roll(-1, -2).unbind(-1)
+    return (x * next_y - next_x * y).sum(-1) / 2
 
 
 def within(corners: Tensor, points: Tensor) -> Tensor:
