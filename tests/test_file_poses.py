@@ -1,4 +1,4 @@
-"""Extrinsics in files: directions, axes, chains, and what comes back to the last bit."""
+"""Extrinsics in files: directions, axes, chains, and that any pose comes back."""
 
 import json
 import math
