@@ -23,7 +23,7 @@ def load(name):
     return ct.load(FILES / name)
 
 
-def assert_same(a, b):
+def assert_same(a, b, atol=0.0):
     """The same rig: cameras to the last bit, poses to the rounding of what their rotations are written as."""
     assert list(a.cameras) == list(b.cameras)
     for one, other in zip(a.cameras.values(), b.cameras.values(), strict=True):
@@ -36,7 +36,7 @@ def assert_same(a, b):
     for one, other in zip(a.extrinsics.values(), b.extrinsics.values(), strict=True):
         there, here = one.matrix(), other.matrix()
         assert there.dtype == here.dtype == torch.float64
-        limit = 1e-15 * (8 + one.translation.norm().item())
+        limit = max(atol, 1e-15 * (8 + one.translation.norm().item()))
         assert torch.allclose(there, here, rtol=0, atol=limit)
     assert a.images == b.images
 
