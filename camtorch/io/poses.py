@@ -47,11 +47,14 @@ def pose(place: Place, rotation: Any, translation: Any, undo: bool = False) -> E
     """The pose of rotation vectors and translations (*B, 3), or with `undo` the pose that undoes it.
 
     Raises:
-        CameraFileError: numbers too large to compute with.
+        CameraFileError: numbers too large to compute with, or that no pose has.
     """
     for values in (rotation, translation):
         check_near(place, values)
-    there = Extrinsics(as_float64(rotation)[..., None], as_float64(translation))
+    try:
+        there = Extrinsics(as_float64(rotation)[..., None], as_float64(translation))
+    except ValueError as error:
+        return (place if isinstance(place, Record) else place(0)).fail(error)
     return there.inverse() if undo else there
 
 
