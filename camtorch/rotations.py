@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from camtorch._arguments import Numbers, as_real, as_rows, as_values, check_devices
 from camtorch._tracing import in_graph, is_concrete, may_look
-from camtorch.optics.special import cosc_root, sinc_root
+from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 
 
 def rotation_matrix(rotation: Tensor) -> Tensor:
@@ -32,24 +32,34 @@ def rotation_matrix(rotation: Tensor) -> Tensor:
 def rotation_vector(matrix: Tensor) -> Tensor:
     """(*B, 3, 3) rotation matrices to (*B, 3) rotation vectors with an angle up to pi.
 
-    Of the quaternion that a matrix stands for, the products with its largest component: Shepperd, "Quaternion from
-    rotation matrix", 1978. kornia's conversions, before its version 0.9, are off by 1e-9 and have NaN gradients at the
-    identity.
+    By Shepperd's method: of the four columns of 4 q q^T, q being the unit quaternion, that with the largest diagonal
+    element is a multiple of q without cancellation.
     """
-    a, b, c, d, e, f, g, h, i = matrix.flatten(-2).unbind(-1)
-    x, y, z, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, g + c
-    squares = torch.stack((1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i), -1)
-    ww, xx, yy, zz = squares.unbind(-1)
-    products = torch.stack((ww, x, y, z, x, xx, xy, zx, y, xy, yy, yz, z, zx, yz, zz), -1).unflatten(-1, (4, 4))
-    largest = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
-    quaternion = products.gather(-2, largest).squeeze(-2)
-    w, axis = quaternion[..., :1].abs(), torch.where(quaternion[..., :1] < 0, -1.0, 1.0) * quaternion[..., 1:]
-    length2 = (axis * axis).sum(-1, keepdim=True)
-    turns = length2 > 0
-    length = torch.where(turns, length2, 1.0).sqrt()
-    # at the identity, where w is the largest, the limit; its square root would have no derivative there
-    vector: Tensor = axis * torch.where(turns, 2 * torch.atan2(length, w) / length, 2 / torch.where(turns, 1.0, w))
-    return vector
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
+    x, y, z, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
+    products = (
+        *(1 + a + e + i, x, y, z),
+        *(x, 1 + a - e - i, xy, zx),
+        *(y, xy, 1 - a + e - i, yz),
+        *(z, zx, yz, 1 - a - e + i),
+    )
+    columns = torch.stack(products, -1).unflatten(-1, (4, 4))
+    largest = columns.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
+    return quaternion_vector(columns.take_along_dim(largest[..., None, None], -2).squeeze(-2))
+
+
+def quaternion_vector(quaternion: Tensor) -> Tensor:
+    """(*B, 4) quaternions w, x, y, z of any length to (*B, 3) rotation vectors with an angle up to pi."""
+    w, vector = quaternion[..., :1], quaternion[..., 1:]
+    half = angle_per_radius((vector * vector).sum(-1, keepdim=True), w.abs())
+    return torch.where(w < 0, -2 * half, 2 * half) * vector
+
+
+def vector_quaternion(rotation: Tensor) -> Tensor:
+    """(*B, 3) rotation vectors to (*B, 4) unit quaternions w, x, y, z."""
+    half = rotation / 2
+    angle2 = (half * half).sum(-1, keepdim=True)
+    return torch.cat((cos_root(angle2), sinc_root(angle2) * half), -1)
 
 
 def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -71,7 +81,7 @@ def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> Non
     """Raise a ValueError unless (*B, 3, 3) are rotations, to the precision that files store them with."""
     if is_concrete(matrix) and not is_rotation(matrix):
         values = matrix.detach().double()
-        error = _rotation_error(values).max().item()
+        error = rotation_error(values).max().item()
         raise ValueError(
             f"{owner}: {name} must hold rotation matrices; R R^T misses the identity by {error:.2g} "
             f"and det R = {torch.linalg.det(values).tolist()}{hint}"
@@ -87,10 +97,11 @@ def are_rotations(matrix: Tensor) -> Tensor:
     """(*B) bool: which of (*B, 3, 3) are rotations; see `is_rotation`. Half precision stores them less precisely."""
     values, precision = matrix.detach().double(), 4 * torch.finfo(matrix.dtype).eps
     proper: Tensor = torch.linalg.det(values) > 0
-    return (_rotation_error(values) < max(1e-3, precision)) & proper
+    return (rotation_error(values) < max(1e-3, precision)) & proper
 
 
-def _rotation_error(values: Tensor) -> Tensor:
+def rotation_error(values: Tensor) -> Tensor:
+    """(*B,): by how much R R^T of (*B, 3, 3) misses the identity."""
     return (values @ values.mT - torch.eye(3, dtype=values.dtype, device=values.device)).abs().amax((-1, -2))
 
 

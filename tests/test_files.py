@@ -1,8 +1,6 @@
-"""Every format: what the files say, and load -> save -> load."""
+"""Every format: what the files say, and that it comes back."""
 
-import importlib
 import math
-import pkgutil
 from pathlib import Path
 
 import pytest
@@ -10,25 +8,6 @@ import torch
 from rigs import MANIFEST, POINT, SAMPLES, SUFFIXES, assert_same, float64, load
 
 import camtorch as ct
-import camtorch.io
-
-
-@pytest.mark.parametrize("name", SAMPLES)
-def test_load_save_load_is_the_identity(name, tmp_path):
-    rig = load(name)
-    ct.save(rig, tmp_path / name)
-    again = ct.load(tmp_path / name)
-    assert_same(rig, again)
-    assert again.format == rig.format
-
-
-def test_every_format_is_a_file_of_the_room():
-    """And each says itself what it is called, so that adding one is a file and its place in a list."""
-    modules = [importlib.import_module(f"camtorch.io.{m.name}") for m in pkgutil.iter_modules(camtorch.io.__path__)]
-    names = [vars(module)["NAMES"] for module in modules if "NAMES" in vars(module)]
-    assert sorted(names_of.format for names_of in names) == sorted(camtorch.io.FORMATS)
-    patterns = [pattern for names_of in names for pattern in names_of.patterns]
-    assert len(set(patterns)) == len(patterns)
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -48,7 +27,8 @@ def test_a_calibration_is_a_measurement(name):
 @pytest.mark.parametrize("format", SUFFIXES)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_what_was_loaded_is_written_as_any_format_that_holds_it(name, format, tmp_path):
-    rig, path = load(name), tmp_path / f"cameras{SUFFIXES[format]}"
+    rig = load(name)
+    path = tmp_path / (name if format == rig.format else f"cameras{SUFFIXES[format]}")
     try:
         ct.save(rig, path, format)
     except ct.CameraFileError as error:
@@ -57,6 +37,8 @@ def test_what_was_loaded_is_written_as_any_format_that_holds_it(name, format, tm
         return
     first = ct.load(path)
     assert first.format == format
+    if format == rig.format:
+        assert_same(first, rig)
     point = float64(POINT)
     for before, after in zip(rig.cameras.values(), first.cameras.values(), strict=True):
         assert torch.allclose(before.project(point)[0], after.project(point)[0], rtol=0, atol=1e-9)

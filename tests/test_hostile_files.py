@@ -6,7 +6,6 @@ import os
 import struct
 import subprocess
 import sys
-import tracemalloc
 
 import pytest
 import torch
@@ -165,6 +164,7 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.xml", XML.format("<a>" * 100_000), "deep"),
         ("a.xml", XML.format(f"<K>{K[1:-1]}</K><K>1</K>"), "line 1: the key 'K' stands there twice"),
         ("a.xml", "<html></html>", "<html> where <opencv_storage> belongs"),
+        ("a.yml", "".join(f"%TAG !{i:x}! b\n" for i in range(20_000)) + "---\na: 1\n", "too many YAML directives"),
         ("a.cameramodel", "{'lensmodel': __import__('os').system('true')}", "line 1"),
         ("a.cameramodel", "{'lensmodel': " + "[" * 100_000, "deep"),
         (
@@ -173,8 +173,9 @@ XML = "<opencv_storage>{}</opencv_storage>"
             "'LENSMODEL_CAHVOR' is not known here",
         ),
         ("a.cameramodel", "{'lensmodel': 1, 'lensmodel': 2}", "stands there twice"),
-        ("a.cameramodel", "{'lensmodel': 'x'", "ends before its last brace"),
-        ("a.cameramodel", "{'lensmodel': 'x'}}", "does not belong|nothing is to be closed"),
+        ("a.cameramodel", "{'lensmodel': [1, 2,],\n'b': (1, 2,), }\n#\n}", "line 4: Extra data"),
+        ("a.cameramodel", "{'lensmodel': 1,\n'b': 'x'", "line 2: Expecting ',' delimiter"),
+        ("a.cameramodel", "{'lensmodel': 1,\n'b': [1 + 2]}", "line 2: Expecting ',' delimiter"),
         ("cameras.txt", CAMERA * 2, "line 2: a second camera has the id 1"),
         (
             "cameras.txt",
@@ -250,7 +251,10 @@ LARGE = {
     "string.cameramodel": filled(b"a", start=b"{'lensmodel': '", end=b"'}"),
     "escapes.cameramodel": filled(b"\\n", start=b"{'lensmodel': '", end=b"'}"),
     "spaces.cameramodel": filled(b" "),
+    "nothing.cameramodel": filled(b"#\n"),
     "comments.cameramodel": filled(b"#\n", start=b"{'lensmodel': ", end=b"}"),
+    "words.cameramodel": filled(b"1 ", start=b"{'lensmodel': ", end=b"}"),
+    "additions.cameramodel": filled(b"1+", start=b"{'lensmodel': ", end=b"1}"),
     "lists.cameramodel": filled(b"[],", start=b"{'lensmodel': [", end=b"]}"),
     "keys.cameramodel": many(b"%d:1,", 6 * MB, b"{'lensmodel': {", b"}}"),
     "lists.yaml": filled(b"[],", 4 * MB - 99, b"a: [", b"]"),
@@ -356,16 +360,6 @@ def test_poses_of_many_images_cost_little(tmp_path):
     assert [*costing_little(folders)][:2] == [True, True]
 
 
-def test_memory(tmp_path):
-    path = written(tmp_path / "anchors.yaml", b"a: [" + b"&a [], *a," * (1 << 14) + b"]")
-    tracemalloc.start()
-    try:
-        assert not loads_or_says_why(path)
-        assert tracemalloc.get_traced_memory()[1] < 200 * path.stat().st_size
-    finally:
-        tracemalloc.stop()
-
-
 @pytest.mark.parametrize("content", [
     {"intrinsics": [[[1, 1, 1, 1]]] * 3000, "distortion": [[[0.0]] * 3000], "distortion_names": ["k1"]},
     {"intrinsics": [[1, 1, 1, 1]] * 3, "distortion": [[0.0]] * 2, "distortion_names": ["k1"]},
@@ -375,12 +369,6 @@ def test_small_files_make_no_large_batches(content, tmp_path):
     path = written(tmp_path / "own.json", json.dumps({"camtorch": 1, "cameras": cameras, "extrinsics": {}}))
     with pytest.raises(ct.CameraFileError, match="batch dims that differ"):
         ct.load(path)
-
-
-def test_many_directives_of_yaml(tmp_path):
-    tags = "".join(f"%TAG !{i:x}! b\n" for i in range(20_000))
-    with pytest.raises(ct.CameraFileError, match="too many YAML directives"):
-        ct.load(written(tmp_path / "a.yml", f"{tags}---\na: 1\n"))
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
@@ -394,9 +382,3 @@ def test_pipes_are_neither_waited_for_nor_replaced(suffix, tmp_path):
     os.mkfifo(tmp_path / "pipe.yml")
     with pytest.raises(OSError, match="no ordinary file"):
         ct.save(camera, tmp_path / "pipe.yml", "opencv")
-
-
-def test_a_file_of_blanks_takes_no_memory(tmp_path):
-    for blank in ("\n", " ", "#\n"):
-        with pytest.raises(ct.CameraFileError):
-            ct.load(written(tmp_path / "a.cameramodel", blank * (1 << 20)))

@@ -52,9 +52,8 @@ def parse(record: Record) -> Rig:
             if len(quaternion) != 2:
                 quaternion.fail(f"is not [w, [x, y, z]], but {quaternion.value!r:.60}")
             w, xyz = quaternion
-            extrinsics[name] = poses.from_quaternion(
-                quaternion, [w.number(), *xyz.numbers(3)], place["Translation"].numbers(3), undo=True
-            )
+            numbers = [w.number(), *xyz.numbers(3), *place["Translation"].numbers(3)]
+            extrinsics[name] = poses.from_quaternions(quaternion, numbers, undo=True)
     return Rig(cameras, extrinsics)
 
 
@@ -70,7 +69,7 @@ def render(rig: Rig, path: str) -> str:
         kind, focals, count = next((kind, f, count) for kind, (k, f, count) in _MODELS.items() if k == key)
         if focals == 1:
             intrinsics = lossy.single_focal(name, intrinsics)
-        quaternion, translation = poses.to_quaternion(extrinsics, undo=True)
+        w, x, y, z, *translation = poses.quaternions(extrinsics, undo=True).tolist()
         entries.append(
             {
                 "Calibrated": True,
@@ -84,7 +83,7 @@ def render(rig: Rig, path: str) -> str:
                 "SerialNumber": "0",
                 "T_Device_Camera": {
                     "Translation": translation,
-                    "UnitQuaternion": [quaternion[0], quaternion[1:]],
+                    "UnitQuaternion": [w, [x, y, z]],
                 },
             }
         )

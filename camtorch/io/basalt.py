@@ -57,7 +57,7 @@ def parse(record: Record) -> Rig:
         intrinsics, distortion = ([values[name].number() for name in names] for names in (_CORE, coefficients))
         cameras[f"cam{i}"] = values.camera(key, intrinsics, distortion, size.size())
         numbers = [place[name].number() for name in ("qw", "qx", "qy", "qz", "px", "py", "pz")]
-        extrinsics[f"cam{i}"] = poses.from_quaternion(place, numbers[:4], numbers[4:], undo=True)
+        extrinsics[f"cam{i}"] = poses.from_quaternions(place, numbers, undo=True)
     return Rig(cameras, extrinsics)
 
 
@@ -77,6 +77,6 @@ def render(rig: Rig, path: str) -> str:
             values["rpmax"] = 0.0
         models.append({"camera_type": camera_type, "intrinsics": values})
         sizes.append([width, height])
-        (w, x, y, z), (px, py, pz) = poses.to_quaternion(extrinsics, undo=True)
+        w, x, y, z, px, py, pz = poses.quaternions(extrinsics, undo=True).tolist()
         placed.append({"px": px, "py": py, "pz": pz, "qx": x, "qy": y, "qz": z, "qw": w})
     return as_json({"value0": {"T_imu_cam": placed, "intrinsics": models, "resolution": sizes, **_IMU}})

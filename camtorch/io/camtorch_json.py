@@ -45,7 +45,7 @@ def parse(record: Record) -> Rig:
         rotation, translation = _tensor(entry["rotation"], 3), _tensor(entry["translation"], 3)
         _same_batch(entry, rotation, translation)
         for key, values in (("rotation", rotation), ("translation", translation)):
-            poses.check_near(entry[key], values.flatten().tolist())
+            poses.check_near(entry[key], values.flatten())
         extrinsics[name] = rotation, translation
     if extrinsics and extrinsics.keys() == images.keys() and all(t.ndim == 1 for _, t in extrinsics.values()):
         batch = _pose(*map(torch.stack, zip(*extrinsics.values(), strict=True)))

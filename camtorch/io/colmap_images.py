@@ -8,18 +8,23 @@ from array import array
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from camtorch.io import poses
-from camtorch.io.parsing import MOST_COMMENTS, check_ordinary
+from camtorch.io.parsing import check_ordinary
 from camtorch.io.record import Record, repeated
 from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
+from camtorch.rotations import quaternion_vector
 
 _HEAD = struct.Struct("<I7dI")
 _POINT = 24  # x, y and the id of a 3D point
+_MOST_COMMENTS = 10_000  # and blank lines, before the first image or between two
 _MOST_IMAGES = 1 << 18  # each takes some 400 bytes
 _LONGEST_NAME = 4096
 _LONGEST_LINE = 1 << 26
+_SAME = 1e-12  # of poses: what another format may have rounded
 LARGEST_ID = (1 << 32) - 2  # of cameras; the one above means none
 
 
@@ -76,8 +81,8 @@ def _from_text(path: str, file: BinaryIO) -> Images:
         words = line.split(None, 9)
         if not words or words[0].startswith(b"#"):
             passed += 1
-            if passed > MOST_COMMENTS:
-                Record(path, None, f"line {line_number}").fail(f"more than {MOST_COMMENTS} lines without an image")
+            if passed > _MOST_COMMENTS:
+                Record(path, None, f"line {line_number}").fail(f"more than {_MOST_COMMENTS} lines without an image")
             continue
         record = Record(path, None, f"line {line_number}")
         if len(words) < 10:
@@ -158,7 +163,8 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
         CameraFileError: the file that is there has points, which would be lost.
     """
     entries = []
-    for name, values in poses.quaternions(rig, lossy).items():
+    posed = poses.all_of(rig, lossy)
+    for name, values in zip(rig.extrinsics, poses.quaternions(posed).tolist(), strict=True):
         if not name or "\0" in name or (not binary and (name.split() != [name])):
             lossy.fail(
                 repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
@@ -166,8 +172,11 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
         entries.append((name, identities[rig.images.get(name, name)], values))
     if os.path.exists(path):
         there = read(path)
-        if entries == list(zip(there.names, map(int, there.cameras), there.values.tolist(), strict=True)):
-            return None
+        if [entry[:2] for entry in entries] == list(zip(there.names, map(int, there.cameras), strict=True)):
+            its = poses.as_float64(there.values)
+            rotations, translations = quaternion_vector(its[:, :4]), its[:, 4:]
+            if _close(rotations, posed.rotation) and _close(translations, posed.translation):
+                return None
         if there.has_points:
             Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
     folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
@@ -175,6 +184,10 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
         if os.path.exists(os.path.join(folder, name + suffix)):
             lossy.fail("extrinsics", f"would contradict {name}{suffix} beside them; write to another folder")
     return _as_bytes(entries) if binary else _as_text(entries)
+
+
+def _close(one: Tensor, other: Tensor) -> bool:
+    return torch.allclose(one, other, rtol=_SAME, atol=_SAME)
 
 
 def _as_text(entries: list[tuple[Any, ...]]) -> bytes:

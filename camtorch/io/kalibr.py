@@ -6,6 +6,9 @@ import itertools
 import re
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
@@ -67,14 +70,8 @@ def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
         return {}
     chain = {names[0]: poses.pose(record, [0.0] * 3, [0.0] * 3)}
     for previous, name in itertools.pairwise(names):
-        step = poses.from_rows(record[name]["T_cn_cnm1"])
-        before, rows = chain[previous], poses.to_rows(step)
-        if poses.is_identity(before):
-            chain[name] = step
-        else:
-            matrix, translation = poses.compose(step, before)
-            chain[name] = poses.pose(record[name], poses.vector_of_matrix(record[name], matrix), translation)
-        poses.keep(chain[name], "step", rows, before)
+        with torch.no_grad():
+            chain[name] = poses.from_rows(record[name]["T_cn_cnm1"]).compose(chain[previous])
     return chain
 
 
@@ -84,26 +81,18 @@ def render(rig: Rig, path: str) -> str:
     lossy.no_images(rig)
     posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
     first = next(iter(posed.values()), None)
-    chained = first is None or (len(posed) > 1 and poses.is_identity(first) and poses.written(first, "rows") is None)
-    lines, previous = [], None
+    chained = first is None or (len(posed) > 1 and poses.is_identity(first))
+    lines: list[str] = []
+    previous = None
     for i, (name, camera) in enumerate(rig.cameras.items()):
         lines.append(f"cam{i}:")
         if not chained:
-            lines += _rows("T_cam_imu", poses.to_rows(posed[name]))
+            lines += _rows("T_cam_imu", poses.matrices(posed[name]))
         if previous is not None:
-            lines += _rows("T_cn_cnm1", _step(posed[name], previous))
+            lines += _rows("T_cn_cnm1", poses.matrices(posed[name]) @ poses.matrices(previous, undo=True))
         previous = posed.get(name)
         lines += _entries(lossy, name, camera, i)
     return "\n".join(lines) + "\n"
-
-
-def _step(this: Extrinsics, previous: Extrinsics) -> list[list[float]]:
-    kept: list[list[float]] | None = poses.written(this, "step", previous)
-    if kept is not None:
-        return kept
-    if poses.is_identity(previous):
-        return poses.to_rows(this)
-    return poses.as_rows(*poses.compose(this, previous.inverse()))
 
 
 def _entries(lossy: Lossy, name: str, camera: Camera, index: int) -> list[str]:
@@ -123,5 +112,5 @@ def _entries(lossy: Lossy, name: str, camera: Camera, index: int) -> list[str]:
     ]
 
 
-def _rows(key: str, rows: list[list[float]]) -> list[str]:
-    return [f"  {key}:", *(f"  - {listed(row)}" for row in rows)]
+def _rows(key: str, matrix: Tensor) -> list[str]:
+    return [f"  {key}:", *(f"  - {listed(row)}" for row in matrix.tolist())]

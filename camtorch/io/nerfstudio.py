@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
 from camtorch.io.protocol import Names
@@ -30,6 +29,7 @@ _MODELS = {
     "FISHEYE624": "fisheye624",
     "EQUIRECTANGULAR": "equirectangular",
 }
+_AXES = np.array([1.0, -1.0, -1.0, 1.0])  # of Nerfstudio's cameras by ours
 _RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
 _TANGENTIAL = ("p1", "p2")
 _CORE = (
@@ -72,13 +72,12 @@ def parse(record: Record) -> Rig:
         if has_own:
             cameras[name] = _camera(record, frame)
         names[name] = None if has_own else "camera"
-        rotation, translation, rows = _pose(frame["transform_matrix"])
-        for vector in (rotation, translation, *rows):
-            found.extend(vector)
+        for row in poses.rows_of(frame["transform_matrix"]):
+            found.extend(row)
     if not found:
         return Rig(cameras)
-    numbers = np.array(found).reshape(len(names), 22)
-    batch = poses.batch(numbers[:, :3], numbers[:, 3:6], "nerfstudio", numbers[:, 6:].reshape(-1, 4, 4))
+    rows = np.array(found).reshape(-1, 4, 4) * _AXES
+    batch = poses.from_matrices(lambda row: frames[row]["transform_matrix"], rows, undo=True)
     return Rig(cameras, (list(names), batch), images={name: camera for name, camera in names.items() if camera})
 
 
@@ -149,19 +148,6 @@ def _distortion(record: Record, key: str) -> tuple[str, list[float]]:
     return key, [there.get(name, 0.0) for name in names]
 
 
-def _pose(record: Record) -> tuple[list[float], list[float], list[list[float]]]:
-    """Rotation vector, translation, and the 4 x 4 matrix that the file has."""
-    rows = poses.rows_of(record)
-    position = [row[3] for row in rows[:3]]
-    # world from our camera: the columns of y and z turned round
-    turned = [[row[0], -row[1], -row[2]] for row in rows[:3]]
-    rotation = [0.0 - v for v in poses.vector_of_matrix(record, turned)]
-    poses.check_near(record, position)
-    translation = [0.0 - v for v in poses.turn(poses.transposed(turned), position)]
-    poses.check_near(record, translation)
-    return rotation, translation, rows
-
-
 def panorama(size: tuple[int, int]) -> list[float]:
     """The intrinsics of the equirectangular image of the whole sphere."""
     height, width = size
@@ -183,11 +169,10 @@ def render(rig: Rig, path: str) -> str:
     if shared:
         whole.update(next(iter(written.values())))
     whole["frames"] = []
-    kept = poses.written_rows(rig, "nerfstudio")
-    for name, extrinsics in rig.extrinsics.items():
+    matrices = (poses.matrices(poses.all_of(rig, lossy), undo=True).numpy() * _AXES + 0.0).tolist()
+    for name, rows in zip(rig.extrinsics, matrices, strict=True):
         own = {} if shared else written[rig.images.get(name, name)]
-        lossy.pose(name, extrinsics)
-        whole["frames"].append({"file_path": name, **own, "transform_matrix": kept.get(name) or _rows(extrinsics)})
+        whole["frames"].append({"file_path": name, **own, "transform_matrix": rows})
     return as_json(whole)
 
 
@@ -211,9 +196,3 @@ def _entries(lossy: Lossy, name: str, camera: Camera) -> dict[str, Any]:
         distortion = lossy.at_most(name, camera, distortion, (4, 5))
         entries |= zip(("k1", "k2", "p1", "p2", "k3"), distortion, strict=False)
     return entries
-
-
-def _rows(extrinsics: Extrinsics) -> list[list[float]]:
-    rotation, position = poses.inverse(*poses.numbers(extrinsics))
-    turned = [[row[0], -row[1], -row[2]] for row in poses.matrix_of_vector(rotation)]
-    return poses.as_rows(turned, position)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -83,15 +83,8 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
     height, width = lossy.size(name, camera)
     (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
     lossy.model(name, camera, {OCamCalib.key})
-    # what is read of these numbers is the camera again, to the last bit where such numbers exist
-    (c,) = _that_give([fy], [fy / fx], lambda values: (fx * values).tolist())
-    (d,) = _that_give(distortion[:1], [distortion[0] * c], lambda values: (values / c).tolist())
+    c, d = fy / fx, distortion[0] * fy / fx
     terms = [-value / fx**i + 0.0 for i, value in enumerate(distortion[2:])]
-    terms = _that_give(
-        distortion[2:],
-        terms,
-        lambda w: OCamCalib.from_ocamcalib(torch.cat((_float64([-fx]), w)), [0, 0]).distortion[2:].tolist(),
-    )
     inverse, error, angle = _inverse(camera, (height, width))
     lines = (
         ("direct mapping: how many coefficients; z of the distance from the centre", [1 + len(terms), -fx, *terms]),
@@ -106,19 +99,6 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
     )
     text = "\n".join(f"#{comment}\n\n{' '.join(map(repr, numbers))}\n" for comment, numbers in lines)
     return {path: text.encode()}
-
-
-def _that_give(wanted: list[float], guesses: list[float], function: Callable[[Tensor], list[float]]) -> list[float]:
-    """The numbers next to the guesses of which the function makes those that are wanted, element by element."""
-    best, missing = list(guesses), [True] * len(wanted)
-    for direction in (-math.inf, math.inf):
-        values = list(guesses)
-        for _ in range(8):
-            for i, made in enumerate(function(_float64(values))):
-                if missing[i] and made == wanted[i]:
-                    best[i], missing[i] = values[i], False
-            values = [math.nextafter(value, direction) for value in values]
-    return best
 
 
 def _inverse(camera: Camera, size: tuple[int, int]) -> tuple[list[float], float, float]:

@@ -206,9 +206,9 @@ class _File:
             if len(values) != count:
                 self.fail(key, f"{len(values)} numbers where {count} belong")
         rows = [rotation[i : i + 3] for i in (0, 3, 6)]
-        record = self.record[rotation_key]
-        pose = poses.pose(self.record[translation_key], poses.vector_of_matrix(record, rows), translation)
-        return poses.keep(pose, "rows", poses.as_rows(rows, translation))
+        poses.check_near(self.record[translation_key], translation)
+        matrix = [[*row, t] for row, t in zip(rows, translation, strict=True)]
+        return poses.from_matrices(self.record[rotation_key], matrix)
 
     def pose_by_vectors(self, rotation_key: str, translation_key: str) -> Extrinsics:
         rotation, translation = self.numbers(rotation_key), self.numbers(translation_key)
@@ -311,7 +311,7 @@ def _add_pose(lossy: Lossy, values: dict[str, Any], rig: Rig, ends_and_names: li
         lossy.all_posed(rig)
         if not poses.is_identity(rig.extrinsics[names[0]]):
             lossy.fail(names[0], "its extrinsics would be lost; in OpenCV's file the first camera is where the rig is")
-        rows = poses.to_rows(rig.extrinsics[names[1]])
+        rows = poses.matrices(rig.extrinsics[names[1]]).tolist()
         values["R"] = [row[:3] for row in rows[:3]]
         values["T"] = [row[3:] for row in rows[:3]]
     else:

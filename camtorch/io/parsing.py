@@ -23,9 +23,9 @@ _LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
 _MOST_DIRECTIVES = 100  # libyaml compares each with all
 _MOST_VALUES = 1 << 17
+_MOST_TOKENS = 1 << 18  # of a Python literal
 _MOST_JSON_UNITS = 1 << 20  # of 32 bytes, what a number takes in memory
 _BYTES_PER_UNIT = 4  # of the file, where there are more
-MOST_COMMENTS = 10_000
 _START = 1 << 16  # of a text, where its kind shows
 
 # how files begin that people pass by mistake
@@ -113,9 +113,7 @@ def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
 
 
 def _from_json(path: str | os.PathLike[str], text: str) -> Any:
-    size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
-    if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
-        raise CameraFileError(path, "content", "too many values")
+    _check_count(path, text)
     # floats at once: no text is made of a number, and integers of any length are no work
     options: dict[str, Any] = {"parse_int": float, "parse_constant": float}
     try:
@@ -124,6 +122,13 @@ def _from_json(path: str | os.PathLike[str], text: str) -> Any:
         raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
     except ValueError as error:
         raise CameraFileError(path, "content", error) from None
+
+
+def _check_count(path: str | os.PathLike[str], text: str) -> None:
+    """Refuse more values than are worth their memory."""
+    size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
+    if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
+        raise CameraFileError(path, "content", "too many values")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -137,11 +142,12 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _TOKEN = re.compile(
-    r"""\s*(?:(?P<mark>[][{}(),:])|b?'(?P<text>[^'\\\n]*(?:\\.[^'\\\n]*){0,999})'|"""
-    r"""b?"(?P<quoted>[^"\\\n]*(?:\\.[^"\\\n]*){0,999})"|(?P<comment>\#[^\n]*)"""
-    r"""|(?P<word>[^][\s{}(),:'"#]+)|(?P<end>\Z))"""
+    r"""(?P<mark>[][{}(),:])|b?'(?P<text>[^'\\\n]*(?:\\.[^'\\\n]*){0,999})'"""
+    r"""|b?"(?P<quoted>[^"\\\n]*(?:\\.[^"\\\n]*){0,999})"|(?P<comment>\#[^\n]*)|(?P<word>[^][\s{}(),:'"#]+)"""
 )
-_CLOSING = {"{": "}", "[": "]", "(": ")"}
+
+
+_as_json_text = json.JSONEncoder(ensure_ascii=False).encode
 
 
 def _is_literal(text: str) -> bool:
@@ -152,50 +158,35 @@ def _is_literal(text: str) -> bool:
 
 
 def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
-    """Texts, numbers, lists, tuples and mappings."""
-    position, comments, expected = 0, 0, "value"
-    tree = Tree(path, lambda: f"line {text.count(chr(10), 0, position) + 1}")
-    closing: list[str] = []
-    while True:
-        token = _TOKEN.match(text, position)
-        if token is None:
-            tree.fail(f"{text[position : position + 40].strip()!r:.40} where a value belongs")
-        kind = token.lastgroup or "end"
-        value, position = token[kind], token.start(kind)
-        if kind == "mark" and value in "]})":
-            if not closing or closing[-1] != value or expected == "end":
-                tree.fail(f"{value!r} where nothing is to be closed by it")
-            closing.pop()
-            tree.close()
-            expected = "separator" if closing else "end"
-        elif kind == "comment":
-            comments += 1
-            if comments > MOST_COMMENTS:
-                tree.fail("too many comments")
-        elif kind == "end":
-            break
-        elif expected == "separator":
-            # a mapping takes : and , in turn, which the tree's key tells apart
-            if kind != "mark" or value != (":" if tree.waits_for_value else ","):
-                tree.fail(f"{value!r:.40} where {':' if tree.waits_for_value else ','!r} belongs")
-            expected = "value"
-        elif expected == "end" or (kind == "mark" and value in ",:"):
-            tree.fail(f"{value!r:.40} does not belong here")
-        elif kind == "mark":
-            tree.open({} if value == "{" else [])
-            closing.append(_CLOSING[value])
-        else:
-            if "\\" in value:
-                try:
-                    value = ast.literal_eval(token[0].strip())
-                except (SyntaxError, ValueError):
-                    tree.fail(f"{value!r:.40} is no text")
-            tree.add(value if isinstance(value, str) else value.decode("latin-1"))
-            expected = "separator" if closing else "end"
-        position = token.end()
-    if closing or not isinstance(tree.root, dict):
-        tree.fail("ends before its last brace")
-    return tree.root
+    """Texts, numbers, lists, tuples and mappings, written as JSON line by line; numbers and other words as texts.
+
+    `ast.literal_eval` takes seconds for 2 MB of additions and passes over keys that stand there twice.
+    """
+    _check_count(path, text)
+    comma = ""  # that has been read: JSON has none before a closing bracket
+
+    def as_json(token: re.Match[str]) -> str:
+        nonlocal comma
+        kind, value = str(token.lastgroup), token[0]
+        if kind == "comment":
+            return ""
+        before = "" if value in ("]", "}", ")") else comma
+        comma = "," if value == "," else ""
+        if kind == "mark":
+            return before + {",": "", "(": "[", ")": "]"}.get(value, value)
+        content: str | bytes = token[kind]
+        if "\\" in token[kind]:
+            try:
+                content = ast.literal_eval(value)
+            except (SyntaxError, ValueError):
+                return before + value  # which JSON refuses, at its line
+        content = content.decode("latin-1") if isinstance(content, bytes) else content
+        return before + _as_json_text(content)
+
+    text, count = _TOKEN.subn(as_json, text, _MOST_TOKENS)
+    if count == _MOST_TOKENS:
+        raise CameraFileError(path, "content", "too many values")
+    return _from_json(path, text)
 
 
 # -- YAML
@@ -282,11 +273,6 @@ class Tree:
     def fail(self, reason: object) -> NoReturn:
         """Raise the CameraFileError of this place."""
         raise CameraFileError(self.path, self.place(), reason) from None
-
-    @property
-    def waits_for_value(self) -> bool:
-        """Whether a key of the innermost mapping has no value yet."""
-        return self._open[-1][1] is not None
 
     def open(self, container: list[Any] | dict[Any, Any], anchor: str | None = None) -> None:
         """Begin a list or a mapping."""

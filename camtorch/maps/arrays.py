@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import io
 import re
 import warnings
@@ -151,11 +150,7 @@ def from_storage(path: str, content: bytes) -> Arrays:
 
 
 def _from_base64(data: bytes, dtype: np.dtype) -> np.ndarray:
-    try:
-        raw = base64.b64decode(b"".join(data.split()), validate=True)
-    except binascii.Error as error:
-        raise ValueError(str(error)) from None
-    return np.frombuffer(raw, dtype, offset=_HEADER)
+    return np.frombuffer(base64.b64decode(b"".join(data.split()), validate=True), dtype, offset=_HEADER)
 
 
 def _from_words(data: bytes, dtype: np.dtype) -> np.ndarray:

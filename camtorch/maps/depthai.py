@@ -7,53 +7,39 @@ Integers are pixel centres.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from camtorch._arguments import shown
 from camtorch.io._errors import CameraFileError
-from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
-from camtorch.maps.mesh import as_step, mesh_of, nodes_every
-from camtorch.maps.protocol import Encoded, Given, Options
-from camtorch.maps.tables import lookup, sizes, table
+from camtorch.maps.exact import Exact, Floats
+from camtorch.maps.mesh import Mesh
+from camtorch.maps.protocol import Given, Options
+from camtorch.maps.tables import Table, table
 
-_ORDERS = ("yx", "xy")
+_ORDERS = {"yx": slice(None, None, -1), "xy": slice(None)}  # of x and y
 
 
-class DepthAI:
+class DepthAI(Table):
     """The format: see the module."""
 
     name = "depthai"
-    suffixes: tuple[str, ...] = ()
-    options: tuple[str, ...] = ("step", "order")
-    described = True
+    options = ("step", "order")
 
-    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
-        """Raises ValueError: an option that is none."""
-        step, order = as_step(options.step, "Warp.save"), "yx" if options.order is None else options.order
+    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
+        """Raises ValueError: an order that is none."""
+        order = "yx" if options.order is None else options.order
         if not isinstance(order, str) or order not in _ORDERS:
             raise ValueError(f"Warp.save: order must be 'yx' (loadMeshFiles) or 'xy' (setWarpMesh); got {shown(order)}")
-        height, width = exact.target_size
-        mesh = mesh_of(path, exact, nodes_every(step, width), nodes_every(step, height))
-        nodes = mesh.nodes if order == "xy" else mesh.nodes[..., ::-1]
-        facts = {"step": step, "nodes": (len(mesh.rows), len(mesh.columns)), "order": order}
-        return Encoded(np.ascontiguousarray(nodes, "<f4").tobytes(), facts)
+        return np.ascontiguousarray(mesh.nodes[..., _ORDERS[order]], "<f4").tobytes(), {"order": order}
 
-    def matches(self, path: str, content: bytes) -> bool:
-        return False
-
-    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
-        """Raises CameraFileError: another length, no such order or step, nobody says the sizes."""
-        source, target = sizes(path, given)
+    def unpack(
+        self, path: str, content: bytes, columns: Floats, rows: Floats, given: Given
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Raises CameraFileError: no such order."""
         order = given.order or "yx"
-        if order not in _ORDERS:
-            raise CameraFileError(path, "order", f"must be 'yx' or 'xy'; got {order!r}")
-        try:
-            step = as_step(given.step, "load_map")
-        except ValueError as error:
-            raise CameraFileError(path, "step", str(error)) from None
-        shape = len(nodes_every(step, target[0])), len(nodes_every(step, target[1])), 2
-        nodes = table(path, content, "<f4", shape).astype(np.float64)
-        return lookup(
-            path, self.name, nodes if order == "xy" else nodes[..., ::-1], step, source, target, {"order": order}
-        )
+        if not isinstance(order, str) or order not in _ORDERS:
+            raise CameraFileError(path, "order", f"must be 'yx' or 'xy'; got {order!r:.60}")
+        nodes = table(path, content, "<f4", (len(rows), len(columns), 2)).astype(np.float64)
+        return nodes[..., _ORDERS[order]], {"order": order}

@@ -10,51 +10,41 @@ https://docs.kernel.org/userspace-api/media/drivers/dw100.html
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from camtorch.io._errors import CameraFileError
-from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
-from camtorch.maps.mesh import held, mesh_of, nodes_every, rounded
-from camtorch.maps.protocol import Encoded, Given, Options
-from camtorch.maps.tables import lookup, sizes, table
+from camtorch.maps.exact import Exact, Floats
+from camtorch.maps.mesh import Mesh, held, rounded
+from camtorch.maps.protocol import Given, Options
+from camtorch.maps.tables import Table, table
 
-_STEP = 16
 _PARTS = 16
 _MOST = (1 << 16) - 1
 _SMALLEST, _LARGEST = (144, 176), (3072, 4096)
 
 
-class DW100:
+class DW100(Table):
     """The format: see the module."""
 
     name = "dw100"
-    suffixes: tuple[str, ...] = ()
-    options: tuple[str, ...] = ("clip",)
-    described = True
+    options = ("clip",)
+    steps = (16,)
 
-    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
+    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """Raises CameraFileError: sizes that the hardware does not take, positions off 0 to 4095.9375."""
         for what, size in (("source", exact.source_size), ("target", exact.target_size)):
             if any(not low <= side <= high for low, side, high in zip(_SMALLEST, size, _LARGEST, strict=True)):
                 raise CameraFileError(
                     path, f"{what} size", f"{size[1]}x{size[0]}; the DW100 takes 176x144 to 4096x3072 pixels"
                 )
-        height, width = exact.target_size
-        mesh = mesh_of(path, exact, nodes_every(_STEP, width), nodes_every(_STEP, height))
         low, high = np.zeros(2), np.full(2, _MOST / _PARTS)
-        mesh = held(path, "dw100", mesh, low, high, clip=bool(options.clip))
-        parts = rounded(mesh, exact, _PARTS, low, high)
-        words = (parts[..., 1] << 16 | parts[..., 0]).astype("<u4")
-        return Encoded(words.tobytes(), {"step": _STEP, "nodes": words.shape})
+        parts = rounded(held(path, self.name, mesh, low, high, clip=bool(options.clip)), exact, _PARTS, low, high)
+        return (parts[..., 1] << 16 | parts[..., 0]).astype("<u4").tobytes(), {}
 
-    def matches(self, path: str, content: bytes) -> bool:
-        return False
-
-    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
-        """Raises CameraFileError: another length, nobody says the sizes."""
-        source, target = sizes(path, given)
-        shape = len(nodes_every(_STEP, target[0])), len(nodes_every(_STEP, target[1]))
-        words = table(path, content, "<u4", shape)
-        nodes = np.stack((words & _MOST, words >> 16), -1) / _PARTS
-        return lookup(path, self.name, nodes, _STEP, source, target, {})
+    def unpack(
+        self, path: str, content: bytes, columns: Floats, rows: Floats, given: Given
+    ) -> tuple[Floats, dict[str, Any]]:
+        words = table(path, content, "<u4", (len(rows), len(columns)))
+        return np.stack((words & _MOST, words >> 16), -1) / _PARTS, {}

@@ -47,9 +47,9 @@ _LARGEST_FILE = 1 << 31
 _LARGEST_DESCRIPTION = 1 << 16
 
 
-def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, options: Options) -> MapReport:
-    """See `Warp.save`."""
-    name = _path(path, "Warp.save")
+def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, **said: Any) -> MapReport:
+    """See `Warp.save`; `said` are the fields of `Options`."""
+    name, options = _path(path, "Warp.save"), Options(**said)
     chosen = _chosen(name, format)
     if options.step is not None:
         options = replace(options, step=as_whole(options.step, "step", "Warp.save"))
@@ -63,8 +63,8 @@ def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, optio
     if not exact.shown.any():
         raise ValueError(f"Warp.save: {name}: no pixel of the target shows anything of the source's image")
     encoded = chosen.encode(name, exact, options)
-    said = {key: encoded.facts.get(key) for key in ("step", "v", "order")}
-    read = chosen.decode(name, encoded.content, Given(exact.source_size, exact.target_size, **said))
+    facts = {key: encoded.facts.get(key) for key in ("step", "v", "order")}
+    read = chosen.decode(name, encoded.content, Given(exact.source_size, exact.target_size, **facts))
     files = _files(name, chosen)
     report = measure(name, read, exact, files, encoded.facts)
     with replacing(*files) as opened:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Bools, Exact, Floats
 
-_STEP, _LONGEST_STEP = 16, 256  # pixels of the target
+STEP, STEPS = 16, range(1, 257)
+"""Pixels of the target between nodes: usually, and those that formats without other limits take."""
 _SLACK = 0.5  # pixels: as far as a pixel that shows the image may lie beyond the outermost pixel centres
 _OUTWARDS = 1 / 32  # of the second differences by which nodes round outwards
 _MOST_STEPS = 200
@@ -66,16 +68,17 @@ def _cells(nodes: Floats, count: int) -> tuple[np.ndarray, Floats]:
     return cell, (pixels - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
 
 
-def as_step(step: int | None, owner: str) -> int:
-    """Pixels of the target between nodes; 16 if nobody says.
+def as_step(step: int | None, owner: str, steps: Sequence[int] = STEPS, usual: int = STEP) -> int:
+    """Pixels of the target between nodes; `usual` if nobody says.
 
     Raises:
-        ValueError: less than 1, or more than 256.
+        ValueError: none of `steps`.
     """
     if step is None:
-        return _STEP
-    if not 1 <= step <= _LONGEST_STEP:
-        raise ValueError(f"{owner}: step must be 1 to {_LONGEST_STEP} pixels; got {step}")
+        return usual
+    if step not in steps:
+        which = f"{steps[0]} to {steps[-1]}" if isinstance(steps, range) else f"one of {', '.join(map(str, steps))}"
+        raise ValueError(f"{owner}: step must be {which} pixels; got {step}")
     return step
 
 

@@ -14,19 +14,19 @@ Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" an
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
-from camtorch.maps.lookup import LookupMap
-from camtorch.maps.mesh import held, mesh_of, nodes_every, rounded
-from camtorch.maps.protocol import Encoded, Given, Options
-from camtorch.maps.tables import lookup, sizes, table
+from camtorch.maps.mesh import Mesh, held, rounded
+from camtorch.maps.protocol import Given, Options
+from camtorch.maps.tables import Table, table
 
 _PARTS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1
-_STEPS = tuple(1 << m for m in range(8))
-_STEP = 8
 _ALIGNED = 16  # bytes
 _LARGEST = 8192  # pixels along a side
 _BLOCKS = ((64, 64), (32, 64), (32, 32), (16, 32), (16, 16), (8, 16), (8, 8), (4, 8), (2, 8))  # height, width
@@ -35,19 +35,15 @@ _BEFORE, _AFTER = 1, 2  # pixels beside the whole part of a position that a bicu
 _LONGEST_BLOCK = 255  # eight bits
 
 
-class TILDC:
+class TILDC(Table):
     """The format: see the module."""
 
     name = "ti_ldc"
-    suffixes: tuple[str, ...] = ()
-    options: tuple[str, ...] = ("step", "block", "clip")
-    described = True
+    options = ("step", "block", "clip")
+    step, steps = 8, tuple(1 << m for m in range(8))
 
-    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
-        """Raises CameraFileError: sizes, offsets or padding that the LDC does not take. ValueError: a bad option."""
-        step = _STEP if options.step is None else options.step
-        if step not in _STEPS:
-            raise ValueError(f"Warp.save: step must be one of {_STEPS} for ti_ldc; got {step!r}")
+    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
+        """Raises CameraFileError: sizes, offsets or padding that the LDC does not take. ValueError: a bad block."""
         block = options.block
         if block is not None and (block[1] % 8 or block[0] % 2 or not all(0 < s <= _LONGEST_BLOCK for s in block)):
             raise ValueError(
@@ -56,36 +52,24 @@ class TILDC:
             )
         if max(*exact.source_size, *exact.target_size) > _LARGEST:
             raise CameraFileError(path, "size", f"a side above {_LARGEST} px, which the LDC does not take")
-        height, width = exact.target_size
-        mesh = mesh_of(path, exact, nodes_every(step, width), nodes_every(step, height))
         places = np.stack(np.meshgrid(mesh.columns, mesh.rows), -1)
         limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
-        mesh = held(path, "ti_ldc", mesh, *limits, clip=bool(options.clip))
-        offsets = (rounded(mesh, exact, _PARTS, *limits) - places * _PARTS).astype("<i2")
+        mesh = held(path, self.name, mesh, *limits, clip=bool(options.clip))
+        parts = rounded(mesh, exact, _PARTS, *limits)
         pitch = _pitch(len(mesh.columns))
         lines = np.zeros((len(mesh.rows), pitch // 2), "<i2")
-        lines[:, : 2 * len(mesh.columns)] = offsets.reshape(len(mesh.rows), -1)
-        content = lines.tobytes()
-        given = Given(exact.source_size, exact.target_size, step)
-        positions = self.decode(path, content, given).positions.numpy()
+        lines[:, : 2 * len(mesh.columns)] = (parts - places * _PARTS).reshape(len(mesh.rows), -1)
+        positions = replace(mesh, nodes=parts / _PARTS).positions(exact.target_size)
         size, padding, largest = _fetched(path, positions, exact.source_size, block)
-        facts = {"step": step, "nodes": (len(mesh.rows), len(mesh.columns)), "line_offset": pitch}
-        return Encoded(content, {**facts, "block_size": size, "pixel_padding": padding, "source_block": largest})
+        facts = {"line_offset": pitch, "block_size": size, "pixel_padding": padding, "source_block": largest}
+        return lines.tobytes(), facts
 
-    def matches(self, path: str, content: bytes) -> bool:
-        return False
-
-    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
-        """Raises CameraFileError: another length, no such step, nobody says the sizes."""
-        source, target = sizes(path, given)
-        step = _STEP if given.step is None else given.step
-        if step not in _STEPS:
-            raise CameraFileError(path, "step", f"{step!r} is none of {_STEPS}")
-        columns, rows = nodes_every(step, target[1]), nodes_every(step, target[0])
+    def unpack(
+        self, path: str, content: bytes, columns: Floats, rows: Floats, given: Given
+    ) -> tuple[Floats, dict[str, Any]]:
         lines = table(path, content, "<i2", (len(rows), _pitch(len(columns)) // 2))
         offsets = lines[:, : 2 * len(columns)].reshape(len(rows), len(columns), 2) / _PARTS
-        places = np.stack(np.meshgrid(columns, rows), -1)
-        return lookup(path, self.name, places + offsets, step, source, target, {})
+        return np.stack(np.meshgrid(columns, rows), -1) + offsets, {}
 
 
 def _pitch(columns: int) -> int:

@@ -34,9 +34,6 @@ from camtorch._tracing import (
     set_aside,
 )
 from camtorch.camera import Camera
-from camtorch.maps.formats import save_map
-from camtorch.maps.protocol import Options as MapOptions
-from camtorch.maps.report import MapReport
 from camtorch.native.sampler import empty
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import compiled
@@ -56,6 +53,9 @@ from camtorch.warp.sampling import (
     render,
 )
 from camtorch.warp.shutter import RollingShutter, Shutters, averaged, in_motion
+
+if TYPE_CHECKING:
+    from camtorch.maps.report import MapReport
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
@@ -614,7 +614,9 @@ class Warp(GeometryModule):
                 format, an option that it does not have. ImportError: a library that it needs is missing; the error
                 names the extra. OSError: the file cannot be written.
         """
-        return save_map(self, path, format, MapOptions(step, v, order, block, dtype, clip))
+        from camtorch.maps.formats import save_map  # all formats of maps: only when needed
+
+        return save_map(self, path, format, step=step, v=v, order=order, block=block, dtype=dtype, clip=clip)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_pinned": None}
