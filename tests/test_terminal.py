@@ -1,97 +1,43 @@
 """What the command says on stderr."""
 
+import io
 import sys
+import time
 
 import pytest
 
 from camtorch.cli import terminal
 
 
-class Terminal:
-    """A stream that is one, and keeps what it is told."""
-
-    def __init__(self, tty):
-        self.tty, self.text = tty, ""
+class Terminal(io.StringIO):
+    """A stream that is one."""
 
     def isatty(self):
-        return self.tty
-
-    def write(self, text):
-        self.text += text
-
-    def flush(self):
-        pass
+        return True
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """The time in seconds, in a list of one."""
-    now = [0.0]
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
-    return now
-
-
-def told(monkeypatch, clock, *, tty, seconds):
-    stream = Terminal(tty)
-    monkeypatch.setattr(sys, "stderr", stream)
-    show = terminal.progress("dewarping")
-    for part in (0.25, 0.5, 1.0):
-        clock[0] += seconds
-        show(part)
-    return stream.text
-
-
-def test_long_work_shows_how_far_it_is_and_leaves_nothing(monkeypatch, clock):
-    text = told(monkeypatch, clock, tty=True, seconds=5)
-    assert text.startswith("\rdewarping: 25 %\rdewarping: 50 %\r")
-    # what a terminal shows in the end: blanks over all that stood there
-    *_, last, end = text.split("\r")
-    assert last == " " * len("dewarping: 100 %")
-    assert end == ""
-
-
-def test_short_work_and_files_show_nothing(monkeypatch, clock):
-    assert told(monkeypatch, clock, tty=True, seconds=0.1) == ""
-    assert told(monkeypatch, clock, tty=False, seconds=5) == ""
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+@pytest.mark.parametrize("pause", [0, 0.6])
+def test_work_of_more_than_a_moment_shows_how_far_it_is_and_leaves_nothing(monkeypatch, stream, pause):
+    stderr = stream()
+    monkeypatch.setattr(sys, "stderr", stderr)
+    show = terminal.progress("searching")
+    time.sleep(pause)  # in a file nothing is shown before 30 seconds
+    show(0.25)
+    show(1)
+    bar = terminal.bar("dewarping", 100, "images")
+    time.sleep(pause)
+    bar.update(10)
+    bar.close()
+    told = stderr.getvalue()
+    for text in ("searching:  25 %|", "dewarping:  10%|", "10/100", " images/s"):
+        assert (text in told) == (stderr.isatty() and pause > 0)
+    assert not told.split("\r")[-1]
 
 
 def test_messages_are_one_line(capsys):
     terminal.note("what\n  pillow said")
     assert capsys.readouterr().err == "camtorch: note: what pillow said\n"
-
-
-def bar(monkeypatch, clock, *, tty, seconds, steps=((10, 0), (30, 10), (100, 10))):
-    stream = Terminal(tty)
-    monkeypatch.setattr(sys, "stderr", stream)
-    shown = terminal.Bar("dewarping", "images")
-    for done, kept in steps:
-        clock[0] += seconds
-        shown.show(done, 100, kept)
-    shown.close()
-    return stream.text
-
-
-def test_a_bar_has_the_rate_and_the_time_left(monkeypatch, clock):
-    text = bar(monkeypatch, clock, tty=True, seconds=2)
-    _, first, second, third, blank, end = text.split("\r")
-    assert first == "dewarping [==                  ]  10 %, 10 of 100 images, 5/s, 18 s left"
-    # what was done before counts for nothing
-    assert second.startswith("dewarping [======              ]  30 %, 30 of 100 images, 5/s, 14 s left")
-    assert third.startswith("dewarping [====================] 100 %, 100 of 100 images, 15/s, 0 s left")
-    assert blank.isspace()
-    assert end == ""
-
-
-def test_a_bar_in_a_file_is_a_line_now_and_then(monkeypatch, clock):
-    assert bar(monkeypatch, clock, tty=False, seconds=20) == (
-        "camtorch: dewarping: 30 of 100 images, 0.5/s, 2 min left\n"
-    )
-    assert bar(monkeypatch, clock, tty=True, seconds=0.1) == ""
-
-
-def test_a_bar_fits_its_terminal(monkeypatch, clock):
-    monkeypatch.setenv("COLUMNS", "40")
-    assert max(map(len, bar(monkeypatch, clock, tty=True, seconds=9999).split("\r"))) == 39
 
 
 def test_names_do_not_steer_the_terminal(capsys):

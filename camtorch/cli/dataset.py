@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     manifest = Manifest(output, "augment", work.settings(), shard)
     if merged is not None and os.path.lexists(merged) and not (arguments.resume or arguments.force):
         manifest.read()
-        if shard.count == 1 or not any(manifest.history(item).begun for item in everything):
+        if shard.count == 1 or not any(map(manifest.has_begun, everything)):
             raise ValueError(f"{merged}: exists already; --resume goes on where it was broken off, --force overwrites")
     status, report = many.carry_out(
         shard.of(everything),
@@ -192,8 +192,8 @@ def _merge(data: coco.DataSet, everything: Sequence[Labelled], manifest: Manifes
 
 def _result(item: Labelled, manifest: Manifest) -> Json | None:
     """What was kept of an item that was made, by whatever shard."""
-    for line in reversed(manifest.history(item).records):
-        if (line["variant"], line["settings"]) == (item.variant, manifest.terms.settings):
+    for line in reversed(manifest.records(item)):
+        if (line["variant"], line["settings"]) == (item.variant, manifest.settings):
             there = all(path.is_file() for path in item.outputs)
             result: Json | None = line["result"] if there else None
             return result

@@ -18,7 +18,7 @@ from camtorch.cli.options import (
     parse_path,
     parse_suffix,
 )
-from camtorch.cli.terminal import Bar, note
+from camtorch.cli.terminal import bar, note
 from camtorch.jobs import pool
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
 
 def _video(arguments: argparse.Namespace, source: Path) -> None:
     from camtorch.cli import targets, videos
-    from camtorch.jobs.items import Item
+    from camtorch.jobs.items import Item, Listener
 
     output = Path(arguments.output or Path(_DEFAULT).with_suffix(source.suffix))
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
@@ -156,25 +156,9 @@ def _video(arguments: argparse.Namespace, source: Path) -> None:
     if arguments.dry_run:
         print(f"{source} -> {output}")
         return
-    bar = Bar("dewarping", "frames")
-    try:
-        told = work(item, _Shown(bar, item))
-    finally:
-        bar.close()
+    with bar("dewarping", int(item.size), "frames") as shown:
+        told = work(item, Listener(note, lambda done: shown.update(int(done) - shown.n)))
     print(f"{output}: dewarped, {_told(arguments, told)}, {told['frames']} frames")
-
-
-class _Shown:
-    """Shows how far one item is; a `camtorch.jobs.items.Listener`."""
-
-    def __init__(self, bar: Bar, item: Item):
-        self._bar, self._item = bar, item
-
-    def note(self, text: str) -> None:
-        note(text)
-
-    def done(self, size: float) -> None:
-        self._bar.show(size, max(size, self._item.size))
 
 
 # -- many files

@@ -19,6 +19,7 @@ from typing import NoReturn
 from camtorch import __version__
 from camtorch.cli import augment, birdseye, board, calibrate, convert, demo, dewarp, lenses, map, rectify, show
 from camtorch.cli.terminal import note, say
+from camtorch.jobs.pool import lacks_memory, reason
 from camtorch.native import library
 
 _INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
@@ -70,9 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("interrupted")
         return _INTERRUPT
     except Exception as error:
-        if not (isinstance(error, (ValueError, ImportError, OSError)) or _lacks_memory(error)):
+        if not (isinstance(error, (ValueError, ImportError, OSError)) or lacks_memory(error)):
             raise
-        say(f"error: {_reason(error)}")
+        say(f"error: {reason(error)}")
         return 2
     return status
 
@@ -85,20 +86,6 @@ def _parser() -> argparse.ArgumentParser:
     for command in (dewarp, rectify, birdseye, augment, map, convert, show, lenses, calibrate, board, demo):
         command.add(commands)
     return parser
-
-
-def _reason(error: Exception) -> str:
-    if _lacks_memory(error):
-        return f"out of memory: {error}" if str(error) else "out of memory"
-    if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return str(error)
-
-
-def _lacks_memory(error: Exception) -> bool:
-    """Whether it is that: neither torch nor the loader of shared libraries has a type for it."""
-    words = {RuntimeError: "allocate memory", ImportError: "failed to map segment", OSError: "allocate memory"}
-    return isinstance(error, MemoryError) or any(isinstance(error, t) and w in str(error) for t, w in words.items())
 
 
 @contextlib.contextmanager

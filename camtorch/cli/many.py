@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from camtorch.cli.terminal import Bar, note, say
+from camtorch.cli.terminal import bar, note, say
 from camtorch.jobs import run
 from camtorch.jobs.items import Item, Json, Shard, Work
 from camtorch.jobs.manifest import Manifest
@@ -75,9 +75,13 @@ def carry_out(
         return _dry_run(items, faults, manifest, arguments.resume), None
     shard = manifest.shard
     part = "" if shard.count == 1 else f", shard {shard.rank + 1} of {shard.count}"
-    bar = Bar(doing + part, units)
     try:
-        with manifest:
+        with manifest, bar(doing + part, int(sum(item.size for item in items)), units) as shown:
+
+            def watch(done: float, kept: float) -> None:
+                shown.initial = int(kept)  # which took no time
+                shown.update(int(done) - shown.n)
+
             report = run.run(
                 items,
                 work,
@@ -85,12 +89,12 @@ def carry_out(
                 processes=min(arguments.jobs or _cores(shard), max(len(items), 1)),
                 resume=arguments.resume,
                 force=arguments.force,
-                watch=lambda progress: bar.show(progress.done, progress.total, progress.kept),
+                watch=watch,
             )
     except FileExistsError as error:
         raise ValueError(f"{error}; --resume goes on where it was broken off, --force overwrites") from None
-    finally:
-        bar.close()
+    except ChildProcessError as error:
+        raise ValueError(f"{error}; --resume goes on where it was broken off, --jobs 1 needs the least") from None
     for text, names in report.notes.items():
         note(f"{names[0]} {text}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {text}")
     failed = [*((str(path), why) for path, why in faults), *report.failed]

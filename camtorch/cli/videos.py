@@ -6,15 +6,15 @@ import contextlib
 import copy
 import importlib
 import os
-import queue
 import re
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,8 +47,6 @@ _OPTIONS = {"libx264": {"mbtree": "0"}, "libx265": {"x265-params": "log-level=er
 _EVEN = ("libx264", "libx265")
 _BY_QUANTISER = ("mpeg4", "mpeg2video", "mjpeg")
 _CUT = 0.5  # seconds that may be missing at the end
-
-T = TypeVar("T")
 
 
 class VideoFileError(ValueError):
@@ -299,7 +297,7 @@ class _Frames:
         return new
 
 
-# -- from file to file: one thread reads, one warps, one writes
+# -- from file to file
 
 
 def remake(
@@ -311,7 +309,7 @@ def remake(
 ) -> dict[str, Any]:
     """Write a video whose frames are those of another one through a warp.
 
-    Time stamps, sound, subtitles, chapters, titles, the rotation with which it is shown, and what colours mean are
+    Time stamps, sound, subtitles, titles, the rotation with which it is shown, and what colours mean are
     those of the source. Pixels are square then. What the format of the target cannot hold is an error.
 
     Args:
@@ -352,8 +350,16 @@ def _remade(
     frames: _Frames | None = None
     waiting: list[Any] = []
     shown = time.monotonic()
-    with _behind() as later, _ahead(read) as things:
-        for thing in things:
+    # the encoder works in a thread of its own, the decoder in those of ffmpeg
+    with ThreadPoolExecutor(1) as writer:
+        at_work: deque[Future[None]] = deque()
+
+        def later(write: Callable[[Any], None], what: Any) -> None:
+            at_work.append(writer.submit(write, what))
+            if len(at_work) > _AHEAD:
+                at_work.popleft().result()
+
+        for thing in read:
             if not hasattr(thing, "planes"):  # a packet of sound or words
                 if frames is None:
                     waiting.append(thing)
@@ -373,6 +379,8 @@ def _remade(
         if frames is None:
             raise VideoFileError(f"{read.path}: no frame of it can be read")
         later(written.encode, None)
+        for future in at_work:
+            future.result()
     read.check_end()
     return facts | {"frames": read.count}
 
@@ -514,7 +522,6 @@ class _Written:
         self._stream = stream
         stream.metadata.update(_kept(read.stream.metadata))
         self.output.metadata.update(_kept(read.container.metadata))
-        self.output.set_chapters(read.container.chapters())
         for other in read.others:
             try:
                 copy = self.output.add_stream_from_template(other)
@@ -544,82 +551,3 @@ def _kept(metadata: dict[str, str]) -> dict[str, str]:
     """What the new file does not say of itself."""
     own = ("brand", "minor_version", "encoder", "DURATION", "BPS", "NUMBER_OF", "_STATISTICS")
     return {name: text for name, text in metadata.items() if not any(word in name for word in own)}
-
-
-# -- threads
-
-
-@contextlib.contextmanager
-def _ahead(things: Iterable[T]) -> Iterator[Iterator[T]]:
-    """The same things, which another thread gets somewhat before they are wanted."""
-    waiting: queue.Queue[tuple[str, Any]] = queue.Queue(_AHEAD)
-    ended = threading.Event()
-
-    def put(kind: str, what: Any) -> None:
-        while not ended.is_set():
-            with contextlib.suppress(queue.Full):
-                waiting.put((kind, what), timeout=0.1)
-                return
-
-    def work() -> None:
-        try:
-            for thing in things:
-                put("thing", thing)
-                if ended.is_set():
-                    return
-            put("end", None)
-        except BaseException as error:  # the other thread's to deal with
-            put("error", error)
-
-    def got() -> Iterator[T]:
-        while True:
-            kind, what = waiting.get()
-            if kind == "end":
-                return
-            if kind == "error":
-                raise what
-            yield what
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        yield got()
-    finally:
-        ended.set()
-        thread.join()
-
-
-@contextlib.contextmanager
-def _behind() -> Iterator[Callable[[Callable[[T], object], T], None]]:
-    """A function that has another thread call one with an argument, in the order of calls, and soon.
-
-    What these raise, a later call does, or the end of the block, before which all is done.
-    """
-    waiting: queue.Queue[tuple[Callable[[Any], object], Any] | None] = queue.Queue(_AHEAD)
-    errors: list[BaseException] = []
-
-    def work() -> None:
-        while (call := waiting.get()) is not None:
-            if not errors:
-                try:
-                    call[0](call[1])
-                except BaseException as error:  # the other thread's to deal with
-                    errors.append(error)
-
-    def later(function: Callable[[T], object], argument: T) -> None:
-        if errors:
-            raise errors[0]
-        waiting.put((function, argument))
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        yield later
-    except BaseException as error:
-        errors.insert(0, error)  # so what waits is left
-        raise
-    finally:
-        waiting.put(None)
-        thread.join()
-    if errors:
-        raise errors[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import glob
 import os
 import re
@@ -82,44 +81,31 @@ def _below(
     root: Path, place: Path, suffixes: Collection[str], output: Path, faults: list[tuple[Path, str]]
 ) -> list[Found]:
     """What is in a folder, and in those in it."""
-    try:
-        skipped = os.stat(output)
-    except OSError:
-        skipped = None
     found: list[Found] = []
-    around = [os.stat(parent) for parent in root.resolve().parents]
-    waiting = [(root, place, frozenset((status.st_dev, status.st_ino) for status in around))]
-    while waiting:
-        folder, place, above = waiting.pop()
-        try:
-            status = os.stat(folder)
-            me = status.st_dev, status.st_ino
-            if me in above:
-                faults.append((folder, "a link to a folder that it lies in"))
+    out = os.path.realpath(output)
+    walk = os.walk(root, followlinks=True, onerror=lambda error: faults.append((Path(error.filename), _reason(error))))
+    for name, folders, names in walk:
+        folder, real = Path(name), os.path.realpath(name)
+        inside = []
+        for one in sorted(folders):
+            target = os.path.realpath(folder / one)
+            if one.startswith(".") or target == out:
                 continue
-            if skipped is not None and folder is not root and os.path.samestat(status, skipped):
+            if _is_below(real, target):
+                faults.append((folder / one, "a link to a folder that it lies in"))
+            else:
+                inside.append(one)
+        folders[:] = inside
+        for path in (folder / one for one in names if not one.startswith(".")):
+            if path.suffix.lower() not in suffixes:
                 continue
-            with os.scandir(folder) as entries:
-                names = [entry.name for entry in entries if not entry.name.startswith(".")]
-        except OSError as error:
-            faults.append((folder, _reason(error)))
-            continue
-        for name in names:
-            path = folder / name
             try:
-                mode = os.stat(path).st_mode
-            except OSError as error:
-                # of what is gone, or was never there, only a file that would have been taken is missed
-                if error.errno == errno.ELOOP or path.suffix.lower() in suffixes:
-                    faults.append((path, "a link to itself" if error.errno == errno.ELOOP else _reason(error)))
-                continue
-            if stat.S_ISDIR(mode):
-                waiting.append((path, place / name, above | {me}))
-            elif path.suffix.lower() in suffixes:
-                if stat.S_ISREG(mode):
-                    found.append(Found(path, place / name))
+                if stat.S_ISREG(os.stat(path).st_mode):
+                    found.append(Found(path, place / path.relative_to(root)))
                 else:
                     faults.append((path, "not an ordinary file"))
+            except OSError as error:
+                faults.append((path, _reason(error)))
     return found
 
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 Json: TypeAlias = Any
 """What JSON holds."""
@@ -32,14 +32,14 @@ class Item:
         return str(self.inputs[0])
 
 
-class Listener(Protocol):
+@dataclass(frozen=True)
+class Listener:
     """Who hears of the work on an item while it goes on."""
 
-    def note(self, text: str) -> None:
-        """What the user should know though the work goes on; where it begins with the item's name, that is left out."""
-
-    def done(self, size: float) -> None:
-        """How much of `Item.size` is done."""
+    note: Callable[[str], None]
+    """Of what the user should know; where it begins with the item's name, that is left out."""
+    done: Callable[[float], object]
+    """Of how much of `Item.size` is done."""
 
 
 Work: TypeAlias = Callable[[Item, Listener], Json]

@@ -7,12 +7,13 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from camtorch.io.hashing import hash_of
 from camtorch.io.writing import all_left_over
 from camtorch.jobs import pool
-from camtorch.jobs.items import Item, Json, Work, real_paths
-from camtorch.jobs.manifest import Manifest, Terms
+from camtorch.jobs.items import Item, Json, Listener, Work, real_paths
+from camtorch.jobs.manifest import Manifest
 
 
 @dataclass
@@ -27,17 +28,7 @@ class Report:
     notes: dict[str, list[str]] = field(default_factory=dict)
     """What was noted, and of which items."""
     results: dict[Item, Json] = field(default_factory=dict)
-    """What `Work` returned, now or then."""
-
-
-@dataclass
-class Progress:
-    """How far a job is, in units of `Item.size`."""
-
-    total: float
-    done: float = 0.0
-    """What was kept among it."""
-    kept: float = 0.0
+    """What `Work` returned, now or then; in the order of items."""
 
 
 def run(
@@ -48,7 +39,7 @@ def run(
     processes: int = 1,
     resume: bool = False,
     force: bool = False,
-    watch: Callable[[Progress], None] | None = None,
+    watch: Callable[[float, float], None] = lambda done, kept: None,
 ) -> Report:
     """Have items made.
 
@@ -60,7 +51,7 @@ def run(
         resume: keep what the manifest knows, where inputs, settings and outputs are those it says; make anew what else
             the job had begun.
         force: overwrite what the job did not begin.
-        watch: is told how far it is, whenever that changes.
+        watch: is told how much of the items' sizes is done, and how much of that was kept, whenever that changes.
 
     Raises:
         FileExistsError: outputs exist, and neither `resume` nor `force`. As `pool.run`.
@@ -69,56 +60,53 @@ def run(
     if there and not (resume or force):
         more = f", and {len(there) - 1} more of {sum(len(item.outputs) for item in items)}" if len(there) > 1 else ""
         raise FileExistsError(f"{there[0]}: exists already{more}")
-    for path in all_left_over(real_paths(path for item in items for path in item.outputs)):
-        _unlink(path)
-    report, progress = Report(), Progress(sum(item.size for item in items))
+    report = Report()
     parts: dict[Item, float] = {}
     failed: dict[Item, str] = {}
+    done = kept = 0.0
 
     def tasks() -> Iterator[_Task]:
         for item in items:
-            history = manifest.history(item)
-            if not history.begun:
+            if not manifest.has_begun(item):
                 if not force and any(map(os.path.lexists, item.outputs)):
-                    fail(item, f"{item.outputs[0]} exists already, and is not of this job")
+                    failed[item] = f"{item.outputs[0]} exists already, and is not of this job"
+                    advance(item, item.size)
                     continue
                 manifest.begin(item)
-            yield _Task(item, history.records if resume else [])
+            yield _Task(item, manifest.records(item) if resume else [])
 
-    def receive(task: _Task, kind: str, what: Json) -> None:
+    def receive(task: _Task, is_done: bool, what: Any) -> None:
+        nonlocal kept
         item = task.item
-        if kind == "failed":
-            fail(item, what.removeprefix(item.name).lstrip(": "))
-        elif kind == "done":
-            record, is_new = what
-            report.results[item] = record["result"]
-            if is_new:
-                manifest.made(record)
+        if not is_done:
+            advance(item, min(what, item.size))
+            return
+        for text in what.notes:
+            report.notes.setdefault(text.removeprefix(item.name).lstrip(": "), []).append(item.name)
+        if what.record is None:
+            failed[item] = what.failure.removeprefix(item.name).lstrip(": ")
+        else:
+            report.results[item] = what.record["result"]
+            if what.is_new:
+                manifest.made(item, what.record)
                 report.made += 1
             else:
                 report.kept += 1
-                progress.kept += item.size
-            advance(item, item.size)
-        elif isinstance(what, str):
-            report.notes.setdefault(what.removeprefix(item.name).lstrip(": "), []).append(item.name)
-        else:
-            advance(item, min(what, item.size))
-
-    def fail(item: Item, reason: str) -> None:
-        failed[item] = reason
-        manifest.failed(item, reason)
-        # by a process that died
-        for path in all_left_over(real_paths(item.outputs)):
-            _unlink(path)
+                kept += item.size
         advance(item, item.size)
 
-    def advance(item: Item, done: float) -> None:
-        progress.done += done - parts.get(item, 0.0)
-        parts[item] = done
-        if watch is not None:
-            watch(progress)
+    def advance(item: Item, part: float) -> None:
+        nonlocal done
+        done += part - parts.get(item, 0.0)
+        parts[item] = part
+        watch(done, kept)
 
-    pool.run(_Attempt(work, manifest.terms), tasks(), receive, processes=processes)
+    _remove_left_over(items)
+    try:
+        pool.run(_Attempt(work, manifest.settings), tasks(), receive, processes=processes)
+    except BaseException:
+        _remove_left_over(items)
+        raise
     report.failed = [(item.name, failed[item]) for item in items if item in failed]
     report.results = {item: report.results[item] for item in items if item in report.results}
     return report
@@ -128,8 +116,8 @@ def pending(items: Iterable[Item], manifest: Manifest, *, resume: bool = False) 
     """Those items that `run` would make, of a manifest that need not be open; nothing is written."""
     manifest.read()
     for item in items:
-        records = manifest.history(item).records if resume else []
-        if not records or manifest.terms.standing(item, records, _hashes(item)) is None:
+        records = manifest.records(item) if resume else []
+        if not records or _standing(item, records, _terms(item, manifest.settings)) is None:
             yield item
 
 
@@ -139,45 +127,59 @@ class _Task:
     records: list[dict[str, Json]]
     """By which it may be as it should already."""
 
+    def __str__(self) -> str:
+        return self.item.name
+
+
+@dataclass
+class _Outcome:
+    record: dict[str, Json] | None = None
+    """For the manifest."""
+    is_new: bool = True
+    failure: str = ""
+    notes: list[str] = field(default_factory=list)
+
 
 @dataclass(frozen=True)
 class _Attempt:
     """What processes do with a task."""
 
     work: Work
-    terms: Terms
+    settings: str
 
-    def __call__(self, task: _Task, tell: pool.Tell) -> tuple[dict[str, Json], bool]:
-        item = task.item
-        hashes = _hashes(item)
-        record = self.terms.standing(item, task.records, hashes)
-        if record is not None:
-            return record, False
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", UserWarning)
-            result = self.work(item, _Teller(tell))
-        for text in dict.fromkeys(str(warning.message) for warning in caught):
-            tell(text)
-        return self.terms.record(item, hashes, result), True
-
-
-@dataclass(frozen=True)
-class _Teller:
-    """A `Listener`."""
-
-    tell: pool.Tell
-
-    def note(self, text: str) -> None:
-        self.tell(text)
-
-    def done(self, size: float) -> None:
-        self.tell(float(size))
+    def __call__(self, task: _Task, tell: Callable[[float], None]) -> _Outcome:
+        item, outcome = task.item, _Outcome()
+        try:
+            terms = _terms(item, self.settings)
+            outcome.record = _standing(item, task.records, terms)
+            outcome.is_new = outcome.record is None
+            if outcome.record is None:
+                with warnings.catch_warnings(record=True) as caught:
+                    warnings.simplefilter("always", UserWarning)
+                    result = self.work(item, Listener(outcome.notes.append, tell))
+                outcome.notes += dict.fromkeys(str(warning.message) for warning in caught)
+                outcome.record = {**terms, "hashes": list(map(hash_of, item.outputs)), "result": result}
+        except Exception as error:
+            outcome.failure = pool.reason(error)
+        return outcome
 
 
-def _hashes(item: Item) -> dict[str, str]:
-    return {str(path): hash_of(path) for path in item.inputs}
+def _terms(item: Item, settings: str) -> dict[str, Json]:
+    """All that an item's outputs depend on."""
+    return {"inputs": list(map(hash_of, item.inputs)), "variant": item.variant, "settings": settings}
 
 
-def _unlink(path: str) -> None:
-    with contextlib.suppress(OSError):
-        os.unlink(path)
+def _standing(item: Item, records: Sequence[dict[str, Json]], terms: dict[str, Json]) -> dict[str, Json] | None:
+    """The record by which all outputs are there as they would be made anew, or None."""
+    fitting = [record for record in records if {**record, **terms} == record]
+    if not fitting or not all(path.is_file() for path in item.outputs):
+        return None
+    hashes = list(map(hash_of, item.outputs))
+    return next((record for record in fitting if record.get("hashes") == hashes), None)
+
+
+def _remove_left_over(items: Iterable[Item]) -> None:
+    """Remove the halves of files that a process which was killed left beside outputs."""
+    for path in all_left_over(real_paths(path for item in items for path in item.outputs)):
+        with contextlib.suppress(OSError):
+            os.unlink(path)
