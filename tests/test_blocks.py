@@ -116,6 +116,7 @@ def test_gradcheck_over_several_blocks(monkeypatch):
     assert gradcheck(lambda p, i, k: ct.Fisheye624(i, k).project(p)[0], (points, *leaves))
 
 
+@pytest.mark.slow
 def test_two_classes_of_one_name_keep_their_own_lens():
     def build(factor):
         class Mine(ct.KannalaBrandt):

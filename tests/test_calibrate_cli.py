@@ -238,7 +238,9 @@ def two_cameras(board):
 
 
 @pytest.mark.parametrize(
-    "board", [pytest.param(BOARD, marks=pytest.mark.slow), Chessboard(7, 7, 0.03)], ids=["clear", "ambiguous"]
+    "board",
+    [pytest.param(board, marks=pytest.mark.slow) for board in (BOARD, Chessboard(7, 7, 0.03))],
+    ids=["clear", "ambiguous"],
 )
 def test_a_pair_becomes_a_rig(capsys, board):
     corners, turn, shift = two_cameras(board)

@@ -124,6 +124,7 @@ def test_cameras_that_are_linked_by_a_third_one():
     torch.testing.assert_close(found.rig.extrinsics["side"].translation.detach(), shifts[2], atol=3e-3, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_held_stays_as_it_is():
     pixels, _, _ = seen(views=12)
     known = the_rig()[0]["left"]

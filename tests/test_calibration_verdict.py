@@ -253,7 +253,7 @@ def test_one_pose_given_twice_is_one_view():
         ct.calibrate("pinhole", board, pixels.repeat(2, 1, 1), image_size=SIZE)
 
 
-@pytest.mark.parametrize("how", ["equal", "in another order", "saved again"])
+@pytest.mark.parametrize("how", ["equal", pytest.param("in another order", marks=pytest.mark.slow), "saved again"])
 def test_copies_of_views_count_once(how):
     board, pixels = views(narrow(), *all_over(5))
     pixels[2, 7] = torch.nan
@@ -277,6 +277,7 @@ def test_copies_of_views_count_once(how):
         assert result.residuals[4].isnan().all()
 
 
+@pytest.mark.slow
 def test_photographs_from_a_tripod_are_no_copies():
     rotations, translations = all_over(4)
     board, pixels = views(narrow(), rotations.repeat(5, 1, 1), translations.repeat(5, 1))
@@ -285,6 +286,7 @@ def test_photographs_from_a_tripod_are_no_copies():
     assert not [text for text in result.warnings if "again" in text]
 
 
+@pytest.mark.slow
 def test_a_view_whose_corners_are_in_another_order():
     board, pixels = views(narrow(), *all_over(12))
     pixels[5] = pixels[5, torch.randperm(54, generator=torch.Generator().manual_seed(0))]

@@ -283,7 +283,9 @@ def test_the_first_line_copies_nothing(name):
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # inductor imports what still uses it
-@pytest.mark.parametrize("antialias", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize(
+    "antialias", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_compiled_code_gives_them_back_as_they_lie(antialias):
     batch = torch.from_numpy(np.stack([colours(), colours()])).permute(0, 3, 1, 2)
     warp = ct.Warp(camera(), ct.Pinhole.from_fov(60, image_size=(40, 60)), antialias=antialias).requires_grad_(False)

@@ -4,13 +4,13 @@ import copy
 
 import pytest
 import torch
-from cameras import KEYS, fan
+from cameras import KEYS, RARE_ARE_SLOW, fan
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import camtorch as ct
 
 every_model = pytest.mark.parametrize("key", KEYS)
-QUICK = ("pinhole", "fisheye624")
+QUICK = ("pinhole", "kannala_brandt")
 some_models = pytest.mark.parametrize(
     "key", [key if key in QUICK else pytest.param(key, marks=pytest.mark.slow) for key in KEYS]
 )
@@ -54,7 +54,7 @@ def varied(layer):
     return layer
 
 
-@every_model
+@pytest.mark.parametrize("key", RARE_ARE_SLOW)
 @pytest.mark.parametrize("fill", ["to_empty", "assign"])
 def test_deferred_initialisation(key, fill):
     reference = varied(build(key))

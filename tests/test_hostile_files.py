@@ -62,7 +62,7 @@ def test_images_truncated_at_every_byte(suffix, tmp_path):
         loads_or_says_why(tmp_path / f"cameras.{suffix}")
 
 
-@settings(max_examples=600)
+@settings(max_examples=200)
 @given(
     name=st.sampled_from(SAMPLES),
     position=st.floats(0, 1),
@@ -94,7 +94,7 @@ junk = st.recursive(
 STRUCTURED = [name for name in SAMPLES if name.endswith(".json")]
 
 
-@settings(max_examples=800)
+@settings(max_examples=250)
 @given(data=st.data(), name=st.sampled_from(STRUCTURED))
 def test_wrong_values(tmp_path_factory, data, name):
     """One value of a good file, anywhere in it, becomes something else, or goes."""
@@ -343,6 +343,7 @@ def reconstruction(folder, suffix, images):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="no peak memory that can be reset")
 def test_poses_of_many_images_cost_little(tmp_path):
     text = b"".join(b"%d 1 0 0 0 0.5 0.25 %d 1 image_%07d.jpg\n\n" % (i, i, i) for i in range(20_000))

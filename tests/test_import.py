@@ -83,6 +83,7 @@ def test_all_models_are_there_whatever_comes_first(first):
     assert python(f"{first}\nimport camtorch as ct\nprint(*ct.MODELS)").split() == list(ct.MODELS)
 
 
+@pytest.mark.slow
 def test_a_part_has_the_models_that_it_needs():
     code = "from camtorch.io import load\nfrom camtorch.camera import MODELS\nprint(*MODELS)"
     assert python(code).split() == list(ct.MODELS)
@@ -114,6 +115,7 @@ def test_exported_programs_load(tmp_path, imports):
     assert "True" in python(imports + code, str(tmp_path / "rays.pt2"))
 
 
+@pytest.mark.slow
 def test_the_first_use_may_be_compiled():
     code = """
 import camtorch as ct, torch

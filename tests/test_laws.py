@@ -497,7 +497,7 @@ def test_fold_of_calibrations(key, name):
 
 
 @few_drawn_models
-@settings(max_examples=3)  # the dearest law of all
+@settings(max_examples=2)  # the dearest law of all
 @given(data=st.data())
 def test_fold_of_drawn_cameras(key, wild, data):
     check_no_shared_pixels(*check_fold(data.draw(drawn(key, wild)), azimuths=6))

@@ -693,7 +693,8 @@ for warp in warps():
 """
 
 
-@pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 2])
 def test_a_trace_holds_the_images(threads):
     command, environment = [sys.executable, "-c", TRACE], {**os.environ, "OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True)

@@ -390,7 +390,7 @@ def test_copies_pickles_and_transforms():
     )
 
 
-@pytest.mark.parametrize("learn", [True, False])
+@pytest.mark.parametrize("learn", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_compile_and_export(learn):
     warp = ct.Warp(fisheye(), pinhole(), turn(5)).requires_grad_(learn)
     images = smooth(dtype=torch.float32)
