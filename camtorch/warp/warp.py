@@ -528,7 +528,6 @@ class Warp(GeometryModule):
             high = torch.maximum(high, torch.where(inside, lattice, -torch.inf).amax(-2))
         return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
 
-    @torch.no_grad()
     def _inside(self, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Points (N, 2) of a lattice from edge to edge of the target, and (B, *M, N): which show what polygons enclose.
 
@@ -537,11 +536,12 @@ class Warp(GeometryModule):
         height, width = self.target._size("Warp")
         share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
         lattice = torch.cartesian_prod(share * width, share * height) - 0.5
-        shown, seen = self._move(lattice.expand(*self.batch_shape, *lattice.shape), back=True)
-        if self.batch_shape:
-            lead = len(shown), *[1] * (corners.ndim - 3), len(lattice)
-            shown, seen = shown.reshape(*lead, 2), seen.reshape(lead)
-        return lattice, within(corners, shown) & seen
+        with torch.no_grad():
+            shown, seen = self._move(lattice.expand(*self.batch_shape, *lattice.shape), back=True)
+            if self.batch_shape:
+                lead = len(shown), *[1] * (corners.ndim - 3), len(lattice)
+                shown, seen = shown.reshape(*lead, 2), seen.reshape(lead)
+            return lattice, within(corners, shown) & seen
 
     def transform_rays(self, rays: Numbers) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay.
