@@ -178,7 +178,9 @@ def same_calibrations(flags, options, guess=(None, None)):
     assert ours.rms == pytest.approx(rms, rel=1e-9)
     close(ours.camera.K, matrix, 1e-4)
     count = ours.camera.distortion.shape[-1]
-    np.testing.assert_allclose(ours.camera.distortion.detach(), distortion.ravel()[:count], rtol=1e-5, atol=1e-7)
+    # of the standard deviations: eight coefficients that trade with each other are known to far fewer digits than two
+    off = np.abs(ours.camera.distortion.detach().numpy() - distortion.ravel()[:count])
+    assert (off <= 1e-3 * ours.std[4:].numpy() + 1e-7).all()
     assert not distortion.ravel()[count:].any()
     return ours
 
