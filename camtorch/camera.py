@@ -76,7 +76,7 @@ class Camera(BatchedModule):
     A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
 
     Convention: camera frame x right, y down, z forward. Pixels (u, v), u right, v down, the centre of the
-    top-left pixel is (0, 0). Image sizes are (height, width). Angles are radians.
+    top-left pixel is (0, 0). Image sizes are (height, width). Angles are radians, a `fov` is degrees.
 
     Shapes: `*B` are the camera's batch dims, `*N` any number of point dims after them. A camera without
     batch dims takes any shape. Batch dims of size 1 broadcast.

@@ -54,7 +54,7 @@ class RandomCamera(Augmentation):
     """Another camera in the same place: turned, with another lens, cropped, and of another size.
 
     Convention: ranges are (low, high), or a number x for x to either side of doing nothing. Angles are in
-    degrees, as every `fov` in camtorch; other angles in camtorch are in radians.
+    degrees, as every `fov` in camtorch.
 
     Args:
         like: whose lens the new camera has. None: the sample's own camera. A Camera, whose numbers are copied and do
