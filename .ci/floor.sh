@@ -26,5 +26,6 @@ pip install --quiet -r "$environment/floor.txt" pytest hypothesis
 pip install --quiet --no-deps -e .
 # without `camtorch.augment.kornia`, which wants kornia 0.9 and says so, and without the export of inverses, whose loops
 # torch 2.10 does not take
-pytest tests/test_{laws,golden,models,new_models,module,extrinsics,rig,files,file_poses,saving,hostile_files,warp,dewarp,augment_door}.py \
-    --deselect 'tests/test_module.py::test_export[unproject-kannala_brandt]'
+pytest tests/models/test_{laws,golden,models,new_models,module,extrinsics}.py tests/io tests/warp/test_{warp,dewarp}.py \
+    tests/augment/test_augment_door.py \
+    --deselect 'tests/models/test_module.py::test_export[unproject-kannala_brandt]'

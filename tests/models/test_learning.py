@@ -12,7 +12,7 @@ import camtorch as ct
 
 @pytest.mark.slow
 def test_adam_calibrates_a_camera_on_real_corners():
-    data = json.loads((Path(__file__).parent / "files" / "corners_opencv_left.json").read_text())
+    data = json.loads((Path(__file__).parents[1] / "files" / "corners_opencv_left.json").read_text())
     corners, board, rotation, translation, matrix = (
         torch.tensor(data[name], dtype=torch.float64) for name in ("corners", "object_points", "rvecs", "tvecs", "K")
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-PAGE = Path(__file__).parent.parent / "docs" / "guides" / "training.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "training.md"
 # Counts what the network learns, dies once where it is told to, and keeps all samples.
 WATCH = """
 import os, signal, sys, torch, train

@@ -437,7 +437,7 @@ def test_large_images_are_smoothed_before_a_lens():
 
 
 def mean_faces():
-    return json.loads((Path(__file__).parent / "files" / "mean_faces.json").read_text())
+    return json.loads((Path(__file__).parents[1] / "files" / "mean_faces.json").read_text())
 
 
 @pytest.mark.parametrize("name", A.LANDMARKS)

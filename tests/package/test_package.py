@@ -12,7 +12,7 @@ import pytest
 
 from camtorch.native.build import LIBRARY, REASON
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 pytestmark = pytest.mark.slow  # builds in an environment of its own, which takes a network
 

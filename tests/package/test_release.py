@@ -8,7 +8,7 @@ import yaml
 
 import camtorch as ct
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 FORMS = ROOT / ".github" / "ISSUE_TEMPLATE"
 RELEASE = r"^## \[?(\d+\.\d+\.\d+)\]? - (\d{4}-\d\d-\d\d)$"
 

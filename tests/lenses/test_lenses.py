@@ -16,7 +16,7 @@ from camtorch.lenses.collection import columns
 from camtorch.lenses.drawing import _good, lenses_for
 from camtorch.warp.warp import along_edges
 
-SAMPLE = Path(__file__).parent / "files" / "lenses.csv"
+SAMPLE = Path(__file__).parents[1] / "files" / "lenses.csv"
 """Some rows of the collection, as they were published, with their numbers."""
 NUMBERS = "ad94623534940b7809d22a2b41f3526d4c7fc6e703053c5101587317b8e97c0e"
 TEXTS = "1c52d1c7241fd41fef74081697c57e0d68169f82c32077cbc7f17324b0c217b0"

@@ -678,7 +678,7 @@ def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
 TRACE = """
 import warnings
 import torch
-from test_native_sampler import images_of_floats, warps
+from test_sampler import images_of_floats, warps
 import camtorch as ct
 
 warnings.simplefilter("ignore")  # a trace keeps sizes
@@ -696,7 +696,9 @@ for warp in warps():
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_trace_holds_the_images(threads):
-    command, environment = [sys.executable, "-c", TRACE], {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    command = [sys.executable, "-c", TRACE]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment["OMP_NUM_THREADS"] = str(threads)
     done = subprocess.run(command, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
 

@@ -17,7 +17,7 @@ import camtorch as ct
 import camtorch.augment.kornia
 import camtorch.augment.numpy
 
-PAGES = sorted((Path(__file__).parent.parent / "docs" / "coming-from").glob("*.md"))
+PAGES = sorted((Path(__file__).parents[2] / "docs" / "coming-from").glob("*.md"))
 for _library in ("opencv", "kornia", "colmap", "albumentations", "pytorch3d", "nvtorchcam"):
     importlib.import_module(f"coming_from.{_library}")  # which registers its checks
 LIBRARIES = ["albumentations", "cv2", "kornia", "nvtorchcam", "pycolmap", "pytorch3d"]

@@ -14,7 +14,7 @@ from camtorch.native import build as building
 from camtorch.native import library
 from camtorch.native.build import LIBRARY, REASON, BuildError, build
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 COMPILER = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), None)
 compiles = pytest.mark.skipif(COMPILER is None, reason="no C compiler is here: neither CC nor cc, gcc or clang")
 

@@ -20,7 +20,7 @@ from benchmarks.tables import Record
 from benchmarks.timing import measure, threads
 from benchmarks.verdict import Requirement, figures, times_faster, verdict
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OPTIONS = Options(
     size=100,
     models=(),

@@ -13,7 +13,7 @@ import torch
 import camtorch as ct
 from camtorch.warp.dewarp import Projection
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 LARGEST = 150_000  # bytes of an image
 
 

@@ -21,7 +21,7 @@ import camtorch as ct
 from camtorch.calibration.boards import Chessboard
 from camtorch.cli.main import main
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 FILES = ROOT / "tests" / "files"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 

@@ -14,7 +14,7 @@ import camtorch as ct
 from camtorch.analysis.summary import summarise
 from camtorch.cli.main import main
 
-FILES = Path(__file__).parent / "files"
+FILES = Path(__file__).parents[1] / "files"
 FISHEYE = (
     "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
     "K: [28, 0, 47, 0, 28, 32, 0, 0, 1]\nD: [-0.02, 0.004, -0.003, 0.0006]\n"

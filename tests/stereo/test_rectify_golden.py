@@ -9,7 +9,7 @@ import torch
 import camtorch as ct
 from camtorch.stereo.rectification import Rectification
 
-GOLDEN = json.loads((Path(__file__).parent / "golden" / "stereo" / "drcal.json").read_text())
+GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "stereo" / "drcal.json").read_text())
 CASES = {case["projection"].removeprefix("LENSMODEL_").lower(): case for case in GOLDEN["cases"]}
 FOV = 80, 60
 

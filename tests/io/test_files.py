@@ -174,7 +174,7 @@ def test_each_model_of_colmap(entry, suffix, tmp_path):
 
 
 def test_texts_of_mrcal_may_have_escapes(tmp_path):
-    given = Path(__file__).parent / "files" / "mrcal_pinhole.cameramodel"
+    given = Path(__file__).parents[1] / "files" / "mrcal_pinhole.cameramodel"
     text = given.read_text()
     before, after = text.split("{", 1)
     path = tmp_path / "noted.cameramodel"

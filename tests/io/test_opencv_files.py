@@ -8,7 +8,7 @@ import torch
 import camtorch as ct
 from camtorch.io import CameraFileError, opencv
 
-FILES = Path(__file__).parent / "files"
+FILES = Path(__file__).parents[1] / "files"
 PLAIN = FILES / "opencv_camera.yml"
 K = [500.0, 0, 320, 0, 500, 240, 0, 0, 1]
 

@@ -16,7 +16,7 @@ from test_docs import blocks
 
 import camtorch as ct
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 # what pages write for short, and no type of ours
 UNTYPED = ("--allow-untyped-defs", "--allow-incomplete-defs", "--allow-untyped-calls", "--allow-any-generics")
@@ -47,7 +47,7 @@ def project(tmp_path_factory):
     for name in ("uses", "pages"):
         (folder / name).mkdir()
     for name in ("typed_uses.py", "wrong_uses.py"):
-        shutil.copy(ROOT / "tests" / name, folder / "uses")
+        shutil.copy(Path(__file__).with_name(name), folder / "uses")
     for param in blocks("python"):
         page, line, code = param.values
         name = re.sub(r"\W", "_", str(page.relative_to(ROOT).with_suffix("")))
