@@ -4,7 +4,6 @@ from camtorch import augment, data, io, lenses, models, plot
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
 from camtorch.calibration.pnp import solve_pnp
-from camtorch.calibration.report import write_report
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.calibration.triangulate import triangulate
 from camtorch.camera import Camera
@@ -21,6 +20,7 @@ from camtorch.networks import losses
 from camtorch.networks.canonical import CanonicalCamera
 from camtorch.networks.head import CameraHead
 from camtorch.parametrize import PositiveFocal, TiedFocal
+from camtorch.report.report import write_report
 from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
 from camtorch.warp import views

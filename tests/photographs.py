@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 import camtorch as ct
-from camtorch.calibration import printing
+from camtorch.boards import printing
 from camtorch.rotations import rotation_matrix
 
 SHARP, SCALE = 2, 3.0

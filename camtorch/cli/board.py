@@ -10,7 +10,7 @@ from camtorch.cli.boards import add_board, parse_length
 from camtorch.cli.options import add_output
 
 if TYPE_CHECKING:
-    from camtorch.calibration.boards import Board
+    from camtorch.boards.boards import Board
     from camtorch.cli.options import Commands
 
 _PAPERS = ("a4", "a3", "a2", "a1", "a0", "letter", "legal", "tabloid")
@@ -53,7 +53,7 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
-    from camtorch.calibration import printing
+    from camtorch.boards import printing
     from camtorch.cli import targets
     from camtorch.cli.boards import read_board, said
     from camtorch.io.writing import replacing
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _fitting(arguments: argparse.Namespace, board: Board, paper: tuple[float, float]) -> Board:
     """The board as large as whole millimetres of a square or tag allow."""
-    from camtorch.calibration import printing
+    from camtorch.boards import printing
     from camtorch.cli.boards import read_board
 
     part = max(printing.largest(board, sides) for sides in (paper, paper[::-1]))

@@ -7,9 +7,9 @@ import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from camtorch.calibration.boards import Board
+    from camtorch.boards.boards import Board
 
-_KINDS = ("chessboard", "charuco", "aprilgrid")  # as `calibration.boards` has them, which takes numpy to import
+_KINDS = ("chessboard", "charuco", "aprilgrid")  # as `camtorch.boards` has them, which takes numpy to import
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "m": 1.0}
 
 
@@ -68,7 +68,7 @@ def read_board(arguments: argparse.Namespace, square: float) -> Board:
     Raises:
         ValueError: no --board, options of another type of board, numbers that no board has.
     """
-    from camtorch.calibration.boards import board_of
+    from camtorch.boards.boards import board_of
 
     if arguments.board is None:
         raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")

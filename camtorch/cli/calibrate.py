@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from camtorch.calibration.boards import Board
+    from camtorch.boards.boards import Board
+    from camtorch.boards.corners import ImageCorners
     from camtorch.calibration.calibrate import Calibration
-    from camtorch.calibration.corners import ImageCorners
     from camtorch.calibration.rig import RigCalibration
     from camtorch.cli.options import Commands
 
@@ -89,9 +89,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.corners is not None and not arguments.corners.exists():
         targets.check(arguments.corners, force=False)
     if arguments.report is not None:
-        from camtorch.plot.axes import require_matplotlib
+        from camtorch.report.report import require_packages
 
-        require_matplotlib()
+        require_packages()
     format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
     board = read_board(arguments, 1.0) if arguments.board is not None else None
     corners = found_corners(
@@ -244,8 +244,8 @@ def _calibrated(
     size: tuple[int, int],
     candidates: list[tuple[str, int]],
 ) -> Calibration:
+    from camtorch.boards.corners import image_points
     from camtorch.calibration.calibrate import calibrate
-    from camtorch.calibration.corners import image_points
 
     pixels = image_points([of_view[""] for of_view in views.values()], len(points))
     model, count = _model_for(arguments, points, pixels, size, candidates, "")
@@ -263,7 +263,7 @@ def _calibrated_rig(
     size_of: Mapping[str, tuple[int, int]],
     candidates: list[tuple[str, int]],
 ) -> RigCalibration:
-    from camtorch.calibration.corners import image_points
+    from camtorch.boards.corners import image_points
     from camtorch.calibration.rig import calibrate_rig
 
     pixels = {name: image_points([of_view.get(name) for of_view in views.values()], len(points)) for name in size_of}
@@ -295,8 +295,8 @@ def _agreeing(
     """The points of a board that looks the same after a turn, numbered alike in all cameras."""
     import numpy as np
 
+    from camtorch.boards.turns import agreeing, reordered
     from camtorch.calibration.calibrate import calibrate
-    from camtorch.calibration.orders import agreeing, reordered
 
     poses = {}
     for name, seen in pixels.items():
@@ -410,7 +410,7 @@ def _write(
     print(f"{path}: {f'{len(found.rig)} cameras' if isinstance(found, RigCalibration) else found.camera.key}")
     if arguments.report is None:
         return
-    from camtorch.calibration.report import write_report
+    from camtorch.report.report import write_report
 
     arguments.report.parent.mkdir(parents=True, exist_ok=True)
 

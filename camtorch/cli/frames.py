@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.boards import Board, opencv
-from camtorch.calibration.corners import Corners, ImageCorners
-from camtorch.calibration.detection import detect
+from camtorch.boards.boards import Board, opencv
+from camtorch.boards.corners import Corners, ImageCorners
+from camtorch.boards.detection import detect
 from camtorch.cli import videos
 from camtorch.cli.terminal import note, progress
 from camtorch.io.hashing import hash_of

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.boards import Board, Chessboard
-from camtorch.calibration.corners import Corners, ImageCorners, read_corners, write_corners
-from camtorch.calibration.detection import NOT_FOUND, detect, largest_chessboard
+from camtorch.boards.boards import Board, Chessboard
+from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_corners
+from camtorch.boards.detection import NOT_FOUND, detect, largest_chessboard
 from camtorch.cli import frames, images, videos
 from camtorch.cli.gathering import together
 from camtorch.cli.terminal import note, progress

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 
 import camtorch as ct
 from camtorch._drawing import INK, PAPER
-from camtorch.calibration.boards import Chessboard
+from camtorch.boards.boards import Chessboard
 from camtorch.cli.labelled_image import LabelledImage, rendered
 from camtorch.cli.labels import Labels
 from camtorch.cli.sheet import marked

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from photographs import raster
 
-from camtorch.calibration import printing
-from camtorch.calibration.boards import AprilGrid, Charuco, Chessboard
-from camtorch.calibration.detection import detect
+from camtorch.boards import printing
+from camtorch.boards.boards import AprilGrid, Charuco, Chessboard
+from camtorch.boards.detection import detect
 from camtorch.cli.main import main
 
 WORDS = {

@@ -13,9 +13,9 @@ from photographs import fisheye, photograph
 from PIL import Image
 
 import camtorch as ct
-from camtorch.calibration.boards import AprilGrid, Chessboard
-from camtorch.calibration.corners import Corners, ImageCorners, read_corners, write_corners
-from camtorch.calibration.orders import agreeing, reordered, turns_of
+from camtorch.boards.boards import AprilGrid, Chessboard
+from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_corners
+from camtorch.boards.turns import agreeing, reordered, turns_of
 from camtorch.calibration.selection import select
 from camtorch.cli import gathering, searching
 from camtorch.cli.main import main

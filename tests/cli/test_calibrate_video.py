@@ -10,7 +10,7 @@ from photographs import fisheye, photograph
 from test_calibrate_cli import BOARD, assert_near, poses
 
 import camtorch as ct
-from camtorch.calibration.corners import read_corners
+from camtorch.boards.corners import read_corners
 from camtorch.cli import frames, videos
 from camtorch.cli.main import main
 

@@ -18,7 +18,7 @@ from PIL import Image
 from videos import write_video
 
 import camtorch as ct
-from camtorch.calibration.boards import Chessboard
+from camtorch.boards.boards import Chessboard
 from camtorch.cli.main import main
 
 ROOT = Path(__file__).parents[2]

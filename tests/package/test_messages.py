@@ -19,7 +19,7 @@ from camtorch.augment import kornia as adapter
 
 STATEMENTS = everything()
 _TOLD_ELSEWHERE = (  # by whoever catches it, with the file and the place in it
-    *("io/npz", "calibration/corners", "calibration/selection", "cli/coco", "cli/rle"),
+    *("io/npz", "boards/corners", "calibration/selection", "cli/coco", "cli/rle"),
     *("maps/arrays", "maps/onnx", "maps/stmap", "maps/texture_mesh", "calibration/observations"),
 )
 _OF_NO_CALL = ("demo", "native", "jobs", "cli")  # which speak of files, options and machines

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.boards import Board
+from camtorch.boards.boards import Board
 
 Array = NDArray[np.float64]
 

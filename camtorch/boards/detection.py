@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.boards import AprilGrid, Board, Charuco, Chessboard, dictionary_of, opencv
+from camtorch.boards.boards import AprilGrid, Board, Charuco, Chessboard, dictionary_of, opencv
 
 Pixels = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.boards import Board, board_of
+from camtorch.boards.boards import Board, board_of
 from camtorch.io.writing import as_json, replacing
 
 _FORMAT = "camtorch_corners"

@@ -5,6 +5,7 @@ import io
 import os
 import re
 import sys
+import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 
 import numpy as np
@@ -18,12 +19,8 @@ import camtorch as ct
 matplotlib = pytest.importorskip("matplotlib")
 matplotlib.use("Agg")
 
-from camtorch.calibration.svg import Plots  # noqa: E402
-
-pytestmark = pytest.mark.slow
-
 SECTIONS = ("coverage", "residuals", "worst", "uncertainty", "parameters")
-VOID = {"meta", "img", "br", "path", "use", "circle", "rect"}
+VOID = {"meta", "img", "br"}
 HOSTILE = "<script>alert('$x^2$ & \"y\"')</script>\u202e\x07\udc80.jpg"
 
 
@@ -39,11 +36,8 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attributes):
         self.elements.append((tag, dict(attributes)))
-        if tag not in VOID or tag in ("path", "circle", "use", "rect"):
+        if tag not in VOID:
             self.open.append(tag)
-
-    def handle_startendtag(self, tag, attributes):
-        self.elements.append((tag, dict(attributes)))
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -56,6 +50,11 @@ class Page(HTMLParser):
 
     def values(self, key):
         return [attributes[key] for _, attributes in self.elements if key in attributes]
+
+    def images(self, kind):
+        """The files within it, of one kind."""
+        parts = [image["src"].partition(",") for image in self.all("img")]
+        return [base64.b64decode(data) for head, _, data in parts if head == f"data:{kind};base64"]
 
 
 def read(path):
@@ -100,76 +99,51 @@ def page(calibration, images, tmp_path_factory):
     return read(path)
 
 
+@pytest.mark.slow
 def test_all_is_there(page, calibration):
-    ids = page.values("id")
+    ids, links = page.values("id"), [reference[1:] for reference in page.values("href")]
     assert len(ids) == len(set(ids))
-    assert set(SECTIONS) <= set(ids)
-    assert [element["href"] for element in page.all("a")][: len(SECTIONS)] == [f"#{section}" for section in SECTIONS]
-    for text in (f"{calibration.rms:.3g}", f"{calibration.sigma:.3g}", "324 corners, 4 outliers"):
+    assert links[: len(SECTIONS)] == list(SECTIONS)
+    assert set(links) <= set(ids)
+    for text in (f"{calibration.rms:.3g}", f"{calibration.sigma:.3g}", "324 corners, 4 outliers", "640 x 480"):
         assert text in page.text
     for name, std in zip(calibration.parameter_names, calibration.std.tolist(), strict=True):
-        assert re.search(rf"{name}[\u2212\d.e-]+{std:.2g}", page.text)
-    assert calibration.verdict.split(".")[0] in page.text
+        assert re.search(rf"{name}\s*[\u2212\d.e-]+{std:.2g}", page.text)
+    assert calibration.verdict in page.text
     for text in calibration.warnings:
         assert text in page.text
 
 
-def test_it_needs_nothing_else(page):
-    for reference in (*page.values("src"), *page.values("href"), *page.values("xlink:href")):
-        assert reference.startswith(("#", "data:image/jpeg;base64,"))
+@pytest.mark.slow
+def test_it_needs_nothing_else_whatever_names_are(page):
+    assert all(reference.startswith("#") for reference in page.values("href"))
     assert not page.all("script")
     assert not page.all("link")
     (policy,) = (meta["content"] for meta in page.all("meta") if "http-equiv" in meta)
     assert policy.startswith("default-src 'none'")
-
-
-def test_references_within_it_lead_somewhere(page):
-    ids = set(page.values("id"))
-    links = [reference[1:] for reference in page.values("href") if reference.startswith("#")]
-    clips = [found for value in page.values("clip-path") for found in re.findall(r"url\(#(.*?)\)", value)]
-    assert set(links) <= ids
-    assert set(clips) <= ids
-    assert clips
-
-
-def test_no_name_becomes_markup(page):
     shown = HOSTILE.replace("\x07", "�").replace("\udc80", "?")
     assert page.text.count(shown) >= 2 + 6 + 6  # title, a row and a photograph of each view
-    assert not page.all("script")
 
 
-def test_photographs_of_all_kinds_are_within(page):
-    assert len(page.all("img")) == 4
+@pytest.mark.slow
+def test_plots_and_photographs_of_all_kinds_are_within(page):
+    plots, photographs = page.images("image/svg+xml"), page.images("image/jpeg")
+    assert len(plots) == 7 + 6
+    assert len(page.all("img")) == len(plots) + len(photographs)
+    for plot in plots:
+        root = ElementTree.fromstring(plot)
+        references = [value for element in root.iter() for key, value in element.items() if key.endswith("href")]
+        assert root.tag.endswith("svg")
+        assert all(reference.startswith("#") for reference in references)
+    assert len(photographs) == 4
     assert page.text.count("no photograph: ") == 2
-    for image in page.all("img"):
-        data = base64.b64decode(image["src"].partition(",")[2])
+    for data in photographs:
         with Image.open(io.BytesIO(data)) as image:
             assert image.size == (640, 480)
             assert abs(np.asarray(image.convert("L"), int) - 90).max() <= (165 if image.mode == "L" else 2)
 
 
-def test_colours_follow_the_page(page):
-    text = "".join(page.values("style"))
-    assert "var(--p" in text
-    assert not re.findall(r"#[0-9a-f]{6}", text)
-
-
-@pytest.fixture
-def no_plots(monkeypatch):
-    """Drawing takes a second."""
-    monkeypatch.setattr(Plots, "draw", lambda *_, **__: ("<svg></svg>", "a title, and more"))
-
-
-@pytest.mark.usefixtures("no_plots")
-def test_without_photographs_views_have_numbers(calibration, tmp_path):
-    ct.write_report(calibration, tmp_path / "report.html")
-    page = read(tmp_path / "report.html")
-    assert "view 4" in page.text
-    assert not page.all("img")
-    assert "640 x 480" in page.text
-
-
-@pytest.mark.usefixtures("no_plots")
+@pytest.mark.slow
 def test_a_report_is_replaced_as_a_whole(calibration, images, tmp_path):
     path = tmp_path / "report.html"
     path.write_text("before")
@@ -180,12 +154,13 @@ def test_a_report_is_replaced_as_a_whole(calibration, images, tmp_path):
     assert os.listdir(tmp_path) == ["report.html"]
 
 
-def test_the_door(calibration, tmp_path, monkeypatch):
+@pytest.mark.parametrize("package", ["matplotlib", "jinja2"])
+def test_the_door(calibration, package, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="2 images for 6 views"):
         ct.write_report(calibration, tmp_path / "report.html", images=[None, None])
     with pytest.raises(ValueError, match="1 names for 6 views"):
         ct.write_report(calibration, tmp_path / "report.html", names=["a"])
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match=r"pip install 'camtorch\[plot\]'"):
         ct.write_report(calibration, tmp_path / "report.html")
     assert not os.listdir(tmp_path)

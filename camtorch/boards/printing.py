@@ -10,7 +10,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.boards import Board
+from camtorch.boards.boards import Board
 
 Outline = list[tuple[float, float]]
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from photographs import fisheye, photograph
 
-from camtorch.calibration import detection
-from camtorch.calibration.boards import AprilGrid, Charuco, Chessboard, board_of
-from camtorch.calibration.detection import detect
+from camtorch.boards import detection
+from camtorch.boards.boards import AprilGrid, Charuco, Chessboard, board_of
+from camtorch.boards.detection import detect
 
 BOARDS = [Chessboard(9, 6, 0.03), Charuco(9, 7, 0.03, 0.022, "4X4_50"), AprilGrid(5, 4, 0.05)]
 BOARDS += [Charuco(8, 6, 0.035, 0.026, "6X6_250", legacy=True), AprilGrid(4, 4, 0.06, 0.25, border=1)]

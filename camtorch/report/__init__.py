@@ -1,0 +1,1 @@
+"""Reports of calibrations: one HTML file to look at and to print."""
