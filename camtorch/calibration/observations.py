@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_image_size
+from camtorch._arguments import Numbers, as_image_size, as_values, shown
 
 Points: TypeAlias = "Numbers | Sequence[Numbers | None]"
 """Points of all views: a tensor, an array, or a list with one of them, or None, for each view."""
@@ -65,7 +65,7 @@ class Layout(NamedTuple):
     image_size: tuple[int, int]
     """(height, width)."""
     copies: tuple[int, ...]
-    """The numbers of the views, of those that were passed, that are no new evidence: see `_kept` and `repeats`."""
+    """The numbers of the views, of those that were passed, that are no new evidence: see `_observed` and `repeats`."""
 
     def restore(self, values: Tensor) -> Any:
         """Results of the observations in the form of the image points, NaN (of bool: False) where nothing was seen.
@@ -112,12 +112,7 @@ def as_observations(
     """
     if isinstance(image_points, Mapping):
         raise TypeError(f"{owner}: image_points of one camera are a tensor or a list; cameras by name make a rig")
-    size = _as_size(image_size, "image_size", owner)
-    given = _Given("image_points", "image_size", _image_views(image_points, "image_points", owner), size)
-    board, (one,) = _together(object_points, [given], owner)
-    _check_sight(board, one, owner)
-    kept, copies = _kept([one], owner)
-    return _observations(board, one, kept), _layout(board, one, kept, copies)
+    return _observed(object_points, {"": image_points}, {"": image_size}, owner)[""]
 
 
 def as_rig_observations(
@@ -144,24 +139,21 @@ def as_rig_observations(
         ValueError: what `as_observations` refuses; names that differ; a camera that sees nothing; cameras that no
             board links. TypeError: no mappings.
     """
-    names = _names({"models": models, "image_points": image_points, "image_sizes": image_sizes}, owner)
-    given = []
-    for name in names:
-        points, size = f"image_points[{name!r}]", f"image_sizes[{name!r}]"
-        views = _image_views(image_points[name], points, owner)
-        given.append(_Given(points, size, views, _as_size(image_sizes[name], size, owner)))
-    if len({len(one.views.rows) for one in given}) > 1:
-        raise ValueError(
-            f"{owner}: all cameras have the same views, None where one does not see the board; got "
-            + ", ".join(f"{len(one.views.rows)} in {one.points_name}" for one in given)
-        )
-    board, cameras = _together(object_points, given, owner)
-    for one in cameras:
-        _check_sight(board, one, owner)
-    _check_links(names, torch.stack([one.seen.any(-1) for one in cameras]), owner)
-    kept, copies = _kept(cameras, owner)
-    observations = {name: _observations(board, one, kept) for name, one in zip(names, cameras, strict=True)}
-    return observations, {name: _layout(board, one, kept, copies) for name, one in zip(names, cameras, strict=True)}
+    for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
+        if not isinstance(given, Mapping):
+            raise TypeError(
+                f"{owner}: {argument} must map names of cameras to theirs, as {{'left': ..., 'right': ...}}; "
+                f"got {type(given).__name__}"
+            )
+        if not all(isinstance(name, str) for name in given):
+            raise TypeError(f"{owner}: names of cameras must be strings; {argument} has {list(given)!r:.60}")
+        if not given or set(given) != set(models):
+            raise ValueError(
+                f"{owner}: models, image_points and image_sizes must name the same cameras; {argument} has "
+                f"{list(given)}, and models {list(models)}"
+            )
+    found = _observed(object_points, {name: image_points[name] for name in models}, image_sizes, owner)
+    return {name: seen for name, (seen, _) in found.items()}, {name: layout for name, (_, layout) in found.items()}
 
 
 def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
@@ -193,337 +185,219 @@ def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Ten
 # -- forms
 
 
+def _observed(
+    object_points: Points, image_points: Mapping[str, Points], image_sizes: Mapping[str, Any], owner: str
+) -> dict[str, tuple[Observations, Layout]]:
+    """What cameras see, by their names; the name of a camera that is no part of a rig is empty.
+
+    Views without corners are left out, and those that have the same corners in all cameras as an earlier one, in any
+    order: noise makes those of no two photographs equal.
+    """
+    rig = any(image_points)
+    labels = {name: f"image_points[{name!r}]" if rig else "image_points" for name in image_points}
+    sizes = {}
+    for name in image_points:
+        size_name = f"image_sizes[{name!r}]" if rig else "image_size"
+        if (size := as_image_size(image_sizes[name], owner, size_name)) is None:
+            raise ValueError(f"{owner}: {size_name} is missing: (height, width) in pixels, as image.shape[:2]")
+        sizes[name] = size_name, size
+    views = {name: _in_views(given, 2, labels[name], owner) for name, given in image_points.items()}
+    for name, given in views.items():
+        if given.single:
+            shape = (*(given.shapes[0] or ()), 2)
+            raise ValueError(
+                f"{owner}: {labels[name]} must be (V, N, 2) or a list of (N_i, 2), one for each view; got shape {shape}"
+            )
+        if all(rows is None for rows in given.rows):
+            raise ValueError(f"{owner}: {labels[name]} has no view with corners; got {shown(image_points[name])}")
+    counts = {labels[name]: len(given.rows) for name, given in views.items()}
+    board = _in_views(object_points, 3, "object_points", owner).rows
+    if len(board) > 1 or any(rows is None for rows in board):
+        counts["object_points"] = len(board)
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {counts}")
+    number = len(next(iter(views.values())).rows)
+    boards = [torch.empty(0, 3) if rows is None else rows for rows in (board * number if len(board) == 1 else board)]
+    device = next(rows.device for given in views.values() for rows in given.rows if rows is not None)
+    points = _padded(boards, max(map(len, boards)), 3, device)
+    pixels = {}
+    for name, given in views.items():
+        for i, (rows, of_board) in enumerate(zip(given.rows, boards, strict=True)):
+            if rows is not None and len(rows) not in (0, len(of_board)):
+                raise ValueError(
+                    f"{owner}: view {i}: object_points are {len(of_board)} corners (of a chessboard its inner ones), "
+                    f"and {labels[name]}[{i}] are {len(rows)}; corners that were not found are rows of NaN"
+                )
+        pixels[name] = _padded(given.rows, points.shape[1], 2, device)
+    seen = {name: ~of.isnan().any(-1) for name, of in pixels.items()}
+    for name in views:
+        _check_corners(points, pixels[name], seen[name], labels[name], owner)
+        _check_inside(pixels[name], seen[name], labels[name], *sizes[name], owner)
+    _check_links(list(views), torch.stack([of.any(-1) for of in seen.values()]), owner)
+    has = torch.stack([of.any(-1) for of in seen.values()]).any(0)
+    if not bool(has.all()):
+        warnings.warn(f"{owner}: left out, as nothing was seen in {_named(~has)}", UserWarning, stacklevel=5)
+    # complex numbers have an order: by u, then by v
+    corners = {name: torch.where(seen[name], torch.view_as_complex(of), torch.inf) for name, of in pixels.items()}
+    ordered = np.concatenate([np.sort(of.numpy(force=True) + 0.0, 1) for of in corners.values()], 1)
+    first: dict[bytes, int] = {}
+    copy = has & torch.tensor([first.setdefault(row.tobytes(), i) != i for i, row in enumerate(ordered)]).to(device)
+    if bool(copy.any()):
+        words = f"{owner}: left out, as the corners are those of another view in {_named(copy)}"
+        warnings.warn(words, UserWarning, stacklevel=5)
+    kept = (has & ~copy).nonzero()[:, 0]
+    found = {}
+    for name, given in views.items():
+        of = seen[name][kept]
+        some = Observations(points[kept].nan_to_num(nan=0.0), torch.where(of[..., None], pixels[name][kept], 0.0), of)
+        shapes = tuple((len(b),) if shape is None else shape for b, shape in zip(boards, given.shapes, strict=True))
+        copies = tuple((copy & seen[name].any(-1)).nonzero()[:, 0].tolist())
+        found[name] = some, Layout(shapes, given.stacked, kept, of, sizes[name][1], copies)
+    return found
+
+
 class _Views(NamedTuple):
     """Points as they came, in views: (n, size) and the shape before the last dim, None where nothing was passed."""
 
     rows: list[Tensor | None]
     shapes: list[tuple[int, ...] | None]
     stacked: bool
-    alone: bool
+    single: bool
     """Whether it was one set of points, without a dim for views."""
-
-    def padded(self, count: int, size: int, device: torch.device) -> Tensor:
-        """(V, count, size), NaN where there is nothing."""
-        padded = torch.full((len(self.rows), count, size), torch.nan, dtype=torch.float64, device=device)
-        for row, points in zip(padded, self.rows, strict=True):
-            if points is not None:
-                row[: len(points)] = points
-        return padded
-
-
-class _Given(NamedTuple):
-    """What was passed of one camera."""
-
-    points_name: str
-    size_name: str
-    views: _Views
-    image_size: tuple[int, int]
-
-
-class _Board(NamedTuple):
-    """The points (1 or V, N, 3) of the boards, NaN where padded, and how many there are in each."""
-
-    points: Tensor
-    counts: list[int]
-
-
-class _Sight(NamedTuple):
-    """What one camera sees: pixels (V, N, 2), NaN where nothing is seen, and seen (V, N)."""
-
-    given: _Given
-    pixels: Tensor
-    seen: Tensor
-
-
-def _observations(board: _Board, sight: _Sight, kept: Tensor) -> Observations:
-    points = board.points.nan_to_num(nan=0.0).expand(len(sight.pixels), -1, -1)[kept]
-    pixels = torch.where(sight.seen[..., None], sight.pixels, 0.0)[kept]
-    return Observations(points.contiguous(), pixels, sight.seen[kept])
-
-
-def _layout(board: _Board, sight: _Sight, kept: Tensor, copies: Sequence[int]) -> Layout:
-    counts = board.counts * (len(sight.pixels) if len(board.counts) == 1 else 1)
-    shapes = tuple((n,) if s is None else s for n, s in zip(counts, sight.given.views.shapes, strict=True))
-    size, has = sight.given.image_size, sight.seen.any(-1).tolist()
-    return Layout(shapes, sight.given.views.stacked, kept, sight.seen[kept], size, tuple(i for i in copies if has[i]))
-
-
-def _together(object_points: Points, given: list[_Given], owner: str) -> tuple[_Board, list[_Sight]]:
-    """The boards and what each camera sees of them, of as many points."""
-    number, name = len(given[0].views.rows), given[0].points_name
-    board = _in_views(object_points, 3, "object_points", owner)
-    shared = len(board.rows) == 1
-    if not shared and len(board.rows) != number:
-        raise ValueError(
-            f"{owner}: object_points are of {len(board.rows)} views and {name} of {number}; "
-            f"give object_points (N, 3) for all views, or one for each view"
-        )
-    for one in given:
-        for i, points in enumerate(one.views.rows):
-            if points is not None and (len(points) or one.views.stacked):
-                _check_count(board.rows[0 if shared else i], points, i, one, owner)
-    counts = [0 if points is None else len(points) for points in board.rows]
-    device = next(points.device for one in given for points in one.views.rows if points is not None)
-    width = max(counts)
-    sights = []
-    for one in given:
-        pixels = one.views.padded(width, 2, device)
-        sights.append(_Sight(one, pixels, ~pixels.isnan().any(-1)))
-    return _Board(board.padded(width, 3, device), counts), sights
-
-
-def _check_count(board: Tensor | None, points: Tensor, view: int, given: _Given, owner: str) -> None:
-    count = 0 if board is None else len(board)
-    if count == len(points):
-        return
-    hint = ""
-    if given.views.stacked and count == len(given.views.rows):
-        hint = ". The axes of views and corners are swapped: transpose the first two"
-    raise ValueError(
-        f"{owner}: view {view}: object_points are {count} corners, {given.points_name}[{view}] are {len(points)}{hint}"
-        f". Is it the board's size (of a chessboard its inner corners)? Corners that were not found go in as rows of "
-        f"NaN, or are left out of both"
-    )
-
-
-def _image_views(value: Points, name: str, owner: str) -> _Views:
-    views = _in_views(value, 2, name, owner)
-    if views.alone:
-        raise ValueError(
-            f"{owner}: {name} must be (V, N, 2) or a list of (N_i, 2), one for each view; got shape "
-            f"{(*(views.shapes[0] or ()), 2)}. A single view goes in as [{name.split('[')[0]}]"
-        )
-    if all(points is None for points in views.rows):
-        raise ValueError(f"{owner}: {name} has no view with corners; got {_brief(value)}")
-    return views
 
 
 def _in_views(value: Points, size: int, name: str, owner: str) -> _Views:
-    if value is None or isinstance(value, (str, bytes, Mapping)):
-        raise TypeError(f"{owner}: {name} must be a tensor, an array, or a list of them; got {type(value).__name__}")
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = list(value)
+    stacked = not isinstance(value, (list, tuple))
     if isinstance(value, (list, tuple)):
-        parts = [None if part is None else _as_float64(part, f"{name}[{i}]", owner) for i, part in enumerate(value)]
-        some = [part for part in parts if part is not None]
-        if not some:
-            raise ValueError(f"{owner}: {name} has no view with points; got {_brief(value)}")
-        if not all(part.ndim == 1 and len(part) for part in some):
-            labels = [f"{name}[{i}]" for i in range(len(parts))]
-            rows = [None if p is None else _as_rows(p, size, at, owner) for p, at in zip(parts, labels, strict=True)]
-            return _Views(rows, [None if p is None else tuple(p.shape[:-1]) or (0,) for p in parts], False, False)
-        whole = _as_float64(list(value), name, owner)  # rows of numbers
+        parts = [None if p is None else _as_float64(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
+        known = [part for part in parts if part is not None]
+        if single := bool(known) and all(part.ndim == 1 and len(part) for part in known):
+            stacked, parts = True, [_as_float64(value, size, name, owner)]  # rows of numbers
     else:
-        whole = _as_float64(value, name, owner)
-    column = whole.ndim == 3 and whole.shape[1] == 1 and whole.shape[0] > 1 and whole.shape[2] == size
-    if whole.ndim <= 2 or column:
-        return _Views([_as_rows(whole, size, name, owner)], [tuple(whole.shape[:-1])], True, True)
-    shape = tuple(whole.shape)
-    rows = [_as_rows(part, size, name, owner, shape) for part in whole]
-    return _Views(rows, [tuple(part.shape[:-1]) for part in whole], True, False)
+        whole = _as_float64(value, size, name, owner)
+        # (N, 1, size) is OpenCV's form of one set of points
+        single = whole.ndim < 3 or (whole.ndim == 3 and whole.shape[1] == 1 < whole.shape[0])
+        parts = [whole] if single else list(whole)
+    if not any(part is not None for part in parts):
+        raise ValueError(f"{owner}: {name} has no view with points; got {shown(value)}")
+    rows: list[Tensor | None] = []
+    for i, part in enumerate(parts):
+        if part is None or not part.numel():
+            rows.append(None if part is None else part.new_empty(0, size))
+            continue
+        flat = part.reshape(-1, part.shape[-1]) if part.ndim == 3 and 1 in part.shape[:2] else part
+        if flat.ndim != 2 or flat.shape[1] != size:
+            label, views = (name, () if single else (len(parts),)) if stacked else (f"{name}[{i}]", ())
+            form = f"(V, N, {size})" if views else f"(N, {size})"
+            raise ValueError(f"{owner}: {label} must be {form}; got shape {(*views, *part.shape)}")
+        rows.append(flat)
+    shapes = [None if part is None else tuple(part.shape[:-1]) or (0,) for part in parts]
+    return _Views(rows, shapes, stacked, single)
 
 
-def _as_rows(value: Tensor, size: int, name: str, owner: str, shape: tuple[int, ...] = ()) -> Tensor:
-    """(n, size) of that, or of OpenCV's (n, 1, size) and (1, n, size); shape: of the whole that it is a view of."""
-    if value.numel() == 0:
-        return value.new_empty(0, size)
-    rows = value
-    if value.ndim == 3 and 1 in value.shape[:2]:
-        rows = value.reshape(-1, value.shape[-1])
-    if rows.ndim == 2 and rows.shape[-1] == size:
-        return rows
-    hint = ""
-    if rows.ndim == 2 and rows.shape[0] == size:
-        hint = ". The axes are swapped: transpose the last two"
-    elif rows.ndim == 2 and rows.shape[-1] == 5 - size:
-        hint = ". Are object_points and image_points exchanged?"
-        hint += " Points of a plane need a column of zeros" if size == 3 else ""
-    form = f"(V, N, {size})" if shape else f"(N, {size})"
-    raise ValueError(f"{owner}: {name} must be {form}; got shape {shape or tuple(value.shape)}{hint}")
-
-
-def _as_float64(value: Any, name: str, owner: str) -> Tensor:
+def _as_float64(value: Any, size: int, name: str, owner: str) -> Tensor:
     """A detached float64 tensor; None among the numbers, or the rows, of a list is NaN."""
-    try:
-        if isinstance(value, (list, tuple)):
-            rows = [row.detach().cpu().numpy() if isinstance(row, Tensor) else row for row in value]
-            like = next((np.shape(row) for row in rows if row is not None), ())
-            value = np.asarray([np.full(like, np.nan) if row is None else row for row in rows], np.float64)
-        if not isinstance(value, Tensor):
-            array = np.asarray(value)
-            if array.dtype.kind not in "fiu":
-                raise TypeError(f"of dtype {array.dtype}")
-            value = torch.from_numpy(array.astype(np.float64))  # a copy: native, writable, in order
-    except TypeError as error:
-        raise TypeError(f"{owner}: {name} must be real numbers; got {_brief(value)}: {error}") from None
-    except ValueError as error:
-        raise ValueError(f"{owner}: {name} must be rows of as many numbers; got {_brief(value)}: {error}") from None
-    if value.is_complex() or value.dtype == torch.bool:
-        raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
-    if value.is_meta:
+    if isinstance(value, (list, tuple)):
+        rows = [row.detach().cpu().numpy() if isinstance(row, Tensor) else row for row in value]
+        try:
+            value = np.asarray([[math.nan] * size if row is None else row for row in rows], np.float64)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"{owner}: {name} must be rows of {size} numbers; got {shown(value)}: {error}") from None
+    values = as_values(value, name, owner)
+    if values.is_meta:
         raise ValueError(f"{owner}: {name} is on the device meta, and has no values")
-    values: Tensor = value.detach().to(torch.float64)
-    return values
+    return values.detach().to(torch.float64)
 
 
-def _as_size(value: Any, name: str, owner: str) -> tuple[int, int]:
-    """(height, width); also of one size a view, where they are all the same."""
-    if value is None:
-        raise ValueError(f"{owner}: {name} is missing: (height, width) in pixels, as image.shape[:2]")
-    if isinstance(value, (Tensor, np.ndarray)):
-        if value.ndim > 2 or value.shape[-1:] != (2,):
-            raise ValueError(
-                f"{owner}: {name} must be (height, width), as image.shape[:2]; got an array of shape "
-                f"{tuple(value.shape)}"
-            )
-        value = value.tolist()
-    if isinstance(value, (list, tuple)) and value and all(isinstance(side, (list, tuple)) for side in value):
-        sizes = sorted({tuple(side) for side in value})
-        if len(sizes) > 1:
-            raise ValueError(
-                f"{owner}: {name} must be one (height, width) for all views; got {_several(sizes)}. "
-                f"Calibrate the images of each size apart, or resize them and scale their corners"
-            )
-        value = sizes[0]
-    try:
-        size = as_image_size(value, owner)
-    except (TypeError, ValueError) as error:
-        raise type(error)(str(error).replace("image_size", name, 1)) from None
-    assert size is not None
-    return size
-
-
-def _names(arguments: Mapping[str, Mapping[str, Any]], owner: str) -> list[str]:
-    """The names of cameras, which all arguments have."""
-    for argument, mapping in arguments.items():
-        if not isinstance(mapping, Mapping):
-            raise TypeError(
-                f"{owner}: {argument} must map names of cameras to theirs, as {{'left': ..., 'right': ...}}; "
-                f"got {type(mapping).__name__}"
-            )
-    first, *others = arguments.items()
-    names = list(first[1])
-    if not names:
-        raise ValueError(f"{owner}: {first[0]} names no camera")
-    strange = [name for name in names if not isinstance(name, str)]
-    if strange:
-        raise TypeError(f"{owner}: names of cameras must be strings; got {_several([repr(name) for name in strange])}")
-    for argument, mapping in others:
-        for missing, there, where in (
-            ([n for n in names if n not in mapping], first[0], argument),
-            ([n for n in mapping if n not in names], argument, first[0]),
-        ):
-            if missing:
-                raise ValueError(
-                    f"{owner}: {_several([repr(n) for n in missing])} of {there} is missing in {where}, "
-                    f"which has {', '.join(repr(n) for n in arguments[where])}"
-                )
-    return names
+def _padded(views: Sequence[Tensor | None], count: int, size: int, device: torch.device) -> Tensor:
+    """(V, count, size), NaN where there is nothing."""
+    padded = torch.full((len(views), count, size), torch.nan, dtype=torch.float64, device=device)
+    for row, points in zip(padded, views, strict=True):
+        if points is not None:
+            row[: len(points)] = points
+    return padded
 
 
 # -- what is in them
 
 
-def _check_sight(board: _Board, sight: _Sight, owner: str) -> None:
-    """Refuse what no camera sees.
+def _check_corners(points: Tensor, pixels: Tensor, seen: Tensor, name: str, owner: str) -> None:
+    """Refuse corners from which no pose can be told.
 
-    Raises:
-        ValueError: as `as_observations` says.
+    Args:
+        points: (V, N, 3), NaN where padded.
+        pixels: (V, N, 2), NaN where unseen.
+        seen: (V, N).
+        name: of the argument that the pixels are, for messages.
+        owner: the name of the function that asks, for messages.
     """
-    name, seen, pixels = sight.given.points_name, sight.seen, sight.pixels
-    if bool(pixels.isinf().any()):
-        raise ValueError(f"{owner}: {name} is infinite{_in(pixels.isinf().any(-1))}; what is unseen is NaN")
-    if not bool(seen.any()):
+
+    def refuse(views: Tensor, words: str) -> None:
+        if bool(views.any()):
+            raise ValueError(f"{owner}: {_named(views)}: {words}")
+
+    refuse(pixels.isinf().any(-1).any(-1), f"{name} is infinite; what is unseen is NaN")
+    number, has = seen.sum(-1), seen.any(-1)
+    if not bool(has.any()):
         raise ValueError(f"{owner}: {name} is NaN everywhere: no view has a corner")
-    number = seen.sum(-1)
-    few = (number > 0) & (number < _LEAST_CORNERS)
-    if bool(few.any()):
-        view = _first(few)
-        raise ValueError(
-            f"{owner}: view {view}: {name}[{view}] has {int(number[view])} seen corners, and a view needs "
-            f"{_LEAST_CORNERS}; leave it out, or make it None or NaN{_likewise(few)}"
-        )
-    _check_boards(board.points.expand(*seen.shape, 3), seen, owner)
-    _check_pixels(pixels, sight, owner)
-
-
-def _check_boards(points: Tensor, seen: Tensor, owner: str) -> None:
-    strange = ~points.isfinite().all(-1) & seen
-    if bool(strange.any()):
-        raise ValueError(f"{owner}: object_points are not finite{_in(strange)}, where image_points are")
-    weights = seen[..., None].double()
-    count = weights.sum(1, keepdim=True).clamp(min=1)
+    few = has & (number < _LEAST_CORNERS)
+    refuse(few, f"{name} has fewer than {_LEAST_CORNERS} seen corners; leave it out, or make it None or NaN")
+    refuse((~points.isfinite().all(-1) & seen).any(-1), "object_points are not finite where image_points are")
     known = torch.where(seen[..., None], points, 0.0)
-    reach = float(known.abs().amax())
-    if reach > 0 and not _LEAST_UNIT < reach < _MOST_UNIT:
-        raise ValueError(f"{owner}: object_points reach {reach:.3g}; give them in a unit near the size of the board")
-    offsets = (known - known.sum(1, keepdim=True) / count) * weights
+    reach = known.abs().amax((1, 2))
+    if not _LEAST_UNIT < float(reach.max()) < _MOST_UNIT and bool(reach.any()):
+        raise ValueError(
+            f"{owner}: object_points reach {float(reach.max()):.3g}; give them in a unit near the size of the board"
+        )
+    offsets = (known - (known.sum(1) / number.clamp(min=1)[:, None])[:, None]) * seen[..., None]
     spread = torch.linalg.eigvalsh(offsets.mT @ offsets).clamp(min=0).sqrt()  # (V, 3) ascending
-    has = seen.any(-1)
-    dot = has & (spread[:, 2] <= _ROUNDING * known.abs().amax((1, 2)))
-    line = has & (spread[:, 1] <= _FLAT * spread[:, 2])
-    if bool((dot | line).any()):
-        view = _first(dot | line)
-        where = "are all the same point" if bool(dot[view]) else "lie on one line"
-        raise ValueError(
-            f"{owner}: view {view}: the object_points of its seen corners {where}, which no pose can be told from"
-            f"{_likewise(dot | line)}"
-        )
-    twice = _repeated(known, seen, 2)
-    if bool(twice.any()):
-        view = _first(twice)
-        raise ValueError(
-            f"{owner}: view {view}: object_points has a corner twice; each corner of a board has its own place, and is "
-            f"seen once in a view{_likewise(twice)}"
-        )
-
-
-def _check_pixels(pixels: Tensor, sight: _Sight, owner: str) -> None:
-    name, (height, width), seen = sight.given.points_name, sight.given.image_size, sight.seen
+    thin = spread[:, 1] <= torch.maximum(_FLAT * spread[:, 2], _ROUNDING * reach)
+    refuse(has & thin, "the object_points of its seen corners lie on one line, or are the same point")
+    refuse(_repeated(known, seen, 2), "object_points has a corner twice; a board has each once")
     at_one = _repeated(pixels, seen, _SAME_PIXEL)
-    if bool(at_one.any()):
-        view = _first(at_one)
-        raise ValueError(
-            f"{owner}: view {view}: {name}[{view}] has {_SAME_PIXEL} or more corners at one pixel; corners that were "
-            f"not found are NaN{_likewise(at_one)}"
-        )
-    found = pixels[seen]
-    if float(found.abs().max()) < _NORMALISED < min(height, width) / 2:
-        raise ValueError(
-            f"{owner}: {name} reaches from {_pair(found.amin(0))} to {_pair(found.amax(0))} in an image of "
-            f"{height} x {width}: pixels are asked for, not normalised coordinates"
-        )
-    long = max(height, width)
+    refuse(at_one, f"{name} has {_SAME_PIXEL} or more corners at one pixel; corners that were not found are NaN")
 
-    def outside(rows: float, columns: float, rim: float) -> Tensor:
-        u, v = pixels.unbind(-1)
-        rim = rim * long
-        return seen & ((u < -rim) | (v < -rim) | (u > columns - 1 + rim) | (v > rows - 1 + rim))
 
-    out, total = outside(height, width, _RIM), len(found)
-    number = int(out.sum())
-    many = f"{owner}: {number} of {total} corners of {name} lie outside the image"
-    size = f"{sight.given.size_name} {(height, width)}"
-    exchanged = int(outside(width, height, _RIM).sum())
-    if number > _FEW_OUTSIDE * total and exchanged <= _FEW_LEFT * number:
+def _repeated(rows: Tensor, seen: Tensor, times: int) -> Tensor:
+    """(V,) whether so many of the seen rows (V, N, k) of a view are equal."""
+    # equal rows have equal sums of multiples that no two others have in common, and stand together once sorted
+    sums = torch.where(seen, (rows * rows.new_tensor([1.0, 2**0.5, 3**0.5])[: rows.shape[-1]]).sum(-1), torch.nan)
+    order = sums.argsort(-1)
+    ordered, both = rows.gather(1, order[..., None].expand_as(rows)), seen.gather(1, order)
+    before, after = slice(None, rows.shape[1] - times + 1), slice(times - 1, None)
+    same = (ordered[:, after] == ordered[:, before]).all(-1) & both[:, after] & both[:, before]
+    return same.any(-1)
+
+
+def _check_inside(pixels: Tensor, seen: Tensor, name: str, size_name: str, size: tuple[int, int], owner: str) -> None:
+    """Refuse pixels that are not those of such an image."""
+    found, (height, width) = pixels[seen], size
+    low, high = ("({:.6g}, {:.6g})".format(*end.tolist()) for end in (found.amin(0), found.amax(0)))
+    if float(found.abs().max()) < _NORMALISED < min(size) / 2:
         raise ValueError(
-            f"{many}, and {'none' if not exchanged else f'only {exchanged}'} would in {(width, height)}: {size} is "
-            f"(height, width), as image.shape[:2] and not OpenCV's (width, height), and points are (u, v), u to the "
-            f"right, not (row, column)"
+            f"{owner}: {name} reaches from {low} to {high} in an image of {height} x {width}: pixels are asked for, "
+            "not normalised coordinates"
         )
-    views = (out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)) & seen.any(-1)
-    if number > _MANY_OUTSIDE * total or bool(views.any()):
-        where = _in(views) if bool(views.any()) else ""
-        raise ValueError(
-            f"{many} of {size}{where}; they reach from {_pair(found.amin(0))} to {_pair(found.amax(0))}. Is it the "
-            f"size of the images that the corners were found in, the same for all? Unseen corners are NaN"
+
+    def outside(rows: int, columns: int, rim: float) -> Tensor:
+        limits = pixels.new_tensor([columns - 1.0, rows - 1.0])
+        return seen & ((pixels < -rim * max(size)) | (pixels > limits + rim * max(size))).any(-1)
+
+    out = outside(height, width, _RIM)
+    number, total = int(out.sum()), len(found)
+    exchanged = number > _FEW_OUTSIDE * total and int(outside(width, height, _RIM).sum()) <= _FEW_LEFT * number
+    views = (out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)) | outside(height, width, _NOWHERE).any(-1)
+    if exchanged or number > _MANY_OUTSIDE * total or bool(views.any()):
+        asked = (
+            f"{size_name} is (height, width), as image.shape[:2], and points are (u, v), u to the right"
+            if exchanged
+            else f"{size_name} is that of all images that the corners were found in, and unseen corners are NaN"
         )
-    nowhere = outside(height, width, _NOWHERE)
-    if bool(nowhere.any()):
-        view = _first(nowhere.any(-1))
         raise ValueError(
-            f"{owner}: {int(nowhere.sum())} of {total} corners of {name} lie far outside the image of {size}"
-            f"{_in(nowhere)}, as {_pair(pixels[view][nowhere[view]][0])}; unseen corners are NaN"
+            f"{owner}: {number} of {total} corners of {name} lie outside the image of {size_name} {size}, in "
+            f"{_named(views if bool(views.any()) else out.any(-1))}; they reach from {low} to {high}: {asked}"
         )
 
 
@@ -533,82 +407,16 @@ def _check_links(names: list[str], sees: Tensor, owner: str) -> None:
     linked[0] = True
     for _ in names:
         linked = linked | (sees & sees[linked].any(0)).any(-1)
-    if not bool(linked.all()):
-        apart = [repr(name) for name, is_linked in zip(names, linked.tolist(), strict=True) if not is_linked]
+    apart = [name for name, is_linked in zip(names, linked.tolist(), strict=True) if not is_linked]
+    if apart:
         raise ValueError(
-            f"{owner}: {_several(apart)} never sees a board in the same view as {names[0]!r}, nor as a camera that "
-            f"does: where it is cannot be told; take views that both see, or calibrate it alone"
+            f"{owner}: {', '.join(map(repr, apart))} never sees a board in the same view as {names[0]!r}, nor as a "
+            "camera that does: where it is cannot be told; take views that both see, or calibrate it alone"
         )
 
 
-def _kept(sights: Sequence[_Sight], owner: str) -> tuple[Tensor, list[int]]:
-    """The numbers of the views with corners, and of those left out that have the same ones as an earlier view.
-
-    A copy has the same corners in all cameras, in any order: noise makes those of no two photographs equal.
-    """
-    has = torch.stack([sight.seen.any(-1) for sight in sights]).any(0)
-    if not bool(has.all()):
-        warnings.warn(f"{owner}: left out, as nothing was seen{_in(~has)}", UserWarning, stacklevel=5)
-    parts = []
-    for sight in sights:
-        ordered = torch.where(sight.seen[..., None], sight.pixels, torch.inf) + 0.0  # no -0
-        for axis in (1, 0):
-            index = ordered[..., axis].argsort(dim=-1, stable=True)
-            ordered = torch.take_along_dim(ordered, index[..., None], 1)
-        parts.append(ordered.flatten(1))
-    views: dict[bytes, int] = {}
-    first = [views.setdefault(row.tobytes(), i) for i, row in enumerate(torch.cat(parts, 1).cpu().numpy())]
-    kept = [i for i in has.nonzero()[:, 0].tolist() if first[i] == i]
-    copies = [i for i in has.nonzero()[:, 0].tolist() if first[i] != i]
-    if copies:
-        mask = torch.zeros_like(has)
-        mask[copies] = True
-        warnings.warn(f"{owner}: left out, as the corners are those of another view{_in(mask)}", stacklevel=5)
-    return torch.tensor(kept, device=has.device), copies
-
-
-def _repeated(rows: Tensor, seen: Tensor, times: int) -> Tensor:
-    """(V,) whether so many of the seen rows (V, N, k) are equal."""
-    # equal rows have equal sums of multiples that no two others have in common, and stand together once sorted
-    factors = rows.new_tensor([1.0, 2**0.5, 3**0.5])[: rows.shape[-1]]
-    sums = torch.where(seen, (rows * factors).sum(-1), torch.nan)
-    order = sums.argsort(-1)
-    ordered = rows.gather(1, order[..., None].expand_as(rows))
-    both = seen.gather(1, order)
-    step = times - 1
-    if rows.shape[1] <= step:
-        return torch.zeros_like(seen[:, 0])
-    same = (ordered[:, step:] == ordered[:, :-step]).all(-1) & both[:, step:] & both[:, :-step]
-    return same.any(-1)
-
-
-# -- words
-
-
-def _first(views: Tensor) -> int:
-    return int(views.nonzero()[0, 0])
-
-
-def _several(names: Sequence[Any]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(map(str, names[:_NAMED])) + more
-
-
-def _in(mask: Tensor) -> str:
-    """Of a mask (V,) or (V, N): the numbers of the views in which it is true."""
-    views = (mask if mask.ndim == 1 else mask.any(-1)).nonzero()[:, 0].tolist()
-    return f" in view{'s' * (len(views) > 1)} {_several(views)}"
-
-
-def _likewise(views: Tensor) -> str:
-    others = views.nonzero()[1:, 0].tolist()
-    return f". Likewise view{'s' * (len(others) > 1)} {_several(others)}" if others else ""
-
-
-def _pair(pixel: Tensor) -> str:
-    return "({:.6g}, {:.6g})".format(*pixel.tolist())
-
-
-def _brief(value: Any) -> str:
-    text = repr(value)
-    return f"{type(value).__name__} {text if len(text) < 80 else text[:77] + '...'}"
+def _named(views: Tensor) -> str:
+    """The views of a mask (V,) in words."""
+    numbers = views.nonzero()[:, 0].tolist()
+    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
+    return f"view{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers[:_NAMED]))}{more}"

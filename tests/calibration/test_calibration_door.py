@@ -201,27 +201,27 @@ def changed(index, value):
 
 
 BAD = {
-    "one view": (BOARD, VIEWS[0], ["image_points", "(54, 2)", "[image_points]"]),
-    "one view of OpenCV's": (BOARD, VIEWS[0][:, None], ["image_points", "(54, 1, 2)", "[image_points]"]),
+    "one view": (BOARD, VIEWS[0], ["image_points", "(V, N, 2)", "(54, 2)"]),
+    "one view of OpenCV's": (BOARD, VIEWS[0][:, None], ["image_points", "(V, N, 2)", "(54, 1, 2)"]),
     "no view": (BOARD, [], ["image_points", "no view"]),
     "nothing found": (BOARD, [None, None], ["image_points", "no view"]),
     "no view in a tensor": (BOARD, VIEWS[:0], ["image_points"]),
     "nan": (BOARD, np.full_like(VIEWS, np.nan), ["NaN everywhere"]),
     "empty": (BOARD, [np.empty((0, 2))] * 3, ["no view has a corner"]),
-    "few corners": (BOARD, changed((2, slice(3, None)), np.nan), ["view 2", "3 seen corners", "4"]),
-    "few corners in two": (BOARD, changed((slice(2, 4), slice(3, None)), np.nan), ["view 2", "Likewise view 3"]),
-    "swapped axes": (BOARD, VIEWS.swapaxes(1, 2), ["image_points", "(5, 2, 54)", "swapped", "transpose"]),
-    "swapped axes in a list": (BOARD, [v.T for v in VIEWS], ["image_points[0]", "(2, 54)", "swapped"]),
-    "swapped axes of the board": (BOARD.T, VIEWS, ["object_points", "(3, 54)", "swapped", "transpose"]),
-    "views for corners": (BOARD, VIEWS.swapaxes(0, 1), ["54", "5", "swapped", "transpose the first two"]),
-    "rows and columns": (BOARD, VIEWS[..., ::-1], ["outside", "(480, 640)", "(row, column)"]),
-    "board size": (board(8, 6), VIEWS, ["view 0", "48 corners", "54", "board's size", "inner corners"]),
+    "few corners": (BOARD, changed((2, slice(3, None)), np.nan), ["view 2", "fewer than 4 seen corners"]),
+    "few corners in two": (BOARD, changed((slice(2, 4), slice(3, None)), np.nan), ["views 2, 3"]),
+    "swapped axes": (BOARD, VIEWS.swapaxes(1, 2), ["image_points", "(V, N, 2)", "(5, 2, 54)"]),
+    "swapped axes in a list": (BOARD, [v.T for v in VIEWS], ["image_points[0]", "(N, 2)", "(2, 54)"]),
+    "swapped axes of the board": (BOARD.T, VIEWS, ["object_points", "(N, 3)", "(3, 54)"]),
+    "views for corners": (BOARD, VIEWS.swapaxes(0, 1), ["view 0", "54 corners", "image_points[0] are 5"]),
+    "rows and columns": (BOARD, VIEWS[..., ::-1], ["outside", "(480, 640)", "points are (u, v)"]),
+    "board size": (board(8, 6), VIEWS, ["view 0", "48 corners", "inner", "54"]),
     "board size in a list": ([BOARD] * 4 + [board(8, 6)], VIEWS, ["view 4", "48", "54"]),
-    "number of views": ([BOARD] * 4, VIEWS, ["4 views", "image_points", "5"]),
-    "number of views in tensors": (REPEATED[:4], VIEWS, ["4 views", "image_points", "5"]),
-    "exchanged": (VIEWS, REPEATED, ["object_points", "exchanged"]),
-    "exchanged in lists": (list(VIEWS), list(REPEATED), ["exchanged"]),
-    "no z": (BOARD[:, :2], VIEWS, ["object_points", "(54, 2)", "column of zeros"]),
+    "number of views": ([BOARD] * 4, VIEWS, ["'image_points': 5", "'object_points': 4"]),
+    "number of views in tensors": (REPEATED[:4], VIEWS, ["'image_points': 5", "'object_points': 4"]),
+    "exchanged": (VIEWS, REPEATED, ["image_points", "(V, N, 2)", "(5, 54, 3)"]),
+    "exchanged in lists": (list(VIEWS), list(REPEATED), ["image_points[0]", "(54, 3)"]),
+    "no z": (BOARD[:, :2], VIEWS, ["object_points", "(N, 3)", "(54, 2)"]),
     "one point": (0 * BOARD, VIEWS, ["object_points", "same point"]),
     "a point far away": (0 * BOARD + 7, VIEWS, ["object_points", "same point"]),
     "a line": (BOARD * np.float32([1, 0, 0]), VIEWS, ["object_points", "one line"]),
@@ -229,7 +229,7 @@ BAD = {
     "a slanted line": ((BOARD[:, :1] + BOARD[:, 1:2]) * np.float32([0.3, 0.7, 0.1]) + 5, VIEWS, ["one line"]),
     "a corner twice": (np.concatenate((BOARD[:53], BOARD[:1])), VIEWS, ["object_points", "twice"]),
     "pixels at zero": (BOARD, changed((1, slice(0, 3)), 0.0), ["view 1", "one pixel", "NaN"]),
-    "infinite": (BOARD, changed((2, 7), np.inf), ["image_points", "infinite", "view 2", "NaN"]),
+    "infinite": (BOARD, changed((2, 7), np.inf), ["view 2", "image_points", "infinite", "NaN"]),
     "an infinite corner of the board": (
         np.where(BOARD[-1] == BOARD, np.inf, BOARD),
         VIEWS,
@@ -241,8 +241,8 @@ BAD = {
     "normalised": (BOARD, VIEWS / 640, ["normalised"]),
     "normalised about the middle": (BOARD, VIEWS / 320 - 1, ["normalised"]),
     "outside": (BOARD, VIEWS * 3, ["corners of image_points lie outside", "(480, 640)", "reach"]),
-    "another size in one view": (BOARD, changed(4, VIEWS[4] * 2), ["outside", "view 4", "same for all"]),
-    "nowhere": (BOARD, changed((2, 7), 99999.0), ["1 of 270", "far outside", "view 2", "(99999, 99999)"]),
+    "another size in one view": (BOARD, changed(4, VIEWS[4] * 2), ["outside", "view 4", "all images"]),
+    "nowhere": (BOARD, changed((2, 7), 99999.0), ["1 of 270", "outside", "view 2", "(99999, 99999)"]),
     "ragged": (BOARD, [[[1.0, 2.0], [3.0]]] * 5, ["image_points[0]"]),
     "ragged rows": (BOARD, [[1.0, 2.0], [3.0]], ["image_points"]),
     "too many dims": (BOARD, VIEWS[None, None], ["image_points", "(1, 1, 5, 54, 2)"]),
@@ -261,7 +261,7 @@ def test_bad_points(object_points, image_points, words):
         (BOARD, None, ["image_points", "NoneType"]),
         (None, VIEWS, ["object_points", "NoneType"]),
         (BOARD, "corners.json", ["image_points", "str"]),
-        (BOARD, ["a.jpg", "b.jpg"], ["image_points[0]", "numbers"]),
+        (BOARD, ["a.jpg", "b.jpg"], ["image_points[0]", "tensor", "str"]),
         (BOARD, {"left": VIEWS}, ["image_points", "rig"]),
         ({"left": BOARD}, VIEWS, ["object_points", "dict"]),
         (BOARD, VIEWS > 0, ["image_points", "bool"]),
@@ -275,20 +275,12 @@ def test_what_is_no_points(object_points, image_points, words):
 
 
 def test_sizes_of_images():
-    for size in ((480, 640), [480, 640], np.array([480, 640]), torch.Size(SIZE), [SIZE] * 5):
+    for size in ((480, 640), [480, 640], np.array([480, 640]), torch.Size(SIZE)):
         assert as_observations(BOARD, VIEWS, size, OWNER)[1].image_size == SIZE
-    with refuses("image_size", "(640, 480)", "not OpenCV's (width, height)"):
+    with refuses("image_size", "(640, 480)", "is (height, width)"):
         as_observations(BOARD, VIEWS, (640, 480), OWNER)
     with refuses("image_size", "missing", "(height, width)"):
         as_observations(BOARD, VIEWS, None, OWNER)
-    with refuses("image_size", "(480, 640), (720, 1280)", "apart"):
-        as_observations(BOARD, VIEWS, [SIZE, SIZE, (720, 1280), SIZE, SIZE], OWNER)
-    with refuses("image_size", "positive", "(480, 0)"):
-        as_observations(BOARD, VIEWS, (480, 0), OWNER)
-    with refuses("image_size", "image.shape[:2]", "array of shape (480, 640)"):
-        as_observations(BOARD, VIEWS, np.zeros(SIZE, np.uint8), OWNER)
-    with refuses("image_size", "(480.5, 640)", error=TypeError):
-        as_observations(BOARD, VIEWS, (480.5, 640), OWNER)
 
 
 def test_corners_at_the_rim_and_a_few_outliers_are_taken():
@@ -331,20 +323,23 @@ def test_cameras_of_a_rig_see_the_same_boards():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"image_points": {"left": VIEWS}}, ["'right' of models is missing in image_points", "'left'"]),
-        ({"image_sizes": {"left": SIZE, "rihgt": SIZE}}, ["'right' of models is missing in image_sizes", "'rihgt'"]),
-        ({"models": {"left": "mei"}}, ["'right' of image_points is missing in models", "'left'"]),
-        ({"models": {}}, ["models", "no camera"]),
-        ({"image_points": {"left": VIEWS, "right": VIEWS[:4]}}, ["same views", "5 in image_points['left']", "4 in"]),
+        ({"image_points": {"left": VIEWS}}, ["same cameras", "image_points has ['left']", "models ['left', 'right']"]),
+        ({"image_sizes": {"left": SIZE, "rihgt": SIZE}}, ["same cameras", "image_sizes has ['left', 'rihgt']"]),
+        ({"models": {"left": "mei"}}, ["same cameras", "['left', 'right']", "models ['left']"]),
+        ({"models": {}}, ["same cameras", "models has []"]),
+        ({"image_points": {"left": VIEWS, "right": VIEWS[:4]}}, ["same views", "left", "5", "right", "4"]),
         ({"image_points": {"left": VIEWS, "right": [None] * 5}}, ["image_points['right']", "no view"]),
         ({"image_points": {"left": VIEWS, "right": VIEWS * np.nan}}, ["image_points['right']", "NaN everywhere"]),
         (
             {"image_sizes": {"left": SIZE, "right": (640, 480)}},
-            ["image_points['right']", "image_sizes['right']", "Open"],
+            ["image_points['right']", "image_sizes['right'] is (height, width)"],
         ),
         ({"image_sizes": {"left": SIZE, "right": None}}, ["image_sizes['right']", "missing"]),
         ({"image_points": {"left": VIEWS, "right": VIEWS[:, :48]}}, ["view 0", "54", "image_points['right'][0]", "48"]),
-        ({"image_points": {"left": VIEWS, "right": changed((1, slice(2, None)), np.nan)}}, ["view 1", "['right'][1]"]),
+        (
+            {"image_points": {"left": VIEWS, "right": changed((1, slice(2, None)), np.nan)}},
+            ["view 1", "image_points['right']"],
+        ),
         (
             {"image_points": {"left": [*VIEWS[:3], None, None], "right": [None, None, None, *VIEWS[3:]]}},
             ["'right' never sees", "'left'"],
