@@ -9,7 +9,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
+    from matplotlib.colors import Colormap, ListedColormap
 
     from camtorch.camera import Camera
 
@@ -18,12 +18,8 @@ COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
 """Of what is told apart by its name, as cameras are; the second one is also that of marks."""
 NO_RAYS = "#d9d4ca"
 """Of pixels without a value."""
-LEVELS = {
-    "counts": ("Blues", 0.2, 0.75, 5),
-    "residuals": ("viridis", 0.85, 0.05, 5),
-    "uncertainty": ("magma", 0.95, 0.2, 8),
-}
-"""Scales of few colours: matplotlib's map, the part of it from the palest colour to the darkest, how many."""
+_LEVELS = {"counts": ("Blues", 0.2, 0.75), "residuals": ("viridis", 0.85, 0.05), "uncertainty": ("magma", 0.95, 0.2)}
+"""matplotlib's maps, and the part of each from the palest colour to the darkest."""
 
 
 def require_matplotlib() -> None:
@@ -95,21 +91,13 @@ def printable(name: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
 
 
-def level_colours(name: str, count: int | None = None) -> list[str]:
-    """A few colours in order, from what is little to what is much, of "counts", "residuals" or "uncertainty".
-
-    Args:
-        name: of the scale.
-        count: as many, evenly chosen; by default, and at most, all of them.
-    """
+def levels(name: str, count: int = 256) -> ListedColormap:
+    """Colours in order, from what is little to what is much, of "counts", "residuals" or "uncertainty"."""
     from matplotlib import colormaps
-    from matplotlib.colors import to_hex
+    from matplotlib.colors import ListedColormap
 
-    source, start, end, most = LEVELS[name]
-    colours = [to_hex(colour) for colour in colormaps[source](np.linspace(start, end, most))]
-    if count is None:
-        return colours
-    return [colours[i] for i in np.linspace(0, most - 1, min(count, most)).round().astype(int)]
+    source, start, end = _LEVELS[name]
+    return ListedColormap(colormaps[source](np.linspace(start, end, count)))
 
 
 def cycle(count: int) -> list[str]:

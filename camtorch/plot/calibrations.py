@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from camtorch.plot.axes import (
     PALE,
     axes_or_new,
     draw_frame,
-    level_colours,
+    levels,
     magnification,
     printable,
     size_of,
@@ -40,7 +41,6 @@ _DENSE = 3000  # corners, that are drawn finer
 _LATTICE = 96  # of the map of uncertainty, along the longer side
 _AZIMUTHS = 16
 _MOST_BANDS = 8
-_FINE_STEPS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10)
 
 
 class Sightings(NamedTuple):
@@ -121,17 +121,16 @@ def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
     Raises:
         ImportError: no matplotlib.
     """
-    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.colors import PowerNorm
 
     ax, shots, (height, width) = _on_image(calibration, ax)
     rows, columns = _cells(height, width)
     pixels = shots.pixels[shots.seen & shots.inliers]
     edges = [np.linspace(-0.5, length - 0.5, count + 1) for length, count in ((height, rows), (width, columns))]
     counts = np.histogram2d(pixels[:, 1], pixels[:, 0], edges)[0]
-    colours = level_colours("counts")
-    steps = np.ceil(len(colours) * np.sqrt(counts / max(counts.max(), 1)))
-    cmap, norm = ListedColormap([PALE, *colours]), BoundaryNorm(np.arange(len(colours) + 2) - 0.5, len(colours) + 1)
-    ax.pcolormesh(edges[1], edges[0], steps, cmap=cmap, norm=norm, zorder=0.5, edgecolors="#ffffff", linewidth=0.6)
+    cells = np.ma.masked_equal(counts, 0)
+    cmap, norm = levels("counts").with_extremes(bad=PALE), PowerNorm(0.5, 0, max(counts.max(), 1))
+    ax.pcolormesh(edges[1], edges[0], cells, cmap=cmap, norm=norm, zorder=0.5, edgecolors="#ffffff", linewidth=0.6)
     _dots(ax, pixels[_thinned(len(pixels))], INK, 0.9 if len(pixels) > _DENSE else 1.6)
     _crosses(ax, shots)
     share = _covered(calibration, counts)
@@ -152,25 +151,29 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
     Raises:
         ImportError: no matplotlib.
     """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm
+    from matplotlib.ticker import MaxNLocator
+
     ax, shots, (height, width) = _on_image(calibration, ax)
     use = shots.seen & shots.inliers
     pixels, errors, lengths = shots.pixels[use], shots.errors[use], shots.lengths[use]
     few = _thinned(len(lengths), lengths)
     pixels, errors, lengths = pixels[few], errors[few], lengths[few]
-    count = len(level_colours("residuals"))
-    usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 1.0
-    most = count * _round_up(usual / count, _FINE_STEPS)
+    usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 0.0
+    bounds = MaxNLocator(5).tick_values(0, usual or 1.0)
     room = 3 * math.sqrt(height * width / max(len(lengths), 1)) / max(height, width)  # for each, of the longer side
-    longer = magnification(min(0.045, max(0.02, room)) * max(height, width) / most)
-    scale = _scale("residuals", np.linspace(0, most, count + 1))
+    longer = magnification(min(0.045, max(0.02, room)) * max(height, width) / bounds[-1])
+    cmap = levels("residuals", len(bounds) - 1)
     dense = len(lengths) > _DENSE
-    place = np.minimum(len(scale.colours) - 1, (lengths / most * len(scale.colours)).astype(int))
-    for i, colour in enumerate(scale.colours):
+    place = np.digitize(lengths, bounds[1:-1])
+    for i, colour in enumerate(cmap.colors):
         start, along = pixels[place == i], longer * errors[place == i]
         _strokes(ax, np.stack((start, start + along), 1), colour, 0.6 if dense else 0.9, 2 + i / 10)
         _dots(ax, start, colour, 1.2 if dense else 2.0, 2 + i / 10)
     _crosses(ax, shots)
-    _bar(ax, scale, "px", open_end=bool((lengths > most).any()))
+    extend = "max" if (lengths > bounds[-1]).any() else "neither"
+    _bar(ax, ScalarMappable(BoundaryNorm(bounds, cmap.N), cmap), "px", extend=extend)
     times = f", {longer:,} times as long" if longer > 1 else ""
     less = "" if len(few) == use.sum() else f", {len(few):,} of {use.sum():,}"
     ax.set_title(f"residuals, from the seen corner to the projected one{times}{less}")
@@ -298,14 +301,12 @@ def uncertainty(calibration: Calibration, ax: Axes | None = None, *, distance: f
     at = "at infinity" if math.isinf(distance) else f"at a distance of {distance:.3g}"
     ax.set_title(f"sigma of a projection {at}")
     if values.count():
-        scale = _scale("uncertainty", _bands(values.compressed()))
+        bounds = _bands(values.compressed())
+        extend = "max" if values.max() > bounds[-1] else "neither"
         u, v = pixels[0, :, 0].numpy(force=True), pixels[:, 0, 1].numpy(force=True)
-        most = max(float(values.max()), scale.bounds[-1]) * 2
-        filled = np.ma.maximum(values, scale.bounds[0])
-        for low, colour in zip(scale.bounds, scale.colours, strict=False):
-            # from this band on: the next ones come on top, so that no seam is left between two
-            ax.contourf(u, v, filled, [low, most], colors=[colour], zorder=1)
-        _bar(ax, scale, "px", open_end=float(values.max()) > scale.bounds[-1])
+        colours = levels("uncertainty", len(bounds) - (extend == "neither")).colors
+        filled = ax.contourf(u, v, np.ma.maximum(values, bounds[0]), bounds, colors=colours, extend=extend, zorder=1)
+        _bar(ax, filled, "px")
         ax.set_title(f"sigma of a projection {at}: median {np.median(values.compressed()):.2g} px")
     outline = _hull(shots.pixels[shots.seen & shots.inliers])
     ax.plot(*outline.T, color=INK, linestyle=(0, (4, 3)), linewidth=1.1, zorder=4)
@@ -395,29 +396,14 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     extent = np.concatenate([outlines[i] for i in some]) if some else np.ones((1, 2))
     size = float(np.abs(extent).max())
     if some:
-        ends = float(rms[some].min()), float(rms[some].max())
-        count = len(level_colours("residuals"))
-        step = _round_up((ends[1] - ends[0]) / (count - 1) + 1e-9, _FINE_STEPS)
-        bounds = math.floor(ends[0] / step) * step + step * np.arange(count + 1)
-        scale = _scale("residuals", bounds)
-        place = [max(0, min(len(scale.colours) - 1, int((rms[i] - bounds[0]) / step))) for i in some]
-        faces = PolyCollection(
-            [outlines[i] for i in some],
-            facecolors=[scale.colours[k] for k in place],
-            edgecolors=[scale.colours[k] for k in place],
-            alpha=0.35 if len(some) < 60 else 0.15,
-            zorder=2,
-        )
+        shapes, cmap, few = [outlines[i] for i in some], levels("residuals"), len(some) < 60
+        faces = PolyCollection(shapes, array=rms[some], cmap=cmap, alpha=0.35 if few else 0.15, zorder=2)
         rims = PolyCollection(
-            [outlines[i] for i in some],
-            facecolors="none",
-            edgecolors=[scale.colours[k] for k in place],
-            linewidths=1.0 if len(some) < 60 else 0.5,
-            zorder=3,
+            shapes, array=rms[some], cmap=cmap, facecolors="none", linewidths=1.0 if few else 0.5, zorder=3
         )
         ax.add_collection(faces)
         ax.add_collection(rims)
-        _bar(ax, scale, "rms, px")
+        _bar(ax, rims, "rms, px")
     _draw_camera(ax, 0.12 * size)
     _ruler(ax, size)
     ax.set_aspect("equal", adjustable="datalim")
@@ -431,34 +417,10 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
 # -- parts of plots
 
 
-class _Scale(NamedTuple):
-    """A few colours and their bounds, one more."""
-
-    colours: list[str]
-    bounds: list[float]
-    mappable: ScalarMappable
-
-
-def _scale(name: str, bounds: np.ndarray) -> _Scale:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-
-    colours = level_colours(name, len(bounds) - 1)
-    norm = BoundaryNorm(bounds.tolist(), len(colours))
-    return _Scale(colours, bounds.tolist(), ScalarMappable(norm, ListedColormap(colours)))
-
-
-def _bar(ax: Axes, scale: _Scale, label: str, *, open_end: bool = False) -> None:
-    bar = ax.figure.colorbar(scale.mappable, ax=ax, shrink=0.8, pad=0.02, aspect=28, spacing="uniform", drawedges=False)
-    ticks = scale.bounds if len(scale.bounds) < 10 else scale.bounds[::2]
-    texts = [f"{value:.3g}" for value in ticks]
-    if open_end:
-        texts[-1] = f"> {texts[-1]}"
-    bar.set_ticks(ticks, labels=texts)
-    bar.ax.minorticks_off()
-    bar.ax.tick_params(length=0)
+def _bar(ax: Axes, mappable: ScalarMappable, label: str, **options: Any) -> None:
+    bar = ax.figure.colorbar(mappable, ax=ax, label=label, format="%g", shrink=0.8, pad=0.02, aspect=28, **options)
     bar.outline.set_visible(False)
-    bar.set_label(label)
+    bar.ax.minorticks_off()
 
 
 def _cells(height: int, width: int) -> tuple[int, int]:
@@ -485,11 +447,11 @@ def _thinned(count: int, lengths: np.ndarray | None = None) -> np.ndarray:
     return np.concatenate((longest, np.sort(others)[evenly]))
 
 
-def _dots(ax: Axes, places: np.ndarray, colour: str, size: float, zorder: float = 2.0) -> None:
+def _dots(ax: Axes, places: np.ndarray, colour: Any, size: float, zorder: float = 2.0) -> None:
     _strokes(ax, np.stack((places, places), 1), colour, size, zorder)
 
 
-def _strokes(ax: Axes, ends: np.ndarray, colour: str, width: float, zorder: float) -> None:
+def _strokes(ax: Axes, ends: np.ndarray, colour: Any, width: float, zorder: float) -> None:
     """(K, 2, 2) lines with round ends, as one path: thousands of them make a small file."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
@@ -514,24 +476,13 @@ def _crosses(ax: Axes, shots: Sightings, index: int | None = None) -> None:
         ax.legend(loc="lower right", framealpha=0.8, handletextpad=0.2)
 
 
-def _bands(values: np.ndarray) -> np.ndarray:
+def _bands(values: np.ndarray) -> list[float]:
     """Bounds from 1, 2, 5, 10, ... around what most values are."""
+    ladder = [float(f"{digit}e{power}") for power in range(-6, 10) for digit in (1, 2, 5)]
     low, high = np.quantile(values, (0.01, 0.97))
-    power = 10.0 ** math.floor(math.log10(max(low, 1e-6)))
-    low = max(n * power for n in (1, 2, 5) if n * power <= max(low, 1e-6) * 1.0001)
-    bounds = [low]
-    while bounds[-1] < high and len(bounds) <= _MOST_BANDS:
-        power = 10.0 ** math.floor(math.log10(bounds[-1] * 1.001))
-        bounds.append(min(n * power for n in (2, 5, 10) if n * power > bounds[-1] * 1.001))
-    if len(bounds) == 1:
-        bounds.append(2 * low)
-    return np.array(bounds)
-
-
-def _round_up(value: float, steps: tuple[float, ...] = (1, 2, 5, 10)) -> float:
-    """The next of such steps times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
-    return min((n * power for n in steps if n * power >= value * (1 - 1e-9)), default=10 * power)
+    first = max(bisect.bisect_right(ladder, low) - 1, 0)
+    last = min(max(bisect.bisect_left(ladder, high), first + 1), first + _MOST_BANDS)
+    return ladder[first : last + 1]
 
 
 def _worst(calibration: Calibration, pixels: Tensor, inside: Tensor) -> np.ndarray:
@@ -591,7 +542,9 @@ def _draw_camera(ax: Axes, size: float) -> None:
 
 def _ruler(ax: Axes, size: float) -> None:
     """A length, for the boards' unit is the user's."""
-    length = _round_up(0.15 * size)
+    from matplotlib.ticker import MaxNLocator
+
+    length = MaxNLocator(2, steps=[1, 2, 5, 10]).tick_values(0, 0.3 * size)[1]
     (left, low), (_, high) = ax.dataLim.min, ax.dataLim.max
     low -= 0.06 * (high - low)
     ax.plot([left, left + length], [low, low], color=GREY, linewidth=1.6, solid_capstyle="butt")
