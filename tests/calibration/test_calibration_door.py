@@ -172,6 +172,16 @@ def test_a_view_left_out_of_a_tensor_comes_back_as_nan():
     torch.testing.assert_close(back, image_points.double(), rtol=0, atol=0, equal_nan=True)
 
 
+@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
+def test_copies_of_views_are_left_out(order):
+    points, image_points = [BOARD, BOARD, BOARD[order]], [VIEWS[0], VIEWS[1], VIEWS[0][order]]
+    with pytest.warns(UserWarning, match="the corners are those of another view in view 2$"):
+        observations, layout = as_observations(points, image_points, SIZE, OWNER)
+    same((observations, layout), REPEATED[:2], VIEWS[:2])
+    assert layout.copies == (2,)
+    assert layout.restore(observations.pixels)[2].isnan().all()
+
+
 def test_views_of_different_corners():
     """As ChArUco boards are found."""
     which = [np.arange(54), np.arange(10, 40), np.arange(0, 54, 3)]

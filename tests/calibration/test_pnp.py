@@ -50,7 +50,7 @@ def rms_of(camera, extrinsics, target, pixels):
 
 
 @pytest.mark.parametrize("kind", ["planar", "space"])
-@pytest.mark.parametrize("fov", [10, 60, 130, 190])
+@pytest.mark.parametrize("fov", [60, 190, *(pytest.param(fov, marks=pytest.mark.slow) for fov in (10, 130))])
 def test_exact_pixels_give_the_pose(fov, kind):
     camera = lens(fov)
     for points in (4, 5, 20):
@@ -91,7 +91,7 @@ def attempts(camera, fov, count, points, kind, noise, seed):
 
 @pytest.mark.parametrize("kind", ["planar", "space"])
 def test_noisy_pixels_are_explained_better_than_by_the_truth(kind):
-    good = [attempts(lens(fov), fov, 60, points, kind, 0.5, points) for fov in (10, 190) for points in (4, 12)]
+    good = [attempts(lens(fov), fov, 25, points, kind, 0.5, points) for fov in (10, 190) for points in (4, 12)]
     assert torch.cat(good).double().mean() > 0.99
 
 
@@ -153,9 +153,9 @@ def test_both_minima_of_a_plane_are_compared():
 
 def test_gradients_are_those_of_the_optimum():
     camera = lens(130)
-    target, _, _, pixels = scenes(camera, 130, 2, 7, "planar")
+    target, _, _, pixels = scenes(camera, 130, 1, 5, "planar")
     pixels = pixels + 2 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
-    weights = torch.rand(2, 7, generator=torch.Generator().manual_seed(2)).double() + 0.5
+    weights = torch.rand(1, 5, generator=torch.Generator().manual_seed(2)).double() + 0.5
     inputs = [w.clone().requires_grad_() for w in (target, pixels, weights, camera.intrinsics, camera.distortion)]
 
     def pose(target, pixels, weights, intrinsics, distortion):

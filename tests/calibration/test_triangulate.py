@@ -96,8 +96,8 @@ def test_parallel_and_diverging_rays_are_invalid(apart):
 
 def test_gradients_are_those_of_the_optimum():
     cameras, extrinsics, _, pixels = rig()
-    seen = (~pixels.isnan().any(-1)).all(0).nonzero()[:3, 0]
-    pixels = pixels[:, seen] + torch.randn(3, 3, 2, generator=torch.Generator().manual_seed(1)).double()
+    seen = (~pixels.isnan().any(-1)).all(0).nonzero()[:1, 0]
+    pixels = pixels[:, seen] + torch.randn(3, 1, 2, generator=torch.Generator().manual_seed(1)).double()
     camera, pose = cameras[0], extrinsics[1]
     inputs = [
         w.detach().clone().requires_grad_()
@@ -145,7 +145,7 @@ def test_shapes():
 
 
 def test_one_camera_that_moves():
-    camera, (_, _, points, _) = CAMERAS[0], rig()
+    camera, points = CAMERAS[0], rig()[2][:40]
     poses = ct.Extrinsics(torch.zeros(4, 3).double(), torch.randn(4, 3).double())
     pixels = torch.stack([camera.project(pose(points))[0] for pose in poses]).detach()
     for cameras in (camera, [camera] * 4):
