@@ -1,5 +1,6 @@
 """Corners of boards: the real ones of `golden/calibration`, and made ones of any camera."""
 
+import functools
 import json
 import math
 from pathlib import Path
@@ -44,6 +45,13 @@ def opencv_left():
         for optimum in given["optima"]
     }
     return Corners(points, pixels, tuple(given["image_size"])), optima
+
+
+@functools.cache
+def opencv_calibration():
+    """The calibration of those views, which several files look at."""
+    corners, _ = opencv_left()
+    return ct.calibrate("brown_conrady", *corners[:2], image_size=corners.image_size)
 
 
 def ov_plane(part):

@@ -56,7 +56,8 @@ def test_chessboards_keep_their_order_however_they_are_turned():
 
 
 @pytest.mark.parametrize(
-    ("columns", "rows", "symmetries"), [(7, 5, 2), (6, 6, 4), pytest.param(5, 5, 2, marks=pytest.mark.slow)]
+    ("columns", "rows", "symmetries"),
+    [(6, 6, 4), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((7, 5, 2), (5, 5, 2)))],
 )
 def test_ambiguous_chessboards_begin_near_the_top_left(columns, rows, symmetries):
     board = Chessboard(columns, rows, 0.03)
@@ -79,7 +80,7 @@ def test_deep_and_large_images():
     assert np.abs((detect(board, large).pixels + 0.5) / 4 - 0.5 - truth).max() < 0.6
 
 
-@pytest.mark.parametrize("board", BOARDS, ids=named)
+@pytest.mark.parametrize("board", BOARDS[:3], ids=named)
 def test_nothing_is_found_where_nothing_is(board):
     noise = np.random.default_rng(0).integers(0, 256, (120, 160), dtype=np.uint8)
     for image in (noise[:60, :80], np.zeros_like(noise)):

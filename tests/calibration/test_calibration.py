@@ -77,6 +77,7 @@ def test_results_are_without_a_graph_but_go_on_learning(left):
     assert bool((camera.distortion.grad.abs() * left.std[4:] < 1e-6).all())
 
 
+@slow
 @torch.inference_mode()
 def test_the_same_bit_for_bit_and_without_autograd(left):
     again = calibrate(LEFT)
@@ -157,14 +158,13 @@ def test_a_view_without_corners_is_left_out(left):
     assert found.extrinsics.batch_shape == (13,)
 
 
-def test_fixed_coefficients(left):
-    found = calibrate(LEFT, fixed=("cx", "k3", "p1"))
+def test_fixed_coefficients():
+    found = calibrate(LEFT._replace(image_points=LEFT.image_points[:5]), fixed=("cx", "k3", "p1"))
     named = dict(zip(found.parameter_names, zip(values(found).tolist(), found.std.tolist(), strict=True), strict=True))
     assert named["k3"] == (0.0, 0.0)
     assert named["p1"] == (0.0, 0.0)
     assert named["cx"] == (319.5, 0.0)  # the middle of the image, whose first pixel is at 0
     assert all(std > 0 for name, (_, std) in named.items() if name not in ("cx", "k3", "p1"))
-    assert found.rms > left.rms
 
 
 @slow
@@ -238,7 +238,7 @@ FREE_TO_TURN = {"cylindrical", "equirectangular", "latlon", "transverse_cylindri
 @pytest.mark.parametrize(
     ("key", "form"),
     slow_unless(
-        {("pinhole", "float64"), ("kannala_brandt", "float32"), ("equirectangular", "float32 poses")}.__contains__,
+        ("kannala_brandt", "float32 poses").__eq__,
         list(itertools.product(KEYS, ("float64", "float32", "float32 poses"))),
     ),
 )

@@ -138,6 +138,7 @@ def test_a_camera_that_is_held_stays_as_it_is():
     assert float(found.std["right"][2]) == 0 < float(found.std["right"][3])
 
 
+@pytest.mark.slow
 def test_one_camera_is_a_rig_as_well():
     pixels, _, _ = seen(views=8)
     alone = ct.calibrate("kannala_brandt", BOARD, pixels["left"], image_size=(480, 640))
@@ -176,6 +177,7 @@ def test_names_that_no_camera_has_are_refused():
         calibrated(pixels, fixed={"middle": "all"})
 
 
+@pytest.mark.slow
 def test_views_are_copies_where_all_cameras_saw_the_same():
     pixels, *_ = seen(views=6)
     some = list(PAIR)

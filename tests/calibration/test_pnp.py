@@ -1,11 +1,14 @@
 """solve_pnp: poses of objects by any lens, at any angle, from no start; the optimum, and its derivatives."""
 
 import math
+from itertools import product
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from cameras import slow_unless
+from derivatives import check_slope
 
 import camtorch as ct
 from camtorch.rotations import rotation_matrix
@@ -49,8 +52,10 @@ def rms_of(camera, extrinsics, target, pixels):
     return (found - pixels).square().sum(-1).mean(-1).sqrt()
 
 
-@pytest.mark.parametrize("kind", ["planar", "space"])
-@pytest.mark.parametrize("fov", [60, 190, *(pytest.param(fov, marks=pytest.mark.slow) for fov in (10, 130))])
+@pytest.mark.parametrize(
+    ("fov", "kind"),
+    slow_unless({(60, "planar"), (190, "space")}.__contains__, list(product((10, 60, 130, 190), ("planar", "space")))),
+)
 def test_exact_pixels_give_the_pose(fov, kind):
     camera = lens(fov)
     for points in (4, 5, 20):
@@ -89,9 +94,9 @@ def attempts(camera, fov, count, points, kind, noise, seed):
     return valid & (rms <= near_truth + 1e-8)
 
 
-@pytest.mark.parametrize("kind", ["planar", "space"])
+@pytest.mark.parametrize("kind", ["planar", pytest.param("space", marks=pytest.mark.slow)])
 def test_noisy_pixels_are_explained_better_than_by_the_truth(kind):
-    good = [attempts(lens(fov), fov, 25, points, kind, 0.5, points) for fov in (10, 190) for points in (4, 12)]
+    good = [attempts(lens(fov), fov, 12, points, kind, 0.5, points) for fov in (10, 190) for points in (4, 12)]
     assert torch.cat(good).double().mean() > 0.99
 
 
@@ -164,7 +169,7 @@ def test_gradients_are_those_of_the_optimum():
         assert valid.all()
         return found.rotation, found.translation, rms
 
-    assert torch.autograd.gradcheck(pose, inputs, eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
+    check_slope(pose, inputs)
 
 
 def test_what_is_unseen_does_not_matter():

@@ -170,6 +170,7 @@ def test_a_bent_board():
     assert found == pytest.approx([100 * 5e-4 / (8 * 0.025), 100 * 2e-4 / (5 * 0.025)], rel=0.3)
 
 
+@pytest.mark.slow
 def test_outliers_and_bad_views():
     board, pixels = views(narrow(), *all_over(10))
     generator = torch.Generator().manual_seed(1)
@@ -204,7 +205,7 @@ def test_noise_that_is_no_noise():
 
 
 def test_a_search_that_did_not_end(monkeypatch):
-    board, pixels = views(narrow(), *all_over(8))
+    board, pixels = views(narrow(), *all_over(5))
     monkeypatch.setattr(calibrate, "STEPS", 0)
     with pytest.warns(UserWarning, match="did not end at an optimum"):
         result = ct.calibrate("brown_conrady", board, pixels, image_size=SIZE)
@@ -237,7 +238,7 @@ def test_a_single_view_of_a_plane(key, tilt, distance):
     ("count", "noise"),
     [
         (1, 0.0),
-        (6, 0.2),
+        pytest.param(6, 0.2, marks=pytest.mark.slow),
         *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, 0.2), (2, 0.0), (2, 0.2), (6, 0.0))),
     ],
 )
@@ -251,23 +252,22 @@ def test_planes_across_the_axis(count, noise):
         ct.calibrate("pinhole", board, pixels[:count], image_size=SIZE)
 
 
-@pytest.mark.parametrize(
-    "how", [*(pytest.param(how, marks=pytest.mark.slow) for how in ("equal", "in another order")), "saved again"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["equal", "in another order", "saved again"])
 def test_copies_of_views_count_once(how):
     board, pixels = views(narrow(), *all_over(5))
     pixels[2, 7] = torch.nan
     alone = ct.calibrate("pinhole", board, pixels[:4], image_size=SIZE)
-    again = pixels[:4].repeat(3, 1, 1)
+    again = pixels[:4].clone()
     if how == "saved again":
         again += 0.01 * torch.randn(again.shape, generator=torch.Generator().manual_seed(5), **F64)
     order = torch.arange(len(board)).flip(0) if how == "in another order" else torch.arange(len(board))
     image_points = [*pixels[:4], *again[:, order]]
     object_points = [board] * 4 + [board[order]] * len(again)
-    said = contextlib.nullcontext() if how == "saved again" else pytest.warns(UserWarning, match="in views 4, 5, 6")
+    said = contextlib.nullcontext() if how == "saved again" else pytest.warns(UserWarning, match="in views 4, 5, 6, 7")
     with said:
         result = ct.calibrate("pinhole", object_points, image_points, image_size=SIZE)
-    assert result.copies == tuple(range(4, 16))
+    assert result.copies == tuple(range(4, 8))
     # saved again they widen what all views say alike
     torch.testing.assert_close(result.std, alone.std, rtol=0.05 if how == "saved again" else 1e-9, atol=0)
     one(result.warnings, "Views 4, 5, 6, 7.* show another view again.* count once")
