@@ -96,7 +96,7 @@ def _parse_copies(text: str) -> int:
 def prepare(arguments: argparse.Namespace) -> None:
     """Before torch is imported: let processes begin to do so as well."""
     if arguments.dataset is not None and arguments.jobs != 1 and not arguments.dry_run:
-        pool.prepare(["camtorch.cli.augmenting"])
+        pool.prepare("camtorch.cli.augmenting")
 
 
 def run(arguments: argparse.Namespace) -> int:

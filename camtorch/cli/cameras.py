@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -151,18 +152,22 @@ def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace
     return fitting(camera, arguments.camera, image, size, arguments.rescale), rig.extrinsics.get(name)
 
 
-def read_unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Namespace) -> Camera:
-    """The camera that took an image, perhaps for another size, by the options of `add_photograph`; see `fitting`.
+def read_for_many(
+    images: Sequence[Path], size_of: Callable[[Path], tuple[int, int] | None], arguments: argparse.Namespace
+) -> Camera:
+    """The camera that took many images, by the options of `add_photograph`; see `fitting`.
 
-    Args:
-        image: which names the trouble.
-        size: (height, width) by which a lens is chosen, or guessed; None: not known.
-        arguments: the options.
+    Where its file states no size, it is for the first image that has one, by which a lens is chosen, or guessed, too.
 
     Raises:
         ValueError: as `read_camera`; no file is given.
     """
-    return _unfitted(image, size, arguments)[2]
+    sized = ((image, size_of(image)) for image in images)
+    first, size = next((pair for pair in sized if pair[1]), (images[0], None))
+    camera = _unfitted(first, size, arguments)[2]
+    if camera.image_size is None and size is not None:
+        camera = fitting(camera, arguments.camera, first, size, rescale=False)
+    return camera
 
 
 def _unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Namespace) -> tuple[Rig, str, Camera]:

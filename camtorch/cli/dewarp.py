@@ -76,7 +76,7 @@ def prepare(arguments: argparse.Namespace) -> None:
     words: list[str] = arguments.image
     several = len(words) > 1 or os.path.isdir(words[0]) or glob.has_magic(words[0])
     if several and arguments.jobs != 1 and not arguments.dry_run:
-        pool.prepare(["camtorch.cli.dewarping"])
+        pool.prepare("camtorch.cli.dewarping")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -231,11 +231,9 @@ def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
     from camtorch.cli import cameras, images, videos
     from camtorch.cli.dewarping import Dewarping
 
-    sized = ((one, (videos if videos.is_video(one) else images).size_of(one)) for one in sources)
-    first, size = next((pair for pair in sized if pair[1]), (sources[0] if sources else Path(arguments.image[0]), None))
-    camera = cameras.read_unfitted(first, size, arguments)
-    if camera.image_size is None and size is not None:
-        camera = cameras.fitting(camera, arguments.camera, first, size, rescale=False)
+    camera = cameras.read_for_many(
+        sources, lambda one: (videos if videos.is_video(one) else images).size_of(one), arguments
+    )
     encoder = videos.Encoder(arguments.codec, arguments.crf)
     if any(map(videos.is_video, sources)):
         encoder.check()
