@@ -106,11 +106,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print("\n".join(labelled_image.presets()))
         return 0
-    of_datasets = ("jobs", "resume", "shard", "dry_run", "copies")
-    for name in ("n", "labels") if arguments.dataset is not None else of_datasets:
+    is_sheet = arguments.dataset is None
+    for name in ("jobs", "resume", "shard", "dry_run", "copies") if is_sheet else ("n", "labels"):
         if getattr(arguments, name):
             option = "-n" if name == "n" else f"--{name.replace('_', '-')}"
-            raise ValueError(f"{option} is for {'--dataset' if name in of_datasets else 'a sheet, without --dataset'}")
+            raise ValueError(f"{option} is for {'--dataset' if is_sheet else 'a sheet, without --dataset'}")
     if arguments.dataset is not None:
         from camtorch.cli import dataset
 
@@ -148,7 +148,7 @@ def _sheet(arguments: argparse.Namespace) -> None:
             f"{100 * empty:.0f} % of the new images shows nothing, as the camera of the image does not see so far; "
             "--fov source or --min-filled 0.9 takes less of that"
         )
-    title = f"One image, {sheet.counted(arguments.n, 'other camera')}"
+    title = f"One image, {arguments.n} other camera{'s' * (arguments.n != 1)}"
     images.write(arguments.output, sheet.drawing(shown, title, labelled_image.origin(lens, before)))
     told = "" if before.is_made_up else ", with what became of the labels"
     print(f"{arguments.output}: the image before, and as each of them sees it{told}")

@@ -14,7 +14,6 @@ from camtorch.cli.options import (
     add_jobs,
     add_photograph,
     add_projection,
-    checked_fov,
     parse_path,
     parse_suffix,
 )
@@ -83,7 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
     from camtorch.cli import videos
 
-    checked_fov(arguments)
     words: list[str] = arguments.image
     output: str | None = arguments.output
     into_folder = output is not None and output.endswith(_SLASHES)
@@ -124,7 +122,7 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
         warp = Dewarp(
             camera,
             projection=arguments.projection,
-            fov=checked_fov(arguments),
+            fov=arguments.fov,
             image_size=arguments.size,
             tolerance=TOLERANCE,
         )
@@ -237,15 +235,12 @@ def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
     encoder = videos.Encoder(arguments.codec, arguments.crf)
     if any(map(videos.is_video, sources)):
         encoder.check()
-    return Dewarping(
-        camera,
-        arguments.camera,
-        arguments.rescale,
-        arguments.projection,
-        checked_fov(arguments),
-        arguments.size,
-        encoder,
+    work = Dewarping(
+        camera, arguments.camera, arguments.rescale, arguments.projection, arguments.fov, arguments.size, encoder
     )
+    if camera.image_size is not None:
+        work.warp_of(camera)  # what is wrong with it is so for all
+    return work
 
 
 def _told(arguments: argparse.Namespace, told: dict[str, Any]) -> str:

@@ -127,24 +127,6 @@ def add_projection(command: argparse._ActionsContainer) -> None:
     )
 
 
-def checked_fov(arguments: argparse.Namespace) -> float | None:
-    """--fov of `add_projection` in degrees.
-
-    Raises:
-        ValueError: one that the projection does not have.
-    """
-    from camtorch._arguments import check_degrees  # it imports torch
-
-    fov: float | None = arguments.fov
-    if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
-        wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
-        allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
-        raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
-    if fov is not None:
-        check_degrees(fov, f"{fov:g}", "--fov")
-    return fov
-
-
 def checked_ranges(arguments: argparse.Namespace) -> dict[str, Any]:
     """What the options of `camtorch augment` say of the ranges of `RandomCamera`.
 

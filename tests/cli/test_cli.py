@@ -147,10 +147,19 @@ def test_an_exchanged_width_and_height_is_not_scaled(folder, capsys):
         (["dewarp", "in.png", "--camera", "camera.yml", "--size", "0x9", "-o", "o.png"], "1 to 32768"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--size", "9x-9", "-o", "o.png"], "not WIDTHxHEIGHT"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "wide", "-o", "o.png"], "--fov: invalid float"),
-        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "180", "-o", "o.png"], "below 180 degrees"),
-        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "nan", "-o", "o.png"], "--fov must be above 0"),
+        (
+            ["dewarp", "in.png", "--camera", "camera.yml", "--fov", "180", "-o", "o.png"],
+            "below 180 for perspective; got 180",
+        ),
+        (
+            ["dewarp", "in.png", "--camera", "camera.yml", "--fov", "nan", "-o", "o.png"],
+            "fov must be in degrees, above 0",
+        ),
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "2.1", "-o", "o.png"], "2.1 seems to be radians"),
-        (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "0", "-o", "o.png"], "--fov must be above 0"),
+        (
+            ["dewarp", "in.png", "--camera", "camera.yml", "--fov", "0", "-o", "o.png"],
+            "fov must be in degrees, above 0",
+        ),
         (["demo", "-o", "in.png"], "in.png: exists already"),
     ],
 )
