@@ -162,7 +162,7 @@ def _photograph(arguments: argparse.Namespace) -> LabelledImage:
     height, width = image.shape[-2:]
     parts = None if arguments.labels is None else labels.entries_of(arguments.labels).get("camera")
     if parts is None:
-        camera = cameras.read_camera_of(arguments.image, (height, width), arguments)
+        camera, _ = cameras.read_posed(arguments.image, (height, width), arguments)
     elif arguments.camera is None:
         try:
             camera = cameras.stated(parts, (height, width))

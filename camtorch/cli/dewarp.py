@@ -114,7 +114,7 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
     images.check_target(output, force=arguments.force, inputs=(source, arguments.camera))
     image, orientation = images.read(source)
     rows, columns = image.shape[-2:]
-    camera = cameras.read_camera_of(source, (rows, columns), arguments)
+    camera, _ = cameras.read_posed(source, (rows, columns), arguments)
     if arguments.dry_run:
         print(f"{source} -> {output}")
         return

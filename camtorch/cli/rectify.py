@@ -251,19 +251,9 @@ def _match(
         write_ply(
             arguments.points,
             points[valid] @ rectification.rotation_left.to(points.dtype),
-            _of_colours(pair[0]).permute(1, 2, 0)[valid],
+            images.in_colour(pair[0]).permute(1, 2, 0)[valid],
         )
         print(f"{arguments.points}: {int(valid.sum())} points at depths of {near:.4g} to {far:.4g}")
-
-
-def _of_colours(image: Tensor) -> Tensor:
-    """(3, H, W) uint8 of an image as `images.read` has it."""
-    import torch
-
-    colours = image[:3] if len(image) > 2 else image[:1].expand(3, -1, -1)
-    if colours.dtype != torch.uint8:
-        colours = (colours.double() * (255 / max(float(colours.double().max()), 1.0))).round().byte()
-    return colours
 
 
 def _side_by_side(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
@@ -274,7 +264,7 @@ def _side_by_side(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
     from camtorch._drawing import BOX, GAZE, POINT
     from camtorch.cli import images
 
-    whole = torch.cat((_of_colours(left), _of_colours(right)), 1 if vertical else 2)
+    whole = torch.cat((images.in_colour(left), images.in_colour(right)), 1 if vertical else 2)
     image = images.from_tensor(whole)
     draw = ImageDraw.Draw(image)
     width, height = image.size
