@@ -81,8 +81,8 @@ class Augmenting:
                 return moved["json"] if not others else moved
 
             moved = move(coco.packed(labels) if item.labels else labels, png=array)
-            new, made = moved["json"], torch.from_numpy(moved["png"])
-            made = images.from_tensor(made.permute(2, 0, 1) if made.ndim == 3 else made[None])
+            new, pixels = moved["json"], torch.from_numpy(moved["png"])
+            made = images.from_tensor(pixels.permute(2, 0, 1) if pixels.ndim == 3 else pixels[None])
             images.write(item.outputs[copy], made, orientation=orientation, tell=listener.note, synced=False)
             if item.labels:
                 result["images"].append({name: new[name] for name in ("camera", "rotation")})

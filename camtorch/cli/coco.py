@@ -269,7 +269,8 @@ def _polygon(edges: list[Array], name: str, new: Json, move: Move, size: tuple[i
     ends = np.cumsum([len(edge) for edge in edges])[:-1]
     pieces = zip(np.split(places, ends), np.split(there, ends), strict=True)
     corners = np.concatenate([_simplified(edge[there]) for edge, there in pieces])
-    return corners[(corners != np.roll(corners, -1, 0)).any(1)]
+    once: Array = corners[(corners != np.roll(corners, -1, 0)).any(1)]
+    return once
 
 
 def _has_place(places: Array) -> NDArray[np.bool_]:
@@ -285,7 +286,7 @@ def _simplified(line: Array) -> Array:
     distance = np.abs(off[:, 0] * along[1] - off[:, 1] * along[0]) / max(math.hypot(*along), 1e-9)
     far = int(distance.argmax())
     if distance[far] <= _SAG:
-        return line[[0, -1]]
+        return np.stack([line[0], line[-1]])
     return np.concatenate([_simplified(line[: far + 1]), _simplified(line[far:])[1:]])
 
 

@@ -102,7 +102,7 @@ def read(path: Path, camera: Camera) -> Labels:
 def _numbers(path: Path, name: str, entry: Any) -> np.ndarray[Any, Any]:
     count, has_many, shape = _SHAPES[name]
     for row in entry if has_many and isinstance(entry, list) else [entry]:
-        numbers = row if isinstance(row, list) and len(row) == count else [None]
+        numbers: list[Any] = row if isinstance(row, list) and len(row) == count else [None]
         if not all(type(n) in (int, float) and abs(n) <= _FARTHEST for n in numbers):
             raise LabelsError(f"{path}: {name}: must be {shape}, numbers between -1e6 and 1e6; got {_short(row)}")
     return np.asarray(entry, np.float64).reshape(-1, count)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 
 LARGEST_SIDE = 32768
 """Pixels."""
-_MOST_JOBS = 1024
 
 
 def parse_path(text: str) -> Path:
@@ -33,6 +33,17 @@ def parse_size(text: str) -> tuple[int, int]:
     if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
         raise argparse.ArgumentTypeError(f"{text!r}: each side must be 1 to {LARGEST_SIDE} pixels")
     return height, width
+
+
+def parse_count(most: int) -> Callable[[str], int]:
+    """What reads a whole number from 1 to `most`."""
+
+    def parse(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and 0 < int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {most}")
+        return int(text)
+
+    return parse
 
 
 def parse_range(text: str) -> float | tuple[float, float]:
@@ -177,7 +188,9 @@ def add_output(command: argparse.ArgumentParser, default: str | None, text: str 
 def add_jobs(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """How many files are worked on."""
     group = command.add_argument_group("many files")
-    group.add_argument("--jobs", type=_parse_jobs, metavar="N", help="processes; by default as many as there are cores")
+    group.add_argument(
+        "--jobs", type=parse_count(1024), metavar="N", help="processes; by default as many as there are cores"
+    )
     group.add_argument(
         "--resume", action="store_true", help="go on where a run was broken off; what is done and unchanged is kept"
     )
@@ -189,12 +202,6 @@ def add_jobs(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     )
     group.add_argument("--dry-run", action="store_true", help="print what would be done")
     return group
-
-
-def _parse_jobs(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 0 < int(text) <= _MOST_JOBS):
-        raise argparse.ArgumentTypeError(f"{text!r} is not 1 to {_MOST_JOBS} processes")
-    return int(text)
 
 
 def _parse_shard(text: str) -> Shard:

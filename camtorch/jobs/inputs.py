@@ -60,7 +60,7 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> Input
         path, place = Path(word), Path()
         if path.is_dir():
             root, place = path, Path(path.resolve().name) if len(words) > 1 else place
-            paths = list(_below(path, output, lambda e: inputs.faults.append((Path(e.filename), e.strerror))))
+            paths = list(_below(path, output, lambda e: inputs.faults.append((Path(e.filename), e.strerror or ""))))
         elif os.path.lexists(path):
             inputs.files.append(Found(path, Path(path.name)))
             continue

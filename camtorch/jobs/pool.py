@@ -8,7 +8,7 @@ import pickle
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
@@ -36,7 +36,9 @@ def prepare(module: str) -> None:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def run(work: Work[T], tasks: Iterable[T], processes: int, add: Callable[[float], None]) -> Iterator[tuple[T, Any]]:
+def run(
+    work: Work[T], tasks: Iterable[T], processes: int, add: Callable[[float], None]
+) -> Generator[tuple[T, Any], None, None]:
     """Tasks with what `work` returned, as they are done.
 
     Args:
@@ -64,7 +66,7 @@ def run(work: Work[T], tasks: Iterable[T], processes: int, add: Callable[[float]
 
 def _run_in_processes(
     work: Work[T], tasks: Iterator[T], processes: int, add: Callable[[float], None]
-) -> Iterator[tuple[T, Any]]:
+) -> Generator[tuple[T, Any], None, None]:
     prepare(type(work).__module__)
     context = multiprocessing.get_context(_HOW)
     done, seen = context.Value("d", 0.0), 0.0

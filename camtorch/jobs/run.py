@@ -81,8 +81,8 @@ def run(
 
     _remove_left_over(items)
     try:
-        work = _Attempt(work, manifest.settings)
-        with contextlib.closing(pool.run(work, tasks(), processes, add)) as outcomes:
+        attempt = _Attempt(work, manifest.settings)
+        with contextlib.closing(pool.run(attempt, tasks(), processes, add)) as outcomes:
             for (item, _), outcome in outcomes:
                 for text in outcome.notes:
                     report.notes.setdefault(text.removeprefix(item.name).lstrip(": "), []).append(item.name)
