@@ -12,6 +12,7 @@ from camtorch.cli.options import (
     add_output,
     add_photograph,
     checked_ranges,
+    parse_count,
     parse_fov,
     parse_path,
     parse_range,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from camtorch.cli.options import Commands
 
 _SHEET = "augment.png"
-_COUNT, _MOST_IMAGES, _MOST_COPIES = 8, 100, 10000
+_COUNT = 8
 _MUCH = 1 / 3  # of the new images
 
 
@@ -52,7 +53,9 @@ def add(commands: Commands) -> None:
     )
     command.add_argument("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
     command.add_argument("--list", action="store_true", help="print the presets, and nothing else")
-    command.add_argument("-n", type=int, metavar="COUNT", help=f"how many other cameras; {_COUNT} by default")
+    command.add_argument(
+        "-n", type=parse_count(100), metavar="COUNT", help=f"how many other cameras; {_COUNT} by default"
+    )
     command.add_argument("--seed", type=int, default=0, help="of what is drawn; 0 by default")
     command.add_argument("--size", type=parse_size, metavar="WxH", help="of the new images; by default the old one's")
     for name, text in (
@@ -84,19 +87,13 @@ def add(commands: Commands) -> None:
         metavar="LABELS",
         help="of all images of the folder IMAGE: a JSON file in COCO's format, or a folder of a JSON file for each",
     )
-    many.add_argument("--copies", type=_parse_copies, metavar="N", help="new images of each; 1 by default")
-
-
-def _parse_copies(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 0 < int(text) <= _MOST_COPIES):
-        raise argparse.ArgumentTypeError(f"{text!r} is not 1 to {_MOST_COPIES} copies")
-    return int(text)
+    many.add_argument("--copies", type=parse_count(10000), metavar="N", help="new images of each; 1 by default")
 
 
 def prepare(arguments: argparse.Namespace) -> None:
     """Before torch is imported: let processes begin to do so as well."""
     if arguments.dataset is not None and arguments.jobs != 1 and not arguments.dry_run:
-        pool.prepare(["camtorch.cli.augmenting"])
+        pool.prepare("camtorch.cli.augmenting")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -106,11 +103,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print("\n".join(labelled_image.presets()))
         return 0
-    of_datasets = ("jobs", "resume", "shard", "dry_run", "copies")
-    for name in ("n", "labels") if arguments.dataset is not None else of_datasets:
+    is_sheet = arguments.dataset is None
+    for name in ("jobs", "resume", "shard", "dry_run", "copies") if is_sheet else ("n", "labels"):
         if getattr(arguments, name):
             option = "-n" if name == "n" else f"--{name.replace('_', '-')}"
-            raise ValueError(f"{option} is for {'--dataset' if name in of_datasets else 'a sheet, without --dataset'}")
+            raise ValueError(f"{option} is for {'--dataset' if is_sheet else 'a sheet, without --dataset'}")
     if arguments.dataset is not None:
         from camtorch.cli import dataset
 
@@ -125,14 +122,10 @@ def _sheet(arguments: argparse.Namespace) -> None:
     arguments.output = arguments.output or Path(_SHEET)
     arguments.n = _COUNT if arguments.n is None else arguments.n
     lens = labelled_image.lens(arguments.preset)
-    if not 1 <= arguments.n <= _MOST_IMAGES:
-        raise ValueError(f"-n must be 1 to {_MOST_IMAGES}; got {arguments.n}")
     ranges = checked_ranges(arguments)
-    needs = {"camera": ("from_model", "name"), "image": ("labels", "rescale")}
-    for needed, names in needs.items():
-        idle = [name for name in names if getattr(arguments, needed) is None and getattr(arguments, name)]
-        if idle:
-            raise ValueError(f"--{idle[0].replace('_', '-')} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
+    for name, needed in {"from_model": "camera", "name": "camera", "labels": "image", "rescale": "image"}.items():
+        if getattr(arguments, needed) is None and getattr(arguments, name):
+            raise ValueError(f"--{name.replace('_', '-')} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
     inputs = (arguments.image, arguments.camera, arguments.labels)
     images.check_target(arguments.output, force=arguments.force, inputs=inputs)
     before = _scene(arguments) if arguments.image is None else _photograph(arguments)
@@ -148,7 +141,7 @@ def _sheet(arguments: argparse.Namespace) -> None:
             f"{100 * empty:.0f} % of the new images shows nothing, as the camera of the image does not see so far; "
             "--fov source or --min-filled 0.9 takes less of that"
         )
-    title = f"One image, {sheet.counted(arguments.n, 'other camera')}"
+    title = f"One image, {arguments.n} other camera{'s' * (arguments.n != 1)}"
     images.write(arguments.output, sheet.drawing(shown, title, labelled_image.origin(lens, before)))
     told = "" if before.is_made_up else ", with what became of the labels"
     print(f"{arguments.output}: the image before, and as each of them sees it{told}")
@@ -162,7 +155,7 @@ def _photograph(arguments: argparse.Namespace) -> LabelledImage:
     height, width = image.shape[-2:]
     parts = None if arguments.labels is None else labels.entries_of(arguments.labels).get("camera")
     if parts is None:
-        camera = cameras.read_camera_of(arguments.image, (height, width), arguments)
+        camera, _ = cameras.read_posed(arguments.image, (height, width), arguments)
     elif arguments.camera is None:
         try:
             camera = cameras.stated(parts, (height, width))

@@ -8,20 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from camtorch.augment import RandomCamera
-from camtorch.augment.change import singles
 from camtorch.camera import Camera
 from camtorch.cli import cameras, coco, images
+from camtorch.data.columns import PARTS, to_columns
 from camtorch.data.samples import MapSamples
-from camtorch.data.seeded import generator
 from camtorch.io.writing import replacing
 from camtorch.jobs.items import Item, Listener
 
 Json = dict[str, Any]
 _EYE, _EYES = "gaze_from", "keypoints_gaze_from"
-_MOST_SIZES = 4
 
 
 @dataclass(frozen=True)
@@ -50,43 +47,50 @@ class Augmenting:
     ranges: dict[str, Any]
     seed: int
     copies: int
-    _augmentations: dict[str, tuple[RandomCamera, MapSamples]] = field(default_factory=dict)
+    _samples: dict[str, MapSamples] = field(default_factory=dict)
 
     def settings(self) -> Json:
         """All that outputs depend on beside images and labels; JSON."""
         names = ("rescale", "like", "image_size", "min_filled", "ranges", "seed", "copies")
-        return {
-            "camera": None if self.camera is None else coco.parts_of(self.camera),
-            **{name: getattr(self, name) for name in names},
-        }
+        camera = None if self.camera is None else _parts_of(self.camera)
+        return {"camera": camera, **{name: getattr(self, name) for name in names}}
 
     def __call__(self, item: Item, listener: Listener) -> Json:
-        """Entries of the new images and their annotations, where labels are no files; what was lost."""
+        """Entries of the new images and their annotations, where labels are no files."""
         assert isinstance(item, Labelled)
         image, orientation = images.read(item.inputs[0], tell=listener.note)
         entry, annotations = json.loads(item.labels) if item.labels else (_read(item.inputs[1]), [])
-        rows, columns = image.shape[-2:]
-        if item.labels and (entry.get("height", rows), entry.get("width", columns)) != (rows, columns):
+        size = rows, columns = image.shape[-2], image.shape[-1]
+        if item.labels and (entry.get("height", rows), entry.get("width", columns)) != size:
             stated = f"{entry.get('width')}x{entry.get('height')}"
             raise ValueError(f"it is {columns}x{rows}, and its labels are for {stated}")
         if orientation not in (None, 1):
             listener.note(f"{item.name} is taken as stored, not turned by its Exif orientation, and so are its labels")
-        camera = self._camera(item.inputs[0], (rows, columns), entry.get("camera"))
-        augmentation, move = self._augmentation(camera)
+        camera = self._camera(item.inputs[0], size, entry.get("camera"))
+        samples = self._samples_of(camera)
+        labels = coco.labels_of(annotations, size, listener.note) if item.labels else dict(entry)
+        if _EYE in labels:  # a pixel, though its name begins with that of a direction
+            labels[_EYES] = [labels.pop(_EYE)]
+        array = image.permute(1, 2, 0).numpy() if len(image) > 1 else image[0].numpy()
         result: Json = {"images": [], "annotations": []}
         for copy in range(self.copies):
             key = item.place, copy
-            target = item.outputs[copy]
+
+            def move(labels: Json, key: object = key, **others: Any) -> Json:
+                moved: Json = samples({"key": key, "json": {**labels, "camera": camera}, **others})
+                return moved["json"] if not others else moved
+
+            moved = move(coco.packed(labels) if item.labels else labels, png=array)
+            new, pixels = moved["json"], torch.from_numpy(moved["png"])
+            made = images.from_tensor(pixels.permute(2, 0, 1) if pixels.ndim == 3 else pixels[None])
+            images.write(item.outputs[copy], made, orientation=orientation, tell=listener.note, synced=False)
             if item.labels:
-                new, entries = self._annotated(image, camera, augmentation, key, annotations, listener)
-                result["images"].append(entries[0])
-                result["annotations"].append(entries[1])
+                result["images"].append({name: new[name] for name in ("camera", "rotation")})
+                result["annotations"].append(coco.moved(annotations, labels, new, move, size))
             else:
-                new, labels = _labelled(image, camera, move, key, entry)
-            made = images.from_tensor(new)
-            images.write(target, made, orientation=orientation, tell=listener.note, synced=False)
-            if not item.labels:
-                _write(item.outputs[self.copies + copy], labels)
+                if _EYES in new:
+                    (new[_EYE],), (new[f"{_EYE}_valid"],) = new.pop(_EYES), new.pop(f"{_EYES}_valid")
+                _write(item.outputs[self.copies + copy], new)
         return result
 
     def _camera(self, path: Path, size: tuple[int, int], stated: Any) -> Camera:
@@ -98,12 +102,10 @@ class Augmenting:
             raise ValueError(f"its labels state its camera, and so does --camera {self.path}; leave that out")
         return cameras.stated(stated, size)
 
-    def _augmentation(self, camera: Camera) -> tuple[RandomCamera, MapSamples]:
-        """For images of a camera, which mostly is the same one, and for such with labels."""
-        known = json.dumps(coco.parts_of(camera))
-        if known not in self._augmentations:
-            while len(self._augmentations) >= _MOST_SIZES:
-                del self._augmentations[next(iter(self._augmentations))]
+    def _samples_of(self, camera: Camera) -> MapSamples:
+        """For images of a camera, which mostly is that of the image before."""
+        known = json.dumps(_parts_of(camera))
+        if known not in self._samples:
             size = self.image_size
             shrinks = size is not None and (size[0] < camera.height or size[1] < camera.width)
             augmentation = RandomCamera(
@@ -114,41 +116,13 @@ class Augmenting:
                 min_filled=self.min_filled,
                 **self.ranges,
             )
-            self._augmentations[known] = augmentation, MapSamples(augmentation, key="key", seed=self.seed)
-        return self._augmentations[known]
-
-    @torch.no_grad()
-    def _annotated(
-        self,
-        image: Tensor,
-        camera: Camera,
-        augmentation: RandomCamera,
-        key: tuple[str, int],
-        annotations: list[Json],
-        listener: Listener,
-    ) -> tuple[Tensor, tuple[Json, list[Json | None]]]:
-        augmentation.tell_of_empty_images(camera)
-        change = augmentation.change(camera, augmentation.draw(1, generator(key, seed=self.seed)))
-        target = change.target
-        assert isinstance(target, Camera)
-        entry = {"camera": coco.parts_of(singles(target)[0]), "rotation": change.rotation[0].tolist()}
-        new = change.images(image[None])[0]
-        return new, (entry, coco.moved(annotations, change, listener.note))
+            self._samples = {known: MapSamples(augmentation, key="key", seed=self.seed)}
+        return self._samples[known]
 
 
-def _labelled(
-    image: Tensor, camera: Camera, move: MapSamples, key: tuple[str, int], labels: Json
-) -> tuple[Tensor, Json]:
-    labels = {**labels, "camera": camera}
-    if _EYE in labels:
-        labels[_EYES] = [labels.pop(_EYE)]
-    array = image.permute(1, 2, 0).numpy() if len(image) > 1 else image[0].numpy()
-    moved = move({"key": key, "png": array, "json": labels})
-    labels, array = moved["json"], moved["png"]
-    if _EYES in labels:
-        (labels[_EYE],), (labels[f"{_EYE}_valid"],) = labels.pop(_EYES), labels.pop(f"{_EYES}_valid")
-    new = torch.from_numpy(array)
-    return new.permute(2, 0, 1) if new.ndim == 3 else new[None], labels
+def _parts_of(camera: Camera) -> Json:
+    columns = to_columns(camera, "")
+    return {part: columns[f"_{part}"].tolist() for part in PARTS[1:]} | {"model": camera.key}
 
 
 def _read(path: Path) -> Json:

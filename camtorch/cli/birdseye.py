@@ -58,7 +58,6 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError("--pitch needs --height: together they are the camera's pose")
     if pitch is not None and not -90 < pitch <= 90:
         raise ValueError(f"--pitch must be above -90 and at most 90 degrees, down from the horizon; got {pitch:g}")
-    _check_ranges(arguments)
     images.check_target(arguments.output, force=arguments.force, inputs=(arguments.image, arguments.camera))
     image, _ = images.read(arguments.image)
     camera, pose = cameras.read_posed(arguments.image, (image.shape[-2], image.shape[-1]), arguments)
@@ -71,29 +70,17 @@ def run(arguments: argparse.Namespace) -> None:
         )
     with torch.no_grad():
         warp = BirdsEye(camera, pose, x=tuple(arguments.x), y=tuple(arguments.y), resolution=arguments.resolution)
+        rows, columns = warp.target.height, warp.target.width
+        if max(rows, columns) > LARGEST_SIDE:
+            ranges = "--x, --y and --resolution"
+            raise ValueError(f"{ranges} make {columns}x{rows} pixels; each side must be at most {LARGEST_SIDE}")
         result, filled = warped(warp, image, "seen from above")
     images.write(arguments.output, images.from_tensor(result))
-    rows, columns = result.shape[-2:]
     print(
         f"{arguments.output}: the ground from above, x {_range(arguments.x)} and y {_range(arguments.y)} at "
         f"{arguments.resolution:g} a pixel, {columns}x{rows}, by {camera.key}, {float(pose.position[2]):.4g} above; "
         f"{100 * filled:.1f} % of it is filled"
     )
-
-
-def _check_ranges(arguments: argparse.Namespace) -> None:
-    for name in ("x", "y"):
-        low, high = getattr(arguments, name)
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise ValueError(f"--{name} takes FROM and TO, ascending; got {low:g} {high:g}")
-    step = arguments.resolution
-    if not 0 < step < math.inf:
-        raise ValueError(f"--resolution must be above 0; got {step:g}")
-    columns, rows = (round((high - low) / step) for low, high in (arguments.x, arguments.y))
-    if not (0 < columns <= LARGEST_SIDE and 0 < rows <= LARGEST_SIDE):
-        raise ValueError(
-            f"--x, --y and --resolution make {columns}x{rows} pixels; each side must be 1 to {LARGEST_SIDE}"
-        )
 
 
 def _looking_down(height: float, pitch: float) -> Extrinsics:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,46 +124,38 @@ def read_camera(
 
 
 def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
-    """The camera to compare with: the only one of its file, or the one of that name; a model if the file needs one.
-
-    Raises:
-        ValueError: there are several, and none of that name.
-    """
+    """The camera to compare with: the only one of its file, or the one of that name; a model if the file needs one."""
     rig = read_rig(path, model=model if model is not None and _leaves_open(path) else None)
-    if name is None or len(rig.cameras) == 1:
-        name, camera = _only(path, rig)
-    else:
-        camera = rig.camera_of(name)
+    name, camera = _only(path, rig) if name is None or len(rig.cameras) == 1 else (name, rig.camera_of(name))
     return _single(path, name, camera)
 
 
-def read_camera_of(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> Camera:
-    """The camera that took an image of that (height, width), by the options of `add_photograph`.
+def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
+    """The camera that took an image of that (height, width), by the options of `add_photograph`; and its pose.
 
     Raises:
         ValueError: as `read_camera`; no file is given, or it is for another size and is not to be scaled.
     """
-    return read_posed(image, size, arguments)[0]
-
-
-def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
-    """As `read_camera_of`, and the camera's pose, None where its file has none."""
     rig, name, camera = _unfitted(image, size, arguments)
     return fitting(camera, arguments.camera, image, size, arguments.rescale), rig.extrinsics.get(name)
 
 
-def read_unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Namespace) -> Camera:
-    """The camera that took an image, perhaps for another size, by the options of `add_photograph`; see `fitting`.
+def read_for_many(
+    images: Sequence[Path], size_of: Callable[[Path], tuple[int, int] | None], arguments: argparse.Namespace
+) -> Camera:
+    """The camera that took many images, by the options of `add_photograph`; see `fitting`.
 
-    Args:
-        image: which names the trouble.
-        size: (height, width) by which a lens is chosen, or guessed; None: not known.
-        arguments: the options.
+    Where its file states no size, it is for the first image that has one, by which a lens is chosen, or guessed, too.
 
     Raises:
         ValueError: as `read_camera`; no file is given.
     """
-    return _unfitted(image, size, arguments)[2]
+    sized = ((image, size_of(image)) for image in images)
+    first, size = next((pair for pair in sized if pair[1]), (images[0], None))
+    camera = _unfitted(first, size, arguments)[2]
+    if camera.image_size is None and size is not None:
+        camera = fitting(camera, arguments.camera, first, size, rescale=False)
+    return camera
 
 
 def _unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Namespace) -> tuple[Rig, str, Camera]:
@@ -199,13 +192,26 @@ def read_pair(
     """The two cameras, left and right, that took images of these (height, width), by the options of `add_pair`.
 
     Raises:
-        ValueError: as `read_camera_of`; it does not say which two cameras, or one has no pose.
+        ValueError: as `read_posed`; it does not say which two cameras, or one has no pose.
     """
     path: Path | None = arguments.camera
     if path is None:
         raise ValueError(f"{images[0]}: which cameras took the pair? --camera RIG, their calibration, says so")
     rig = read_rig(path, model=arguments.from_model)
-    names = _two_names(path, rig, arguments.left_camera, arguments.right_camera)
+    left, right = arguments.left_camera, arguments.right_camera
+    for name in (left, right):
+        if name is not None and name not in rig:
+            raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig)}")
+    if left is None or right is None:
+        if len(rig) != 2:
+            there = f"{len(rig)} camera{'s' * (len(rig) != 1)}, not two"
+            raise ValueError(f"{path}: {there}; --left-camera and --right-camera say which of {', '.join(rig)}")
+        first, second = rig
+        left = left or (second if right == first else first)
+        right = right or (second if left == first else first)
+    if left == right:
+        raise ValueError(f"{path}: --left-camera and --right-camera are both {left!r}")
+    names = left, right
     cameras = {}
     for name, image, size in zip(names, images, sizes, strict=True):
         camera = _single(path, name, rig.camera_of(name))
@@ -213,23 +219,6 @@ def read_pair(
         if name not in rig.extrinsics:
             raise ValueError(f"{path}: {name} has no pose, so how the cameras stand to each other is not known")
     return Rig(cameras, {name: rig.extrinsics[name] for name in names})
-
-
-def _two_names(path: Path, rig: Rig, left: str | None, right: str | None) -> tuple[str, str]:
-    for name in filter(None, (left, right)):
-        if name not in rig:
-            raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig)}")
-    if left is not None and left == right:
-        raise ValueError(f"{path}: --left-camera and --right-camera are both {left!r}")
-    if left is not None and right is not None:
-        return left, right
-    if len(rig) != 2:
-        there = f"{len(rig)} cameras" if len(rig) > 1 else "one camera"
-        raise ValueError(
-            f"{path}: {there}, not two; --left-camera and --right-camera say which of {', '.join(rig)} took the images"
-        )
-    first, second = rig
-    return (second, first) if left == second or right == first else (first, second)
 
 
 def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:
@@ -267,16 +256,13 @@ def _single(path: Path, name: str, camera: Camera) -> Camera:
 def _not_scaled(image: tuple[int, int], camera: tuple[int, int]) -> str:
     """Why a camera for one (height, width) is not to be scaled to another; empty if it may be."""
     if image == camera[::-1]:
-        return (
-            "width and height are exchanged: is the photograph turned, or does the calibration exchange them? "
-            "Scaling undoes neither"
-        )
-    stretch = image[1] * camera[0] / (image[0] * camera[1])
-    if max(stretch, 1 / stretch) <= 1 + _ASPECT:
+        return "width and height are exchanged, which scaling does not undo: is the photograph turned?"
+    shapes = image[1] / image[0], camera[1] / camera[0]
+    if max(shapes) <= (1 + _ASPECT) * min(shapes):
         return ""
     return (
-        f"their aspect ratios, {image[1] / image[0]:.4g} and {camera[1] / camera[0]:.4g}, differ by more than "
-        f"{100 * _ASPECT:g} %: the image may be cropped, which --rescale does not undo"
+        f"their aspect ratios, {shapes[0]:.4g} and {shapes[1]:.4g}, differ by more than {100 * _ASPECT:g} %: the image "
+        "may be cropped, which --rescale does not undo"
     )
 
 

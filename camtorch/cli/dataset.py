@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,7 @@ from camtorch.cli.labels import LabelsError
 from camtorch.cli.options import checked_ranges
 from camtorch.io.writing import replacing
 from camtorch.jobs import inputs, items
-from camtorch.jobs.manifest import Manifest
-
-try:
-    import fcntl
-except ImportError:  # on Windows shards must not end at the same moment
-    fcntl = None  # type: ignore[assignment]
+from camtorch.jobs.manifest import Manifest, lock
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -78,7 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
         units="images",
     )
     if data is not None and merged is not None and report is not None:
-        with _alone(output) if shard.count > 1 else contextlib.nullcontext():
+        with (output / ".camtorch-augment.lock").open("wb") as file:  # the last shard has what all have made
+            lock(file, wait=True)
             _merge(data, everything, manifest, merged, copies)
     return status
 
@@ -86,16 +81,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _camera(arguments: argparse.Namespace, everything: Sequence[Labelled]) -> Any:
     """Of all images; None where their labels are to state it."""
     if arguments.camera is None:
-        needless = [name for name in ("from_model", "name", "rescale") if getattr(arguments, name)]
-        if needless:
-            raise ValueError(f"--{needless[0].replace('_', '-')} needs --camera FILE")
+        for name in ("from_model", "name", "rescale"):
+            if getattr(arguments, name):
+                raise ValueError(f"--{name.replace('_', '-')} needs --camera FILE")
         return None
-    sized = ((item.inputs[0], images.size_of(item.inputs[0])) for item in everything)
-    first, size = next((pair for pair in sized if pair[1]), (everything[0].inputs[0], None))
-    camera = cameras.read_unfitted(first, size, arguments)
-    if camera.image_size is None and size is not None:
-        camera = cameras.fitting(camera, arguments.camera, first, size, rescale=False)
-    return camera
+    return cameras.read_for_many([item.inputs[0] for item in everything], images.size_of, arguments)
 
 
 def _copies_of(place: Path, copies: int) -> list[Path]:
@@ -145,16 +135,6 @@ def _text_of(content: Any, what: str) -> str:
         return json.dumps(content, sort_keys=True, allow_nan=False)
     except ValueError:
         raise LabelsError(f"{what}: NaN and infinity are no JSON; null is, or leave them out") from None
-
-
-@contextlib.contextmanager
-def _alone(output: Path) -> Iterator[None]:
-    """No other shard is at this at the same time: the last one has what all have made."""
-    with (output / ".camtorch-augment.lock").open("w") as file:
-        if fcntl is not None:
-            with contextlib.suppress(OSError):  # some network file systems know no locks
-                fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _merge(data: coco.DataSet, everything: Sequence[Labelled], manifest: Manifest, path: Path, copies: int) -> None:

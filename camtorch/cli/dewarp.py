@@ -14,7 +14,6 @@ from camtorch.cli.options import (
     add_jobs,
     add_photograph,
     add_projection,
-    checked_fov,
     parse_path,
     parse_suffix,
 )
@@ -76,14 +75,13 @@ def prepare(arguments: argparse.Namespace) -> None:
     words: list[str] = arguments.image
     several = len(words) > 1 or os.path.isdir(words[0]) or glob.has_magic(words[0])
     if several and arguments.jobs != 1 and not arguments.dry_run:
-        pool.prepare(["camtorch.cli.dewarping"])
+        pool.prepare("camtorch.cli.dewarping")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
     from camtorch.cli import videos
 
-    checked_fov(arguments)
     words: list[str] = arguments.image
     output: str | None = arguments.output
     into_folder = output is not None and output.endswith(_SLASHES)
@@ -116,7 +114,7 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
     images.check_target(output, force=arguments.force, inputs=(source, arguments.camera))
     image, orientation = images.read(source)
     rows, columns = image.shape[-2:]
-    camera = cameras.read_camera_of(source, (rows, columns), arguments)
+    camera, _ = cameras.read_posed(source, (rows, columns), arguments)
     if arguments.dry_run:
         print(f"{source} -> {output}")
         return
@@ -124,7 +122,7 @@ def _image(arguments: argparse.Namespace, source: Path) -> None:
         warp = Dewarp(
             camera,
             projection=arguments.projection,
-            fov=checked_fov(arguments),
+            fov=arguments.fov,
             image_size=arguments.size,
             tolerance=TOLERANCE,
         )
@@ -231,23 +229,18 @@ def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
     from camtorch.cli import cameras, images, videos
     from camtorch.cli.dewarping import Dewarping
 
-    sized = ((one, (videos if videos.is_video(one) else images).size_of(one)) for one in sources)
-    first, size = next((pair for pair in sized if pair[1]), (sources[0] if sources else Path(arguments.image[0]), None))
-    camera = cameras.read_unfitted(first, size, arguments)
-    if camera.image_size is None and size is not None:
-        camera = cameras.fitting(camera, arguments.camera, first, size, rescale=False)
+    camera = cameras.read_for_many(
+        sources, lambda one: (videos if videos.is_video(one) else images).size_of(one), arguments
+    )
     encoder = videos.Encoder(arguments.codec, arguments.crf)
     if any(map(videos.is_video, sources)):
         encoder.check()
-    return Dewarping(
-        camera,
-        arguments.camera,
-        arguments.rescale,
-        arguments.projection,
-        checked_fov(arguments),
-        arguments.size,
-        encoder,
+    work = Dewarping(
+        camera, arguments.camera, arguments.rescale, arguments.projection, arguments.fov, arguments.size, encoder
     )
+    if camera.image_size is not None:
+        work.warp_of(camera)  # what is wrong with it is so for all
+    return work
 
 
 def _told(arguments: argparse.Namespace, told: dict[str, Any]) -> str:

@@ -69,14 +69,15 @@ class Dewarping:
         images.write(target, made, orientation=orientation, tell=listener.note, synced=False)
         return told
 
+    def warp_of(self, camera: Camera) -> Dewarp:
+        """That of images of a camera."""
+        return Dewarp(camera, projection=self.projection, fov=self.fov, image_size=self.image_size, tolerance=TOLERANCE)
+
     def _warp(self, source: Path, size: tuple[int, int]) -> tuple[Dewarp, dict[str, Any]]:
         if size not in self._warps:
-            camera = cameras.fitting(self.camera, self.path, source, size, self.rescale)
             while len(self._warps) >= _MOST_KEPT:
                 del self._warps[next(iter(self._warps))]
-            warp = Dewarp(
-                camera, projection=self.projection, fov=self.fov, image_size=self.image_size, tolerance=TOLERANCE
-            )
+            warp = self.warp_of(cameras.fitting(self.camera, self.path, source, size, self.rescale))
             self._warps[size] = warp, _facts(warp)
         return self._warps[size]
 

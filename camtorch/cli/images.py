@@ -137,6 +137,17 @@ def check_kind(path: Path) -> None:
         raise ImageFileError(f"{path}: {path.suffix or 'no suffix'}: {why}; try .png")
 
 
+def in_colour(image: Tensor, paper: tuple[int, int, int] = (255, 255, 255)) -> Tensor:
+    """(3, H, W) uint8 of any image; deep ones from their darkest to their brightest, what is clear on paper."""
+    if image.dtype != torch.uint8:
+        deep = image.float()
+        image = (255 * (deep - deep.min()) / (deep.max() - deep.min()).clamp(min=1)).round().byte()
+    if len(image) in (2, 4):
+        alpha = image[-1:] / 255
+        image = (image[:-1] * alpha + torch.tensor(paper)[:, None, None] * (1 - alpha)).round().byte()
+    return image.expand(3, -1, -1)
+
+
 def from_tensor(image: Tensor) -> Image.Image:
     """A Pillow image of (C, H, W) uint8 or (1, H, W) uint16."""
     pixels = image.permute(1, 2, 0).contiguous().numpy()

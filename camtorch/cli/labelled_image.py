@@ -12,6 +12,7 @@ from torch import Tensor
 
 from camtorch.augment import PRESETS, RandomCamera, mount_rotation
 from camtorch.camera import Camera
+from camtorch.cli import images
 from camtorch.cli.labels import Labels
 
 if TYPE_CHECKING:
@@ -63,18 +64,7 @@ def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str)
         box = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]], dtype=torch.float64) - 0.5
         none = torch.zeros(0, 3, dtype=torch.float64)
         labels = Labels(torch.stack([x, y], -1).flatten(0, 1), box, none, none)
-    return replace(_before(_in_colour(image), camera, labels, title), is_made_up=is_made_up)
-
-
-def _in_colour(image: Tensor) -> Tensor:
-    """(3, H, W) uint8 of any image; deep ones from their darkest to their brightest, what is clear on paper."""
-    if image.dtype != torch.uint8:
-        deep = image.float()
-        image = (255 * (deep - deep.min()) / (deep.max() - deep.min()).clamp(min=1)).round().byte()
-    if len(image) in (2, 4):
-        alpha = image[-1:] / 255
-        image = (image[:-1] * alpha + torch.tensor(NOTHING)[:, None, None] * (1 - alpha)).round().byte()
-    return image.expand(3, -1, -1)
+    return replace(_before(images.in_colour(image, NOTHING), camera, labels, title), is_made_up=is_made_up)
 
 
 def _before(image: Tensor, camera: Camera, labels: Labels, title: str) -> LabelledImage:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from camtorch.cli.options import add_output, parse_size
+from camtorch.cli.options import add_output, parse_count, parse_size
 
 if TYPE_CHECKING:
     from camtorch.cli.options import Commands
@@ -25,7 +25,9 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "--size", type=parse_size, metavar="WxH", help="of images: only lenses of that aspect ratio, scaled to it"
     )
-    command.add_argument("-n", type=int, default=10, metavar="N", help="how many are listed at most; 10 by default")
+    command.add_argument(
+        "-n", type=parse_count(100000), default=10, metavar="N", help="how many are listed at most; 10 by default"
+    )
     command.add_argument("--format", help="of OUT; by default what its name says")
     add_output(command, None, "the calibration of the first")
 
@@ -37,8 +39,6 @@ def run(arguments: argparse.Namespace) -> None:
     from camtorch.io import save
 
     words, output, size = " ".join(arguments.words), arguments.output, arguments.size
-    if arguments.n < 1:
-        raise ValueError(f"-n must be at least 1; got {arguments.n}")
     if output is not None:
         targets.check(output, force=arguments.force)
     camera = lenses.find(words, image_size=size)

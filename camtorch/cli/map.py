@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camtorch.cli.options import add_calibration, add_output, add_projection, checked_fov, parse_path, parse_size
+from camtorch.cli.options import add_calibration, add_output, add_projection, parse_path, parse_size
 
 if TYPE_CHECKING:
     from camtorch.cli.options import Commands
@@ -79,7 +79,7 @@ def _warp(arguments: argparse.Namespace) -> Warp:
         raise ValueError(f"{arguments.camera} states no image size; --camera-size WxH says it")
     if arguments.target is None:
         return Dewarp(
-            camera, projection=arguments.projection, fov=checked_fov(arguments), image_size=arguments.size, tolerance=0
+            camera, projection=arguments.projection, fov=arguments.fov, image_size=arguments.size, tolerance=0
         )
     for name in ("fov", "size"):
         if getattr(arguments, name) is not None:

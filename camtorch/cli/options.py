@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 
 LARGEST_SIDE = 32768
 """Pixels."""
-_MOST_JOBS = 1024
 
 
 def parse_path(text: str) -> Path:
@@ -33,6 +33,17 @@ def parse_size(text: str) -> tuple[int, int]:
     if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
         raise argparse.ArgumentTypeError(f"{text!r}: each side must be 1 to {LARGEST_SIDE} pixels")
     return height, width
+
+
+def parse_count(most: int) -> Callable[[str], int]:
+    """What reads a whole number from 1 to `most`."""
+
+    def parse(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and 0 < int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {most}")
+        return int(text)
+
+    return parse
 
 
 def parse_range(text: str) -> float | tuple[float, float]:
@@ -127,24 +138,6 @@ def add_projection(command: argparse._ActionsContainer) -> None:
     )
 
 
-def checked_fov(arguments: argparse.Namespace) -> float | None:
-    """--fov of `add_projection` in degrees.
-
-    Raises:
-        ValueError: one that the projection does not have.
-    """
-    from camtorch._arguments import check_degrees  # it imports torch
-
-    fov: float | None = arguments.fov
-    if fov is not None and not (0 < fov < 180 or (arguments.projection != "perspective" and 0 < fov <= 360)):
-        wider = "; --projection cylindrical goes to 360" if arguments.projection == "perspective" and fov >= 180 else ""
-        allowed = "below 180" if arguments.projection == "perspective" else "at most 360"
-        raise ValueError(f"--fov must be above 0 and {allowed} degrees for {arguments.projection}; got {fov:g}{wider}")
-    if fov is not None:
-        check_degrees(fov, f"{fov:g}", "--fov")
-    return fov
-
-
 def checked_ranges(arguments: argparse.Namespace) -> dict[str, Any]:
     """What the options of `camtorch augment` say of the ranges of `RandomCamera`.
 
@@ -195,7 +188,9 @@ def add_output(command: argparse.ArgumentParser, default: str | None, text: str 
 def add_jobs(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """How many files are worked on."""
     group = command.add_argument_group("many files")
-    group.add_argument("--jobs", type=_parse_jobs, metavar="N", help="processes; by default as many as there are cores")
+    group.add_argument(
+        "--jobs", type=parse_count(1024), metavar="N", help="processes; by default as many as there are cores"
+    )
     group.add_argument(
         "--resume", action="store_true", help="go on where a run was broken off; what is done and unchanged is kept"
     )
@@ -207,12 +202,6 @@ def add_jobs(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     )
     group.add_argument("--dry-run", action="store_true", help="print what would be done")
     return group
-
-
-def _parse_jobs(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 0 < int(text) <= _MOST_JOBS):
-        raise argparse.ArgumentTypeError(f"{text!r} is not 1 to {_MOST_JOBS} processes")
-    return int(text)
 
 
 def _parse_shard(text: str) -> Shard:

@@ -93,10 +93,14 @@ def run(arguments: argparse.Namespace) -> None:
     from camtorch.stereo.rectification import rectify
 
     folder: Path = arguments.output
-    fov = _fov(arguments)
-    _check_depth(arguments)
-    _check_targets(arguments)
     matches = arguments.disparity is not None or arguments.points is not None
+    if arguments.depth is not None:
+        near, far = arguments.depth
+        if not 0 < near < far:
+            raise ValueError(f"--depth takes NEAR and FAR, 0 < NEAR < FAR; got {near:g} {far:g}")
+        if not matches:
+            raise ValueError("--depth is for --disparity and --points")
+    _check_targets(arguments)
     if matches:
         opencv()
     taken = (arguments.left, arguments.right)
@@ -114,7 +118,7 @@ def run(arguments: argparse.Namespace) -> None:
             rig[second],
             rig.between(first, second),
             projection=arguments.projection,
-            fov=fov,
+            fov=arguments.fov,
             image_size=arguments.size,
             vertical=arguments.vertical,
             align=arguments.align,
@@ -130,41 +134,6 @@ def run(arguments: argparse.Namespace) -> None:
         _tell(rectification, rig, folder, (filled_left, filled_right, both))
         if matches:
             _match(rectification, (left, right), limits, arguments)
-
-
-def _check_depth(arguments: argparse.Namespace) -> None:
-    if arguments.depth is None:
-        return
-    near, far = arguments.depth
-    if not 0 < near < far:
-        raise ValueError(f"--depth takes NEAR and FAR, 0 < NEAR < FAR; got {near:g} {far:g}")
-    if arguments.disparity is None and arguments.points is None:
-        raise ValueError("--depth is for --disparity and --points")
-
-
-def _fov(arguments: argparse.Namespace) -> float | tuple[float, float] | None:
-    """In degrees.
-
-    Raises:
-        ValueError: angles that the projection does not reach.
-    """
-    from camtorch._arguments import check_degrees
-
-    if arguments.fov is None:
-        return None
-    angles = arguments.fov if isinstance(arguments.fov, tuple) else (arguments.fov,)
-    for i, angle in enumerate(angles):
-        along = (i == 1) == arguments.vertical
-        most = 180 if along or arguments.projection == "perspective" else 360
-        if not 0 < angle < most:
-            side = ("horizontal", "vertical")[i]
-            hint = "; --projection latlon goes further" if arguments.projection == "perspective" else ""
-            raise ValueError(
-                f"--fov must be above 0 and below {most} degrees, {side}, for {arguments.projection}; got {angle:g}"
-                f"{hint}"
-            )
-        check_degrees(angle, f"{angle:g}", "--fov")
-    return arguments.fov  # type: ignore[no-any-return]
 
 
 def _check_targets(arguments: argparse.Namespace) -> None:
@@ -217,28 +186,27 @@ def _write_cameras(folder: Path, rig: Rig, rectification: Rectification) -> None
     from camtorch.io.formats import save
     from camtorch.rig import Rig
 
-    turns = (rectification.rotation_left, rectification.rotation_right)
-    cameras = (rectification.camera_left, rectification.camera_right)
-    poses = {
-        name: Extrinsics.from_matrix(turn, [0.0] * 3).compose(rig.extrinsics[name])
-        for name, turn in zip(rig, turns, strict=True)
-    }
-    save(Rig(dict(zip(rig, cameras, strict=True)), poses), folder / "rectified.json")
+    cameras, poses = {}, {}
+    for name, side in zip(rig, ("left", "right"), strict=True):
+        cameras[name] = getattr(rectification, f"camera_{side}")
+        turn = Extrinsics.from_matrix(getattr(rectification, f"rotation_{side}"), [0.0] * 3)
+        poses[name] = turn.compose(rig.extrinsics[name])
+    save(Rig(cameras, poses), folder / "rectified.json")
     if rectification.projection == "perspective":
         rectification.save(folder / "opencv.yml")
 
 
-def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: tuple[float, float, float]) -> None:
+def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: tuple[float, ...]) -> None:
     camera = rectification.camera_left
     fx, fy, cx, cy = camera.intrinsics.tolist()
     across, down = camera.fov[:2].tolist()
-    lines = "columns" if rectification.vertical else "rows"
     left, right, both = (100 * part for part in parts)
     print(
         f"{folder}: {' and '.join(rig[name].key for name in rig)} rectified to {rectification.projection}, "
         f"{across:.1f} x {down:.1f} degrees, {camera.width}x{camera.height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} "
-        f"cy {cy:.6g}; {lines} correspond, baseline {float(rectification.baseline):.6g}; {left:.0f} % of left.png and "
-        f"{right:.0f} % of right.png are filled, {both:.0f} % of both"
+        f"cy {cy:.6g}; {'columns' if rectification.vertical else 'rows'} correspond, baseline "
+        f"{float(rectification.baseline):.6g}; {left:.0f} % of left.png and {right:.0f} % of right.png are filled, "
+        f"{both:.0f} % of both"
     )
 
 
@@ -283,19 +251,9 @@ def _match(
         write_ply(
             arguments.points,
             points[valid] @ rectification.rotation_left.to(points.dtype),
-            _of_colours(pair[0]).permute(1, 2, 0)[valid],
+            images.in_colour(pair[0]).permute(1, 2, 0)[valid],
         )
         print(f"{arguments.points}: {int(valid.sum())} points at depths of {near:.4g} to {far:.4g}")
-
-
-def _of_colours(image: Tensor) -> Tensor:
-    """(3, H, W) uint8 of an image as `images.read` has it."""
-    import torch
-
-    colours = image[:3] if len(image) > 2 else image[:1].expand(3, -1, -1)
-    if colours.dtype != torch.uint8:
-        colours = (colours.double() * (255 / max(float(colours.double().max()), 1.0))).round().byte()
-    return colours
 
 
 def _side_by_side(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
@@ -306,7 +264,7 @@ def _side_by_side(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
     from camtorch._drawing import BOX, GAZE, POINT
     from camtorch.cli import images
 
-    whole = torch.cat((_of_colours(left), _of_colours(right)), 1 if vertical else 2)
+    whole = torch.cat((images.in_colour(left), images.in_colour(right)), 1 if vertical else 2)
     image = images.from_tensor(whole)
     draw = ImageDraw.Draw(image)
     width, height = image.size

@@ -6,13 +6,10 @@ one where more follow, as characters from "0" on; from the fourth number on it i
 
 from __future__ import annotations
 
-from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-_LARGEST = 1 << 32
 
 
 def decode(counts: Any, size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -23,30 +20,25 @@ def decode(counts: Any, size: tuple[int, int]) -> NDArray[np.bool_]:
     """
     runs = _of_text(counts) if isinstance(counts, str) else counts
     height, width = size
-    if not isinstance(runs, list) or not all(type(run) is int and 0 <= run < _LARGEST for run in runs):
+    if not isinstance(runs, list) or not all(type(run) is int and 0 <= run < 1 << 32 for run in runs):
         raise ValueError("counts are no runs of pixels")
     if sum(runs) != height * width:
         raise ValueError(f"counts are of {sum(runs)} pixels, and the size says {width}x{height}")
-    values = np.arange(len(runs)) % 2 == 1
-    mask: np.ndarray = np.repeat(values, runs).reshape(width, height).T
+    mask: NDArray[np.bool_] = np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
     return mask
 
 
 def encode(mask: NDArray[np.bool_], *, as_text: bool) -> list[int] | str:
     """The runs of a mask (H, W)."""
-    flat = mask.T.reshape(-1)
-    ends = [0, *(np.flatnonzero(flat[1:] != flat[:-1]) + 1).tolist(), flat.size]
-    runs = [after - before for before, after in pairwise(ends)]
-    if flat.size and flat[0]:
-        runs.insert(0, 0)
+    flat = np.concatenate([[False], mask.T.reshape(-1)])
+    runs: list[int] = np.diff(np.flatnonzero(flat[1:] != flat[:-1]), prepend=0, append=mask.size).tolist()
     return _as_text(runs) if as_text else runs
 
 
 def _as_text(runs: list[int]) -> str:
     characters = []
     for i, run in enumerate(runs):
-        rest = run - runs[i - 2] if i > 2 else run
-        more = True
+        rest, more = run - runs[i - 2] if i > 2 else run, True
         while more:
             low, rest = rest & 31, rest >> 5
             more = rest != (-1 if low & 16 else 0)
@@ -55,7 +47,8 @@ def _as_text(runs: list[int]) -> str:
 
 
 def _of_text(text: str) -> list[int]:
-    numbers, value, shift = [], 0, 0
+    runs: list[int] = []
+    value = shift = 0
     for character in text:
         group = ord(character) - 48
         if not 0 <= group < 64 or shift > 60:
@@ -63,10 +56,9 @@ def _of_text(text: str) -> list[int]:
         value |= (group & 31) << shift
         shift += 5
         if not group & 32:
-            numbers.append(value - (1 << shift) if group & 16 else value)
-            value, shift = 0, 0
+            value -= group >> 4 << shift  # the sixth bit is 0 here, the fifth is the sign
+            runs.append(value + runs[-2] if len(runs) > 2 else value)
+            value = shift = 0
     if shift:
         raise ValueError("counts end within a number")
-    # those at odd places go on from each other, and so do those at even ones but the first
-    numbers[1::2], numbers[2::2] = accumulate(numbers[1::2]), accumulate(numbers[2::2])
-    return numbers
+    return runs

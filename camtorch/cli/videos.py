@@ -161,10 +161,29 @@ def frames(path: Path) -> Iterator[tuple[float, float, Any]]:
         stream.thread_type = "AUTO"
         length, step = float(_length(container, stream)), float(1 / _rate(stream))
         start = None
-        for number, frame in enumerate(container.decode(stream)):
+        for number, (frame, _) in enumerate(_decoded(container, stream)):
             seconds = number * step if frame.time is None else float(frame.time)
             start = seconds if start is None else start
             yield seconds, min((seconds - start) / length, 1.0) if length else 0.0, frame
+
+
+def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, Any]]:
+    """(frame, None) of a stream, and (None, packet) of others, in the order in which they are stored."""
+    has_begun = False
+    for packet in container.demux(stream, *others):
+        if packet.stream is not stream:
+            if packet.dts is not None:
+                yield None, packet
+            continue
+        try:
+            decoded = packet.decode()
+        except _av().error.InvalidDataError:
+            if has_begun:
+                raise
+            continue  # a recording that begins between whole frames
+        for frame in decoded:
+            has_begun = True
+            yield frame, None
 
 
 def sized(item: Item) -> Item:
@@ -243,22 +262,12 @@ def _is_full(frame: Any) -> bool:
     return bool(frame.color_range == 2 or frame.format.name.startswith("yuvj"))
 
 
-def _of_plane(warp: Warp, source: tuple[int, int], target: tuple[int, int], fill: int, *, left: bool) -> Warp:
-    """A warp between planes of these (height, width), which are those of its images or rounded up from half of them.
-
-    Args:
-        warp: of images.
-        source: of the plane.
-        target: of the new one.
-        fill: of what shows nothing.
-        left: whether planes of half the width have their pixels where the left ones of the image's pairs are, as in
-            MPEG-2 and what came after, rather than between.
-    """
-    old, new = _camera_of_plane(warp.source, source, left), _camera_of_plane(warp.target, target, left)
-    return Warp(old, new, warp.rotation, fill=float(fill), tolerance=warp.tolerance)
-
-
 def _camera_of_plane(camera: Camera, size: tuple[int, int], left: bool) -> Camera:
+    """The camera of a plane of a (height, width), that of its image's or half of it, rounded up.
+
+    `left` says whether planes of half the width have their pixels where the left ones of the image's pairs are, as in
+    MPEG-2 and what came after, rather than between.
+    """
     height, width = size
     down, across = (-(-whole // part) for whole, part in zip((camera.height, camera.width), size, strict=True))
     if (down, across) == (1, 1):
@@ -281,8 +290,10 @@ class _Frames:
         self.size, self._format = (new.height, new.width), frame.format.name
         self._pairs = []
         for old, made in zip(_planes(frame), _planes(new), strict=True):
-            sizes = (old.height, old.width), (made.height, made.width)
-            self._pairs.append((old, made, _of_plane(warp, *sizes, old.fill, left=left).requires_grad_(False)))
+            before = _camera_of_plane(warp.source, (old.height, old.width), left)
+            after = _camera_of_plane(warp.target, (made.height, made.width), left)
+            of_plane = Warp(before, after, warp.rotation, fill=float(old.fill), tolerance=warp.tolerance)
+            self._pairs.append((old, made, of_plane.requires_grad_(False)))
 
     def __call__(self, frame: Any) -> Any:
         """The new frame, at the same time."""
@@ -326,191 +337,140 @@ def remake(
         VideoFileError: what is not a video, ends too early, changes its size, or cannot be written so.
     """
     av = _av()
+    format = FORMATS[target.suffix.lower()]
+    with _opened(source) as (container, stream):
+        first, _ = next(_decoded(container, stream), (None, None))
+        if first is None:
+            raise VideoFileError(f"{source}: no frame of it can be read")
+    warp, facts = warp_of((first.height, first.width))
     target.parent.mkdir(parents=True, exist_ok=True)
     with replacing(target) as (file,), _opened(source) as (container, stream):
-        read = _Read(source, container, stream, encoder.of(FORMATS[target.suffix.lower()]), listener)
         # exact: no random identifiers
-        output = av.open(file, "w", format=FORMATS[target.suffix.lower()], options={"fflags": "+bitexact"})
+        output = av.open(file, "w", format=format, options={"fflags": "+bitexact"})
         try:
-            facts = _remade(read, _Written(target, output), warp_of, encoder.crf)
+            count = _Remake(source, target, container, stream, output, encoder, first, listener).run(warp)
         except BaseException:
             with contextlib.suppress(av.error.FFmpegError):
                 output.close()
             raise
         output.close()
-    return facts
+    return facts | {"frames": count}
 
 
-def _remade(
-    read: _Read,
-    written: _Written,
-    warp_of: Callable[[tuple[int, int]], tuple[Warp, dict[str, Any]]],
-    crf: int | None,
-) -> dict[str, Any]:
-    frames: _Frames | None = None
-    waiting: list[Any] = []
-    shown = time.monotonic()
-    # the encoder works in a thread of its own, the decoder in those of ffmpeg
-    with ThreadPoolExecutor(1) as writer:
-        at_work: deque[Future[None]] = deque()
+class _Remake:
+    """A video on its way from file to file."""
 
-        def later(write: Callable[[Any], None], what: Any) -> None:
-            at_work.append(writer.submit(write, what))
-            if len(at_work) > _AHEAD:
-                at_work.popleft().result()
-
-        for thing in read:
-            if not hasattr(thing, "planes"):  # a packet of sound or words
-                if frames is None:
-                    waiting.append(thing)
-                else:
-                    later(written.copy, thing)
-                continue
-            if frames is None:
-                warp, facts = warp_of((thing.height, thing.width))
-                frames = _Frames(warp, thing)
-                written.begin(read, thing, frames.size, crf)
-                for packet in waiting:
-                    later(written.copy, packet)
-            later(written.encode, frames(thing))
-            if time.monotonic() > shown + _OFTEN:
-                shown = time.monotonic()
-                read.listener.done(read.count)
-        if frames is None:
-            raise VideoFileError(f"{read.path}: no frame of it can be read")
-        later(written.encode, None)
-        for future in at_work:
-            future.result()
-    read.check_end()
-    return facts | {"frames": read.count}
-
-
-class _Read:
-    """The frames of a video, in a format that an encoder takes, and the packets of sound and subtitles between them."""
-
-    def __init__(self, path: Path, container: Any, stream: Any, codec: str, listener: Listener):
-        self.path, self.container, self.stream, self.codec, self.listener = path, container, stream, codec, listener
+    def __init__(
+        self,
+        source: Path,
+        target: Path,
+        container: Any,
+        stream: Any,
+        output: Any,
+        encoder: Encoder,
+        first: Any,
+        listener: Listener,
+    ):
+        self.source, self.target, self.container, self.stream = source, target, container, stream
+        self.output, self.encoder, self.listener = output, encoder, listener
+        self.codec = encoder.of(output.format.name)
         self.others = [other for other in container.streams if other.type in ("audio", "subtitle")]
-        kept = [stream, *self.others]
-        lost = sorted({other.type for other in container.streams if other not in kept})
-        if lost:
-            listener.note(f"{path}: its other streams, {', '.join(lost)}, are left out")
-        stream.thread_type = "AUTO"
         self.rate = _rate(stream)
-        self.count = 0
-        """Frames so far."""
-        self._first: int | None = None
+        self.size = first.height, first.width
+        self.pixels = _pixels(first.format.name, self.codec)
+        if first.interlaced_frame:
+            listener.note(f"{source}: is interlaced; two moments get mixed within its frames")
+        self.first = _converted(first, self.pixels)
+        # formats and encoders that know no time stamps but multiples of one step
+        whole = output.format.name == "avi" or self.codec == "mpeg4"
+        self.tick = 1 / self.rate if whole else first.time_base or 1 / self.rate
+        self.begin = float((container.start_time or 0) / 1e6)
+        self._first_stamp: int | None = None
         self._stamp: int | None = None
         """Of the last frame."""
-        self._end = self._last = 0.0
-        """Of its frames, and of all, in seconds from the begin."""
 
-    def __iter__(self) -> Iterator[Any]:
-        av = _av()
-        size = pixels = None
-        begin = float((self.container.start_time or 0) / 1e6)
-        for packet in self.container.demux(self.stream, *self.others):
-            if packet.stream is not self.stream:
-                if packet.dts is not None:
-                    self._last = max(self._last, float((packet.pts or packet.dts) * packet.time_base) - begin)
-                    yield packet
-                continue
-            try:
-                frames = packet.decode()
-            except av.error.InvalidDataError:
-                if self.count:
-                    raise
-                continue  # a recording that begins between whole frames
-            for frame in frames:
-                if size is None:
-                    size, pixels = (frame.height, frame.width), self._pixels(frame.format.name)
-                    if frame.interlaced_frame:
-                        self.listener.note(f"{self.path}: is interlaced; two moments get mixed within its frames")
-                if size != (frame.height, frame.width):
-                    raise VideoFileError(
-                        f"{self.path}: its frames are {size[1]}x{size[0]}, then {frame.width}x{frame.height}"
-                    )
-                self._date(frame)
-                self._end = float(frame.pts * frame.time_base + 1 / self.rate) - begin
-                self.count += 1
-                yield self._converted(frame, pixels)
+    def run(self, warp: Warp) -> int:
+        """How many frames were written."""
+        lost = sorted({one.type for one in self.container.streams if one not in (self.stream, *self.others)})
+        if lost:
+            self.listener.note(f"{self.source}: its other streams, {', '.join(lost)}, are left out")
+        frames = _Frames(warp, self.first)
+        stream, copies = self._new_stream(frames.size), self._copied_streams()
+        self.stream.thread_type = "AUTO"
+        count, end, last, shown = 0, 0.0, 0.0, time.monotonic()
+        # the encoder works in a thread of its own, the decoder in those of ffmpeg
+        with ThreadPoolExecutor(1) as writer:
+            at_work: deque[Future[None]] = deque()
+            for frame, packet in _decoded(self.container, self.stream, *self.others):
+                if packet is not None:
+                    last = max(last, float((packet.pts or packet.dts) * packet.time_base) - self.begin)
+                    packet.stream = copies[packet.stream.index]
+                    at_work.append(writer.submit(self.output.mux, packet))
+                else:
+                    if self.size != (frame.height, frame.width):
+                        was, now = f"{self.size[1]}x{self.size[0]}", f"{frame.width}x{frame.height}"
+                        raise VideoFileError(f"{self.source}: its frames are {was}, then {now}")
+                    self._date(frame)
+                    end = float(frame.pts * frame.time_base + 1 / self.rate) - self.begin
+                    count += 1
+                    at_work.append(writer.submit(self._encode, stream, frames(_converted(frame, self.pixels))))
+                if len(at_work) > _AHEAD:
+                    at_work.popleft().result()
+                if time.monotonic() > shown + _OFTEN:
+                    shown = time.monotonic()
+                    self.listener.done(count)
+            at_work.append(writer.submit(self._encode, stream, None))
+            for future in at_work:
+                future.result()
+        length = float(_length(self.container, self.stream))
+        end = end if self.stream.duration is not None else max(end, last)
+        if length - end > max(_CUT, 0.02 * length):
+            raise VideoFileError(
+                f"{self.source}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged"
+            )
+        return count
 
     def _date(self, frame: Any) -> None:
         """Have a frame's time stamp, where there is none, or a wrong one, follow the last one's."""
         frame.time_base = frame.time_base or 1 / self.rate
         stamp = frame.pts
         if self.container.format.name == "avi":  # whose stamps are those of the order in which frames are stored
-            self._first = frame.dts if self._first is None else self._first
-            stamp = None if frame.dts is None or self._first is None else frame.dts - self._first
+            self._first_stamp = frame.dts if self._first_stamp is None else self._first_stamp
+            stamp = None if frame.dts is None or self._first_stamp is None else frame.dts - self._first_stamp
         if stamp is None:
             stamp = 0 if self._stamp is None else self._stamp + round(1 / self.rate / frame.time_base)
         if self._stamp is not None:
             stamp = max(stamp, self._stamp + 1)
         frame.pts = self._stamp = stamp
 
-    def _pixels(self, format: str) -> str:
-        """The format to work in: that of the video, if that can be done and written."""
-        codec = _av().Codec(self.codec, "w")
-        known = [one.name for one in codec.video_formats or ()]
-        if _PLANAR.fullmatch(format) and (format in known or not known):
-            return format
-        return "yuv420p" if "yuv420p" in known or not known else next(filter(_PLANAR.fullmatch, known), known[0])
+    def _encode(self, stream: Any, frame: Any) -> None:
+        """Write a frame; None in the end."""
+        if frame is not None and frame.time_base != self.tick:
+            frame.pts, frame.time_base = round(frame.pts * frame.time_base / self.tick), self.tick
+            frame.duration = 1
+        self.output.mux(stream.encode(frame))
 
-    def _converted(self, frame: Any, format: str | None) -> Any:
-        if frame.format.name.startswith("gray") and not frame.color_range:
-            frame.color_range = 2  # as ffmpeg takes it, but not what reads it as brightness without colours
-        if frame.format.name == format:
-            return frame
-        # of RGB nothing else is known, and this is what players take for granted; all else keeps its range
-        is_full = _is_full(frame) and not frame.format.is_rgb
-        options = {"dst_colorspace": "ITU709"} if frame.format.is_rgb else {}
-        new = frame.reformat(format=format, dst_color_range="JPEG" if is_full else "MPEG", **options)
-        new.colorspace, new.color_range = 1 if frame.format.is_rgb else frame.colorspace, 2 if is_full else 1
-        return new
-
-    def check_end(self) -> None:
-        """Refuse a video that ended before it should.
-
-        Raises:
-            VideoFileError: it is cut off.
-        """
-        length = float(_length(self.container, self.stream))
-        end = self._end if self.stream.duration is not None else max(self._end, self._last)
-        if length - end > max(_CUT, 0.02 * length):
-            raise VideoFileError(f"{self.path}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged")
-
-
-class _Written:
-    """The new file."""
-
-    def __init__(self, path: Path, output: Any):
-        self.path, self.output = path, output
-        self._stream: Any = None
-        self._copies: dict[int, Any] = {}
-        self._tick: Fraction | None = None
-
-    def begin(self, read: _Read, frame: Any, size: tuple[int, int], crf: int | None) -> None:
-        """Say what will be in it: new frames of a (height, width), all else as `read` has it; `frame` is its first."""
-        format, codec = self.output.format.name, read.codec
-        # formats and encoders that know no time stamps but multiples of one step
-        self._tick = 1 / read.rate if format == "avi" or codec == "mpeg4" else frame.time_base
+    def _new_stream(self, size: tuple[int, int]) -> Any:
+        """Of frames of a (height, width) that are as the first one, but for that."""
+        frame, format, (height, width) = self.first, self.output.format.name, size
         try:
-            stream = self.output.add_stream(codec, rate=read.rate, time_base=self._tick)
+            stream = self.output.add_stream(self.codec, rate=self.rate, time_base=self.tick)
         except ValueError as error:
-            raise VideoFileError(f"{self.path}: {error}; --codec names another encoder") from None
-        height, width = size
+            raise VideoFileError(f"{self.target}: {error}; --codec names another encoder") from None
         halved = {(c.width < frame.width, c.height < frame.height) for c in frame.format.components if c.is_chroma}
-        if codec in _EVEN and any((across and width % 2) or (down and height % 2) for across, down in halved):
-            raise VideoFileError(f"{self.path}: {width}x{height}, but {codec} wants even numbers; --size names them")
+        if self.codec in _EVEN and any((across and width % 2) or (down and height % 2) for across, down in halved):
+            raise VideoFileError(
+                f"{self.target}: {width}x{height}, but {self.codec} wants even numbers; --size names them"
+            )
         stream.width, stream.height, stream.pix_fmt = width, height, frame.format.name
         context = stream.codec_context
         context.color_range, context.colorspace = frame.color_range, frame.colorspace
         context.color_primaries, context.color_trc = frame.color_primaries, frame.color_trc
         context.thread_count = _THREADS
-        if _has_crf(codec):
-            stream.options = {"crf": str(_QUALITIES.get(codec, 20) if crf is None else crf)}
-            stream.options |= _OPTIONS.get(codec, {})
-        elif codec in _BY_QUANTISER:
+        if _has_crf(self.codec):
+            crf = _QUALITIES.get(self.codec, 20) if self.encoder.crf is None else self.encoder.crf
+            stream.options = {"crf": str(crf), **_OPTIONS.get(self.codec, {})}
+        elif self.codec in _BY_QUANTISER:
             context.qscale, context.global_quality = True, _QUANTISER * _LAMBDA
         if format == "avi":
             stream.options |= {"bf": "0"}  # its frames come in the order in which they are shown
@@ -518,33 +478,46 @@ class _Written:
         if matrix is not None:
             stream.set_display_matrix(np.frombuffer(matrix, np.int32).tolist())
             if format not in ("mp4", "mov", "matroska"):
-                read.listener.note(f"{read.path}: is shown turned, which {self.path.suffix} files do not say")
-        self._stream = stream
-        stream.metadata.update(_kept(read.stream.metadata))
-        self.output.metadata.update(_kept(read.container.metadata))
-        for other in read.others:
+                self.listener.note(f"{self.source}: is shown turned, which {self.target.suffix} files do not say")
+        stream.metadata.update(_kept(self.stream.metadata))
+        self.output.metadata.update(_kept(self.container.metadata))
+        return stream
+
+    def _copied_streams(self) -> dict[int, Any]:
+        """The new streams of sound and subtitles, by the indices of the old ones."""
+        copies = {}
+        for other in self.others:
             try:
-                copy = self.output.add_stream_from_template(other)
+                copies[other.index] = copy = self.output.add_stream_from_template(other)
             except ValueError:
                 raise VideoFileError(
-                    f"{read.path}: its {other.type}, {other.codec_context.name}, cannot be kept in {self.path.suffix}; "
-                    ".mkv takes nearly all"
+                    f"{self.source}: its {other.type}, {other.codec_context.name}, cannot be kept in "
+                    f"{self.target.suffix}; .mkv takes nearly all"
                 ) from None
             copy.metadata.update(_kept(other.metadata))
             copy.disposition = other.disposition
-            self._copies[other.index] = copy
+        return copies
 
-    def copy(self, packet: Any) -> None:
-        """Write a packet as it is."""
-        packet.stream = self._copies[packet.stream.index]
-        self.output.mux(packet)
 
-    def encode(self, frame: Any) -> None:
-        """Write a frame; None in the end."""
-        if frame is not None and frame.time_base != self._tick:
-            frame.pts, frame.time_base = round(frame.pts * frame.time_base / self._tick), self._tick
-            frame.duration = 1
-        self.output.mux(self._stream.encode(frame))
+def _pixels(format: str, codec: str) -> str:
+    """The format of pixels to work in: that of the video, if that can be done and written."""
+    known = [one.name for one in _av().Codec(codec, "w").video_formats or ()]
+    if _PLANAR.fullmatch(format) and (format in known or not known):
+        return format
+    return "yuv420p" if "yuv420p" in known or not known else next(filter(_PLANAR.fullmatch, known), known[0])
+
+
+def _converted(frame: Any, format: str) -> Any:
+    if frame.format.name.startswith("gray") and not frame.color_range:
+        frame.color_range = 2  # as ffmpeg takes it, but not what reads it as brightness without colours
+    if frame.format.name == format:
+        return frame
+    # of RGB nothing else is known, and this is what players take for granted; all else keeps its range
+    is_full = _is_full(frame) and not frame.format.is_rgb
+    options = {"dst_colorspace": "ITU709"} if frame.format.is_rgb else {}
+    new = frame.reformat(format=format, dst_color_range="JPEG" if is_full else "MPEG", **options)
+    new.colorspace, new.color_range = 1 if frame.format.is_rgb else frame.colorspace, 2 if is_full else 1
+    return new
 
 
 def _kept(metadata: dict[str, str]) -> dict[str, str]:

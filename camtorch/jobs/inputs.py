@@ -5,9 +5,9 @@ from __future__ import annotations
 import glob
 import os
 import re
-import stat
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 
 IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
@@ -29,7 +29,7 @@ class Inputs:
 
     files: list[Found] = field(default_factory=list)
     faults: list[tuple[Path, str]] = field(default_factory=list)
-    """What could not be looked into, and why."""
+    """Folders that could not be looked into, and why."""
 
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
@@ -57,19 +57,23 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> Input
     """
     inputs = Inputs()
     for word in words:
-        path = Path(word)
+        path, place = Path(word), Path()
         if path.is_dir():
-            place = Path(path.resolve().name) if len(words) > 1 else Path()
-            found = _below(path, place, suffixes, output, inputs.faults)
-        elif os.path.lexists(path) or not glob.has_magic(word):
-            if not os.path.lexists(path):
-                raise ValueError(f"{path}: no such file or folder")
-            found = [Found(path, Path(path.name))]
+            root, place = path, Path(path.resolve().name) if len(words) > 1 else place
+            paths = list(_below(path, output, lambda e: inputs.faults.append((Path(e.filename), e.strerror or ""))))
+        elif os.path.lexists(path):
+            inputs.files.append(Found(path, Path(path.name)))
+            continue
+        elif glob.has_magic(word):
+            root = Path(*takewhile(lambda part: not glob.has_magic(part), path.parts))
+            paths = _matching(word, root, output)
         else:
-            found = _matching(word, suffixes, output)
-            if not found:
-                raise ValueError(f"{word}: no file of a known type has such a name")
-        inputs.files += found
+            raise ValueError(f"{path}: no such file or folder")
+        # a link to nothing is taken, so that it is told of; what is neither a file nor that, as a pipe, is not
+        found = [p for p in paths if p.suffix.lower() in suffixes and (p.is_file() or not os.path.exists(p))]
+        if not found and root is not path:
+            raise ValueError(f"{word}: no file of a known type has such a name")
+        inputs.files += [Found(path, place / path.relative_to(root)) for path in found]
     once = {os.path.abspath(found.path): found for found in inputs.files}
     inputs.files = sorted(once.values(), key=lambda found: natural(found.path))
     if not inputs.files and not inputs.faults:
@@ -77,56 +81,25 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> Input
     return inputs
 
 
-def _below(
-    root: Path, place: Path, suffixes: Collection[str], output: Path, faults: list[tuple[Path, str]]
-) -> list[Found]:
-    """What is in a folder, and in those in it."""
-    found: list[Found] = []
+def _below(root: Path, output: Path, failed: Callable[[OSError], object]) -> Iterator[Path]:
+    """What is in a folder, and in those in it; a link to a folder that it lies in shows nothing new."""
     out = os.path.realpath(output)
-    walk = os.walk(root, followlinks=True, onerror=lambda error: faults.append((Path(error.filename), _reason(error))))
-    for name, folders, names in walk:
-        folder, real = Path(name), os.path.realpath(name)
-        inside = []
-        for one in sorted(folders):
-            target = os.path.realpath(folder / one)
-            if one.startswith(".") or target == out:
-                continue
-            if _is_below(real, target):
-                faults.append((folder / one, "a link to a folder that it lies in"))
-            else:
-                inside.append(one)
-        folders[:] = inside
-        for path in (folder / one for one in names if not one.startswith(".")):
-            if path.suffix.lower() not in suffixes:
-                continue
-            try:
-                if stat.S_ISREG(os.stat(path).st_mode):
-                    found.append(Found(path, place / path.relative_to(root)))
-                else:
-                    faults.append((path, "not an ordinary file"))
-            except OSError as error:
-                faults.append((path, _reason(error)))
-    return found
+    for name, folders, names in os.walk(root, followlinks=True, onerror=failed):
+        real = os.path.realpath(name)
+        targets = {one: os.path.realpath(os.path.join(name, one)) for one in folders if not one.startswith(".")}
+        folders[:] = [one for one, target in targets.items() if target != out and not _is_below(real, target)]
+        yield from (Path(name, one) for one in names if not one.startswith("."))
 
 
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)
-
-
-def _matching(pattern: str, suffixes: Collection[str], output: Path) -> list[Found]:
-    parts = Path(pattern).parts
-    before = next(i for i, part in enumerate(parts) if glob.has_magic(part))
-    root = Path(*parts[:before])
-    out, real_root = os.path.realpath(output), os.path.realpath(root)
-    inside = not _is_below(real_root, out)
+def _matching(pattern: str, root: Path, output: Path) -> list[Path]:
+    out = os.path.realpath(output)
+    inside = not _is_below(os.path.realpath(root), out)
     shortest: dict[str, Path] = {}  # links in a circle make paths of any length
-    for path in sorted(
-        map(Path, glob.glob(pattern, recursive=True)), key=lambda path: (len(path.parts), natural(path))
-    ):
+    for path in sorted(map(Path, glob.glob(pattern, recursive=True)), key=lambda path: len(path.parts)):
         real = os.path.realpath(path)
-        if path.suffix.lower() in suffixes and path.is_file() and not (inside and _is_below(real, out)):
+        if not (inside and _is_below(real, out)):
             shortest.setdefault(real, path)
-    return [Found(path, path.relative_to(root)) for path in shortest.values()]
+    return list(shortest.values())
 
 
 def _is_below(path: str, folder: str) -> bool:

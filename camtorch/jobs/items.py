@@ -56,27 +56,16 @@ def check(items: Sequence[Item], others: Iterable[Path] = ()) -> None:
     Raises:
         ValueError: two items have the same output; an output is an input.
     """
-    inputs = [*(path for item in items for path in item.inputs), *others]
-    read = dict(zip(real_paths(inputs), inputs, strict=True))
-    outputs = [(path, item) for item in items for path in item.outputs]
+    read = {os.path.realpath(path): path for path in (*(path for item in items for path in item.inputs), *others)}
     of_place: dict[str, Item] = {}
-    for place, (path, item) in zip(real_paths(path for path, _ in outputs), outputs, strict=True):
-        other = of_place.setdefault(place, item)
-        if other is not item:
-            raise ValueError(f"{other.name} and {item.name} would both be written to {path}")
-        if place in read:
-            raise ValueError(f"{path}: would overwrite {read[place]}, which is read; name another folder")
-
-
-def real_paths(paths: Iterable[Path]) -> list[str]:
-    """What they are without links; quick for many files in few folders."""
-    folders: dict[Path, str] = {}
-    real = []
-    for path in paths:
-        folder = folders.get(path.parent) or folders.setdefault(path.parent, os.path.realpath(path.parent))
-        place = os.path.join(folder, path.name)
-        real.append(os.path.realpath(place) if path.name in ("", "..") or os.path.islink(place) else place)
-    return real
+    for item in items:
+        for path in item.outputs:
+            place = os.path.realpath(path)
+            other = of_place.setdefault(place, item)
+            if other is not item:
+                raise ValueError(f"{other.name} and {item.name} would both be written to {path}")
+            if place in read:
+                raise ValueError(f"{path}: would overwrite {read[place]}, which is read; name another folder")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import errno
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from camtorch.jobs.items import Item, Json, Shard
 
@@ -43,15 +43,11 @@ class Manifest:
 
     folder: Path
     shard: Shard
-    path: Path
     settings: str
     """A hash of them."""
 
     def __init__(self, folder: Path, job: str, settings: Json, shard: Shard | None = None):
-        self.folder, self.shard = folder, shard or Shard()
-        of = "" if self.shard.count == 1 else f"-{self.shard.rank}-of-{self.shard.count}"
-        self.path = folder / f".camtorch-{job}{of}.jsonl"
-        self._accounts, self._stated = f".camtorch-{job}*.jsonl", settings
+        self.folder, self.shard, self._job, self._stated = folder, shard or Shard(), job, settings
         text = json.dumps(settings, sort_keys=True, allow_nan=False)
         self.settings = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
         self._begun: set[str] = set()
@@ -59,14 +55,13 @@ class Manifest:
 
     def __enter__(self) -> Manifest:
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._file = self.path.open("ab")
+        of = "" if self.shard.count == 1 else f"-{self.shard.rank}-of-{self.shard.count}"
+        self._file = (self.folder / f".camtorch-{self._job}{of}.jsonl").open("ab")
         try:
-            if fcntl is not None:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EACCES):  # some network file systems know no locks
-                self._file.close()
-                raise BlockingIOError(errno.EAGAIN, "another process does this right now", str(self.path)) from None
+            lock(self._file, wait=False)
+        except OSError:
+            self._file.close()
+            raise
         self.read()
         if self._file.tell():
             self._file.write(b"\n")  # the last line may be cut off
@@ -79,7 +74,7 @@ class Manifest:
     def read(self) -> None:
         """Take up what all shards have said so far, of whatever number they were; nothing if there is no folder."""
         self._begun, self._records = set(), {}
-        for path in sorted(self.folder.glob(self._accounts)):
+        for path in sorted(self.folder.glob(f".camtorch-{self._job}*.jsonl")):
             for text in path.read_bytes().splitlines():
                 with contextlib.suppress(ValueError, TypeError, AttributeError):  # cut off, or not written by a job
                     line = json.loads(text)
@@ -109,3 +104,17 @@ class Manifest:
     def _append(self, line: dict[str, Any]) -> None:
         self._file.write(json.dumps(line, allow_nan=False).encode() + b"\n")
         self._file.flush()
+
+
+def lock(file: IO[bytes], *, wait: bool) -> None:
+    """Have a file alone until it is closed; a file system that knows no locks gives none.
+
+    Raises:
+        BlockingIOError: another process has it, and `wait` is false.
+    """
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EACCES):
+                raise BlockingIOError(errno.EAGAIN, "another process does this right now", file.name) from None

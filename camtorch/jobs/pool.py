@@ -8,25 +8,25 @@ import pickle
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-Work = Callable[[T, Callable[[Any], None]], Any]
-"""What is done with a task; the function that it gets as well sends what it is called with to `receive`."""
+Work = Callable[[T, Callable[[float], None]], Any]
+"""What is done with a task; the function that it gets as well adds to what is done."""
 
 _HOW = "spawn" if sys.platform == "win32" else "forkserver"
 
 
-def prepare(modules: Sequence[str]) -> None:
-    """Have these modules imported, once for all processes of pools to come, while this one does something else."""
+def prepare(module: str) -> None:
+    """Have a module imported, once for all processes of pools to come, while this one does something else."""
     if _HOW == "forkserver":
         from multiprocessing import forkserver, resource_tracker
 
-        multiprocessing.set_forkserver_preload([__name__, *modules])
+        multiprocessing.set_forkserver_preload([__name__, module])
         resource_tracker.ensure_running()  # which lets signals through again as it starts
         # an interrupt during these imports would print a traceback
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -36,21 +36,22 @@ def prepare(modules: Sequence[str]) -> None:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def run(work: Work[T], tasks: Iterable[T], receive: Callable[[T, bool, Any], None], *, processes: int) -> None:
-    """Work on tasks.
+def run(
+    work: Work[T], tasks: Iterable[T], processes: int, add: Callable[[float], None]
+) -> Generator[tuple[T, Any], None, None]:
+    """Tasks with what `work` returned, as they are done.
 
     Args:
         work: is pickled once for each process, and must not raise.
         tasks: are pickled, and taken as processes get free.
-        receive: is called here, with a task, whether it is done, and what `work` returned, or what it sent before.
         processes: how many; with one, the work is done here, by one thread as well.
+        add: is called here with what was done since it was called last.
 
     Raises:
-        ChildProcessError: a process was killed. What `receive` and `tasks` raise, or an interrupt: processes are then
-            ended at once.
+        ChildProcessError: a process was killed. What `tasks` raise, or an interrupt: processes are then ended at once.
     """
     if processes > 1:
-        _run_in_processes(work, iter(tasks), receive, processes)
+        yield from _run_in_processes(work, iter(tasks), processes, add)
         return
     import torch  # not before: `prepare` is called so early that both processes import it at the same time
 
@@ -58,60 +59,56 @@ def run(work: Work[T], tasks: Iterable[T], receive: Callable[[T, bool, Any], Non
     torch.set_num_threads(1)
     try:
         for task in tasks:
-            receive(task, True, work(task, lambda what, task=task: receive(task, False, what)))  # type: ignore[misc]
+            yield task, work(task, add)
     finally:
         torch.set_num_threads(threads)
 
 
 def _run_in_processes(
-    work: Work[T], tasks: Iterator[T], receive: Callable[[T, bool, Any], None], processes: int
-) -> None:
-    prepare([type(work).__module__])
+    work: Work[T], tasks: Iterator[T], processes: int, add: Callable[[float], None]
+) -> Generator[tuple[T, Any], None, None]:
+    prepare(type(work).__module__)
     context = multiprocessing.get_context(_HOW)
-    sent = context.SimpleQueue()
+    done, seen = context.Value("d", 0.0), 0.0
     others = multiprocessing.active_children()
     # pickled here, as multiprocessing would share the memory of tensors
-    arguments = pickle.dumps(work), sent
+    executor = ProcessPoolExecutor(processes, context, _begin, (pickle.dumps(work), done))
     at_work: dict[Future[Any], T] = {}
-    with ProcessPoolExecutor(processes, context, _begin, arguments) as executor:
-        try:
-            while True:
-                for task in islice(tasks, 2 * processes - len(at_work)):
-                    at_work[executor.submit(_work_on, task)] = task
-                if not at_work:
-                    return
-                finished = wait(at_work, timeout=0.1, return_when=FIRST_COMPLETED).done
-                while not sent.empty():
-                    task, what = sent.get()
-                    receive(task, False, what)
-                for future in finished:
-                    result = future.result()
-                    receive(at_work.pop(future), True, result)
-        except BaseException as error:
-            executor.shutdown(wait=False, cancel_futures=True)
-            for process in set(multiprocessing.active_children()).difference(others):
-                process.terminate()
-            if isinstance(error, BrokenProcessPool):
-                names = ", ".join(str(task) for task in at_work.values())
-                raise ChildProcessError(
-                    f"a process was killed, perhaps for lack of memory; at work were {names}"
-                ) from None
-            raise
+    try:
+        while True:
+            for task in islice(tasks, 2 * processes - len(at_work)):
+                at_work[executor.submit(_work_on, task)] = task
+            if not at_work:
+                return
+            finished = wait(at_work, timeout=0.1, return_when=FIRST_COMPLETED).done
+            add(done.value - seen)
+            seen = done.value
+            for future in finished:
+                result = future.result()
+                yield at_work.pop(future), result
+    except BrokenProcessPool:
+        names = ", ".join(map(str, at_work.values()))
+        raise ChildProcessError(f"a process was killed, perhaps for lack of memory; at work were {names}") from None
+    finally:
+        executor.shutdown(wait=not at_work, cancel_futures=True)
+        for process in set(multiprocessing.active_children()).difference(others):  # those of a work that is broken off
+            process.terminate()
+            process.join()
 
 
 _work: Work[Any]
-_sent: Any
+_done: Any
 
 
-def _begin(pickled: bytes, sent: Any) -> None:
+def _begin(pickled: bytes, done: Any) -> None:
     """What each process does first."""
-    global _work, _sent
+    global _work, _done
     import torch
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one decides what an interrupt means
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
-    _work, _sent = pickle.loads(pickled), sent
+    _work, _done = pickle.loads(pickled), done
 
 
 def _end_with_parent() -> None:
@@ -123,7 +120,12 @@ def _end_with_parent() -> None:
 
 
 def _work_on(task: Any) -> Any:
-    return _work(task, lambda what: _sent.put((task, what)))
+    return _work(task, _add)
+
+
+def _add(part: float) -> None:
+    with _done.get_lock():
+        _done.value += part
 
 
 def reason(error: Exception) -> str:

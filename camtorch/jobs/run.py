@@ -7,12 +7,12 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 from camtorch.io.hashing import hash_of
 from camtorch.io.writing import all_left_over
 from camtorch.jobs import pool
-from camtorch.jobs.items import Item, Json, Listener, Work, real_paths
+from camtorch.jobs.items import Item, Json, Listener, Work
 from camtorch.jobs.manifest import Manifest
 
 
@@ -61,49 +61,42 @@ def run(
         more = f", and {len(there) - 1} more of {sum(len(item.outputs) for item in items)}" if len(there) > 1 else ""
         raise FileExistsError(f"{there[0]}: exists already{more}")
     report = Report()
-    parts: dict[Item, float] = {}
     failed: dict[Item, str] = {}
     done = kept = 0.0
+
+    def add(part: float) -> None:
+        nonlocal done
+        done += part
+        watch(done, kept)
 
     def tasks() -> Iterator[_Task]:
         for item in items:
             if not manifest.has_begun(item):
                 if not force and any(map(os.path.lexists, item.outputs)):
                     failed[item] = f"{item.outputs[0]} exists already, and is not of this job"
-                    advance(item, item.size)
+                    add(item.size)
                     continue
                 manifest.begin(item)
             yield _Task(item, manifest.records(item) if resume else [])
 
-    def receive(task: _Task, is_done: bool, what: Any) -> None:
-        nonlocal kept
-        item = task.item
-        if not is_done:
-            advance(item, min(what, item.size))
-            return
-        for text in what.notes:
-            report.notes.setdefault(text.removeprefix(item.name).lstrip(": "), []).append(item.name)
-        if what.record is None:
-            failed[item] = what.failure.removeprefix(item.name).lstrip(": ")
-        else:
-            report.results[item] = what.record["result"]
-            if what.is_new:
-                manifest.made(item, what.record)
-                report.made += 1
-            else:
-                report.kept += 1
-                kept += item.size
-        advance(item, item.size)
-
-    def advance(item: Item, part: float) -> None:
-        nonlocal done
-        done += part - parts.get(item, 0.0)
-        parts[item] = part
-        watch(done, kept)
-
     _remove_left_over(items)
     try:
-        pool.run(_Attempt(work, manifest.settings), tasks(), receive, processes=processes)
+        attempt = _Attempt(work, manifest.settings)
+        with contextlib.closing(pool.run(attempt, tasks(), processes, add)) as outcomes:
+            for (item, _), outcome in outcomes:
+                for text in outcome.notes:
+                    report.notes.setdefault(text.removeprefix(item.name).lstrip(": "), []).append(item.name)
+                if outcome.record is None:
+                    failed[item] = outcome.failure.removeprefix(item.name).lstrip(": ")
+                    continue
+                report.results[item] = outcome.record["result"]
+                if outcome.is_new:
+                    manifest.made(item, outcome.record)
+                    report.made += 1
+                else:
+                    report.kept += 1
+                    kept += item.size
+                    watch(done, kept)
     except BaseException:
         _remove_left_over(items)
         raise
@@ -121,8 +114,7 @@ def pending(items: Iterable[Item], manifest: Manifest, *, resume: bool = False) 
             yield item
 
 
-@dataclass(frozen=True)
-class _Task:
+class _Task(NamedTuple):
     item: Item
     records: list[dict[str, Json]]
     """By which it may be as it should already."""
@@ -147,8 +139,14 @@ class _Attempt:
     work: Work
     settings: str
 
-    def __call__(self, task: _Task, tell: Callable[[float], None]) -> _Outcome:
-        item, outcome = task.item, _Outcome()
+    def __call__(self, task: _Task, add: Callable[[float], None]) -> _Outcome:
+        item, outcome, done = task.item, _Outcome(), 0.0
+
+        def advance(to: float) -> None:
+            nonlocal done
+            add(min(to, item.size) - done)
+            done = min(to, item.size)
+
         try:
             terms = _terms(item, self.settings)
             outcome.record = _standing(item, task.records, terms)
@@ -156,11 +154,12 @@ class _Attempt:
             if outcome.record is None:
                 with warnings.catch_warnings(record=True) as caught:
                     warnings.simplefilter("always", UserWarning)
-                    result = self.work(item, Listener(outcome.notes.append, tell))
+                    result = self.work(item, Listener(outcome.notes.append, advance))
                 outcome.notes += dict.fromkeys(str(warning.message) for warning in caught)
                 outcome.record = {**terms, "hashes": list(map(hash_of, item.outputs)), "result": result}
         except Exception as error:
             outcome.failure = pool.reason(error)
+        advance(item.size)
         return outcome
 
 
@@ -180,6 +179,6 @@ def _standing(item: Item, records: Sequence[dict[str, Json]], terms: dict[str, J
 
 def _remove_left_over(items: Iterable[Item]) -> None:
     """Remove the halves of files that a process which was killed left beside outputs."""
-    for path in all_left_over(real_paths(path for item in items for path in item.outputs)):
+    for path in all_left_over(os.path.realpath(path) for item in items for path in item.outputs):
         with contextlib.suppress(OSError):
             os.unlink(path)

@@ -31,7 +31,25 @@ def fixed_change(source, target, angles):
         yaw, pitch, roll = ((angle, angle) for angle in angles)
         options = dict.fromkeys(("focal", "centre", "distortion", "crop"))
         augmentation = ct.augment.RandomCamera(target, yaw=yaw, pitch=pitch, roll=roll, **options)
-    return augmentation.change(source.requires_grad_(False), augmentation.draw(1))
+    return fixed(augmentation, source)
+
+
+def fixed(augmentation, source):
+    """Moves labels from a camera always in the same way; and the warp."""
+    draw = augmentation.draw(1)
+    warp = augmentation.change(source.requires_grad_(False), draw).parts[0].warp
+    return ct.data.MapSamples(warp), warp
+
+
+def moved(annotations, change, told=None):
+    """Annotations by a change of `fixed`."""
+    samples, _ = change
+
+    def move(labels):
+        return samples({"json": labels})["json"]
+
+    labels = coco.labels_of(annotations, SIZE, (told if told is not None else []).append)
+    return coco.moved(annotations, labels, move({"points": np.zeros(3), **coco.packed(labels)}), move, SIZE)
 
 
 def drawn(polygon):
@@ -79,8 +97,8 @@ POLYGON = [20.0, 15.0, 70.0, 12.0, 66.0, 55.0, 45.0, 30.0, 24.0, 50.0]
 def test_annotations_move_with_the_image(source, target, angles):
     change = fixed_change(source, target, angles)
     mask = drawn(POLYGON)
-    image = torch.from_numpy(mask.astype(np.uint8))[None, None]
-    truth = change.labels(image)[0, 0].numpy() > 0
+    warp = change[1]
+    truth = change[0]({"mask.npy": mask.astype(np.uint8), "json": {}})["mask.npy"] > 0
     annotations = [
         {"id": 1, "image_id": 1, "segmentation": [POLYGON], "bbox": [20, 12, 50, 43], "area": 1, "category_id": 3},
         {"id": 2, "area": 1, "segmentation": {"counts": rle.encode(mask, as_text=True), "size": list(SIZE)}},
@@ -88,8 +106,7 @@ def test_annotations_move_with_the_image(source, target, angles):
         {"id": 4, "image_id": 1, "keypoints": [30, 20, 2, 60, 18, 1, 45, 28, 0], "num_keypoints": 2},
         {"id": 5, "image_id": 1, "caption": "a cat", "gaze": [0.0, 0.0, -1.0]},
     ]
-    outline, runs, box, points, rest = coco.moved(annotations, change)
-    warp = change.parts[0].warp
+    outline, runs, box, points, rest = moved(annotations, change)
     height, width = SIZE
     if outline is None:
         assert not truth.any()
@@ -126,7 +143,7 @@ def test_annotations_move_with_the_image(source, target, angles):
             assert np.allclose(points["keypoints"][3 * i : 3 * i + 3], expected, atol=0.006)
         assert points["keypoints"][6:] == [0, 0, 0]
     assert rest["caption"] == "a cat"
-    assert np.allclose(rest["gaze"], change.rotation[0] @ torch.tensor([0.0, 0.0, -1.0]).double())
+    assert np.allclose(rest["gaze"], [0, 0, -1] if warp.rotation is None else -warp.rotation.reshape(3, 3)[:, 2])
 
 
 FOLDED = ct.BrownConrady([45.0, 45.0, 48.0, 36.0], [-0.5, 0.1, 0.0, 0.0], image_size=SIZE).double()
@@ -136,13 +153,13 @@ FOLDED = ct.BrownConrady([45.0, 45.0, 48.0, 36.0], [-0.5, 0.1, 0.0, 0.0], image_
 @pytest.mark.parametrize("box", [[8, 6, 80, 60], [-10, -10, 116, 92], [-10, 2, 60, 68], [2, 2, 90, 30]])
 def test_what_is_larger_than_the_image_is_on_it(source, box):
     zoomed = ct.augment.RandomMount(zoom=(2, 2), yaw=(0, 0), pitch=(0, 0), roll=(20, 20))
-    change = zoomed.change(source.requires_grad_(False), zoomed.draw(1))
+    change = fixed(zoomed, source)
     x, y, w, h = box
     polygon = [x, y, x + w, y, x + w, y + h, x, y + h]
-    mask = torch.from_numpy(drawn(polygon).astype(np.uint8))[None, None]
+    mask = drawn(polygon).astype(np.uint8)
     # beyond the image, too, there is what has a ray: all that is shown comes from it
-    truth = (change.labels(mask)[0, 0] > 0).numpy()
-    boxed, outlined = coco.moved(
+    truth = change[0]({"mask.npy": mask, "json": {}})["mask.npy"] > 0
+    boxed, outlined = moved(
         [
             {"id": 1, "bbox": box, "keypoints": [48, 25, 2], "area": w * h},
             {"id": 2, "bbox": box, "segmentation": [polygon], "area": w * h},
@@ -161,12 +178,12 @@ def test_what_is_larger_than_the_image_is_on_it(source, box):
         assert top + height >= rows.max() + 1 - margin
     # what lies beyond all that has a ray is gone
     beyond = [-90.0, -90.0, -60.0, -90.0, -60.0, -60.0, -90.0, -60.0]
-    assert coco.moved([{"id": 3, "bbox": [-90, -90, 30, 30], "segmentation": [beyond]}], change) == [None]
+    assert moved([{"id": 3, "bbox": [-90, -90, 30, 30], "segmentation": [beyond]}], change) == [None]
 
 
 def test_straight_edges_get_no_more_corners():
     change = fixed_change(CAMERAS["pinhole"], CAMERAS["pinhole"], (0, 0, 0))
-    (same,) = coco.moved([{"id": 1, "segmentation": [POLYGON], "bbox": [20, 12, 50, 43]}], change)
+    (same,) = moved([{"id": 1, "segmentation": [POLYGON], "bbox": [20, 12, 50, 43]}], change)
     assert np.allclose(same["segmentation"], [POLYGON], atol=0.01)
     assert np.allclose(same["bbox"], [20, 12, 50, 43], atol=0.01)
 
@@ -183,12 +200,12 @@ def test_wrong_annotations_are_told():
         ({"segmentation": 5}, "segmentation must be a list of polygons"),
         ({"segmentation": [[1, 2, 3, 4]]}, "a polygon must have three corners"),
         ({"segmentation": {"counts": [], "size": [1, 2]}}, r"size \[1, 2\], the image \[72, 96\]"),
-        ({"gaze": [1, 2]}, r"annotation 7: gaze must be \(\*N, 3\) directions"),
+        ({"gaze": [1, 2]}, r"gaze_0_of_annotation_7 must be \(\*N, 3\) directions"),
     ):
         with pytest.raises(ValueError, match=message):
-            coco.moved([{"id": 7, **entry}], change)
+            moved([{"id": 7, **entry}], change)
     told = []
-    coco.moved([{"id": 7, "center": [1.5, 2.0], "score": 0.5}], change, told.append)
+    moved([{"id": 7, "center": [1.5, 2.0], "score": 0.5}], change, told)
     assert told == ["'center' of annotations holds numbers that stay as they are"]
 
 

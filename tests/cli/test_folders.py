@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import MATRIX, command, opened, refused, write_photograph
 from PIL import Image
-from test_cli import FISHEYE, MATRIX, command, opened, refused
 
 TRIALS = int(os.environ.get("CAMTORCH_TRIALS", "3"))
 WORDS = ["dewarp", "in", "--camera", "camera.yml", "-o", "out/"]
@@ -25,7 +25,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("TORCHELASTIC_RUN_ID", "RANK", "WORLD_SIZE", "SLURM_STEP_ID", "SLURM_PROCID", "SLURM_NTASKS"):
         monkeypatch.delenv(name, raising=False)
-    Path("camera.yml").write_text(FISHEYE + MATRIX)
+    write_photograph(tmp_path)
     write_images({"1.png": "RGB", "2.jpg": "RGB", "deep/1.png": "L", "deep/er/3.tif": "I;16", "deep/4.webp": "RGBA"})
     return tmp_path
 
@@ -84,7 +84,7 @@ def test_what_there_is_already(folder, capsys):
     assert not Path("out").exists()
     command(*WORDS, "--jobs", 1)
     before = outputs()
-    assert "out/1.png: exists already, and 4 more of 5; --resume goes on" in refused_of(capsys, *WORDS)
+    assert "out/1.png: exists already, and 4 more of 5; --resume goes on" in refused(capsys, *WORDS)
     Path("in/1.png").rename("in/9.png")
     Path("out/2.jpg").unlink()
     Path("out/2.jpg").write_bytes(b"")
@@ -98,11 +98,6 @@ def test_what_there_is_already(folder, capsys):
     assert "out: 5 of 5 files made, kannala_brandt to cylindrical" in capsys.readouterr().out
     command(*WORDS, "--jobs", 1, "--force")
     assert outputs() == before | {"9.png": before["1.png"]}
-
-
-def refused_of(capsys, *words):
-    capsys.readouterr()
-    return refused(capsys, *words)
 
 
 def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
@@ -125,11 +120,8 @@ def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
     capsys.readouterr()
     command(*WORDS, "--jobs", 1, "--force", expect=1)
     told = capsys.readouterr()
-    # the folder's links come first, then images in their order
     expected = [
         "in/me.png: Too many levels of symbolic links",
-        "in/deep/circle: a link to a folder that it lies in",
-        "in/more: a link to a folder that it lies in",
         "in/bomb.png: more than 179 million pixels, which are not read",
         "in/cut.png: ",
         "in/large.png: is 96x65, but the camera in camera.yml is for 96x64; ",
@@ -146,14 +138,13 @@ def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
     made = outputs()
     assert {name: made[name] for name in before} == before
     assert made.keys() - before.keys() == (set() if locked else {"locked.png"})
-    command(*WORDS, "--dry-run", "--resume", expect=1)
-    assert capsys.readouterr().out.endswith(f"{len(expected) - 3} to be made, {len(made)} there already\n")
+    command(*WORDS, "--dry-run", "--resume")
+    assert capsys.readouterr().out.endswith(f"{len(expected)} to be made, {len(made)} there already\n")
 
 
 def test_two_shards_are_one_run(folder, capsys, monkeypatch):
     write_images({f"more/{i}.png": "RGB" for i in range(4)})
-    Path("in/deep/circle").symlink_to("..", target_is_directory=True)
-    command(*WORDS, "--jobs", 1, expect=1)
+    command(*WORDS, "--jobs", 1)
     whole = outputs()
     capsys.readouterr()
     by_torchrun, by_srun = (
@@ -166,15 +157,15 @@ def test_two_shards_are_one_run(folder, capsys, monkeypatch):
             for name, value in zip(names, (rank, 2, 0), strict=False):
                 monkeypatch.setenv(name, str(value))
             shard = [] if names else ["--shard", f"{rank + 1}/2"]
-            command(*WORDS[:-1], place, "--jobs", 1, *shard, expect=1 if rank == 0 else 0)  # who tells of the circle
+            command(*WORDS[:-1], place, "--jobs", 1, *shard)
         assert outputs(place) == whole
         told = capsys.readouterr()
         assert f"{place}, shard 2 of 2: 4 of 4 files made" in told.out
-        assert told.err.count("\n") == 1
+        assert told.err == ""
         for name in names:
             monkeypatch.delenv(name)
-        command(*WORDS[:-1], place, "--jobs", 1, "--resume", expect=1)
-        assert "0 of 10 files made" in capsys.readouterr().out
+        command(*WORDS[:-1], place, "--jobs", 1, "--resume")
+        assert "0 of 9 files made" in capsys.readouterr().out
 
 
 def test_ranks_left_over_in_a_shell_ask_for_nothing(folder, capsys, monkeypatch):
@@ -216,42 +207,11 @@ def test_notes_are_said_once(folder, capsys):
 
 
 def test_other_suffixes(folder, capsys):
-    assert "in/1.png and in/deep/1.png" not in refused_suffix(capsys, ".ico")
     command(*WORDS, "--jobs", 1, "--suffix", ".png")
     assert outputs().keys() == {"1.png", "2.png", "deep/1.png", "deep/er/3.png", "deep/4.png"}
     Path("in/1.jpg").write_bytes(Path("in/2.jpg").read_bytes())
-    text = refused_of(capsys, *WORDS, "--force", "--suffix", ".png")
+    text = refused(capsys, *WORDS, "--force", "--suffix", ".png")
     assert "in/1.jpg and in/1.png would both be written to out/1.png" in text
-
-
-def refused_suffix(capsys, suffix):
-    text = refused_of(capsys, *WORDS, "--suffix", suffix)
-    assert f"{suffix}: icons have sizes of their own" in text
-    return text
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["dewarp", "in", "--camera", "camera.yml"], "into which folder? -o OUT/"),
-        (["dewarp", "in/1.png", "camera.yml"], "camera.yml: a calibration, not an image; --camera camera.yml names it"),
-        (["dewarp", "in", "camera.yml", "-o", "o.png"], "--camera camera.yml names it"),
-        (["dewarp", "in", "none", "--camera", "camera.yml", "-o", "out"], "none: no such file or folder"),
-        (["dewarp", "in", "--camera", "camera.yml", "-o", "camera.yml"], "camera.yml: is no folder"),
-        (["dewarp", "in", "-o", "out"], "which camera took it? --camera FILE"),
-        (["dewarp", "in", "--camera", "camera.yml", "-o", "in"], "would overwrite in/1.png, which is read"),
-        (["dewarp", "in/1.png", "in/deep/1.png", "--camera", "camera.yml", "-o", "out"], "would both be written to"),
-        ([*WORDS, "--jobs", "0"], "'0' is not 1 to 1024 processes"),
-        ([*WORDS, "--shard", "0/4"], "'0/4' is not I/N, the I-th of N parts"),
-        ([*WORDS, "--suffix", "png"], "'png' is no suffix, as .png is"),
-        (["dewarp", "in/1.png", "--camera", "camera.yml", "-o", "o.png", "--resume"], "--resume is for folders"),
-        (["dewarp", "in/1.png", "--camera", "camera.yml", "-o", "o.png", "--shard", "1/2"], "--shard is for folders"),
-    ],
-)
-def test_errors_before_the_work(folder, capsys, words, text):
-    before = sorted(Path().rglob("*"))
-    assert text in refused(capsys, *words)
-    assert sorted(Path().rglob("*")) == before
 
 
 def test_one_image_into_a_folder(folder, capsys):

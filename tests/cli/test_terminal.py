@@ -17,7 +17,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize("stream", [Terminal, io.StringIO])
-@pytest.mark.parametrize("pause", [0, 0.6])
+@pytest.mark.parametrize("pause", [0, pytest.param(0.6, marks=pytest.mark.slow)])
 def test_work_of_more_than_a_moment_shows_how_far_it_is_and_leaves_nothing(monkeypatch, stream, pause):
     stderr = stream()
     monkeypatch.setattr(sys, "stderr", stderr)

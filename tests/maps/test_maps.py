@@ -678,7 +678,7 @@ def test_the_command_writes_a_map_and_measures_one(folder, capsys):
         ("-o a.bin", "does not say the format"),
         ("-o camera.json --format obj", "would overwrite camera.json"),
         ("-o a.npz --fov 2.1", "2.1 seems to be radians"),
-        ("-o a.npz --fov 200", "--projection cylindrical goes to 360"),
+        ("-o a.npz --fov 200", "below 180 for perspective; got 200"),
         ("-o a.npz --target camera.json --size 10x10", "--size is for a dewarping"),
         ("-o camera --format dw100 --force", "camera.json: would overwrite"),
         ("-o a.npz --step 8", "opencv has no step"),

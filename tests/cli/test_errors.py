@@ -1,0 +1,188 @@
+"""What is refused is so in one line that names it, before anything is written."""
+
+import json
+import shutil
+import sys
+
+import pytest
+import torch
+from command_line import FILES, LEVEL, opened, refused, write_photograph
+from PIL import Image
+
+import camtorch as ct
+
+PHOTO = "in.png --camera camera.yml"
+PAIR = "rectify in.png in.png"
+GROUND = "--x -2 2 --y 0.5 4.5 --resolution 0.02"
+CASES = {
+    "words": [
+        ("", "the following arguments are required: COMMAND"),
+        ("undistort", "invalid choice: 'undistort'"),
+        ("dewarp", "required: IMAGE"),
+        ("show", "required: FILE"),
+        ("convert camera.yml", "required: OUT"),
+    ],
+    "files": [
+        ("dewarp none.png --camera camera.yml", "none.png: no such file"),
+        ("dewarp camera.yml --camera camera.yml", "camera.yml: not an image"),
+        ("dewarp cut.png --camera camera.yml", "cut.png: "),
+        ("dewarp in.png --camera none.yml", "none.yml: No such file"),
+        ("dewarp in.png --camera in.png", "in.png: byte 0: an image; a calibration is read here"),
+        ("dewarp in.png --camera bad.yml", "bad.yml: K: a camera matrix has 3 x 3"),
+        ("dewarp in.png", "in.png: which camera took it? --camera FILE"),
+        (f"dewarp {PHOTO} -o in.png/o.png", "in.png is no folder"),
+        (f"dewarp {PHOTO} -o o.ico", "o.ico: .ico: icons have sizes of their own"),
+        (f"dewarp {PHOTO} -o a\0b.png", "'a\\x00b.png' is no name of a file"),
+        (f"dewarp {PHOTO} -o o.docx", "o.docx: .docx: no image can be written as that"),
+        (f"dewarp {PHOTO} -o o", "o: no suffix: no image can be written as that; try .png"),
+        (f"dewarp {PHOTO} -o .", "is a folder"),
+        (f"dewarp {PHOTO} -o cut.png", "cut.png: exists already; --force"),
+        (f"dewarp {PHOTO} -o in.png --force", "in.png: would overwrite in.png, which is read"),
+        ("dewarp alpha.png --camera camera.yml -o o.jpg", "o.jpg: .jpg files hold no image of mode RGBA"),
+    ],
+    "dewarp": [
+        (f"dewarp {PHOTO} --model x", "known are brown_conrady"),
+        (f"dewarp {PHOTO} --model brown_conrady", "says that the model is kannala_brandt; do not name brown_conrady"),
+        (f"dewarp {PHOTO} --size 80", "'80' is not WIDTHxHEIGHT"),
+        (f"dewarp {PHOTO} --size 0x9", "1 to 32768"),
+        (f"dewarp {PHOTO} --fov wide", "--fov: invalid float"),
+        (f"dewarp {PHOTO} --fov 180", "below 180 for perspective; got 180"),
+        (f"dewarp {PHOTO} --fov nan", "fov must be in degrees, above 0"),
+        (f"dewarp {PHOTO} --fov 2.1", "2.1 seems to be radians"),
+        ("dewarp in.png --guess-fov 2.1", "2.1 seems to be radians: 120.3 degrees"),
+        ("dewarp in.png --guess-fov 361", "'361' is no field of view in degrees, as 120"),
+        ("dewarp in.png --guess-fov wide", "'wide' is no field of view"),
+        (f"dewarp in.png --camera {FILES}/opencv_stereo.yml", "several cameras; --name says which"),
+    ],
+    "many": [
+        ("dewarp images --camera camera.yml", "into which folder? -o OUT/"),
+        ("dewarp in.png camera.yml", "camera.yml: a calibration, not an image; --camera camera.yml names it"),
+        ("dewarp images none --camera camera.yml -o out", "none: no such file or folder"),
+        ("dewarp images --camera camera.yml -o camera.yml", "camera.yml: is no folder"),
+        ("dewarp images --camera camera.yml -o o.png", "o.png: is the name of one file"),
+        ("dewarp images -o out", "which camera took it? --camera FILE"),
+        ("dewarp images --camera camera.yml -o images", "would overwrite images/in.png, which is read"),
+        ("dewarp in.png images/in.png --camera camera.yml -o out", "would both be written to"),
+        ("dewarp images --camera camera.yml -o out --fov 200", "below 180 for perspective; got 200"),
+        ("dewarp images --camera camera.yml -o out --suffix .ico", ".ico: icons have sizes of their own"),
+        ("dewarp images --camera camera.yml -o out --suffix png", "'png' is no suffix, as .png is"),
+        ("dewarp images --camera camera.yml -o out --jobs 0", "'0' is not a whole number from 1 to 1024"),
+        ("dewarp images --camera camera.yml -o out --shard 0/4", "'0/4' is not I/N, the I-th of N parts"),
+        (f"dewarp {PHOTO} -o o.png --resume", "--resume is for folders"),
+    ],
+    "show": [
+        ("show camera.yml -o camera.yml --force", "camera.yml: would overwrite camera.yml, which is read"),
+        ("show bare.yml --against camera.yml", "bare.yml states no image size; --size says which"),
+        ("show camera.yml --size 640x480", "camera.yml: camera is for 96x64, not 640x480"),
+        (f"show {FILES}/opencv_stereo.yml -o o.png", "--name says which camera is meant: 1, 2"),
+        ("show camera.yml --name left", "no camera is called 'left'; there are camera"),
+        (f"show camera.yml --against {FILES}/opencv_camera.yml", "is for 1280x800, but camera.yml for 96x64"),
+        ("show batch.json", "batch.json: camera is a batch of (2,) cameras; single ones are shown"),
+        ("show camera.yml --against batch.json", "batch.json: camera is a batch of (2,) cameras; here one"),
+        (f"show {FILES}/kalibr_camchain.yaml --from-model pinhole", "a file of kalibr, which says the models"),
+    ],
+    "convert": [
+        ("convert camera.yml bad.yml --model fisheye624", "bad.yml: exists already; --force"),
+        ("convert camera.yml camera.yml --force", "camera.yml: would overwrite camera.yml, which is read"),
+        ("convert camera.yml . --format opencv --force", ".: is a folder; opencv is one file"),
+        ("convert camera.yml o.yml --model fisheye63", "did you mean 'fisheye62'? Known are"),
+        ("convert camera.yml o.yml --model brown_conrady --count 6", "got count=6"),
+        ("convert camera.yml o.yml --max-angle nan", "--max-angle must be above 0"),
+    ],
+    "birdseye": [
+        (f"birdseye {PHOTO} {GROUND}", "camera.yml: no pose, so where the ground is is not known; --height"),
+        (f"birdseye {PHOTO} --pitch 3 {GROUND}", "--pitch needs --height"),
+        (f"birdseye {PHOTO} --height 0 {GROUND}", "--height must be above 0; got 0"),
+        (f"birdseye {PHOTO} --height 1 --pitch 91 {GROUND}", "at most 90 degrees"),
+        (
+            f"birdseye {PHOTO} --height 1 --x 1 0 --y 0.5 4.5 --resolution 0.02",
+            "x must be (from, to), ascending; got (1.0, 0.0)",
+        ),
+        (f"birdseye {PHOTO} --height 1 --x -2 2 --y 0 4 --resolution 0", "resolution must be positive"),
+        (f"birdseye {PHOTO} --height 1 --x -2 2 --y 0 4 --resolution 1e-5", "make 400000x400000 pixels"),
+        (f"birdseye in.png --camera below.json {GROUND}", "on the ground, whose z points up; it has to be above"),
+        (f"birdseye {PHOTO} --height 1 {GROUND} -o in.png", "would overwrite in.png"),
+    ],
+    "augment": [
+        ("augment --labels labels.json", "--labels needs IMAGE"),
+        ("augment --rescale", "--rescale needs IMAGE"),
+        ("augment --model pinhole", "--from-model needs --camera FILE"),
+        ("augment --preset fish", "no preset 'fish'. There are none, the image's own lens; webcam, a VGA camera"),
+        ("augment -n 101", "-n: '101' is not a whole number from 1 to 100"),
+        ("augment --seed -1", "--seed must be 0 or more"),
+        ("augment --min-filled 90", "--min-filled must be 0 to 1; got 90"),
+        (f"augment {PHOTO} --fov 2.1", "2.1 seems to be radians"),
+        (f"augment {PHOTO} --fov sources", "--fov: 'sources' is neither a number nor LOW,HIGH"),
+        ("augment --yaw 1,2,3", "--yaw: '1,2,3' is neither"),
+        (f"augment {PHOTO} --yaw 200", "yaw must lie within [-180, 180]"),
+        (f"augment {PHOTO} --pitch=5,-5", "pitch must be (low, high)"),
+        (f"augment {PHOTO} --preset webcam --fov 200", "does not reach 200 degrees"),
+        (f"augment {PHOTO} --labels labels.json -o labels.json --force", "would overwrite labels.json"),
+        ("augment half.png --camera camera.yml", "--rescale scales the camera"),
+    ],
+    "rectify": [
+        (PAIR, "in.png: which cameras took the pair? --camera RIG"),
+        (f"{PAIR} --camera three.json", "three.json: 3 cameras, not two; --left-camera and --right-camera say which"),
+        (f"{PAIR} --camera three.json --left-camera x", "no camera is called 'x'; there are left, right, third"),
+        (f"{PAIR} --camera rig.json --left-camera left --right-camera left", "are both 'left'"),
+        (f"{PAIR} --camera three.json --left-camera left --right-camera third", "third has no pose"),
+        (f"{PAIR} --camera rig.json --fov 80,1.2", "1.2 seems to be radians"),
+        (f"{PAIR} --camera rig.json --projection latlon --fov 361", "below 180 for latlon; got 361"),
+        (f"{PAIR} --camera rig.json --depth 1 2", "--depth is for --disparity and --points"),
+        (f"{PAIR} --camera rig.json --points c.ply --depth 2 1", "0 < NEAR < FAR; got 2 1"),
+        (f"{PAIR} --camera rig.json --points c.obj", "c.obj: must be called .ply"),
+        (f"{PAIR} --camera rig.json --disparity d.jpg", "d.jpg: must be called .png or .npy"),
+        (f"{PAIR} --camera rig.json --disparity rectified/left.png", "left.png: is the name of another result"),
+        (f"{PAIR} --camera rig.json --disparity --depth 0.01 1", "a .png to 255; name an .npy"),
+        (f"{PAIR} --camera rig.json -o in.png", "in.png is no folder"),
+        ("rectify in.png grey.png --camera rig.json", "are images of different kinds"),
+        ("rectify half.png half.png --camera rig.json", "half.png is 48x32, but the camera in rig.json is for 96x64"),
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    write_photograph(folder)
+    (folder / "bad.yml").write_text("K: [1, 2]")
+    (folder / "bare.yml").write_text(LEVEL)
+    (folder / "labels.json").write_text(json.dumps({"keypoints": [[20, 30]]}))
+    (folder / "cut.png").write_bytes((folder / "in.png").read_bytes()[:3000])
+    (folder / "images").mkdir()
+    shutil.copy(folder / "in.png", folder / "images")
+    for name, kind in (("alpha", "RGBA"), ("grey", "L")):
+        opened(folder / "in.png").convert(kind).save(folder / f"{name}.png")
+    Image.new("RGB", (48, 32)).save(folder / "half.png")
+    lens = ct.KannalaBrandt([28.0, 28, 47, 32], [0.0] * 4, image_size=(64, 96)).double().requires_grad_(False)
+    ct.save(ct.KannalaBrandt(torch.tensor([[28.0, 28, 47, 32]] * 2), torch.zeros(2, 4)), folder / "batch.json")
+    poses = {"left": ct.Extrinsics([0.0] * 3, [0.0] * 3), "right": ct.Extrinsics([0.0] * 3, [-0.25, 0.0, 0.0])}
+    ct.save(ct.Rig({"left": lens, "right": lens}, poses), folder / "rig.json")
+    ct.save(ct.Rig({"left": lens, "right": lens, "third": lens}, poses), folder / "three.json")
+    ct.save(ct.Rig({"front": lens}, {"front": ct.Extrinsics([0.0] * 3, [0.0, 0.0, 1.0])}), folder / "below.json")
+    return folder
+
+
+@pytest.mark.parametrize("group", CASES)
+def test_errors_are_one_line_and_leave_nothing(files, monkeypatch, capsys, group):
+    if group == "rectify":
+        pytest.importorskip("cv2")
+    monkeypatch.chdir(files)
+    before = {path: path.read_bytes() for path in files.rglob("*.*")}
+    for words, text in CASES[group]:
+        assert text in refused(capsys, *words.split(" ")[: None if words else 0]), words
+        assert {path: path.read_bytes() for path in files.rglob("*.*")} == before, words
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "text"),
+    [
+        ("matplotlib", "show camera.yml -o out.png", "pip install 'camtorch[plot]'"),
+        ("cv2", f"{PAIR} --camera rig.json --disparity", 'pip install "camtorch[stereo]"'),
+        ("av", "dewarp in.mkv --camera camera.yml -o out.mkv", "pip install 'camtorch[video]'"),
+    ],
+)
+def test_a_package_that_lacks_is_named(files, monkeypatch, capsys, module, words, text):
+    monkeypatch.chdir(files)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert text in refused(capsys, *words.split())
