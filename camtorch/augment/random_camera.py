@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees
-from camtorch._module import Memo, same
+from camtorch._module import Memo
 from camtorch._tracing import in_graph, is_concrete
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import frozen, numbers_by, size_of
@@ -22,7 +22,7 @@ from camtorch.camera import Camera, from_values
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.mixed import remade
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.domain import Domain, domain_of, keep
+from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.rays import field_of_view, image_lattice
 from camtorch.projection.unproject import shown
 from camtorch.rotations import mount_rotation
@@ -489,8 +489,6 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
         first = fits.to(torch.uint8).argmax(0) * len(left) + torch.arange(len(left), device=left.device)
         some = fits.any(0)
         result[left] = torch.where(some.unsqueeze(-1), others.k[first], given[0])
-        if bool(some.all()):  # what is known of their folds is asked for soon
-            keep(camera._model, lenses.replaced(left, others, first))
     return result.view(*batch, count)
 
 
@@ -508,22 +506,13 @@ def _(
     return amounts.new_empty(*amounts.shape[:-1], distortion.shape[-1])
 
 
-_KEPT = 24  # of a batch of eight models
-_known: list[tuple[tuple[object, ...], tuple[Tensor, ...], Tensor]] = []
+_measured = Memo(24)  # of a batch of eight models
 
 
 def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
-    """`measure(camera, *inputs)`, of which these tensors are all that counts. The last results are kept: mostly the
-    lens is the same one.
-    """
-    options = (measure, type(camera), camera.image_size)
-    for known_options, known_inputs, result in _known:
-        if known_options == options and all(map(same, known_inputs, inputs)):
-            return result
-    result = measure(camera, *inputs)
-    _known.insert(0, (options, tuple(t.detach().clone() for t in inputs), result))
-    del _known[_KEPT:]
-    return result
+    """`measure(camera, *inputs)`, of which these tensors are all that counts: mostly the lens is the same one."""
+    found: Tensor = _measured(inputs, (measure, type(camera), camera.image_size), lambda: measure(camera, *inputs))
+    return found
 
 
 def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
@@ -577,7 +566,7 @@ def _rim(camera: Camera) -> tuple[Tensor, Tensor]:
     lenses, which = (
         camera.distortion.detach().reshape(-1, camera.distortion.shape[-1]).unique(dim=0, return_inverse=True)
     )
-    if len(lenses) > _KEPT // 2:
+    if len(lenses) > _measured.capacity // 2:
         ends = _ends(camera, camera.distortion).to(edges).reshape(-1, _AZIMUTHS, 2)
     else:
         ends = torch.stack([_kept(_ends, camera, lens) for lens in lenses])[which].to(edges)

@@ -12,13 +12,11 @@ from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
 from camtorch._portable import leading, plus
+from camtorch._registry import register
 from camtorch._threads import ALONE, undivided
-from camtorch._tracing import is_exporting, register
+from camtorch._tracing import is_exporting
 from camtorch.optics.derivatives import derivatives_of, vjp_of
 from camtorch.optics.special import angle_per_radius, first_root, root
-
-FACTORS: dict[str, type[RadialFactor]] = {}
-"""Every class of radial factors by its full name: operators take no classes."""
 
 
 def total(plane: Tensor) -> Tensor:
@@ -33,13 +31,13 @@ class RadialFactor:
     """
 
     name: str
-    """That of the class in `FACTORS`."""
+    """That of the class in the registry."""
     parameters: tuple[Tensor, ...]
     """What the formula learns, in the order in which `vjp` gives the cotangents."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        cls.name = register(FACTORS, cls)
+        cls.name = register(cls)
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.parameters: tuple[Tensor, ...] = tuple(coefficients)

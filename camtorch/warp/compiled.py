@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from threading import local
 from typing import Any
 
 import torch
@@ -115,14 +114,7 @@ def _layout(channels_last: bool) -> torch.memory_format:
     return torch.channels_last if channels_last else torch.contiguous_format
 
 
-class _Kept(local):
-    """The positions that a thread's last call used: masks are warped after their images, and cameras may be still."""
-
-    def __init__(self) -> None:
-        self.memo = Memo()
-
-
-_kept = _Kept()
+_located = Memo(2)  # masks are warped after their images, and cameras may be still
 
 
 @torch.library.custom_op("camtorch::warp", mutates_args=())
@@ -154,7 +146,7 @@ def _warp(
 
     inputs = [*numbers] if rotation is None else [*numbers, rotation]
     what = source_model, target_model, tuple(sizes), tolerance, antialias, padding, rotation is None
-    where = _kept.memo(inputs, what, positions)
+    where = _located(inputs, what, positions)
     options = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp"), tuple(fill)
     return render(images, where, *options).contiguous(memory_format=_layout(channels_last))
 
