@@ -13,12 +13,13 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees
 from camtorch._module import Memo
+from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph, is_concrete
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.camera import Camera, from_values
+from camtorch.camera import Camera
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.mixed import remade
 from camtorch.models import MODELS, KannalaBrandt
@@ -454,17 +455,18 @@ def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
             rim is measured there.
     """
     with torch.no_grad():
-        if torch.compiler.is_compiling():
-            numbers = camera.intrinsics, camera.distortion
-            coefficients: Tensor = _opaque_jittered(camera._model, *numbers, list(size_of(camera)), amounts, nominal)
-            return coefficients
-        return _jittered(camera, amounts, nominal)
+        return _jittered(camera, amounts, nominal)[0]
 
 
-def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
+def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
+    return (amounts.new_empty(*amounts.shape[:-1], camera.distortion.shape[-1]),)
+
+
+@opaque(_shapes)
+def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
     batch, count = amounts.shape[:-1], camera.distortion.shape[-1]
     if count == 0:
-        return camera.distortion.expand(*batch, 0)
+        return (camera.distortion.new_empty(*batch, 0),)
     amounts = amounts.reshape(-1, DRAWN)
     if count != DRAWN:
         amounts = amounts[:, :count] if count < DRAWN else amounts[:, torch.arange(count) % DRAWN]
@@ -489,21 +491,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
         first = fits.to(torch.uint8).argmax(0) * len(left) + torch.arange(len(left), device=left.device)
         some = fits.any(0)
         result[left] = torch.where(some.unsqueeze(-1), others.k[first], given[0])
-    return result.view(*batch, count)
-
-
-@torch.library.custom_op("camtorch::jittered", mutates_args=())
-def _opaque_jittered(
-    model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
-) -> Tensor:
-    return _jittered(from_values(model, intrinsics, distortion, size), amounts, nominal).clone()
-
-
-@_opaque_jittered.register_fake
-def _(
-    model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
-) -> Tensor:
-    return amounts.new_empty(*amounts.shape[:-1], distortion.shape[-1])
+    return (result.view(*batch, count),)
 
 
 _measured = Memo(24)  # of a batch of eight models
