@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, no_camera, shown
+from camtorch._arguments import as_image_size, as_number, fails, no_camera, shown
 from camtorch._module import typed_as
 from camtorch._threads import as_cores_are_free
-from camtorch._tracing import is_concrete
 from camtorch.augment.change import Change, Part, alone, camera_like, copied
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
@@ -120,7 +119,7 @@ class FaceNormalizer(SampleTransform):
                 f"its centre at {centre[row].tolist()}"
             )
         scale = self.distance / distance.detach()
-        if is_concrete(scale) and not bool(((scale < _ODD) & (scale > 1 / _ODD)).all()):
+        if fails((scale < _ODD) & (scale > 1 / _ODD)):
             at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())
             raise ValueError(
                 f"{self._name}: faces are at distances of {at}, but distance={self.distance:g}; both must be in one "

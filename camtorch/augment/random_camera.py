@@ -11,10 +11,10 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees
+from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees, fails
 from camtorch._module import Memo
 from camtorch._opaque import CameraNumbers, opaque
-from camtorch._tracing import in_graph, is_concrete
+from camtorch._tracing import in_graph
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
@@ -215,7 +215,7 @@ class RandomCamera(Augmentation):
         asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
         share = self.min_filled or 0.0
         key = self._name, asked, share
-        if asked is None or not is_concrete(factor) or key in _told or not bool((factor > 1).any()):
+        if asked is None or key in _told or not fails(factor <= 1):
             return
         made = _across(target)
         least = torch.minimum(_across(scaled(target, 1 / factor)), torch.full_like(made, asked))
@@ -309,7 +309,7 @@ class RandomCamera(Augmentation):
         if plane.batch_shape:
             rays = rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3)))
         ends, valid = plane.project(rays)
-        if is_concrete(valid) and not bool(valid.all()):
+        if fails(valid):
             raise ValueError(
                 f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees"
             )

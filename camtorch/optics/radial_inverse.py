@@ -23,7 +23,6 @@ from camtorch._portable import (
     times,
 )
 from camtorch._registry import CLASSES
-from camtorch._tracing import is_concrete, may_look
 from camtorch.optics.charts import even_steps_and_ratios
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
     # of numbers that are not known, or that another runtime is to compute with, it is looked for
-    known = radii.dtype == torch.float64 and is_concrete(radii) and not for_elsewhere()
+    known = radii.dtype == torch.float64 and not radii.is_meta and not for_elsewhere()
     if known and (fold := radial.closed_fold()) is not None:
         fold = fold.clamp(max=end)
         for _ in range(_LIMITING):
@@ -347,7 +346,7 @@ def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
 
 def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
-    scale, settled = solve(CLASSES[name](columns(k)), table, r2, may_look(r2))
+    scale, settled = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not for_elsewhere())
     camera, point = (~(settled > 0)).nonzero(as_tuple=True)
     if for_elsewhere() or len(camera):
         radial = CLASSES[name](of_points(k, camera))

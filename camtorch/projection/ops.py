@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from camtorch._arguments import columns
 from camtorch._registry import CLASSES
-from camtorch._tracing import in_transform, is_for_here
+from camtorch._tracing import in_transform, is_for_here, keeps_graph
 from camtorch.optics.radial_inverse import table_width
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.fold import AZIMUTHS
@@ -159,6 +159,30 @@ def positive(mask: Tensor) -> Tensor:
     """The mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
     compiled = is_for_here() and mask.device.type == "cpu"
     return _positive(mask.detach()) if compiled else mask > 0
+
+
+def as_kept(plane: Tensor) -> Tensor:
+    """The plane, for inductor to compute once: it repeats the whole expression of what is used twice while it compiles.
+
+    That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
+    """
+    return torch.as_strided(plane, plane.shape, plane.stride()) if is_for_here() else plane
+
+
+def power_of_two(size: Tensor) -> Tensor:
+    """The largest one not above: to divide by it costs no bit."""
+    if torch.compiler.is_compiling():  # which leaves its vectors for bits
+        return size
+    if in_transform():  # torch.vmap looks at no bits before torch 2.11
+        return size / torch.frexp(size).mantissa / 2
+    exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
+    return (size.view(integer) & exponent).view(size.dtype)
+
+
+def order_of(order: int, *inputs: Tensor) -> int:
+    """Of the derivatives that a recorded inverse has to have: compiled code that does not learn needs none."""
+    compiled = torch.compiler.is_compiling() and not in_transform()
+    return 0 if compiled and not keeps_graph(*inputs) else order
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:

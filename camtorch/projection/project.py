@@ -10,15 +10,13 @@ from torch.autograd import Function
 
 from camtorch._arguments import columns
 from camtorch._threads import as_cores_are_free
-from camtorch._tracing import in_transform
 from camtorch.optics.charts import Planes3, floor_of
-from camtorch.projection.ops import positive, to_planes, without_keeping
+from camtorch.projection.ops import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.projection.rows import (
     FEW,
     Cameras,
     Sums,
     Traced,
-    as_kept,
     blocks,
     both,
     by_formulas,
@@ -80,23 +78,13 @@ def normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, looks: bool) -> Ray
         # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
         valid = ((size > floor_of(size.dtype)) & (size < torch.inf)).to(size.dtype)
         # a constant: the projection does not depend on the distance, so this has no part in its derivative
-        shrink = as_kept(_power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
+        shrink = as_kept(power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
         x_0, y_0, z_0 = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x_0, 0.0), (y_0, 0.0), (z_0, 1.0)))
         x, y, z = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
     mask = both(valid, to_mask(chart.margin(x_0, y_0, z_0), looks))
     mask = None if mask is None else as_kept(mask)
     x, y, z = (replace(mask, w, axis, looks) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
     return Ray(x, y, z, shrink, mask)
-
-
-def _power_of_two(size: Tensor) -> Tensor:
-    """The largest one not above: to divide by it costs no bit."""
-    if torch.compiler.is_compiling():  # which leaves its vectors for bits
-        return size
-    if in_transform():  # torch.vmap looks at no bits before torch 2.11
-        return size / torch.frexp(size).mantissa / 2
-    exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
-    return (size.view(integer) & exponent).view(size.dtype)
 
 
 def see(

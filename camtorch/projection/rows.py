@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns
+from camtorch._arguments import columns, holds
 from camtorch._portable import for_elsewhere
 from camtorch._threads import ALONE, EVEN, split
-from camtorch._tracing import is_for_here, may_look
 from camtorch.optics.radial import total
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
@@ -55,7 +54,7 @@ class Cameras(NamedTuple):
         with torch.no_grad():
             given = intrinsics.detach().clone(), distortion.detach().clone()
             usable, values, mask = _usable(model, *given), given, None
-            if not (may_look(usable) and bool(usable.all())):
+            if not holds(usable):
                 ideal = _ideal(model, *given)
                 values = torch.where(usable, given[0], ideal[0]), torch.where(usable, given[1], ideal[1])
                 mask = usable.to(intrinsics.dtype)
@@ -197,14 +196,6 @@ def both(*masks: Tensor | None) -> Tensor | None:
         if mask is not None:
             product = mask if product is None else product * mask
     return product
-
-
-def as_kept(plane: Tensor) -> Tensor:
-    """The plane, for inductor to compute once: it repeats the whole expression of what is used twice while it compiles.
-
-    That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
-    """
-    return torch.as_strided(plane, plane.shape, plane.stride()) if is_for_here() else plane
 
 
 # -- derivatives

@@ -12,10 +12,9 @@ from torch.autograd import Function
 from camtorch._arguments import columns
 from camtorch._portable import for_elsewhere, times
 from camtorch._threads import as_cores_are_free
-from camtorch._tracing import in_transform, keeps_graph
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, BriefTable, short, solve
-from camtorch.projection.ops import positive, search_in_place, search_open, to_planes, without_keeping
+from camtorch.projection.ops import order_of, positive, search_in_place, search_open, to_planes, without_keeping
 from camtorch.projection.rows import (
     FEW,
     Block,
@@ -316,9 +315,7 @@ class Unproject(Function):
             rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
             return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
-        learns = keeps_graph(pixels, intrinsics, distortion)
-        if torch.compiler.is_compiling() and not learns and not in_transform():
-            order = 0
+        order = order_of(order, pixels, intrinsics, distortion)
         rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
         return rays, positive(torch.ones_like(a) if mask is None else mask.expand_as(a))
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import Memo
 from camtorch._opaque import CameraNumbers, opaque
-from camtorch._tracing import is_exporting
 from camtorch.camera import Camera, from_values
 from camtorch.native.sampler import layout
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
@@ -61,9 +60,7 @@ def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
         images: of the source.
         inputs: all that the positions depend on.
     """
-    return not is_exporting() and all(
-        t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs)
-    )
+    return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
 
 
 def warped(

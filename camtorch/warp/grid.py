@@ -127,6 +127,11 @@ class Lattice:
         return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None, self.seam)
 
 
+def is_plain(*tensors: Tensor) -> bool:
+    """Whether tensors are the CPU's, and neither a graph nor a transform is at work."""
+    return not in_transform() and all(t.is_cpu and not in_graph(t) for t in tensors)
+
+
 @as_cores_are_free
 def locate(
     source: Camera,
@@ -247,7 +252,7 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
 
     Without a graph that happens in the memory of the pixels.
     """
-    if may_look(seen) and not in_graph(seen) and not in_transform():
+    if may_look(seen) and is_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
             plane.mul_(2 / side).add_(1 / side - 1).clamp_(-_FAR, _FAR)
         if not bool(mapped.all()):
