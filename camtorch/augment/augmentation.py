@@ -15,7 +15,7 @@ from torch import Tensor
 
 from camtorch._arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, fails, holds, shown
 from camtorch._module import typed_as
-from camtorch._threads import as_cores_are_free
+from camtorch._threads import on_one_thread
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, rows_of, size_of
 from camtorch.augment.filling import enough, filled, scaled
@@ -446,7 +446,7 @@ class Augmentation(SampleTransform):
 
     # -- applying
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def forward(
         self,
@@ -482,7 +482,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def inverse(
         self,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, fails, no_camera, shown
 from camtorch._module import typed_as
-from camtorch._threads import as_cores_are_free
+from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, Part, alone, camera_like, copied
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
@@ -132,7 +132,7 @@ class FaceNormalizer(SampleTransform):
         target = camera_like(Pinhole([1.0, 1.0, 0.0, 0.0]), intrinsics, intrinsics[..., :0], self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Normalise a sample, a dict or keyword arguments.
@@ -164,7 +164,7 @@ class FaceNormalizer(SampleTransform):
             moved["source_rotation"] = sample["rotation"].clone()
         return moved
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Move what was predicted on a normalised sample back to the frame and the image of its source camera.

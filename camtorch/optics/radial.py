@@ -13,15 +13,14 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch._portable import leading, plus
 from camtorch._registry import register
-from camtorch._threads import ALONE, undivided
 from camtorch._tracing import is_exporting
 from camtorch.optics.derivatives import derivatives_of, vjp_of
 from camtorch.optics.special import angle_per_radius, first_root, root
 
 
 def total(plane: Tensor) -> Tensor:
-    """(*B, N) -> (*B, 1). Within `as_cores_are_free` it is rounded alike by any number of threads."""
-    return undivided(lambda: plane.sum(-1, keepdim=True)) if plane.numel() > ALONE else plane.sum(-1, keepdim=True)
+    """(*B, N) -> (*B, 1)."""
+    return plane.sum(-1, keepdim=True)
 
 
 class RadialFactor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from camtorch._portable import plus
-from camtorch._threads import ALONE, EVEN, is_split
+from camtorch._threads import ALONE, EVEN
 from camtorch._tracing import is_exporting
 
 _PAIR = 32  # numbers of two vectors of 64 bytes, or a multiple
@@ -83,7 +83,7 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
     if is_exporting():
         return _recorded_atan2(y, x)
     count = y.numel()
-    if torch.compiler.is_compiling() or not y.is_cpu or count % (EVEN if is_split() and count > ALONE else _PAIR) == 0:
+    if torch.compiler.is_compiling() or not y.is_cpu or count % (EVEN if count > ALONE else _PAIR) == 0:
         return torch.atan2(y, x)
     y, x, shape = y.reshape(-1), x.reshape(-1), y.shape
     even = count // EVEN * EVEN if count > ALONE else 0

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._threads import as_cores_are_free
+from camtorch._threads import on_one_thread
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
@@ -132,7 +132,7 @@ def is_plain(*tensors: Tensor) -> bool:
     return not in_transform() and all(t.is_cpu and not in_graph(t) for t in tensors)
 
 
-@as_cores_are_free
+@on_one_thread
 def locate(
     source: Camera,
     target: Camera,
@@ -173,7 +173,7 @@ def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
     return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size("Warp"), seam), seam)
 
 
-@as_cores_are_free
+@on_one_thread
 def tabulate(
     source: Camera,
     target: Camera,

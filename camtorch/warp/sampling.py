@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch._arguments import as_flag, as_number, shown
 from camtorch._dtypes import SIGNED, narrow, wide_dtype, widen
-from camtorch._threads import as_cores_are_free, thread_count
+from camtorch._threads import thread_count
 from camtorch._tracing import converted, in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
@@ -171,7 +171,6 @@ def blended(parts: Iterable[Tensor], weights: Iterable[Tensor], mode: Mode) -> T
     return result
 
 
-@as_cores_are_free
 def _by_torch(
     images: Tensor,
     where: Sampling | Lattice,
