@@ -148,11 +148,14 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
         if torch.compiler.is_compiling() or torch.jit.is_tracing() or _limits is None or _mine.threads:  # type: ignore[attr-defined]
             return function(*args, **kwargs)
         _mine.threads = torch.get_num_threads()
-        of_mkl = _limit(1, 1)
+        openmp, mkl = _limits  # torch.set_num_threads reaches other threads as well
+        openmp(1)
+        of_mkl = mkl(1)  # which splits what torch has not split
         try:
             return function(*args, **kwargs)
         finally:
-            _limit(_mine.threads, of_mkl)
+            openmp(_mine.threads)
+            mkl(of_mkl)
             _mine.threads = 0
 
     return call
@@ -168,15 +171,7 @@ class _Mine(threading.local):
     """Among how many threads operations are split before and after the function `on_one_thread`; 0 in none."""
 
 
-def _limit(threads: int, of_mkl: int) -> int:
-    """Among how many the operations of this thread are split, and what torch leaves to MKL; the latter before."""
-    assert _limits is not None  # or nobody comes here
-    openmp, mkl = _limits
-    openmp(threads)  # torch.set_num_threads reaches other threads as well
-    return 0 if mkl is None else mkl(of_mkl)
-
-
-def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int] | None] | None:
+def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int]] | None:
     """How OpenMP, and MKL where it is used, are told among how many threads to split the work of the calling one."""
     if sys.platform == "win32":
         return None
@@ -190,7 +185,7 @@ def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int] | None
         is_it = torch.get_num_threads() == threads + 1
         openmp(threads)
         if is_it:
-            return openmp, getattr(of_torch, "MKL_Set_Num_Threads_Local", None)
+            return openmp, getattr(of_torch, "MKL_Set_Num_Threads_Local", int)
     return None
 
 

@@ -169,7 +169,7 @@ def over_blocks(given: Cameras, rows: Tensor, work: Callable[[Block], R]) -> lis
     """
     parts = list(blocks(given, rows))
     if not given.looks or rows.shape[:2].numel() <= ALONE:
-        return [work(part) for part in parts]
+        return list(map(work, parts))
     results: dict[int, R] = {}
     left, inference = iter(enumerate(parts)), torch.is_inference_mode_enabled()
 

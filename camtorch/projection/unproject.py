@@ -336,7 +336,9 @@ class Unproject(Function):
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
         brief = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
 
-        def evaluate(block: Block) -> tuple[bool, list[tuple[Tensor, ...]]]:
+        all_valid, left_open = True, []
+
+        def evaluate(block: Block) -> tuple[bool, Iterable[tuple[Tensor, ...]]]:
             """Whether all is valid, and what is left open."""
             here, domain = block.here, block.domain
             u, v = planes_of(pixels[here])
@@ -348,10 +350,11 @@ class Unproject(Function):
                 solution[0][here], solution[1][here] = a, b
             if mask is not None:
                 valid[here] = mask > 0
-            return mask is None, [] if left is None else list(_places(block, target, left))
+            return mask is None, () if left is None else _places(block, target, left)
 
-        parts = over_blocks(cameras, pixels, evaluate)
-        all_valid, left_open = all(part[0] for part in parts), [places for part in parts for places in part[1]]
+        for is_valid, places in over_blocks(cameras, pixels, evaluate):
+            all_valid = all_valid and is_valid
+            left_open += places
         if left_open:
             _search(cameras, left_open, rays, solution, valid)
         if keeps:
