@@ -140,12 +140,15 @@ EVEN = 3 * 4 * 2 * 16
 """Multiples of so many elements are split between pairs of vectors, up to 64 bytes wide, by one to four threads."""
 
 
+_in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
+
+
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
     """Leave the operations of a function undivided on the CPU; so their results are always the same."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or torch.jit.is_tracing() or _limits is None or _mine.threads:  # type: ignore[attr-defined]
+        if torch.compiler.is_compiling() or _in_jit_trace() or _limits is None or _mine.threads:
             return function(*args, **kwargs)
         _mine.threads = torch.get_num_threads()
         openmp, mkl = _limits  # torch.set_num_threads reaches other threads as well

@@ -329,7 +329,7 @@ class RadialInverse:
         if for_elsewhere():
             inner2 = self.inner2.reshape(-1, 1)
             return _scale(self.factor.name, self.k, inner2, self._table, rows).view_as(r2)
-        found, _, _ = _radial_inverse(self.factor.name, self.k, self.end, rows)
+        found: Tensor = _radial_inverse(self.factor.name, self.k, self.end, rows)[0]
         return found.view_as(r2)
 
 

@@ -336,7 +336,8 @@ class Unproject(Function):
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
         brief = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
 
-        all_valid, left_open = True, []
+        all_valid = True
+        left_open: list[tuple[Tensor, ...]] = []
 
         def evaluate(block: Block) -> tuple[bool, Iterable[tuple[Tensor, ...]]]:
             """Whether all is valid, and what is left open."""
