@@ -46,6 +46,26 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
     return value
 
 
+def fails(condition: Tensor) -> bool:
+    """Whether a condition is known not to hold everywhere: what is traced is not checked."""
+    return is_concrete(condition) and not bool(condition.all())
+
+
+def holds(condition: Tensor) -> bool:
+    """Whether a condition is known to hold everywhere: False where that would take more than a quick look."""
+    return may_look(condition) and bool(condition.all())
+
+
+def values_of(tensor: Tensor) -> Tensor | None:
+    """The values in float64 in the CPU's memory; None where they may not be looked at."""
+    return tensor.detach().to("cpu", torch.float64) if is_concrete(tensor) else None
+
+
+def as_own(value: Tensor) -> Tensor:
+    """A Parameter or a tensor of a graph as it is, of other values a copy."""
+    return value if isinstance(value, nn.Parameter) or in_graph(value) else value.detach().clone()
+
+
 def _check_list(value: object, name: str, owner: str) -> None:
     if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
         raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")

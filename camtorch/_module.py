@@ -226,7 +226,7 @@ class BatchedModule(GeometryModule):
         nn.Module.__init__(made)
         for name, value in self.__dict__.items():
             if name not in made.__dict__:
-                made.__dict__[name] = Memo() if isinstance(value, Memo) else value
+                made.__dict__[name] = Memo(value.capacity) if isinstance(value, Memo) else value
         made.training = self.training
         for name, tensor in tensors.items():
             made.hold(name, tensor, tuple(tensor.shape))
@@ -234,37 +234,42 @@ class BatchedModule(GeometryModule):
 
 
 class Memo:
-    """The last result of a computation, kept until one of its inputs changes.
+    """The last results of a computation, by the values of its inputs.
 
     Values are compared, not versions: a change through `.data`, or by functional_call, leaves no other trace.
     Nothing is kept while the values may not be looked at. Copies and pickles begin empty.
     """
 
+    capacity: int
     result: Any = None
-    """What is kept, of whatever inputs."""
+    """The one that was asked for last, of whatever inputs."""
 
-    def __init__(self) -> None:
-        self._kept: tuple[Any, ...] | None = None
+    def __init__(self, capacity: int = 1) -> None:
+        self.capacity = capacity
+        self._kept: list[tuple[tuple[Any, ...], list[Tensor], Any]] = []  # the last one used is first
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
         if not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
-        if self._kept is not None:
-            kept_inputs, kept_options = self._kept
-            if options == kept_options and all(map(same, inputs, kept_inputs)):
-                return self.result
+        known = self._kept
+        for i, entry in enumerate(known):
+            if options == entry[0] and all(map(same, inputs, entry[1])):
+                if i:  # a list of its own: another thread may be looking at this one
+                    self._kept = [entry, *known[:i], *known[i + 1 :]]
+                self.result = entry[2]
+                return entry[2]
         if in_transform():  # what a transform makes dies with it
             return compute()
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
             copies = [t.detach().clone() for t in inputs]
             result = compute()
-        self._kept, self.result = (copies, options), result
+        self._kept, self.result = [(options, copies, result), *self._kept[: self.capacity - 1]], result
         return result
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_kept": None}
+        return {"capacity": self.capacity, "_kept": []}
 
 
 def same(a: Tensor, b: Tensor) -> bool:

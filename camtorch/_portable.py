@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor
 
+from camtorch._arguments import broadcast_shapes
 from camtorch._tracing import is_exporting
 
 
@@ -134,3 +136,65 @@ def repeat(
     start = (torch.zeros((), dtype=torch.int64, device=moves.device), moves, *(w.clone() for w in state))
     result: tuple[Tensor, ...] = while_loop(goes_on, body, start)
     return result[1:]
+
+
+def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
+    """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
+    if is_exporting():  # one by one: few, or the memory of all comparisons
+        passed = [(node <= place).long() for node in nodes]
+        return reduce(torch.add, passed)
+    table = torch.stack(nodes, -1).contiguous()
+    if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own
+        return torch.searchsorted(table, place.unsqueeze(-1).contiguous(), right=True).squeeze(-1)
+    table = table.squeeze(-2).expand(*place.shape[:-1], -1)
+    return torch.searchsorted(table.contiguous(), place.contiguous(), right=True)
+
+
+def pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
+    """From each plane's own columns the one of that index."""
+    if is_exporting():  # no sizes are compared, which may be unknown
+        found = columns[0] + torch.zeros_like(index, dtype=columns[0].dtype)
+        for i, column in enumerate(columns[1:], 1):
+            found = torch.where(index == i, column, found)
+        return found
+    table = torch.stack(torch.broadcast_tensors(*columns), -1)
+    shape = broadcast_shapes(table.shape[:-1], index.shape)
+    return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
+
+
+def solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor) -> Tensor:
+    """The solution (*B, N) of equations with diagonals (*B, N - 1), (*B, N), (*B, N - 1)."""
+    if not is_exporting():
+        matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
+        found: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
+        return found
+    # by Gauss's elimination from the first to the last, and back
+    lower, upper, pivots, values = below.unbind(-1), above.unbind(-1), [main[..., 0]], [right[..., 0]]
+    for i, factor in enumerate(lower):
+        share = factor / pivots[i]
+        pivots.append(main[..., i + 1] - share * upper[i])
+        values.append(right[..., i + 1] - share * values[i])
+    solution = [values[-1] / pivots[-1]]
+    for i in reversed(range(len(upper))):
+        solution.append((values[i] - upper[i] * solution[-1]) / pivots[i])
+    return torch.stack(solution[::-1], -1)
+
+
+def unbound(table: Tensor) -> tuple[Tensor, ...]:
+    """The columns (...) of a table (..., N)."""
+    columns = table.unbind(-1)
+    return tuple(c.clone() for c in columns) if is_exporting() else columns  # a recorded loop takes no views of one
+
+
+def exported_atan2(y: Tensor, x: Tensor) -> Tensor:
+    """torch.atan2 for ONNX, whose composed one is -pi at y = 0 behind; ONNX Runtime has none in float64."""
+    y, x = torch.broadcast_tensors(y, x)
+    behind = (y == 0) & (x < 0)
+    if y.dtype != torch.float64:
+        return torch.where(behind, math.pi, torch.atan2(y, x))
+    nearly = torch.where(behind, math.pi, torch.atan2(y.float(), x.float())).double()
+    c, s = torch.cos(nearly), torch.sin(nearly)
+    along = x * c + y * s
+    # what is left is about 1e-7, whose fifth power is nothing
+    rest = torch.where(along > 0, (y * c - x * s) / torch.where(along > 0, along, 1.0), 0.0)
+    return nearly + (rest - rest * rest * rest / 3)

@@ -1,13 +1,11 @@
-"""Work that threads share: a caller with the workers of a pool, and the threads of torch where they have free cores."""
+"""Work that threads share: a caller with the workers of a pool; and work that torch shall not split among its own."""
 
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable
 from functools import wraps
 from queue import SimpleQueue
@@ -15,8 +13,6 @@ from threading import Lock, Thread
 from typing import ParamSpec, TypeVar
 
 import torch
-
-from camtorch._tracing import in_jit_trace
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -135,170 +131,50 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 # -- the threads of torch
 #
 # Each of its operations is split among them and waits until all have done their part: for milliseconds, where another
-# process has the core of one. To a chain of a hundred operations that happens a hundred times.
+# process has the core of one. To a chain of a hundred operations that happens a hundred times. So such chains run on
+# one thread, or on several that each do a part of their own.
 
 ALONE = (1 << 15) - 1
-"""Elements up to which it is not worth while to split an operation."""
+"""Elements up to which torch does not split an operation."""
 EVEN = 3 * 4 * 2 * 16
 """Multiples of so many elements are split between pairs of vectors, up to 64 bytes wide, by one to four threads."""
-_GLANCE = 1e-3  # seconds for which a look at the cores holds
-_SPIN = 1e-3  # seconds for which threads certainly go on running after an operation
-_LONGEST = 0.5  # seconds
-_CORES = os.cpu_count() or 1
 
 
-def as_cores_are_free(function: Callable[P, R]) -> Callable[P, R]:
-    """Let torch split the operations of a function, on the CPU, only where its threads have cores to run on.
-
-    That is looked at when it begins, and wherever it calls `split`. Results shall not depend on it: a single sum over
-    more than `ALONE` elements has to be `undivided`, and for atan2 there is `optics.special.atan2`. What autograd sums
-    does depend on it, as it does on the number of torch's threads.
-    """
-
-    @wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or in_jit_trace():  # its sizes are tensors
-            return function(*args, **kwargs)
-        if _mine.threads:  # of a function that called this one, and goes on as before
-            was_alone = _mine.is_alone
-            try:
-                return function(*args, **kwargs)
-            finally:
-                _mine.set_alone(was_alone)
-        _mine.threads = torch.get_num_threads() if _limits is not None else 1
-        try:
-            split()
-            return function(*args, **kwargs)
-        finally:
-            if _mine.was_split:
-                _crowd.last_together = time.perf_counter()
-            _mine.set_alone(False)
-            _mine.threads, _mine.was_split = 0, False
-
-    return call
+_in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
 
 
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Leave the operations of a function undivided on the CPU: many small ones, whose results are always the same."""
+    """Leave the operations of a function undivided on the CPU; so their results are always the same."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or in_jit_trace() or _limits is None or _mine.stays_alone:
+        if torch.compiler.is_compiling() or _in_jit_trace() or _limits is None or _mine.threads:
             return function(*args, **kwargs)
-        threads, was_alone = _mine.threads, _mine.is_alone
-        _mine.threads, _mine.stays_alone = threads or torch.get_num_threads(), True
+        _mine.threads = torch.get_num_threads()
+        openmp, mkl = _limits  # torch.set_num_threads reaches other threads as well
+        openmp(1)
+        of_mkl = mkl(1)  # which splits what torch has not split
         try:
-            _mine.set_alone(True)
             return function(*args, **kwargs)
         finally:
-            _mine.set_alone(was_alone)
-            _mine.threads, _mine.stays_alone = threads, False
+            openmp(_mine.threads)
+            mkl(of_mkl)
+            _mine.threads = 0
 
     return call
 
 
-def split(elements: int | None = None) -> None:
-    """Whether the next operations are to be split. elements: of each of them, if that is known."""
-    if _mine.threads > 1 and not _mine.stays_alone:
-        small = elements is not None and elements <= ALONE
-        _mine.set_alone(small or _crowd.meets(_mine.threads, _mine.was_split))
-        _mine.was_split = elements is not None and not _mine.is_alone
-
-
 def thread_count() -> int:
-    """Of torch on this thread: `torch.get_num_threads()`, also while a function that goes by free cores has but one."""
-    return max(_mine.threads, torch.get_num_threads())
-
-
-def is_split() -> bool:
-    """Whether operations on large tensors are split, in a function that goes by free cores."""
-    return _mine.threads > 1 and not _mine.is_alone
-
-
-def undivided(operation: Callable[[], R]) -> R:
-    """The result of an operation that is not split: a single sum, which would be rounded otherwise."""
-    if not is_split():
-        return operation()
-    _mine.set_alone(True)
-    try:
-        return operation()
-    finally:
-        _mine.set_alone(False)
+    """Of torch on this thread: `torch.get_num_threads()`, also in a function that leaves operations undivided."""
+    return _mine.threads or torch.get_num_threads()
 
 
 class _Mine(threading.local):
-    """Among how many threads the operations of this thread are split, while a function goes by free cores."""
-
     threads = 0
-    """Before and after it; 0 where there is none."""
-    is_alone = False
-    was_split = False
-    """Whether the last operations were."""
-    stays_alone = False
-    """Whether that is so to the end of a function."""
-    _of_mkl = 0
-
-    def set_alone(self, alone: bool) -> None:
-        """Split them, or not."""
-        if alone != self.is_alone:
-            assert _limits is not None  # there is but one thread otherwise
-            # not torch.set_num_threads: that reaches other threads as well
-            openmp, mkl = _limits
-            self.is_alone = alone
-            openmp(1 if alone else self.threads)
-            if mkl is not None:  # which splits what torch has not split
-                self._of_mkl = mkl(1 if alone else self._of_mkl)
+    """Among how many threads operations are split before and after the function `on_one_thread`; 0 in none."""
 
 
-class _Crowd:
-    """Whether more threads, of all processes, want to run than there are cores.
-
-    Torch's own are among them while they are at work, and for a moment after, so that a look taken then tells what is
-    there beside them. Who computes alone does not know whether there is room for them as well, unless he is the only
-    one. So after a crowd they stay away for a while, twice as long if there was one again as soon as they were back.
-    """
-
-    def __init__(self) -> None:
-        self.is_here = False
-        self.last_together = -math.inf
-        """When torch's threads were last at work."""
-        self._pause = _GLANCE
-        self._next_look = self._doubt_ends = -math.inf
-
-    def meets(self, threads: int, together: bool) -> bool:
-        """Whether so many threads of torch would be in it. together: whether they have just been at work."""
-        now = time.perf_counter()
-        if together:
-            self.last_together = now
-        if now < self._next_look:
-            return self.is_here
-        wanting, room = _wanting(), max(_CORES, threads)
-        beside_them = now < self.last_together + _SPIN
-        if wanting > room:
-            if beside_them:
-                self._doubt_ends, self._pause = now + self._pause, min(2 * self._pause, _LONGEST)
-            self.is_here = True
-        elif wanting - 1 + threads <= room or now >= self._doubt_ends:
-            if beside_them:
-                self._pause = _GLANCE
-            self.is_here = False
-        self._next_look = now + _GLANCE
-        return self.is_here
-
-
-def _wanting() -> int:
-    """How many threads of all processes run or want to; 0 where there is nobody to ask."""
-    try:
-        file = os.open("/proc/loadavg", os.O_RDONLY)
-    except OSError:
-        return 0
-    try:
-        return int(os.read(file, 64).split()[3].partition(b"/")[0])
-    finally:
-        os.close(file)
-
-
-def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int] | None] | None:
+def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int]] | None:
     """How OpenMP, and MKL where it is used, are told among how many threads to split the work of the calling one."""
     if sys.platform == "win32":
         return None
@@ -312,10 +188,9 @@ def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int] | None
         is_it = torch.get_num_threads() == threads + 1
         openmp(threads)
         if is_it:
-            return openmp, getattr(of_torch, "MKL_Set_Num_Threads_Local", None)
+            return openmp, getattr(of_torch, "MKL_Set_Num_Threads_Local", int)
     return None
 
 
 _limits = _find_limits()
 _mine = _Mine()
-_crowd = _Crowd()

@@ -113,16 +113,3 @@ def converted(tensor: Tensor, dtype: torch.dtype) -> Tensor:
 def may_look(tensor: Tensor) -> bool:
     """Whether the values may be looked at and that costs next to nothing, to take a shorter way with a whole block."""
     return tensor.is_cpu and is_concrete(tensor) and tensor.numel() > 0
-
-
-def register(registry: dict[str, type], entry: type) -> str:
-    """Put a class into a registry under its full name: operators, which take no classes, find it by that.
-
-    A class of the same name, made by a function that was called again, gets a name of its own.
-    """
-    wanted = name = f"{entry.__module__}.{entry.__qualname__}"
-    count = 2
-    while name in registry:
-        name, count = f"{wanted}#{count}", count + 1
-    registry[name] = entry
-    return name

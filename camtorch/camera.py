@@ -31,6 +31,7 @@ from camtorch._arguments import (
 )
 from camtorch._module import BatchedModule, Memo, is_constant, typed_as, with_values
 from camtorch._portable import for_elsewhere
+from camtorch._registry import CLASSES, register
 from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, in_jit_trace, is_concrete, is_exporting, keeps_graph
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
@@ -38,7 +39,6 @@ from camtorch.optics.lens import Lens
 from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.projection.explanation import explain, unusable
 from camtorch.projection.fields import local_pinhole, patch_centres, perspective_field, plucker
-from camtorch.projection.ops import CLASSES, register_camera
 from camtorch.projection.project import Project
 from camtorch.projection.rays import AXES, field_of_view, focal_for
 from camtorch.projection.rows import Cameras
@@ -146,7 +146,7 @@ class Camera(BatchedModule):
                     f"{cls.__name__}: {name} must be a @staticmethod of the coefficients k alone; got a "
                     f"{type(inspect.getattr_static(cls, name)).__name__}"
                 )
-        cls._model = register_camera(cls)
+        cls._model = register(cls)
         if "key" not in cls.__dict__:
             cls.key = ""
             return
@@ -978,7 +978,7 @@ def from_values(model: str, intrinsics: Tensor, distortion: Tensor, image_size: 
         distortion: (*B, n).
         image_size: (height, width).
     """
-    kind = CLASSES[model]
+    kind: type[Camera] = CLASSES[model]
     # of any values, to be replaced; bad ones give results that are invalid, and no error
     usual = [torch.ones(4)] + [torch.tensor(kind.ideal(n)) for n in distortion.shape[-1:] if n]
     made: Camera = kind(*usual, image_size=(image_size[0], image_size[1]))

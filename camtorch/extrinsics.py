@@ -18,9 +18,10 @@ from camtorch._arguments import (
     check_devices,
     check_radians,
     columns,
+    fails,
+    values_of,
 )
 from camtorch._module import BatchedModule, typed_as
-from camtorch._tracing import is_concrete
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
 
@@ -118,9 +119,9 @@ class Extrinsics(BatchedModule):
             raise ValueError(
                 f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}{hint}"
             )
-        if matrix.shape[-2] == 4 and is_concrete(matrix):
+        if matrix.shape[-2] == 4:
             bottom = matrix[..., 3, :].detach()
-            if bool((bottom != bottom.new_tensor([0, 0, 0, 1])).any()):
+            if fails(bottom == bottom.new_tensor([0, 0, 0, 1])):
                 raise ValueError(f"Extrinsics: the last row of matrix must be 0 0 0 1; got {bottom.tolist()}")
         rotation = matrix[..., :3, :3]
         check_rotation(rotation, "matrix", "Extrinsics")
@@ -153,9 +154,10 @@ class Extrinsics(BatchedModule):
 
     def extra_repr(self) -> str:
         """Batch, or the numbers of a single pose."""
-        if self.batch_shape or not is_concrete(self.rotation):
+        rotation, translation = values_of(self.rotation), values_of(self.translation)
+        if self.batch_shape or rotation is None or translation is None:
             return f"batch_shape={tuple(self.batch_shape)}"
-        return f"rotation={self.rotation.tolist()}, translation={self.translation.tolist()}"
+        return f"rotation={rotation.tolist()}, translation={translation.tolist()}"
 
 
 def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
@@ -165,7 +167,7 @@ def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
         ValueError: they may be both, or neither.
     """
     beside = translation.ndim == rotation.ndim - 1
-    if not is_concrete(rotation):
+    if values_of(rotation) is None:
         return beside
     if is_rotation(rotation):
         if translation.shape[-2:] == (3, 3) and not beside:

@@ -9,9 +9,8 @@ from typing import TypeVar, cast
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_mapping, shown
+from camtorch._arguments import as_mapping, shown, values_of
 from camtorch._module import BatchedModule
-from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 
@@ -279,8 +278,8 @@ def _line(name: str, camera: Camera, extrinsics: Extrinsics | None) -> str:
     numbers = where = ""
     if camera.batch_shape:
         numbers = f" batch_shape={tuple(camera.batch_shape)}"
-    elif is_concrete(camera.intrinsics):
-        numbers = " ({:.7g}, {:.7g}, {:.7g}, {:.7g})".format(*camera.intrinsics.tolist())
-    if extrinsics is not None and not extrinsics.batch_shape and is_concrete(extrinsics.translation):
-        where = " at ({:.4g}, {:.4g}, {:.4g})".format(*(extrinsics.position + 0.0).tolist())
+    elif (values := values_of(camera.intrinsics)) is not None:
+        numbers = " ({:.7g}, {:.7g}, {:.7g}, {:.7g})".format(*values.tolist())
+    if extrinsics is not None and not extrinsics.batch_shape and (at := values_of(extrinsics.position)) is not None:
+        where = " at ({:.4g}, {:.4g}, {:.4g})".format(*(at + 0.0).tolist())
     return f"  {name}: {type_before_parametrizations(camera).__name__}{size}{numbers}{where}"

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from camtorch._arguments import Numbers, as_real, as_rows, as_values, check_devices
-from camtorch._tracing import in_graph, is_concrete, may_look
+from camtorch._arguments import Numbers, as_own, as_real, as_rows, as_values, check_devices, fails, holds
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 
 
@@ -70,7 +67,7 @@ def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, .
     x, y, z = planes
     rows = [row.unsqueeze(-1).unbind(-2) for row in matrix.unbind(-2)]
     # a sum shows what is not finite: the whole planes are looked at once
-    if may_look(x) and math.isfinite(x.detach().sum() + y.detach().sum() + z.detach().sum()):
+    if x.is_cpu and holds(torch.isfinite(x.detach().sum() + y.detach().sum() + z.detach().sum())):
         return tuple(torch.addcmul(torch.addcmul(a * x, b, y), c, z) for a, b, c in rows)
     finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
     x, y, z = (torch.where(finite, plane, 0.0) for plane in planes)
@@ -79,7 +76,7 @@ def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, .
 
 def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> None:
     """Raise a ValueError unless (*B, 3, 3) are rotations, to the precision that files store them with."""
-    if is_concrete(matrix) and not is_rotation(matrix):
+    if fails(are_rotations(matrix)):
         values = matrix.detach().double()
         error = rotation_error(values).max().item()
         raise ValueError(
@@ -115,7 +112,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
         hint = hint if rotation.shape[-1:] == (3,) or rotation.shape[-2:] == (3, 1) else ""
         raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}{hint}")
     check_rotation(rotation, "rotation", owner)
-    return rotation if isinstance(rotation, nn.Parameter) or in_graph(rotation) else rotation.detach().clone()
+    return as_own(rotation)
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:

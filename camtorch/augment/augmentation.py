@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
 import torch
 from torch import Tensor
 
-from camtorch._arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, shown
+from camtorch._arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, fails, holds, shown
 from camtorch._module import typed_as
-from camtorch._threads import as_cores_are_free
+from camtorch._threads import on_one_thread
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, rows_of, size_of
 from camtorch.augment.filling import enough, filled, scaled
@@ -412,10 +412,9 @@ class Augmentation(SampleTransform):
 
     def _tell_of_too_few(self, found: Tensor, share: float) -> None:
         """Warn, once, if less than a share of some images was found filled."""
-        few = int((found < share).sum()) if is_concrete(found) else 0
-        if self._warned or not few:
+        if self._warned or not fails(found >= share):
             return
-        self._warned = True
+        self._warned, few = True, int((found < share).sum())
         warnings.warn(
             f"{self._name}: min_filled={share:g} is out of reach for {few} of {found.numel()} new images, of "
             f"which down to {float(found.min()):.0%} shows something: the camera of the images does not see along the "
@@ -447,7 +446,7 @@ class Augmentation(SampleTransform):
 
     # -- applying
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def forward(
         self,
@@ -483,7 +482,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def inverse(
         self,
@@ -532,6 +531,4 @@ class Augmentation(SampleTransform):
 
 def _one_for_all(values: Mapping[str, Tensor]) -> bool:
     """Whether all samples draw the same. Of none, nothing can be said."""
-    if not all(may_look(value) for value in values.values()):
-        return False
-    return all(len(value) == 1 or bool((value == value[:1]).all()) for value in values.values())
+    return all(holds(value == value[:1]) for value in values.values())

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch._arguments import fails, holds
 from camtorch._dtypes import narrow, widen
-from camtorch._tracing import is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed, held, kind, remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
@@ -184,9 +184,9 @@ class Change:
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
         ours, theirs = _intrinsics(self.target), _intrinsics(camera)
-        if not (is_concrete(ours) and is_concrete(theirs)):
-            return True
-        return ours.shape == theirs.shape and torch.allclose(ours.double(), theirs.to(ours.device).double(), _ROUNDED)
+        return ours.shape == theirs.shape and not fails(
+            torch.isclose(ours.double(), theirs.to(ours.device).double(), _ROUNDED)
+        )
 
     def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
         counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]
@@ -227,7 +227,7 @@ class Change:
             for t, n in zip(turns, counts, strict=True)
         ]
         rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
-        return None if may_look(rows) and not bool(rows.any()) else rows
+        return None if holds(~rows) else rows
 
     def then(self, second: Change) -> Change:
         """This change, and then another one of the cameras that this one ends with, by single warps.

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_whole
-from camtorch._tracing import is_concrete, may_look
+from camtorch._arguments import as_image_size, as_whole, fails, holds
 from camtorch.augment.augmentation import Augmentation, EditOptions, Range, as_range
 from camtorch.augment.change import Change, Part, by_kinds, edited, size_of
 from camtorch.augment.landmarks import Mirroring, TableLike
@@ -87,8 +86,7 @@ class Edit(Augmentation):
         """What a draw does to images of a size: `edit`, where it applies; None where it never does."""
         applied = draw["apply"]
         matrix, new = self.edit(size, {name: value.double() for name, value in draw.items() if name != "apply"})
-        looks = may_look(applied)
-        all_are = bool(applied.all()) if looks else self.p == 1
+        all_are = self.p == 1 or holds(applied)
         if new != size and (not all_are or 0 < self.p < 1):
             raise ValueError(
                 f"{self._name}: with p < 1 images must keep their size, so that all come out alike; here they "
@@ -96,7 +94,7 @@ class Edit(Augmentation):
             )
         if all_are:
             return matrix, new
-        if looks and not bool(applied.any()):
+        if holds(~applied):
             return None, new
         still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
@@ -120,7 +118,7 @@ def change_by(
                 matrix = one if matrix is None else after(one, matrix)
         if matrix is None:
             return Part(rows, None, source)
-        if matrix.ndim == 3 and may_look(matrix) and not source.batch_shape and bool((matrix == matrix[:1]).all()):
+        if matrix.ndim == 3 and not source.batch_shape and holds(matrix == matrix[:1]):
             matrix = matrix[0]  # one map serves the whole batch
         matrix = matrix.to(source.intrinsics.device)
         warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
@@ -131,7 +129,7 @@ def change_by(
 
 def _turn(matrix: Tensor, source: Camera) -> Tensor | None:
     """(*B, 3, 3): what an edit does to rays; None: nothing."""
-    if is_concrete(matrix) and bool((matrix[..., :2].diagonal(dim1=-2, dim2=-1) > 0).all()):
+    if holds(matrix[..., :2].diagonal(dim1=-2, dim2=-1) > 0):
         return None
     return on_rays(matrix).to(torch.promote_types(source.intrinsics.dtype, torch.float32))
 
@@ -338,12 +336,12 @@ class Rotate90(Edit):
         turns = (low + step * (values["times"] * count).floor().clamp(max=count - 1)).long() % 4
         maps = turns.new_tensor(quarter_turns(size), dtype=torch.float64)
         on_side = turns % 2
-        if height != width and is_concrete(on_side) and on_side.numel() and int(on_side.min()) != int(on_side.max()):
+        if height != width and fails(on_side == on_side[:1]):
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {size} and {size[::-1]}; "
                 "same_on_batch=True turns all alike, step=2 leaves images as they lie"
             )
-        turned = bool(on_side.any()) if is_concrete(on_side) else bool(low % 2)
+        turned = fails(on_side == 0) or bool(low % 2 and not holds(on_side == 0))
         return maps[turns], size[::-1] if turned else size
 
 

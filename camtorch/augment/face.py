@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, no_camera, shown
+from camtorch._arguments import as_image_size, as_number, fails, no_camera, shown
 from camtorch._module import typed_as
-from camtorch._threads import as_cores_are_free
-from camtorch._tracing import is_concrete
+from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, Part, alone, camera_like, copied
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
@@ -120,7 +119,7 @@ class FaceNormalizer(SampleTransform):
                 f"its centre at {centre[row].tolist()}"
             )
         scale = self.distance / distance.detach()
-        if is_concrete(scale) and not bool(((scale < _ODD) & (scale > 1 / _ODD)).all()):
+        if fails((scale < _ODD) & (scale > 1 / _ODD)):
             at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())
             raise ValueError(
                 f"{self._name}: faces are at distances of {at}, but distance={self.distance:g}; both must be in one "
@@ -133,7 +132,7 @@ class FaceNormalizer(SampleTransform):
         target = camera_like(Pinhole([1.0, 1.0, 0.0, 0.0]), intrinsics, intrinsics[..., :0], self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Normalise a sample, a dict or keyword arguments.
@@ -165,7 +164,7 @@ class FaceNormalizer(SampleTransform):
             moved["source_rotation"] = sample["rotation"].clone()
         return moved
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Move what was predicted on a normalised sample back to the frame and the image of its source camera.

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
+from camtorch._opaque import CameraNumbers, opaque
 from camtorch.augment.change import frozen, size_of
-from camtorch.camera import Camera, from_values
+from camtorch.camera import Camera
 from camtorch.mixed import remade
 from camtorch.rotations import rotation_matrix, rotation_vector, turn
 from camtorch.warp.warp import along_edges
@@ -84,16 +85,21 @@ def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float
     with torch.no_grad():
         if rotation is None:
             rotation = torch.eye(3, dtype=target.intrinsics.dtype, device=target.intrinsics.device)
-        if torch.compiler.is_compiling():
-            numbers = (
-                (camera._model, camera.intrinsics, camera.distortion, list(size_of(camera)))
-                for camera in (source, target)
-            )
-            factor, rotation, found = _opaque_enough(*next(numbers), *next(numbers), rotation, share)
-            return factor, rotation, found
-        return _enough(frozen(source, source.image_size), frozen(target, target.image_size), rotation, share)
+        factor, turned, found = _enough(
+            frozen(source, source.image_size), frozen(target, target.image_size), rotation, share
+        )
+        return factor, turned, found
 
 
+def _shapes(
+    source: CameraNumbers, target: CameraNumbers, rotation: Tensor, share: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    batch = broadcast_shapes(*(t.shape[:-1] for camera in (source, target) for t in camera[:2]), rotation.shape[:-2])
+    like = target.intrinsics
+    return like.new_empty(batch), rotation.new_empty(*batch, 3, 3), like.new_empty(batch)
+
+
+@opaque(_shapes)
 def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor]:
     part_shown = partial(_part_shown, source, target, _points(target))
     found = part_shown(rotation)
@@ -112,7 +118,7 @@ def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> t
         factor, found = torch.where(better, zoom, factor), torch.where(better, now, found)
         rotation = torch.where(better[..., None, None], turned, rotation)
         done = found >= share
-    return factor, rotation.expand(*found.shape, 3, 3), found
+    return factor, rotation.expand(*found.shape, 3, 3).clone(), found
 
 
 def _least_zoom(
@@ -133,41 +139,3 @@ def _least_zoom(
     if bool((high == most).any()):  # not looked at yet
         at_high = torch.where(high == most, part_shown(high), at_high)
     return high, at_high
-
-
-@torch.library.custom_op("camtorch::enough", mutates_args=())
-def _opaque_enough(
-    source: str,
-    source_intrinsics: Tensor,
-    source_distortion: Tensor,
-    source_size: Sequence[int],
-    target: str,
-    target_intrinsics: Tensor,
-    target_distortion: Tensor,
-    target_size: Sequence[int],
-    rotation: Tensor,
-    share: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    before = from_values(source, source_intrinsics, source_distortion, source_size)
-    after = from_values(target, target_intrinsics, target_distortion, target_size)
-    factor, turned, found = _enough(before, after, rotation, share)
-    return factor.clone(), turned.clone(), found.clone()
-
-
-@_opaque_enough.register_fake
-def _(
-    source: str,
-    source_intrinsics: Tensor,
-    source_distortion: Tensor,
-    source_size: Sequence[int],
-    target: str,
-    target_intrinsics: Tensor,
-    target_distortion: Tensor,
-    target_size: Sequence[int],
-    rotation: Tensor,
-    share: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
-    batch = broadcast_shapes(*(t.shape[:-1] for t in numbers), rotation.shape[:-2])
-    like = target_intrinsics
-    return like.new_empty(batch), rotation.new_empty(*batch, 3, 3), like.new_empty(batch)

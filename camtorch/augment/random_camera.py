@@ -11,18 +11,19 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees
-from camtorch._module import Memo, same
-from camtorch._tracing import in_graph, is_concrete
+from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees, fails
+from camtorch._module import Memo
+from camtorch._opaque import CameraNumbers, opaque
+from camtorch._tracing import in_graph
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.camera import Camera, from_values
+from camtorch.camera import Camera
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.mixed import remade
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.domain import Domain, domain_of, keep
+from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.rays import field_of_view, image_lattice
 from camtorch.projection.unproject import shown
 from camtorch.rotations import mount_rotation
@@ -214,7 +215,7 @@ class RandomCamera(Augmentation):
         asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
         share = self.min_filled or 0.0
         key = self._name, asked, share
-        if asked is None or not is_concrete(factor) or key in _told or not bool((factor > 1).any()):
+        if asked is None or key in _told or not fails(factor <= 1):
             return
         made = _across(target)
         least = torch.minimum(_across(scaled(target, 1 / factor)), torch.full_like(made, asked))
@@ -308,7 +309,7 @@ class RandomCamera(Augmentation):
         if plane.batch_shape:
             rays = rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3)))
         ends, valid = plane.project(rays)
-        if is_concrete(valid) and not bool(valid.all()):
+        if fails(valid):
             raise ValueError(
                 f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees"
             )
@@ -454,17 +455,18 @@ def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
             rim is measured there.
     """
     with torch.no_grad():
-        if torch.compiler.is_compiling():
-            numbers = camera.intrinsics, camera.distortion
-            coefficients: Tensor = _opaque_jittered(camera._model, *numbers, list(size_of(camera)), amounts, nominal)
-            return coefficients
-        return _jittered(camera, amounts, nominal)
+        return _jittered(camera, amounts, nominal)[0]
 
 
-def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
+def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
+    return (amounts.new_empty(*amounts.shape[:-1], camera.distortion.shape[-1]),)
+
+
+@opaque(_shapes)
+def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
     batch, count = amounts.shape[:-1], camera.distortion.shape[-1]
     if count == 0:
-        return camera.distortion.expand(*batch, 0)
+        return (camera.distortion.new_empty(*batch, 0),)
     amounts = amounts.reshape(-1, DRAWN)
     if count != DRAWN:
         amounts = amounts[:, :count] if count < DRAWN else amounts[:, torch.arange(count) % DRAWN]
@@ -489,41 +491,16 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
         first = fits.to(torch.uint8).argmax(0) * len(left) + torch.arange(len(left), device=left.device)
         some = fits.any(0)
         result[left] = torch.where(some.unsqueeze(-1), others.k[first], given[0])
-        if bool(some.all()):  # what is known of their folds is asked for soon
-            keep(camera._model, lenses.replaced(left, others, first))
-    return result.view(*batch, count)
+    return (result.view(*batch, count),)
 
 
-@torch.library.custom_op("camtorch::jittered", mutates_args=())
-def _opaque_jittered(
-    model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
-) -> Tensor:
-    return _jittered(from_values(model, intrinsics, distortion, size), amounts, nominal).clone()
-
-
-@_opaque_jittered.register_fake
-def _(
-    model: str, intrinsics: Tensor, distortion: Tensor, size: Sequence[int], amounts: Tensor, nominal: Tensor
-) -> Tensor:
-    return amounts.new_empty(*amounts.shape[:-1], distortion.shape[-1])
-
-
-_KEPT = 24  # of a batch of eight models
-_known: list[tuple[tuple[object, ...], tuple[Tensor, ...], Tensor]] = []
+_measured = Memo(24)  # of a batch of eight models
 
 
 def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
-    """`measure(camera, *inputs)`, of which these tensors are all that counts. The last results are kept: mostly the
-    lens is the same one.
-    """
-    options = (measure, type(camera), camera.image_size)
-    for known_options, known_inputs, result in _known:
-        if known_options == options and all(map(same, known_inputs, inputs)):
-            return result
-    result = measure(camera, *inputs)
-    _known.insert(0, (options, tuple(t.detach().clone() for t in inputs), result))
-    del _known[_KEPT:]
-    return result
+    """`measure(camera, *inputs)`, of which these tensors are all that counts: mostly the lens is the same one."""
+    found: Tensor = _measured(inputs, (measure, type(camera), camera.image_size), lambda: measure(camera, *inputs))
+    return found
 
 
 def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
@@ -577,7 +554,7 @@ def _rim(camera: Camera) -> tuple[Tensor, Tensor]:
     lenses, which = (
         camera.distortion.detach().reshape(-1, camera.distortion.shape[-1]).unique(dim=0, return_inverse=True)
     )
-    if len(lenses) > _KEPT // 2:
+    if len(lenses) > _measured.capacity // 2:
         ends = _ends(camera, camera.distortion).to(edges).reshape(-1, _AZIMUTHS, 2)
     else:
         ends = torch.stack([_kept(_ends, camera, lens) for lens in lenses])[which].to(edges)

@@ -21,9 +21,9 @@ from camtorch._arguments import (
     as_number,
     check_boxes,
     check_radians,
+    fails,
     no_camera,
 )
-from camtorch._tracing import may_look
 from camtorch.augment.change import Change, alone, copied, on_device, singles
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
@@ -246,15 +246,15 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
         check_boxes(value, name, owner)
     elif kind == "rvec":
         check_radians(value, name, owner)
-    elif kind in ("head_pose", "pose") and may_look(value) and not value.requires_grad:
+    elif kind in ("head_pose", "pose") and value.is_cpu and not value.requires_grad:
         rotations = value[..., :3, :3]
         wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
-        if bool(wrong.any()):
+        if fails(~wrong):
             check_rotation(rotations[wrong][:1], name, owner)
-    elif kind == "pitch_yaw" and may_look(value) and not value.requires_grad:
+    elif kind == "pitch_yaw" and value.is_cpu and not value.requires_grad:
         # with room for the rounding of half precision
         beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * (1 + _ROUNDING)
-        if bool(beyond.any()):
+        if fails(~beyond):
             pitch, yaw = value[beyond.any(-1)][0].tolist()
             raise ValueError(
                 f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "

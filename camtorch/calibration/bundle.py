@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera, from_values
-from camtorch.convert.least_squares import bounds
+from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of

@@ -12,7 +12,7 @@ from camtorch._arguments import Numbers, as_image_size, as_values
 from camtorch._threads import on_one_thread
 from camtorch.calibration.calibrate import as_model
 from camtorch.camera import Camera, from_values
-from camtorch.convert import least_squares, views
+from camtorch.convert import fitting, views
 from camtorch.convert.conversion import Conversion
 from camtorch.models import UCM
 from camtorch.projection.rays import angles_from_axis
@@ -80,7 +80,7 @@ def fit(
     starts = asked.kind.fit_start(names, *views.radii(lens, slopes, reach.clamp(max=math.pi)))
     ideal = slopes.new_tensor(asked.kind.ideal(asked.count)).expand(len(slopes), -1)
     template = from_values(asked.kind._model, slopes, ideal, size or (1, 1))
-    parameters = least_squares.fit(template, seen, starts, slopes)
+    parameters = fitting.fit(template, seen, starts, slopes)
     parts = parameters[:, :4].reshape(*batch, 4), parameters[:, 4:].reshape(*batch, asked.count)
     camera = asked.kind(*parts[: 1 + (asked.count > 0)], image_size=size)
     found, valid = from_values(asked.kind._model, parameters[:, :4], parameters[:, 4:], (1, 1)).project(seen.rays)
@@ -97,9 +97,7 @@ def fit(
     return Conversion(camera, **{name: t.reshape(batch) for name, t in numbers.items()}, source_name="rays")
 
 
-def _observations(
-    pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: int, owner: str
-) -> least_squares.Observations:
+def _observations(pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: int, owner: str) -> fitting.Observations:
     """Rows of unit rays; what is not finite, or of no length, has no weight."""
     shape = rays.shape[:-1]
     flat_rays = rays.reshape(-1, math.prod(shape[-dims:]), 3)
@@ -121,10 +119,10 @@ def _observations(
         flat_weights = flat_weights * given.sqrt()
     axis = flat_rays.new_tensor([0.0, 0.0, 1.0])
     unit = torch.where(good[..., None], flat_rays / torch.where(good[..., None], lengths, 1.0), axis)
-    return least_squares.Observations(unit, torch.where(good[..., None], flat_pixels, 0.0), flat_weights)
+    return fitting.Observations(unit, torch.where(good[..., None], flat_pixels, 0.0), flat_weights)
 
 
-def _unified(seen: least_squares.Observations, owner: str) -> Camera:
+def _unified(seen: fitting.Observations, owner: str) -> Camera:
     """The unified lenses (C,) that see the rays best, of a few: focal lengths and axis are linear in the pixels.
 
     Raises:

@@ -12,7 +12,7 @@ from torch import Tensor
 from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.camera import Camera, from_values
-from camtorch.convert import least_squares, views
+from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
 from camtorch.projection.rays import angles_from_axis
 
@@ -434,14 +434,14 @@ def _fitted(
         more[:, names.index(along)] = more.new_tensor(values)
         sets.append((more, [*held, along]))
     sets += [(starts[:1], [*held, *names[order:]]) for order in _LOW_ORDERS if len(names) > order and not values]
-    seen = least_squares.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
+    seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
     template = _camera(model, torch.cat((slopes[0], ideal))[None], image_size)
     is_held = torch.tensor([name in held for name in names], dtype=torch.bool, device=slopes.device)
     fitted = []
     for some, stay in sets:
         some = torch.where(is_held, ideal, some)
-        rows = least_squares.Observations(*(t.expand(len(some), *t.shape[1:]) for t in seen))
-        fitted.append(least_squares.fit(template, rows, some[None], slopes.expand(len(some), -1), stay))
+        rows = fitting.Observations(*(t.expand(len(some), *t.shape[1:]) for t in seen))
+        fitted.append(fitting.fit(template, rows, some[None], slopes.expand(len(some), -1), stay))
     parameters = _distinct(torch.cat(fitted))
     for i, name in enumerate(("cx", "cy"), 2):
         if name in fixed:

@@ -13,7 +13,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_image_size, as_number, as_whole
 from camtorch.convert import views
-from camtorch.convert.least_squares import fit, refine_minimax
+from camtorch.convert.fitting import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
 from camtorch.convert.relations import carry_over, default_count
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.convert.least_squares import Observations
+from camtorch.convert.fitting import Observations
 from camtorch.projection.rays import (
     angles_from_axis,
     followed,

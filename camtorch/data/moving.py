@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_mapping
+from camtorch._module import Memo
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part, frozen
 from camtorch.augment.face import FaceNormalizer
@@ -70,7 +71,7 @@ class Mover:
         self._seeded: Seeded | None = None
         self._fixed: Transform | None = None
         self._make: Callable[[Camera], Warp] | None = None
-        self._made: dict[str, Transform] = {}
+        self._made = Memo(_MOST_WARPS)
         if isinstance(transform, (Augmentation, FaceNormalizer)):
             transform = copy.copy(transform)
             transform.fields = self.fields = {**transform.fields, **self.fields}
@@ -137,18 +138,13 @@ class Mover:
             raise ValueError(
                 f"no camera in the sample, of which a warp is made; it has {', '.join(sample) or 'nothing'}"
             )
-        numbers = camera.key, camera.image_size, camera.intrinsics.tolist(), camera.distortion.tolist()
-        known = repr((*numbers, camera.intrinsics.dtype))
-        found = self._made.pop(known, None)
-        if found is None:
-            warp = self._make(camera)
+        make = self._make
+
+        def made() -> Transform:
+            warp = make(camera)
             if not isinstance(warp, Warp):
                 raise TypeError(f"what makes the warp of a camera must return a Warp; got {type(warp).__name__}")
-            found = Transform(Always(warp, self.owner, self.fields))
-        self._made[known] = found  # the last one used is the last to go
-        if len(self._made) > _MOST_WARPS:
-            del self._made[next(iter(self._made))]
-        return found
+            return Transform(Always(warp, self.owner, self.fields))
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_made": {}}
+        found: Transform = self._made((camera.intrinsics, camera.distortion), (camera.key, camera.image_size), made)
+        return found

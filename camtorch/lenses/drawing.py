@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cache, lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from camtorch._opaque import opaque
 from camtorch.lenses.collection import as_number, columns, is_as_seen
 from camtorch.models import KannalaBrandt
 from camtorch.projection.domain import Domain
@@ -120,19 +120,18 @@ def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses
 
 def drawn(share: Tensor, size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses:
     """The lenses at shares (*B,) of the way through those of `lenses_for`, from 0 to 1, compiled or not."""
-    if torch.compiler.is_compiling():
-        return Lenses(*_opaque_drawn(share, size, fov or ()))
-    return lenses_for(size, fov).at(share)
+    low, high = (None, None) if fov is None else map(float, fov)
+    return Lenses(*_drawn(share, size, low, high))
 
 
-@torch.library.custom_op("camtorch::real_lenses", mutates_args=())
-def _opaque_drawn(share: Tensor, size: Sequence[int], fov: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
-    (height, width), (low, high) = size, fov or (0.0, 0.0)
-    found = lenses_for((height, width), (low, high) if fov else None).at(share)
-    return found.intrinsics, found.distortion, found.reach
-
-
-@_opaque_drawn.register_fake
-def _(share: Tensor, size: Sequence[int], fov: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
+def _drawn_shapes(share: Tensor, *_: object) -> tuple[Tensor, Tensor, Tensor]:
     four = share.new_empty(*share.shape, 4)
     return four, four.clone(), share.new_empty(share.shape)
+
+
+@opaque(_drawn_shapes)
+def _drawn(
+    share: Tensor, size: tuple[int, int], low: float | None, high: float | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    found = lenses_for(size, None if low is None or high is None else (low, high)).at(share)
+    return found.intrinsics, found.distortion, found.reach

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from camtorch._arguments import Numbers, as_batch, as_number, as_real
-from camtorch._tracing import is_concrete
+from camtorch._arguments import Numbers, as_batch, as_number, as_real, fails
 from camtorch.camera import Camera
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ class FreePolynomial(Camera):
         if coefficients.ndim == 0 or coefficients.shape[-1] < 2:
             raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 2; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
-        if is_concrete(first) and not bool((first > 0).all()):
+        if fails(first > 0):
             raise ValueError(
                 f"{cls.__name__}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
                 "A constant before it, which is zero, is left out"

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_batch, as_real
-from camtorch._tracing import is_concrete
+from camtorch._arguments import Numbers, as_batch, as_real, fails
 from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
@@ -58,7 +57,7 @@ class KannalaBrandt(OddPolynomial):
         if coefficients.ndim == 0 or coefficients.shape[-1] == 0:
             raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 1; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
-        if is_concrete(first) and not bool((first > 0).all()):
+        if fails(first > 0):
             raise ValueError(f"{cls.__name__}: the first coefficient must be positive; got {first.tolist()}")
         as_batch(cls.__name__, intrinsics=intrinsics.shape, coefficients=coefficients.shape)
         focal, centre = torch.broadcast_tensors(intrinsics[..., :2] * first, intrinsics[..., 2:])

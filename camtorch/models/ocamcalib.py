@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_real
-from camtorch._tracing import is_concrete
+from camtorch._arguments import Numbers, as_real, fails
 from camtorch.camera import Camera
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Stage
 from camtorch.optics.lens import StageAt
@@ -129,7 +128,7 @@ class OCamCalib(Camera):
         shapes = [tuple(t.shape) for t in (polynomial, centre, affine)]
         if polynomial.ndim != 1 or len(polynomial) < 2 or shapes[1:] != [(2,), (3,)]:
             raise ValueError(f"{owner}: polynomial must be (n,), n >= 2, centre (2,), affine (3,); got shapes {shapes}")
-        if is_concrete(polynomial) and not (polynomial[0] != 0 and affine[0] > 0):
+        if fails((polynomial[0] != 0) & (affine[0] > 0)):
             raise ValueError(
                 f"{owner}: ss[0], the focal length, must not be zero, and c must be positive; got ss[0] = "
                 f"{float(polynomial[0])}, c = {float(affine[0])}"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, no_camera, shown
 from camtorch._module import typed_as
-from camtorch._threads import as_cores_are_free
+from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, Part, alone, by_kinds, copied, edited, size_of
 from camtorch.augment.sample import Named, Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
@@ -104,7 +104,7 @@ class CanonicalCamera(SampleTransform):
         slopes = slopes_at_axis(camera.optics, k.reshape(batch.numel(), count)).view(*batch, 2)
         return self.focal / ((camera.fx * camera.fy).sqrt() * slopes.prod(-1).sqrt())
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Make a sample canonical, a dict or keyword arguments, single or a batch.
@@ -124,7 +124,7 @@ class CanonicalCamera(SampleTransform):
         moved["scale"] = scale if batched else scale.squeeze(0)
         return moved
 
-    @as_cores_are_free
+    @on_one_thread
     @without_graph_in_workers
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Undo it, of a sample as it came out, or of what was predicted of one.

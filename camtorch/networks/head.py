@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from camtorch._arguments import as_flag, as_image_size, as_number, as_values, as_whole
 from camtorch._module import GeometryModule, typed_as
-from camtorch._tracing import in_graph
 from camtorch.calibration.calibrate import as_model
 from camtorch.camera import Camera
 from camtorch.networks.limits import Limits
@@ -195,7 +194,7 @@ class CameraHead(GeometryModule):
         lead = numbers.shape[:-1]
         parts = [intrinsics.reshape(*lead, 4), k.to(dtype).reshape(*lead, len(lens))][: 2 if len(lens) else 1]
         camera = self.model(*parts, image_size=self.image_size)
-        return camera if in_graph(parts[0]) else camera.requires_grad_(False)
+        return camera.requires_grad_(False) if isinstance(camera.intrinsics, nn.Parameter) else camera
 
     def _moves(self, limits: Limits, numbers: Tensor, disc: Tensor) -> Tensor:
         """(R, n): what is added to the coefficients given, for numbers (R, free) and logarithms (R, 1) of discs."""

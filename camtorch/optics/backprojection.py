@@ -9,6 +9,7 @@ from contextlib import nullcontext
 import torch
 from torch import Tensor
 
+from camtorch._arguments import holds
 from camtorch._portable import for_elsewhere, times
 from camtorch._tracing import has_tangent, is_fake, may_look, set_aside
 from camtorch.optics.charts import Chart, Equidistant, Planes2, Planes3, even_steps_and_ratios
@@ -57,7 +58,7 @@ class Inverted(Chart):
 
     def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
         most2 = self._inverse.most2
-        return may_look(most2) and bool(most2.amin() > (math.pi / 2) ** 2)
+        return holds(most2 > (math.pi / 2) ** 2)
 
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         angle = Equidistant().scale(x, y, z, order)

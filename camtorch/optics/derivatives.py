@@ -39,9 +39,14 @@ def vjp_of(
     return gradients[: len(leaves)], list(gradients[len(leaves) :])
 
 
+def goes_forward(tensor: Tensor) -> bool:
+    """Whether derivatives that no graph shall have go forward: transforms and compilers have no gradients."""
+    return in_transform() or not is_concrete(tensor)
+
+
 def jacobian_of(part: Any, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """du/da, du/db, dv/da, dv/db of a stage (a, b) -> (u, v), of each point by itself. Graph-free."""
-    if in_transform() or not is_concrete(a):
+    """du/da, du/db, dv/da, dv/db of a map (a, b) -> (u, v), such as a stage, of each point by itself. Graph-free."""
+    if goes_forward(a):
         one, zero = torch.ones_like(a), torch.zeros_like(a)
         (ua, va), (ub, vb) = (torch.func.jvp(part, (a, b), along)[1] for along in ((one, zero), (zero, one)))
         return ua, ub, va, vb
@@ -58,7 +63,7 @@ def derivatives_of(part: Any, t: Tensor, order: int) -> tuple[Tensor, ...]:
     """The value and the first `order` derivatives of a factor, of each number by itself; those are graph-free."""
     if order == 0:
         return (part(t),)
-    if in_transform() or not is_concrete(t):
+    if goes_forward(t):
 
         def slope(of: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
             return lambda t: torch.func.jvp(of, (t,), (torch.ones_like(t),))[1]
@@ -89,7 +94,7 @@ def _recorded() -> Iterator[None]:
 
 def _usable(part: Any) -> Any:
     """The stage or factor, with parameters that a graph may keep: not those that inference mode made."""
-    if not any(w.is_inference() for w in part.parameters):
+    if not any(w.is_inference() for w in getattr(part, "parameters", ())):
         return part
     usable = copy.copy(part)
     usable.parameters = tuple(w.clone() for w in part.parameters)

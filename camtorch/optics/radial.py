@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from camtorch._arguments import broadcast_shapes
-from camtorch._portable import leading, plus
-from camtorch._threads import ALONE, undivided
-from camtorch._tracing import is_exporting, register
+from camtorch._portable import leading, pick, piece_of, plus, solve_tridiagonal, unbound
+from camtorch._registry import register
 from camtorch.optics.derivatives import derivatives_of, vjp_of
 from camtorch.optics.special import angle_per_radius, first_root, root
 
-FACTORS: dict[str, type[RadialFactor]] = {}
-"""Every class of radial factors by its full name: operators take no classes."""
-
 
 def total(plane: Tensor) -> Tensor:
-    """(*B, N) -> (*B, 1). Within `as_cores_are_free` it is rounded alike by any number of threads."""
-    return undivided(lambda: plane.sum(-1, keepdim=True)) if plane.numel() > ALONE else plane.sum(-1, keepdim=True)
+    """(*B, N) -> (*B, 1)."""
+    return plane.sum(-1, keepdim=True)
 
 
 class RadialFactor:
@@ -33,13 +27,13 @@ class RadialFactor:
     """
 
     name: str
-    """That of the class in `FACTORS`."""
+    """That of the class in the registry."""
     parameters: tuple[Tensor, ...]
     """What the formula learns, in the order in which `vjp` gives the cotangents."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        cls.name = register(FACTORS, cls)
+        cls.name = register(cls)
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.parameters: tuple[Tensor, ...] = tuple(coefficients)
@@ -264,9 +258,7 @@ class RadiusTable(RadialFactor):
         squares = torch.where(first & (radii[..., :-1] == 0), 0.0, squares)
         cubes = (before + after - 2 * secants) / (steps * steps)
         # by powers of the distance from the node: those of the radius itself would cancel, the more the finer the table
-        self.cubics = tuple(power.unbind(-1) for power in (heights[..., :-1], before, squares, cubes))
-        if is_exporting():  # a recorded loop takes no views of one tensor
-            self.cubics = tuple(tuple(c.clone() for c in power) for power in self.cubics)
+        self.cubics = tuple(unbound(power) for power in (heights[..., :-1], before, squares, cubes))
         self.parameters: tuple[Tensor, ...] = tuple(c for power in self.cubics for c in power)
 
     @property
@@ -284,13 +276,13 @@ class RadiusTable(RadialFactor):
         radius = root(t)
         behind = radius > self.end
         place = torch.where(behind, (2 * self.end - radius).clamp(min=0), radius)
-        piece = _piece(self.nodes[1:], place)
-        return radius, behind, piece, place - _pick(self.nodes, piece)
+        piece = piece_of(self.nodes[1:], place)
+        return radius, behind, piece, place - pick(self.nodes, piece)
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
         """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
         radius, behind, piece, offset = self._at(t)
-        zeroth, first, second, third = (_pick(power, piece) for power in self.cubics)
+        zeroth, first, second, third = (pick(power, piece) for power in self.cubics)
         # on the first piece neither division nor root has a part in the derivatives of the outer terms
         central = (piece == 0) & ~behind
         share, square = torch.where(central, 1.0, offset / radius), torch.where(central, t, offset * offset)
@@ -316,48 +308,6 @@ class RadiusTable(RadialFactor):
         return sums
 
 
-def _piece(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
-    """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
-    if is_exporting():  # one by one: few, or the memory of all comparisons
-        passed = [(node <= place).long() for node in nodes]
-        return reduce(torch.add, passed)
-    table = torch.stack(nodes, -1).contiguous()
-    if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own
-        return torch.searchsorted(table, place.unsqueeze(-1).contiguous(), right=True).squeeze(-1)
-    table = table.squeeze(-2).expand(*place.shape[:-1], -1)
-    return torch.searchsorted(table.contiguous(), place.contiguous(), right=True)
-
-
-def _pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
-    """From each plane's own columns the one of that index."""
-    if is_exporting():  # no sizes are compared, which may be unknown
-        found = columns[0] + torch.zeros_like(index, dtype=columns[0].dtype)
-        for i, column in enumerate(columns[1:], 1):
-            found = torch.where(index == i, column, found)
-        return found
-    table = torch.stack(torch.broadcast_tensors(*columns), -1)
-    shape = broadcast_shapes(table.shape[:-1], index.shape)
-    return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
-
-
-def _solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor) -> Tensor:
-    """The solution (*B, N) of equations with diagonals (*B, N - 1), (*B, N), (*B, N - 1)."""
-    if not is_exporting():
-        matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
-        found: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
-        return found
-    # by Gauss's elimination from the first to the last, and back
-    lower, upper, pivots, values = below.unbind(-1), above.unbind(-1), [main[..., 0]], [right[..., 0]]
-    for i, factor in enumerate(lower):
-        share = factor / pivots[i]
-        pivots.append(main[..., i + 1] - share * upper[i])
-        values.append(right[..., i + 1] - share * values[i])
-    solution = [values[-1] / pivots[-1]]
-    for i in reversed(range(len(upper))):
-        solution.append((values[i] - upper[i] * solution[-1]) / pivots[i])
-    return torch.stack(solution[::-1], -1)
-
-
 def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
     """(*B, N) of the pieces -> (*B, N + 1): the slopes of the cubic spline at the nodes, made to ascend where it does.
 
@@ -373,7 +323,7 @@ def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
     end = (last * last * secants[..., -2:-1] + (2 * both + last) * last_but_one * secants[..., -1:]) / both
     middle = 3 * (after * secants[..., :-1] + before * secants[..., 1:])
     right = torch.cat((3 * secants[..., :1], middle, end), -1)
-    slopes = _solve_tridiagonal(below, main, above, right)
+    slopes = solve_tridiagonal(below, main, above, right)
     # between pieces of different orientation there is no slope
     turns = torch.cat((zero > 1, secants[..., :-1] * secants[..., 1:] <= 0, zero > 1), -1)
     neighbours = torch.stack((torch.cat((secants[..., :1], secants), -1), torch.cat((secants, secants[..., -1:]), -1)))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch._module import same
+from camtorch._module import Memo
 from camtorch._portable import (
     as_index,
     choose,
@@ -22,9 +22,8 @@ from camtorch._portable import (
     running_max,
     times,
 )
-from camtorch._tracing import is_concrete, may_look
+from camtorch._registry import CLASSES
 from camtorch.optics.charts import even_steps_and_ratios
-from camtorch.optics.radial import FACTORS
 
 if TYPE_CHECKING:
     from camtorch.optics.radial import RadialFactor
@@ -86,7 +85,7 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
     # of numbers that are not known, or that another runtime is to compute with, it is looked for
-    known = radii.dtype == torch.float64 and is_concrete(radii) and not for_elsewhere()
+    known = radii.dtype == torch.float64 and not radii.is_meta and not for_elsewhere()
     if known and (fold := radial.closed_fold()) is not None:
         fold = fold.clamp(max=end)
         for _ in range(_LIMITING):
@@ -313,12 +312,13 @@ class RadialInverse:
         k, rows = self.k, None
         if for_elsewhere():
             inner2, table = _made_tables(factor.name, k, end)
+            self._table = InverseTable(table)
+            most2 = self._table.most2
         else:
             if self.of_points and len(k) > 1:
                 k, rows = k.unique(dim=0, return_inverse=True)
-            inner2, table = _radial_tables(factor.name, k, end)
-        self._table: Tensor = table
-        of_each = [w if rows is None else w[rows] for w in (inner2, InverseTable(table).most2)]
+            _, inner2, most2 = _radial_inverse(factor.name, k, end, k.new_empty(len(k), 0))
+        of_each = [w if rows is None else w[rows] for w in (inner2, most2)]
         self.inner2, self.most2 = (w.reshape(parameters[0].shape).clone() for w in of_each)
 
     def __call__(self, r2: Tensor) -> Tensor:
@@ -328,82 +328,54 @@ class RadialInverse:
         rows = r2.reshape(self.k.shape[0], -1)
         if for_elsewhere():
             inner2 = self.inner2.reshape(-1, 1)
-            return _scale(self.factor.name, self.k, inner2, InverseTable(self._table), rows).view_as(r2)
-        found: Tensor = _radial_scale(self.factor.name, self.k, self.end, rows)
+            return _scale(self.factor.name, self.k, inner2, self._table, rows).view_as(r2)
+        found: Tensor = _radial_inverse(self.factor.name, self.k, self.end, rows)[0]
         return found.view_as(r2)
 
 
-_KEPT = 8
-_tables: list[tuple[str, float, Tensor, Tensor, Tensor]] = []
-
-
-@torch.library.custom_op("camtorch::radial_tables", mutates_args=())
-def _radial_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
-    """`RadialInverse.inner2` and the columns of its `InverseTable`."""
-    # clones: who gets them may write into them
-    inner2, table = _kept_tables(name, k, end)
-    return inner2.clone(), table.clone()
-
-
-def _kept_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
-    for kept_name, kept_end, kept_k, inner2, table in _tables:
-        if kept_name == name and kept_end == end and same(kept_k, k):
-            return inner2, table
-    with torch.inference_mode(False), torch.no_grad():
-        values = k.detach().clone()
-        inner2, table = _made_tables(name, values, end)
-    _tables.insert(0, (name, end, values, inner2, table))
-    del _tables[_KEPT:]
-    return inner2, table
+_tables = Memo(8)
 
 
 def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
     wide = k if for_elsewhere() else precise(k)  # ONNX Runtime has no arc tangent in float64
-    radial = FACTORS[name](columns(wide))
+    radial = CLASSES[name](columns(wide))
     radii = even_steps_and_ratios(RADII, end, end, wide, torch.positive)
     fold = fold_of(radial, radii, end, torch.finfo(k.dtype).max ** 0.25)
     return within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
 
 
-@_radial_tables.register_fake
-def _(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
-    return k.new_empty(len(k), 1), k.new_empty(len(k), table_width())
-
-
-@_radial_tables.register_vmap
-def _(info: Any, in_dims: tuple[Any, ...], name: str, k: Tensor, end: float) -> Any:
-    results = _radial_tables(name, k.movedim(in_dims[1], 0).flatten(0, 1), end)
-    return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0)
-
-
-@torch.library.custom_op("camtorch::radial_scale", mutates_args=())
-def _radial_scale(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
-    """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
-    inner2, table = _kept_tables(name, k, end)
-    return _scale(name, k, inner2, InverseTable(table), r2)
-
-
 def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
-    scale, settled = solve(FACTORS[name](columns(k)), table, r2, may_look(r2))
+    """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
+    scale, settled = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not for_elsewhere())
     camera, point = (~(settled > 0)).nonzero(as_tuple=True)
     if for_elsewhere() or len(camera):
-        radial = FACTORS[name](of_points(k, camera))
+        radial = CLASSES[name](of_points(k, camera))
         found = bracketed(radial, r2[camera, point], inner2[camera, 0])
         scale = scale.index_put((camera, point), found)
     return scale
 
 
-@_radial_scale.register_fake
-def _(name: str, k: Tensor, end: float, r2: Tensor) -> Tensor:
-    return torch.empty_like(r2)
+@torch.library.custom_op("camtorch::radial_inverse", mutates_args=())
+def _radial_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The factors of coefficients (C, n) and squared radii (C, N), and `RadialInverse.inner2` and `most2`."""
+    inner2, table = _tables((k,), (name, end), lambda: _made_tables(name, k.detach(), end))
+    inverse = InverseTable(table)
+    scale = _scale(name, k, inner2, inverse, r2) if r2.numel() else torch.empty_like(r2)
+    # clones: who gets them may write into them
+    return scale, inner2.clone(), inverse.most2.clone()
 
 
-@_radial_scale.register_vmap
+@_radial_inverse.register_fake
+def _(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.empty_like(r2), k.new_empty(len(k), 1), k.new_empty(len(k), 1)
+
+
+@_radial_inverse.register_vmap
 def _(info: Any, in_dims: tuple[Any, ...], name: str, k: Tensor, end: float, r2: Tensor) -> Any:
     _, of_k, _, of_r2 = in_dims
     r2 = r2.expand(info.batch_size, *r2.shape) if of_r2 is None else r2.movedim(of_r2, 0)
     if of_k is None:  # what is mapped joins the points
-        found = _radial_scale(name, k, end, r2.movedim(0, 1).flatten(1))
-        return found.unflatten(1, (info.batch_size, -1)), 1
-    found = _radial_scale(name, k.movedim(of_k, 0).flatten(0, 1), end, r2.flatten(0, 1))
-    return found.unflatten(0, (info.batch_size, -1)), 0
+        found, inner2, most2 = _radial_inverse(name, k, end, r2.movedim(0, 1).flatten(1))
+        return (found.unflatten(1, (info.batch_size, -1)), inner2, most2), (1, None, None)
+    results = _radial_inverse(name, k.movedim(of_k, 0).flatten(0, 1), end, r2.flatten(0, 1))
+    return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._portable import plus
-from camtorch._threads import ALONE, EVEN, is_split
-from camtorch._tracing import is_exporting
+from camtorch._portable import exported_atan2, for_elsewhere, plus
+from camtorch._threads import ALONE, EVEN
 
 _PAIR = 32  # numbers of two vectors of 64 bytes, or a multiple
 # Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
@@ -80,10 +79,10 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
 
     torch takes the last elements of each thread's part, fewer than two vectors, one by one, and rounds them otherwise.
     """
-    if is_exporting():
-        return _recorded_atan2(y, x)
+    if for_elsewhere():
+        return exported_atan2(y, x)
     count = y.numel()
-    if torch.compiler.is_compiling() or not y.is_cpu or count % (EVEN if is_split() and count > ALONE else _PAIR) == 0:
+    if torch.compiler.is_compiling() or not y.is_cpu or count % (EVEN if count > ALONE else _PAIR) == 0:
         return torch.atan2(y, x)
     y, x, shape = y.reshape(-1), x.reshape(-1), y.shape
     even = count // EVEN * EVEN if count > ALONE else 0
@@ -92,20 +91,6 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
         return torch.atan2(torch.cat((y, more)), torch.cat((x, more)))[:count].view(shape)
     tail = torch.atan2(torch.cat((y[even:], more)), torch.cat((x[even:], more)))[: count - even]
     return torch.cat((torch.atan2(y[:even], x[:even]), tail)).view(shape)
-
-
-def _recorded_atan2(y: Tensor, x: Tensor) -> Tensor:
-    """The same for ONNX, whose composed one is -pi at y = 0 behind; ONNX Runtime has none in float64."""
-    y, x = torch.broadcast_tensors(y, x)
-    behind = (y == 0) & (x < 0)
-    if y.dtype != torch.float64:
-        return torch.where(behind, math.pi, torch.atan2(y, x))
-    nearly = torch.where(behind, math.pi, torch.atan2(y.float(), x.float())).double()
-    c, s = torch.cos(nearly), torch.sin(nearly)
-    along = x * c + y * s
-    # what is left is about 1e-7, whose fifth power is nothing
-    rest = torch.where(along > 0, (y * c - x * s) / torch.where(along > 0, along, 1.0), 0.0)
-    return nearly + (rest - rest * rest * rest / 3)
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:

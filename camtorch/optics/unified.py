@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from camtorch._tracing import may_look
+from camtorch._arguments import holds
 from camtorch.optics.charts import Chart, Perspective, Planes3, even_steps_and_ratios, unit
 from camtorch.optics.radial import total
 
@@ -42,11 +42,8 @@ class Unified(Chart):
     def _is_tame(self) -> bool:
         """Whether a look at the parameters shows that every ray with z > 0 is covered but for the largest angles."""
         xi, alpha, _ = self._parts()
-        tensors = [w for w in (xi, alpha) if isinstance(w, Tensor)]
-        if not all(map(may_look, tensors)):
-            return False
-        inside = 0 <= alpha <= 1 if isinstance(alpha, float) else bool(((alpha >= 0) & (alpha <= 1)).all())
-        return inside and (xi is None or bool((xi >= 0).all()))
+        inside = 0 <= alpha <= 1 if isinstance(alpha, float) else holds((alpha >= 0) & (alpha <= 1))
+        return inside and (xi is None or holds(xi >= 0))
 
     def _shifted(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """x^2 + y^2, z', d' and d, that one only if it is needed."""

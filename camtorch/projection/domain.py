@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch._module import same
+from camtorch._module import Memo
 from camtorch._portable import for_elsewhere, of_points, plus
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import AZIMUTHS, Azimuths, Outline, azimuth, limits_and_outline
@@ -81,19 +81,6 @@ class Domain:
     def optics_of(self, camera: Tensor) -> tuple[Chart, Lens]:
         """Of single points (M,), each seen by the camera of that index."""
         return self.optics(of_points(self.k, camera))
-
-    def replaced(self, rows: Tensor, other: Domain, index: Tensor) -> Domain:
-        """The domain in which the cameras `rows` are those of another at `index`; what both know of folds is kept."""
-
-        def mixed(mine: Tensor, its: Tensor) -> Tensor:
-            return mine.index_copy(0, rows, its[index])
-
-        with torch.inference_mode(False), torch.no_grad():
-            made = Domain(self.optics, mixed(self.k, other.k))
-            for name in ("_fold", "edge2", "circle2"):
-                if name in self.__dict__ and name in other.__dict__:
-                    made.__dict__[name] = mixed(self.__dict__[name], other.__dict__[name])
-        return made
 
     def _set(self, **tables: object) -> None:
         """Tables that are not cached at first use: a compiler cannot follow the lock of a cached property."""
@@ -284,26 +271,10 @@ def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
     return plus(torch.nan_to_num(lens.at(a, b).orientation, nan=-1.0), -(torch.finfo(a.dtype).tiny ** 0.25))
 
 
-_KEPT = 24  # of a batch of eight models before, while and after it changes
-_domains: list[tuple[str, Tensor, Domain]] = []
+_domains = Memo(24)  # of a batch of eight models before, while and after it changes
 
 
 def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
     """The domain of these values: one of the last ones that were asked for, or a new one."""
-    global _domains
-    known = _domains
-    for i, (name, values, domain) in enumerate(known):
-        if name == model and same(values, k):
-            if i:  # a list of its own: another thread may be looking at this one
-                _domains = [known[i], *known[:i], *known[i + 1 :]]
-            return domain
-    with torch.inference_mode(False), torch.no_grad():
-        domain = Domain(optics, k.detach().clone())
-    keep(model, domain)
-    return domain
-
-
-def keep(model: str, domain: Domain) -> None:
-    """Have `domain_of` know a domain, whose coefficients will not change."""
-    global _domains
-    _domains = [(model, domain.k, domain), *_domains[: _KEPT - 1]]
+    found: Domain = _domains((k,), (model,), lambda: Domain(optics, k.detach().clone()))
+    return found

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_whole, broadcast_shapes, check_devices, working_dtype
-from camtorch._tracing import in_transform, is_concrete
 from camtorch.extrinsics import Extrinsics
+from camtorch.optics.derivatives import goes_forward
 from camtorch.rotations import rotate_planes, rotation_matrix
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class Tangents(NamedTuple):
 
 def tangents(camera: Camera, pixels: Tensor) -> Tangents:
     """Rays of pixels (*B, *N, 2) with their exact derivatives, in a graph where the camera or the pixels are in one."""
-    if in_transform() or not is_concrete(pixels):
+    if goes_forward(pixels):
         right, below = (pixels.new_tensor(unit).expand_as(pixels) for unit in ((1.0, 0.0), (0.0, 1.0)))
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
         by_v: Any = torch.func.jvp(camera.unproject, (pixels,), (below,), has_aux=True)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._module import Memo
 from camtorch._portable import as_index, for_elsewhere, hypot, repeat, running_max
 from camtorch.optics.radial_inverse import first_loss
 
@@ -25,7 +26,7 @@ _RECORDED_LOOKS = 2  # at such dips, one after the other, in an exported program
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 _FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
 _ROWS = 2048  # azimuths that are followed at a time
-_KEPT = 64  # cameras whose outlines are kept
+_KEPT = 8  # outlines of some of the cameras
 _BEYOND, _ASIDE = 1.01, 4  # what an outline allows for outside of its rim and, in azimuths, beside it
 _SPAN = 12  # how many azimuths the rim may go on from one to the next, and beside it, or else it becomes a circle
 
@@ -51,7 +52,7 @@ class Azimuths:
         self._radii = k.new_full((len(k), _COARSE + _CLOSE), torch.nan)
         self._lost = k.new_full((len(k), AZIMUTHS), torch.nan)
         self._limits2 = self._lost.clone()
-        self._outlines: dict[int, Outline] = {}
+        self._outlines = Memo(_KEPT)
 
     def limits2(self, camera: Tensor, index: Tensor) -> Tensor:
         """(M,): the squared radius, up to the next azimuth, before which the orientation decides.
@@ -78,17 +79,8 @@ class Azimuths:
 
     def outline(self, camera: Tensor) -> Outline:
         """Of several cameras (G,), each given once."""
-        wanted = camera.tolist()
-        (missing,) = torch.tensor([c not in self._outlines for c in wanted]).nonzero(as_tuple=True)
-        known = {c: self._outlines[c] for c in wanted if c in self._outlines}
-        if len(missing):
-            made = self._made_outline(camera[missing.to(camera.device)])
-            for i, c in enumerate(missing.tolist()):
-                known[wanted[c]] = Outline(*(w[i : i + 1] for w in made))
-            if len(self._outlines) + len(missing) <= _KEPT:
-                self._outlines.update(known)
-        rows = [known[c] for c in wanted]
-        return Outline(*(torch.cat(w) for w in zip(*rows, strict=True))) if len(rows) > 1 else rows[0]
+        found: Outline = self._outlines((camera,), (), lambda: self._made_outline(camera))
+        return found
 
     def _made_outline(self, camera: Tensor) -> Outline:
         index = torch.arange(AZIMUTHS, device=camera.device).repeat(len(camera))

@@ -6,41 +6,31 @@ As operators of their own they keep compiled graphs small, and look at values in
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from camtorch._arguments import columns
-from camtorch._tracing import in_transform, is_for_here, register
+from camtorch._registry import CLASSES
+from camtorch._tracing import in_transform, is_for_here, keeps_graph
 from camtorch.optics.radial_inverse import table_width
-from camtorch.projection.domain import Optics, domain_of
+from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
 
-if TYPE_CHECKING:
-    from camtorch.camera import Camera
-
 Result = TypeVar("Result")
 
-OPTICS: dict[str, Optics] = {}
-"""The optics of every class of cameras, by its full name: operators take no functions."""
-CLASSES: dict[str, type[Camera]] = {}
-"""The classes."""
 
-
-def register_camera(camera_class: type[Camera]) -> str:
-    """The name under which operators find the optics of a class."""
-    name = register(CLASSES, camera_class)
-    OPTICS[name] = camera_class.optics
-    return name
+def _domain(model: str, k: Tensor) -> Domain:
+    return domain_of(model, k, CLASSES[model].optics)
 
 
 @torch.library.custom_op("camtorch::tables", mutates_args=())
 def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`Domain.inner2`, `limits2` and `table` of coefficients (C, n); without columns where the lens needs none."""
-    domain = domain_of(model, k, OPTICS[model])
+    domain = _domain(model, k)
     empty = k.new_empty(len(k), 0)
     # clones: who gets them may write into them
     return (
@@ -52,7 +42,7 @@ def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @tables.register_fake
 def _(model: str, k: Tensor) -> tuple[Tensor, ...]:
-    lens = OPTICS[model](columns(k))[1]
+    lens = CLASSES[model].optics(columns(k))[1]
     widths = 1, 0 if lens.is_radial else AZIMUTHS, table_width() if lens.radial else 0
     return tuple(k.new_empty(len(k), width) for width in widths)
 
@@ -66,7 +56,7 @@ def search_in_place(
         return
     camera, point = (~(solved > 0) & (possible > 0)).nonzero(as_tuple=True)
     if len(camera):
-        found_a, found_b, found = search(domain_of(model, k, OPTICS[model]), camera, u[camera, point], v[camera, point])
+        found_a, found_b, found = search(_domain(model, k), camera, u[camera, point], v[camera, point])
         a[camera, point], b[camera, point] = found_a, found_b
         solved[camera, point] = torch.where(found, 1.0, -1.0).to(solved.dtype)
 
@@ -123,38 +113,36 @@ def _mapped(
     return tuple(r.unflatten(1, (info.batch_size, -1)) for r in results), (1, 1, 1)
 
 
-@torch.library.custom_op("camtorch::to_planes", mutates_args=())
-def _to_planes(rows: Tensor) -> Tensor:
-    planes = rows.new_empty(rows.shape[-1], *rows.shape[:-1])
-    for plane, interleaved in zip(planes, rows.unbind(-1), strict=True):
+@torch.library.custom_op("camtorch::transposed", mutates_args=())
+def _transposed(points: Tensor, to_planes: bool) -> Tensor:
+    if not to_planes:
+        return torch.stack(points.unbind(0), -1)
+    planes = points.new_empty(points.shape[-1], *points.shape[:-1])
+    for plane, interleaved in zip(planes, points.unbind(-1), strict=True):
         torch.sub(interleaved, 0, out=plane)  # twice as fast as a copy, and bit for bit the same
     return planes
 
 
-@_to_planes.register_fake
-def _(rows: Tensor) -> Tensor:
-    return rows.new_empty(rows.shape[-1], *rows.shape[:-1])
+@_transposed.register_fake
+def _(points: Tensor, to_planes: bool) -> Tensor:
+    size = points.shape
+    return points.new_empty((size[-1], *size[:-1]) if to_planes else (*size[1:], size[0]))
 
 
-@torch.library.custom_op("camtorch::to_rows", mutates_args=())
-def _to_rows(planes: Tensor) -> Tensor:
-    return torch.stack(planes.unbind(0), -1)
+def _note_way(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.to_planes = inputs[1]
 
 
-@_to_rows.register_fake
-def _(planes: Tensor) -> Tensor:
-    return planes.new_empty(*planes.shape[1:], len(planes))
-
-
-_to_planes.register_autograd(lambda ctx, cotangent: _to_rows(cotangent))
-_to_rows.register_autograd(lambda ctx, cotangent: _to_planes(cotangent))
+_transposed.register_autograd(
+    lambda ctx, cotangent: (_transposed(cotangent, not ctx.to_planes), None), setup_context=_note_way
+)
 
 
 def to_planes(rows: Tensor) -> tuple[Tensor, ...]:
     """(C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
     interleaved = is_for_here() and rows.device.type == "cpu" and rows.stride(-2) != 1
     interleaved = interleaved and not in_transform()  # the operator has no forward mode
-    return (_to_planes(rows) if interleaved else rows.movedim(-1, 0)).unbind(0)
+    return (_transposed(rows, True) if interleaved else rows.movedim(-1, 0)).unbind(0)
 
 
 @torch.library.custom_op("camtorch::positive", mutates_args=())
@@ -171,6 +159,30 @@ def positive(mask: Tensor) -> Tensor:
     """The mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
     compiled = is_for_here() and mask.device.type == "cpu"
     return _positive(mask.detach()) if compiled else mask > 0
+
+
+def as_kept(plane: Tensor) -> Tensor:
+    """The plane, for inductor to compute once: it repeats the whole expression of what is used twice while it compiles.
+
+    That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
+    """
+    return torch.as_strided(plane, plane.shape, plane.stride()) if is_for_here() else plane
+
+
+def power_of_two(size: Tensor) -> Tensor:
+    """The largest one not above: to divide by it costs no bit."""
+    if torch.compiler.is_compiling():  # which leaves its vectors for bits
+        return size
+    if in_transform():  # torch.vmap looks at no bits before torch 2.11
+        return size / torch.frexp(size).mantissa / 2
+    exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
+    return (size.view(integer) & exponent).view(size.dtype)
+
+
+def order_of(order: int, *inputs: Tensor) -> int:
+    """Of the derivatives that a recorded inverse has to have: compiled code that does not learn needs none."""
+    compiled = torch.compiler.is_compiling() and not in_transform()
+    return 0 if compiled and not keeps_graph(*inputs) else order
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:

@@ -9,19 +9,18 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch._arguments import columns
-from camtorch._threads import as_cores_are_free
-from camtorch._tracing import in_transform
+from camtorch._threads import on_one_thread
 from camtorch.optics.charts import Planes3, floor_of
-from camtorch.projection.ops import positive, to_planes, without_keeping
+from camtorch.projection.ops import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.projection.rows import (
     FEW,
+    Block,
     Cameras,
     Sums,
     Traced,
-    as_kept,
-    blocks,
     both,
     by_formulas,
+    over_blocks,
     planes_of,
     replace,
     to_mask,
@@ -80,23 +79,13 @@ def normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, looks: bool) -> Ray
         # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
         valid = ((size > floor_of(size.dtype)) & (size < torch.inf)).to(size.dtype)
         # a constant: the projection does not depend on the distance, so this has no part in its derivative
-        shrink = as_kept(_power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
+        shrink = as_kept(power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
         x_0, y_0, z_0 = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x_0, 0.0), (y_0, 0.0), (z_0, 1.0)))
         x, y, z = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
     mask = both(valid, to_mask(chart.margin(x_0, y_0, z_0), looks))
     mask = None if mask is None else as_kept(mask)
     x, y, z = (replace(mask, w, axis, looks) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
     return Ray(x, y, z, shrink, mask)
-
-
-def _power_of_two(size: Tensor) -> Tensor:
-    """The largest one not above: to divide by it costs no bit."""
-    if torch.compiler.is_compiling():  # which leaves its vectors for bits
-        return size
-    if in_transform():  # torch.vmap looks at no bits before torch 2.11
-        return size / torch.frexp(size).mantissa / 2
-    exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
-    return (size.view(integer) & exponent).view(size.dtype)
 
 
 def see(
@@ -174,7 +163,7 @@ class Project(Function):
         return pixels, positive(mask)
 
     @staticmethod
-    @as_cores_are_free
+    @on_one_thread
     def forward(
         ctx: Any,
         points: Tensor,
@@ -189,9 +178,11 @@ class Project(Function):
         pixels = points.new_empty(2, *shape)
         valid = torch.ones(shape, dtype=torch.bool, device=points.device)
         scales = points.new_empty(shape if keeps and cameras.domain.chart.has_scale else (0, 0))
-        ctx.plain, looks = [], cameras.looks
+        looks = cameras.looks
         brief = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
-        for block in blocks(cameras, points):
+
+        def evaluate(block: Block) -> tuple[tuple[int, int], bool]:
+            """Where it begins, and whether the formula took all of it as it came."""
             here, domain = block.here, block.domain
             x, y, z = planes_of(points[here])
             a, b, mask, scale, is_plain = see(
@@ -205,17 +196,21 @@ class Project(Function):
                 valid[here] = mask > 0
             if scale is not None and scales.numel():
                 scales[here] = scale
-            ctx.plain.append(mask is None and is_plain)
+            return block.first, mask is None and is_plain
+
+        ctx.plain = dict(over_blocks(cameras, points, evaluate))
         if keeps:
             # a copy: what is handed out belongs to the caller
-            ctx.save_for_backward(points, intrinsics, distortion, None if all(ctx.plain) else valid.clone(), scales)
+            ctx.save_for_backward(
+                points, intrinsics, distortion, None if all(ctx.plain.values()) else valid.clone(), scales
+            )
             ctx.cameras, ctx.model = cameras, model
         ctx.mark_non_differentiable(valid)
         ctx.set_materialize_grads(False)
         return pixels, valid
 
     @staticmethod
-    @as_cores_are_free
+    @on_one_thread
     def backward(ctx: Any, by_pixels: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """The cotangents of points and parameters; with a graph if that is asked for."""
         if by_pixels is None:
@@ -228,13 +223,14 @@ class Project(Function):
         points, looks = inputs[0], cameras.looks
         sums = Sums(cameras, wanted, points)
         by_points = torch.empty_like(points) if wanted[0] else None
-        for block, plain in zip(blocks(cameras, points), ctx.plain, strict=True):
+
+        def evaluate(block: Block) -> tuple[Block, list[Tensor], list[Tensor]]:
             here, chart = block.here, block.domain.chart
             x, y, z = planes_of(points[here])
             shrink = mask = None
             # a sum is rounded by how what it adds lies in memory
             gu, gv = planes_of(by_pixels.movedim(0, -1)[here])
-            if not plain:
+            if not ctx.plain[block.first]:
                 x, y, z, shrink, _ = normalise(chart, x, y, z, looks)
                 mask = valid[here].to(x.dtype)
                 x, y, z = (replace(mask, w, axis, looks) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
@@ -242,15 +238,18 @@ class Project(Function):
                 gu, gv = (torch.where(valid[here], g, 0.0) for g in (gu, gv))
             scale = replace(mask, scales[here], 1.0, looks) if scales.numel() else None
             at = block.domain.lens.at(*chart.to_plane(x, y, z, 1, scale))
-            sums.add_intrinsics(block, gu, gv, *at.value)
+            of_intrinsics = sums.of_intrinsics(gu, gv, *at.value)
             wants = sums.wants_distortion
             (ga, gb), by_lens = at.vjp(gu * block.intrinsics[0], gv * block.intrinsics[1], wants)
             by_ray: tuple[Tensor, ...] = ()
             by_chart: list[Tensor] = []
             if by_points is not None or (wants and chart.parameters):
                 by_ray, by_chart = chart.to_plane_vjp(x, y, z, ga, gb, scale, wants)
-            sums.add_optics(block, by_chart + by_lens)
             if by_points is not None:
                 for i, w in enumerate(by_ray):
                     by_points[here][..., i] = w if shrink is None else w * shrink
+            return block, of_intrinsics, by_chart + by_lens
+
+        for parts in over_blocks(cameras, points, evaluate):
+            sums.add(*parts)
         return by_points, *sums.result(), None, None, None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch._tracing import is_concrete
+from camtorch.optics.derivatives import jacobian_of
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -75,16 +75,9 @@ def slopes_at_axis(optics: Optics, k: Tensor) -> Tensor:
         a, b = chart.to_plane(x, y, torch.ones_like(x), order=1)
         return lens(a, b) if lens.stages else (a, b)
 
-    if is_concrete(k):
-        with torch.inference_mode(False), torch.enable_grad():
-            x, y = (k.new_zeros(len(k), 1).requires_grad_() for _ in range(2))
-            pairs = zip(to_sensor(x, y), (x, y), strict=True)
-            slopes = torch.cat([torch.autograd.grad(to.sum(), of, retain_graph=True)[0] for to, of in pairs], -1)
-    else:  # a compiler has no gradients, but derivatives ahead
-        zero, one = k.new_zeros(len(k), 1), k.new_ones(len(k), 1)
-        across: Any = torch.func.jvp(to_sensor, (zero, zero), (one, zero))[1]
-        down: Any = torch.func.jvp(to_sensor, (zero, zero), (zero, one))[1]
-        slopes = torch.cat((across[0], down[1]), -1)
+    zero = k.detach().new_zeros(len(k), 1)
+    across, _, _, down = jacobian_of(to_sensor, zero, zero)
+    slopes = torch.cat((across, down), -1)
     return torch.where(torch.isfinite(slopes) & (slopes > 0), slopes, 1.0)
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns
+from camtorch._arguments import columns, holds
 from camtorch._portable import for_elsewhere
-from camtorch._threads import ALONE, EVEN, split
-from camtorch._tracing import is_for_here, may_look
+from camtorch._threads import ALONE, EVEN, on_one_thread, spread, thread_count
+from camtorch._tracing import is_recorded
 from camtorch.optics.radial import total
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
 Columns = tuple[Tensor, ...]
+R = TypeVar("R")
 
-_BLOCK = 341 * EVEN  # points, not quite 2^17: so that torch splits them among four threads at the most
+_BLOCK = 170 * EVEN  # points, not quite 2^16: temporaries stay in the cache, and each thread has one
 FEW = 1024
 """Points of one camera that are fewer than the nodes of its table."""
 
@@ -55,7 +56,7 @@ class Cameras(NamedTuple):
         with torch.no_grad():
             given = intrinsics.detach().clone(), distortion.detach().clone()
             usable, values, mask = _usable(model, *given), given, None
-            if not (may_look(usable) and bool(usable.all())):
+            if not holds(usable):
                 ideal = _ideal(model, *given)
                 values = torch.where(usable, given[0], ideal[0]), torch.where(usable, given[1], ideal[1])
                 mask = usable.to(intrinsics.dtype)
@@ -129,6 +130,11 @@ class Block(NamedTuple):
     domain: Domain
     usable: Tensor | None
 
+    @property
+    def first(self) -> tuple[int, int]:
+        """The first camera, and its first point."""
+        return self.cameras.start, self.points.start
+
 
 def blocks(given: Cameras, rows: Tensor) -> Iterator[Block]:
     """Parts of (C, N, ...) of about one size: of one camera's points, or of several cameras."""
@@ -137,8 +143,6 @@ def blocks(given: Cameras, rows: Tensor) -> Iterator[Block]:
         return
     if not given.looks or count * length <= _BLOCK:  # elsewhere than on a CPU a kernel more costs more than memory
         everything = slice(0, count), slice(0, length)
-        if given.looks:
-            split(count * length)
         yield Block(*everything, (), given.columns, given.domain, given.usable)
         return
     if length > _BLOCK // 2:
@@ -155,8 +159,28 @@ def blocks(given: Cameras, rows: Tensor) -> Iterator[Block]:
             last = cameras
             shared = columns(given.intrinsics[cameras]), given.domain.part(cameras)
             usable = None if given.usable is None else given.usable[cameras]
-        split((cameras.stop - cameras.start) * (points.stop - points.start))
         yield Block(cameras, points, (cameras, points), *shared, usable)
+
+
+def over_blocks(given: Cameras, rows: Tensor, work: Callable[[Block], R]) -> list[R]:
+    """What is made of each block, in their order: several at a time, each on one thread.
+
+    So results depend neither on the number of threads nor on who else wants the cores.
+    """
+    parts = list(blocks(given, rows))
+    if not given.looks or rows.shape[:2].numel() <= ALONE:
+        return list(map(work, parts))
+    results: dict[int, R] = {}
+    left, inference = iter(enumerate(parts)), torch.is_inference_mode_enabled()
+
+    @on_one_thread
+    def take() -> None:
+        with torch.inference_mode(inference), torch.no_grad():
+            for i, part in left:
+                results[i] = work(part)
+
+    spread(take, 1 if is_recorded() else min(thread_count(), len(parts)))
+    return [results[i] for i in range(len(parts))]
 
 
 def planes_of(rows: Tensor) -> tuple[Tensor, ...]:
@@ -199,14 +223,6 @@ def both(*masks: Tensor | None) -> Tensor | None:
     return product
 
 
-def as_kept(plane: Tensor) -> Tensor:
-    """The plane, for inductor to compute once: it repeats the whole expression of what is used twice while it compiles.
-
-    That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
-    """
-    return torch.as_strided(plane, plane.shape, plane.stride()) if is_for_here() else plane
-
-
 # -- derivatives
 
 
@@ -226,15 +242,15 @@ class Sums:
         learning = _parameters(cameras.domain.chart, cameras.domain.lens) if self.wants_distortion else ()
         self.optics = [like.new_zeros(count, 1) for _ in learning]
 
-    def add_intrinsics(self, block: Block, gu: Tensor, gv: Tensor, x: Tensor, y: Tensor) -> None:
-        """gu, gv: the cotangents of pixels. x, y: the points on the plane of the lens."""
-        if self.wants_intrinsics:
-            for i, plane in enumerate((gu * x, gv * y, gu, gv)):
-                self.intrinsics[block.cameras, i, None] += total(plane)
+    def of_intrinsics(self, gu: Tensor, gv: Tensor, x: Tensor, y: Tensor) -> list[Tensor]:
+        """Those of a block. gu, gv: the cotangents of pixels. x, y: the points on the plane of the lens."""
+        return [total(plane) for plane in (gu * x, gv * y, gu, gv)] if self.wants_intrinsics else []
 
-    def add_optics(self, block: Block, sums: list[Tensor]) -> None:
-        """sums: those of the chart's parameters, then those of the lens."""
-        for whole, part in zip(self.optics, sums, strict=True):
+    def add(self, block: Block, of_intrinsics: list[Tensor], of_optics: list[Tensor]) -> None:
+        """Add those of a block: of the intrinsics, and of the chart's parameters, then the lens's."""
+        for i, part in enumerate(of_intrinsics):
+            self.intrinsics[block.cameras, i, None] += part
+        for whole, part in zip(self.optics, of_optics, strict=True):
             whole[block.cameras] += part
 
     def result(self) -> tuple[Tensor | None, Tensor | None]:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from camtorch._portable import for_elsewhere, hypot, repeat, times
-from camtorch._tracing import is_exporting
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
@@ -131,7 +130,7 @@ class _Search:
         self.domain, self.camera, self.outline, self.row = domain, camera, outline, row
         self.within = within
         self.chart, self.lens = domain.optics_of(camera)
-        self.limits2 = domain.limits2 if is_exporting() and not (is_circle or self.lens.is_radial) else None
+        self.limits2 = domain.limits2 if for_elsewhere() and not (is_circle or self.lens.is_radial) else None
         self.is_circle = is_circle or self.lens.is_radial
 
     def __call__(self, u: Tensor, v: Tensor, sent: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:

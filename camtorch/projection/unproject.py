@@ -11,20 +11,19 @@ from torch.autograd import Function
 
 from camtorch._arguments import columns
 from camtorch._portable import for_elsewhere, times
-from camtorch._threads import as_cores_are_free
-from camtorch._tracing import in_transform, keeps_graph
+from camtorch._threads import on_one_thread
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, BriefTable, short, solve
-from camtorch.projection.ops import positive, search_in_place, search_open, to_planes, without_keeping
+from camtorch.projection.ops import order_of, positive, search_in_place, search_open, to_planes, without_keeping
 from camtorch.projection.rows import (
     FEW,
     Block,
     Cameras,
     Sums,
     Traced,
-    blocks,
     both,
     by_formulas,
+    over_blocks,
     planes_of,
     replace,
     to_mask,
@@ -316,14 +315,12 @@ class Unproject(Function):
             rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
             return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
-        learns = keeps_graph(pixels, intrinsics, distortion)
-        if torch.compiler.is_compiling() and not learns and not in_transform():
-            order = 0
+        order = order_of(order, pixels, intrinsics, distortion)
         rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
         return rays, positive(torch.ones_like(a) if mask is None else mask.expand_as(a))
 
     @staticmethod
-    @as_cores_are_free
+    @on_one_thread
     def forward(
         ctx: Any,
         pixels: Tensor,
@@ -337,9 +334,13 @@ class Unproject(Function):
         shape, looks = pixels.shape[:2], cameras.looks
         rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
+        brief = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
+
+        all_valid = True
         left_open: list[tuple[Tensor, ...]] = []
-        all_valid, brief = True, looks and ctx.needs_input_grad[2] and shape[1] <= FEW
-        for block in blocks(cameras, pixels):
+
+        def evaluate(block: Block) -> tuple[bool, Iterable[tuple[Tensor, ...]]]:
+            """Whether all is valid, and what is left open."""
             here, domain = block.here, block.domain
             u, v = planes_of(pixels[here])
             a, b, mask, target, left = solutions(u, v, block.intrinsics, domain, block.usable, None, looks, brief)
@@ -349,9 +350,12 @@ class Unproject(Function):
             if solution is not None:
                 solution[0][here], solution[1][here] = a, b
             if mask is not None:
-                valid[here], all_valid = mask > 0, False
-            if left is not None:
-                left_open += _places(block, target, left)
+                valid[here] = mask > 0
+            return mask is None, () if left is None else _places(block, target, left)
+
+        for is_valid, places in over_blocks(cameras, pixels, evaluate):
+            all_valid = all_valid and is_valid
+            left_open += places
         if left_open:
             _search(cameras, left_open, rays, solution, valid)
         if keeps:
@@ -363,7 +367,7 @@ class Unproject(Function):
         return rays, valid
 
     @staticmethod
-    @as_cores_are_free
+    @on_one_thread
     def backward(ctx: Any, by_rays: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """The cotangents of pixels and parameters; with a graph if that is asked for."""
         if by_rays is None:
@@ -375,7 +379,8 @@ class Unproject(Function):
             return *again, None, None, None
         sums = Sums(cameras, wanted, inputs[0])
         by_pixels = torch.empty_like(inputs[0]) if wanted[0] else None
-        for block in blocks(cameras, inputs[0]):
+
+        def evaluate(block: Block) -> tuple[Block, list[Tensor], list[Tensor]]:
             here, chart = block.here, block.domain.chart
             a, b = solution[0][here], solution[1][here]
             gx, gy, gz = (by_rays[i][here] for i in range(3))
@@ -389,12 +394,14 @@ class Unproject(Function):
                 ga, gb, _ = newton_step((ua, va, ub, vb), ga, gb)
                 if sums.wants_distortion:
                     by_optics = by_optics + at.vjp(-ga, -gb)[1]
-            sums.add_optics(block, by_optics)
             focal_x, focal_y, _, _ = block.intrinsics
             ga, gb = ga / focal_x, gb / focal_y
-            sums.add_intrinsics(block, -ga, -gb, *at.value)
             if by_pixels is not None:
                 by_pixels[here][..., 0], by_pixels[here][..., 1] = ga, gb
+            return block, sums.of_intrinsics(-ga, -gb, *at.value), by_optics
+
+        for parts in over_blocks(cameras, inputs[0], evaluate):
+            sums.add(*parts)
         return by_pixels, *sums.result(), None, None, None
 
 

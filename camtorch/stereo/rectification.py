@@ -22,10 +22,10 @@ from camtorch._arguments import (
     as_values,
     check_devices,
     check_path,
+    fails,
     shown,
 )
 from camtorch._module import GeometryModule, Memo, typed_as
-from camtorch._tracing import is_concrete
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.filestorage import Value, write
@@ -425,7 +425,7 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
     rotation = rotation_matrix(extrinsics.rotation.double())
     translation = extrinsics.translation.double()
     length = torch.linalg.vector_norm(translation, dim=-1)
-    if is_concrete(length) and not bool((length > 0).all()):
+    if fails(length > 0):
         raise ValueError(f"{owner}: the cameras stand at one place; extrinsics.translation is {translation.tolist()}")
     axis = 1 if vertical else 0
     if align == "opencv":
@@ -448,7 +448,7 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
     along = toward * sign[..., None]
     ahead = view - (view * along).sum(-1, keepdim=True) * along
     size = torch.linalg.vector_norm(ahead, dim=-1)
-    if is_concrete(size) and not bool((size > _PARALLEL).all()):
+    if fails(size > _PARALLEL):
         raise ValueError(
             f"{owner}: the cameras look along their baseline, or away from each other: no direction lies before both"
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from threading import local
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import Memo
-from camtorch._tracing import is_exporting
+from camtorch._opaque import CameraNumbers, opaque
 from camtorch.camera import Camera, from_values
 from camtorch.native.sampler import layout
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
@@ -23,30 +22,8 @@ def positions(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
 ) -> tuple[Tensor, Tensor]:
     """`grid.tabulate` of all pixels, between cameras that do not learn."""
-    cameras = [n for c in (source, target) for n in (c._model, c.intrinsics, c.distortion)]
-    sizes = [side for camera in (source, target) for side in camera._size("Warp")]
-    planes, mapped = _positions(*cameras, rotation, sizes, tolerance, padding)
+    planes, mapped = _positions(source, target, rotation, tolerance, padding)
     return planes.movedim(1, -1), mapped
-
-
-@torch.library.custom_op("camtorch::positions", mutates_args=())
-def _positions(
-    source_model: str,
-    source_intrinsics: Tensor,
-    source_distortion: Tensor,
-    target_model: str,
-    target_intrinsics: Tensor,
-    target_distortion: Tensor,
-    rotation: Tensor | None,
-    sizes: Sequence[int],
-    tolerance: float,
-    padding: str,
-) -> tuple[Tensor, Tensor]:
-    """The positions: planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
-    source = from_values(source_model, source_intrinsics, source_distortion, sizes[:2])
-    target = from_values(target_model, target_intrinsics, target_distortion, sizes[2:])
-    grid, mapped = tabulate(source, target, rotation, tolerance, padding=padding)
-    return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
 def _count(rotation: Tensor | None, *numbers: Tensor) -> int:
@@ -55,23 +32,22 @@ def _count(rotation: Tensor | None, *numbers: Tensor) -> int:
     return math.prod(broadcast_shapes(*shapes))
 
 
-@_positions.register_fake
-def _(
-    _: str,
-    source: Tensor,
-    source_distortion: Tensor,
-    __: str,
-    target: Tensor,
-    target_distortion: Tensor,
-    rotation: Tensor | None,
-    sizes: Sequence[int],
-    *_options: Any,
-) -> tuple[Tensor, Tensor]:
-    count = _count(rotation, source, source_distortion, target, target_distortion)
-    dtype = torch.promote_types(source.dtype, target.dtype)
+def _shapes(source: CameraNumbers, target: CameraNumbers, rotation: Tensor | None, *_: Any) -> tuple[Tensor, Tensor]:
+    given = [*source[:2], *target[:2]]
+    count, size = _count(rotation, *given), target.image_size
+    dtype = torch.promote_types(source.intrinsics.dtype, target.intrinsics.dtype)
     dtype = dtype if rotation is None else torch.promote_types(dtype, rotation.dtype)
-    planes = source.new_empty(count, 2, *sizes[2:], dtype=dtype)
-    return planes, source.new_empty(count, *sizes[2:], dtype=torch.bool)
+    planes = source.intrinsics.new_empty(count, 2, *size, dtype=dtype)
+    return planes, planes.new_empty(count, *size, dtype=torch.bool)
+
+
+@opaque(_shapes)
+def _positions(
+    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
+) -> tuple[Tensor, Tensor]:
+    """The positions: planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
+    grid, mapped = tabulate(source, target, rotation, tolerance, padding=padding)
+    return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
 # -- images
@@ -84,9 +60,7 @@ def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
         images: of the source.
         inputs: all that the positions depend on.
     """
-    return not is_exporting() and all(
-        t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs)
-    )
+    return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
 
 
 def warped(
@@ -115,14 +89,7 @@ def _layout(channels_last: bool) -> torch.memory_format:
     return torch.channels_last if channels_last else torch.contiguous_format
 
 
-class _Kept(local):
-    """The positions that a thread's last call used: masks are warped after their images, and cameras may be still."""
-
-    def __init__(self) -> None:
-        self.memo = Memo()
-
-
-_kept = _Kept()
+_located = Memo(2)  # masks are warped after their images, and cameras may be still
 
 
 @torch.library.custom_op("camtorch::warp", mutates_args=())
@@ -154,7 +121,7 @@ def _warp(
 
     inputs = [*numbers] if rotation is None else [*numbers, rotation]
     what = source_model, target_model, tuple(sizes), tolerance, antialias, padding, rotation is None
-    where = _kept.memo(inputs, what, positions)
+    where = _located(inputs, what, positions)
     options = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp"), tuple(fill)
     return render(images, where, *options).contiguous(memory_format=_layout(channels_last))
 

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._threads import as_cores_are_free
+from camtorch._threads import on_one_thread
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
@@ -127,7 +127,12 @@ class Lattice:
         return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None, self.seam)
 
 
-@as_cores_are_free
+def is_plain(*tensors: Tensor) -> bool:
+    """Whether tensors are the CPU's, and neither a graph nor a transform is at work."""
+    return not in_transform() and all(t.is_cpu and not in_graph(t) for t in tensors)
+
+
+@on_one_thread
 def locate(
     source: Camera,
     target: Camera,
@@ -168,7 +173,7 @@ def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
     return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size("Warp"), seam), seam)
 
 
-@as_cores_are_free
+@on_one_thread
 def tabulate(
     source: Camera,
     target: Camera,
@@ -247,7 +252,7 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
 
     Without a graph that happens in the memory of the pixels.
     """
-    if may_look(seen) and not in_graph(seen) and not in_transform():
+    if may_look(seen) and is_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
             plane.mul_(2 / side).add_(1 / side - 1).clamp_(-_FAR, _FAR)
         if not bool(mapped.all()):

@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_values
-from camtorch._tracing import may_look
+from camtorch._arguments import as_values, holds
 from camtorch.camera import Camera
 from camtorch.warp.grid import STEP, interpolated
 from camtorch.warp.warp import as_sized
@@ -38,7 +37,7 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
     height, width = as_sized(camera, "camera", "vignetting")._size("vignetting")
     with torch.no_grad():
         single = camera.intrinsics.dtype == torch.float32
-        cosine = _between_nodes(camera, height, width) if single and may_look(camera.intrinsics) else None
+        cosine = _between_nodes(camera, height, width) if single and holds(camera.intrinsics[..., 0] > 0) else None
         if cosine is None:
             rays, valid = camera.rays()
             cosine = torch.where(valid, rays[..., 2], _LEAST)

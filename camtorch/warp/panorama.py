@@ -8,8 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_coordinates
-from camtorch._tracing import is_concrete
+from camtorch._arguments import Numbers, as_coordinates, values_of
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
 
@@ -87,15 +86,15 @@ def seam_of(camera: Camera) -> Seam | None:
     """
     if not isinstance(camera, PANORAMAS):
         return None
-    if is_concrete(camera.intrinsics):
-        camera._seam = _found(camera)  # type: ignore[assignment]
+    numbers = values_of(camera.intrinsics)
+    if numbers is not None:
+        camera._seam = _found(camera, numbers.reshape(-1, 4))  # type: ignore[assignment]
     return getattr(camera, "_seam", None)
 
 
-def _found(camera: Camera) -> Seam | None:
+def _found(camera: Camera, numbers: Tensor) -> Seam | None:
     axis = int(isinstance(camera, _DOWN))
     sides = camera._size("Warp")[::-1]
-    numbers = camera.intrinsics.detach().reshape(-1, 4).to("cpu", torch.float64)
     turn, focal, centre = numbers[:, axis], numbers[:, 1 - axis], numbers[:, 3 - axis]
     if not len(numbers) or not bool(((2 * math.pi * turn - sides[axis]).abs() < _NEAR).all()):
         return None

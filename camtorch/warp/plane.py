@@ -8,8 +8,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_batch, as_coordinates, as_number, as_real, check_devices, shown
-from camtorch._tracing import in_graph, is_concrete
+from camtorch._arguments import (
+    Numbers,
+    as_batch,
+    as_coordinates,
+    as_number,
+    as_own,
+    as_real,
+    check_devices,
+    fails,
+    shown,
+    values_of,
+)
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.models import Pinhole
@@ -80,7 +90,7 @@ class PlaneWarp(SurfaceWarp):
             if isinstance(value, nn.Parameter):
                 self.register_parameter(name, value)
             else:
-                self.register_buffer(name, value if in_graph(value) else value.detach().clone())
+                self.register_buffer(name, as_own(value))
         self._check(owner)
 
     normal: Tensor
@@ -88,11 +98,10 @@ class PlaneWarp(SurfaceWarp):
 
     def _check(self, owner: str) -> None:
         """Raise a ValueError where the plane goes through a camera, or between them."""
-        plane = self.plane
-        if not all(map(is_concrete, plane)):
+        known = [values for t in self.plane if (values := values_of(t)) is not None]
+        if len(known) < 4:
             return
-        _, shift, normal, distance = (t.detach().double() for t in plane)
-        rotation = plane[0].detach().double()
+        rotation, shift, normal, distance = known
         place = -(rotation.mT @ shift[..., None])[..., 0]
         of_source = distance - (normal * place).sum(-1)
         if not bool(torch.isfinite(normal).all() & (torch.linalg.vector_norm(normal, dim=-1) > 0).all()):
@@ -230,7 +239,7 @@ class BirdsEye(PlaneWarp):
     def _check(self, owner: str) -> None:
         """Raise a ValueError where the camera is not above the ground."""
         place = self.extrinsics.position.detach()
-        if is_concrete(place) and not bool((place[..., 2] > 0).all()):
+        if fails(place[..., 2] > 0):
             raise ValueError(
                 f"{owner}: the camera stands at {place.tolist()} on the ground, whose z points up; it has to be above. "
                 "Are the extrinsics camera from ground?"

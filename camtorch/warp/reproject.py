@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_batch, as_number, check_devices
+from camtorch._arguments import Numbers, as_batch, as_number, check_devices, holds
 from camtorch._module import GeometryModule, Memo, typed_as
-from camtorch._tracing import in_graph, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.rotations import rotate_planes, rotation_matrix
-from camtorch.warp.grid import Sampling, to_positions
+from camtorch.warp.grid import Sampling, is_plain, to_positions
 from camtorch.warp.panorama import seam_of, seen_by
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
 from camtorch.warp.warp import as_sized
@@ -136,8 +135,8 @@ class Reproject(GeometryModule):
             valid = valid & self._shows(seen, far, source_depth, kind, as_number(tolerance, "tolerance", owner), owner)
         rows, steps = seen.shape[0], seen.shape[1]
         # an image that stays where it is, or is shifted by whole pixels, is copied to the bit
-        plain = steps == 1 and may_look(seen) and not in_graph(seen)
-        mode: Mode = "nearest" if plain and bool((seen == seen.round())[valid].all()) else self.mode
+        plain = steps == 1 and is_plain(seen) and holds((seen == seen.round()).all(-1) | ~valid)
+        mode: Mode = "nearest" if plain else self.mode
         positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), size)
         seam = seam_of(self.source)
         inner = positions.detach() if seam is None else seam.drawn_in(positions.detach())
@@ -181,7 +180,7 @@ class Reproject(GeometryModule):
     def _rays(self) -> tuple[Tensor, Tensor]:
         """The target's, kept while nothing can learn."""
         inputs = self.target._tensors
-        if (torch.is_grad_enabled() and any(map(in_graph, inputs))) or not all(map(is_concrete, inputs)):
+        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self.target.rays()
         kept: tuple[Tensor, Tensor] = self._memo(inputs, self.target._form, self.target.rays)
         return kept
@@ -218,4 +217,4 @@ def _snapped(pixels: Tensor) -> Tensor:
     near = pixels.detach().round()
     off = near - pixels.detach()
     off = torch.where(off.abs() <= _SNAP.get(pixels.dtype, 0.0), off, 0.0)
-    return pixels + off if in_graph(pixels) else pixels.add_(off)
+    return pixels + off

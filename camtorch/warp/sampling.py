@@ -13,11 +13,11 @@ from torch import Tensor
 
 from camtorch._arguments import as_flag, as_number, shown
 from camtorch._dtypes import SIGNED, narrow, wide_dtype, widen
-from camtorch._threads import as_cores_are_free, thread_count
+from camtorch._threads import thread_count
 from camtorch._tracing import converted, in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.warp.grid import Lattice, Sampling
+from camtorch.warp.grid import Lattice, Sampling, is_plain
 
 Mode = Literal["nearest", "bilinear", "bicubic"]
 PaddingMode = Literal["zeros", "border", "reflection"]
@@ -171,7 +171,6 @@ def blended(parts: Iterable[Tensor], weights: Iterable[Tensor], mode: Mode) -> T
     return result
 
 
-@as_cores_are_free
 def _by_torch(
     images: Tensor,
     where: Sampling | Lattice,
@@ -182,14 +181,14 @@ def _by_torch(
 ) -> Tensor:
     """What `grid_sample` makes of B images."""
     count, dtype = images.shape[0], images.dtype
-    plain = images.is_cpu and not in_graph(images) and not in_transform()
+    plain = is_plain(images)
     wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
     if isinstance(where, Lattice):
         where = where.pixels
     if mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
         return _pick(images, where, padding_mode, fill)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
-    plain = plain and not in_graph(where.grid)
+    plain = plain and is_plain(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
     step = count if wide or not plain else 1 if large else thread_count()
@@ -364,7 +363,7 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
         grid = grid.expand(images.shape[0], -1, -1, -1)
     if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
-    if images.is_cpu and not any(in_graph(t) for t in (images, grid)) and not in_transform():
+    if is_plain(images, grid):
         return _sample(images, grid, mode, padding_mode, finite)
     result: Tensor = _Sample.apply(images, grid, mode, padding_mode)  # type: ignore[no-untyped-call]
     return result
@@ -458,7 +457,7 @@ def _pick(images: Tensor, where: Sampling, padding_mode: PaddingMode, fill: tupl
     limits = torch.iinfo(images.dtype)
     values = [min(max(round(value), limits.min), limits.max) for value in fill]
     value = torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None]
-    if images.is_cpu and not in_graph(images) and not in_transform() and not in_graph(where.grid):
+    if is_plain(images, where.grid):
         picked = _pick_bits(images, where.grid, padding_mode)
         if padding_mode == "zeros" and not any(values):
             return picked

@@ -16,16 +16,18 @@ from camtorch._arguments import (
     as_coordinates,
     as_image_size,
     as_number,
+    as_own,
     as_points,
     as_real,
     as_vectors,
     as_whole,
     broadcast_shapes,
+    fails,
     shown,
 )
 from camtorch._dtypes import narrow, widen
 from camtorch._module import GeometryModule
-from camtorch._tracing import in_graph, in_transform, is_concrete, keeps_graph
+from camtorch._tracing import in_transform, is_concrete, keeps_graph
 from camtorch.camera import Camera
 from camtorch.optics.special import cosc_root, sinc_root
 
@@ -95,15 +97,15 @@ class RollingShutter(GeometryModule):
         for name, value in times.items():
             if value.ndim > 1:
                 raise ValueError(f"{owner}: {name} must be a number or (B,); got shape {tuple(value.shape)}")
-            if is_concrete(value) and not bool((value.detach().abs() < _LONGEST).all()):
+            if fails(value.detach().abs() < _LONGEST):
                 raise ValueError(
                     f"{owner}: {name} is in seconds; got {value.tolist()}, which would be milliseconds: {name} / 1000"
                 )
-        if is_concrete(rates) and not bool((rates.detach().abs() < _FASTEST).all()):
+        if fails(rates.detach().abs() < _FASTEST):
             raise ValueError(
                 f"{owner}: rates are in radians per second; got {rates.tolist()}, which would be degrees: numpy.deg2rad"
             )
-        if is_concrete(times["exposure"]) and not bool((times["exposure"].detach() >= 0).all()):
+        if fails(times["exposure"].detach() >= 0):
             raise ValueError(f"{owner}: exposure must not be negative; got {times['exposure'].tolist()}")
         samples, gamma = as_whole(samples, "samples", owner), as_number(gamma, "gamma", owner)
         if samples < 1 or not (math.isfinite(gamma) and gamma > 0):
@@ -116,7 +118,7 @@ class RollingShutter(GeometryModule):
             if isinstance(value, nn.Parameter):
                 self.register_parameter(name, value)
             else:
-                self.register_buffer(name, value if in_graph(value) else value.detach().clone())
+                self.register_buffer(name, as_own(value))
         self.direction, self.samples, self.gamma = direction, samples, gamma
         self._moment: float | None = None
         self._blurs = not is_concrete(self.exposure) or bool((self.exposure.detach() > 0).any())

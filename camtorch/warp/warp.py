@@ -29,6 +29,7 @@ from camtorch._tracing import (
     in_transform,
     is_concrete,
     is_exporting,
+    is_for_here,
     keeps_graph,
     may_look,
     set_aside,
@@ -400,11 +401,11 @@ class Warp(GeometryModule):
         """Whether code is compiled that calls this warp as one; it knows cameras of one model, and no shutters."""
         plain = self.shutter is None and self.target_shutter is None
         plain = plain and not (self.source.is_mixed or self.target.is_mixed)
-        return torch.compiler.is_compiling() and self.is_an_operator and plain
+        return is_for_here() and self.is_an_operator and plain
 
     def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
         may = self._is_operator() and self.tolerance and self.target.intrinsics.is_cpu
-        if may and not is_exporting():
+        if may:
             where = self.source, self.target, self.rotation
             return self._with_scale(*compiled.positions(*where, self.tolerance, padding))
         return self._strip(range(self.target._size("Warp")[0]), padding)

@@ -1,0 +1,103 @@
+"""Functions of cameras that compiled code calls as one operator, and does not look into."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.camera import Camera, from_values
+
+Function = Callable[..., tuple[Tensor, ...]]
+
+
+class CameraNumbers(NamedTuple):
+    """What is known of a camera before it has values."""
+
+    intrinsics: Tensor
+    distortion: Tensor
+    image_size: tuple[int, int]
+
+
+_FUNCTIONS: dict[str, tuple[Function, Function]] = {}
+
+
+def opaque(shapes: Function) -> Callable[[Function], Function]:
+    """A function of cameras of known image_size, tensors, None, floats, strings and pairs of whole numbers.
+
+    While it is compiled cameras arrive without their graphs, and none of its results may share memory with an argument.
+
+    Args:
+        shapes: makes empty tensors like its results, of the same arguments with `CameraNumbers` for cameras.
+    """
+
+    def decorate(function: Function) -> Function:
+        name = f"{function.__module__}.{function.__qualname__}"
+        _FUNCTIONS[name] = function, shapes
+
+        @wraps(function)
+        def call(*arguments: Any) -> tuple[Tensor, ...]:
+            if not torch.compiler.is_compiling():
+                return function(*arguments)
+            kinds: list[str] = []
+            tensors: list[Tensor] = []
+            sizes: list[int] = []
+            floats: list[float] = []
+            for argument in arguments:
+                if isinstance(argument, Camera):
+                    kinds.append(f"camera {argument._model}")
+                    tensors += [argument.intrinsics.detach(), argument.distortion.detach()]
+                    sizes += argument._size(name)
+                elif isinstance(argument, Tensor):
+                    kinds.append("tensor")
+                    tensors.append(argument)
+                elif isinstance(argument, float):
+                    kinds.append("float")
+                    floats.append(argument)
+                elif isinstance(argument, tuple):
+                    kinds.append("pair")
+                    sizes += argument
+                else:
+                    kinds.append("none" if argument is None else f"text {argument}")
+            return tuple(_computed(name, "\n".join(kinds), tensors, sizes, floats))
+
+        return call
+
+    return decorate
+
+
+def _arguments(
+    kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float], camera: Callable[..., Any]
+) -> list[Any]:
+    numbers, sides, shares = iter(tensors), iter(sizes), iter(floats)
+    arguments: list[Any] = []
+    for kind, _, text in (line.partition(" ") for line in kinds.split("\n")):
+        if kind == "camera":
+            arguments.append(camera(text, next(numbers), next(numbers), (next(sides), next(sides))))
+        elif kind == "tensor":
+            arguments.append(next(numbers))
+        elif kind == "float":
+            arguments.append(next(shares))
+        elif kind == "pair":
+            arguments.append((next(sides), next(sides)))
+        else:
+            arguments.append(text if kind == "text" else None)
+    return arguments
+
+
+@torch.library.custom_op("camtorch::computed", mutates_args=())
+def _computed(
+    name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float]
+) -> list[Tensor]:
+    return list(_FUNCTIONS[name][0](*_arguments(kinds, tensors, sizes, floats, from_values)))
+
+
+@_computed.register_fake
+def _(name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float]) -> list[Tensor]:
+    def numbers(_: str, *values: Any) -> CameraNumbers:
+        return CameraNumbers(*values)
+
+    return list(_FUNCTIONS[name][1](*_arguments(kinds, tensors, sizes, floats, numbers)))
