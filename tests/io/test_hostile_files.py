@@ -43,11 +43,10 @@ def loads_or_says_why(path):
     return True
 
 
-@pytest.mark.parametrize("step", [23, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SAMPLES)
-def test_truncated_anywhere(name, step, tmp_path):
+def test_truncated_anywhere(name, tmp_path):
     whole = (FILES / name).read_bytes()
-    for length in {*range(0, len(whole), step), *range(max(0, len(whole) - 5), len(whole))}:
+    for length in {*range(0, len(whole), 19), *range(max(0, len(whole) - 5), len(whole))}:
         loads_or_says_why(written(tmp_path / name, whole[:length]))
 
 
@@ -62,7 +61,7 @@ def test_images_truncated_at_every_byte(suffix, tmp_path):
         loads_or_says_why(tmp_path / f"cameras.{suffix}")
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(
     name=st.sampled_from(SAMPLES),
     position=st.floats(0, 1),
@@ -76,7 +75,7 @@ def test_damaged_bytes(tmp_path_factory, name, position, content, cut):
     loads_or_says_why(written(tmp_path_factory.getbasetemp() / name, whole[:start] + content + whole[start + cut :]))
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(
     content=st.binary(max_size=200) | st.text(max_size=100).map(lambda text: text.encode("utf-8", "surrogatepass")),
     suffix=st.sampled_from(["yaml", "json", "xml", "txt", "bin", "cameramodel"]),
@@ -94,7 +93,7 @@ junk = st.recursive(
 STRUCTURED = [name for name in SAMPLES if name.endswith(".json")]
 
 
-@settings(max_examples=250)
+@settings(max_examples=100)
 @given(data=st.data(), name=st.sampled_from(STRUCTURED))
 def test_wrong_values(tmp_path_factory, data, name):
     """One value of a good file, anywhere in it, becomes something else, or goes."""
@@ -246,41 +245,19 @@ def many(pattern, size, start=b"", end=b""):
 
 LARGE = {
     "blank.txt": filled(b"\n"),
-    "comments.txt": filled(b"#\n"),
     "numbers.txt": filled(b" 1", start=b"1 PINHOLE 640 480"),
-    "string.cameramodel": filled(b"a", start=b"{'lensmodel': '", end=b"'}"),
     "escapes.cameramodel": filled(b"\\n", start=b"{'lensmodel': '", end=b"'}"),
-    "spaces.cameramodel": filled(b" "),
-    "nothing.cameramodel": filled(b"#\n"),
-    "comments.cameramodel": filled(b"#\n", start=b"{'lensmodel': ", end=b"}"),
-    "words.cameramodel": filled(b"1 ", start=b"{'lensmodel': ", end=b"}"),
-    "additions.cameramodel": filled(b"1+", start=b"{'lensmodel': ", end=b"1}"),
     "lists.cameramodel": filled(b"[],", start=b"{'lensmodel': [", end=b"]}"),
-    "keys.cameramodel": many(b"%d:1,", 6 * MB, b"{'lensmodel': {", b"}}"),
-    "lists.yaml": filled(b"[],", 4 * MB - 99, b"a: [", b"]"),
     "keys.yaml": many(b"k%d: 1\n", 4 * MB - 99),
     "anchors.yaml": filled(b"&a [], *a,", 4 * MB - 99, b"a: [", b"]"),
     "documents.yaml": filled(b"---\n", 4 * MB - 99),
-    "comments.yaml": filled(b"#\n", 4 * MB - 99),
     "directives.yaml": filled(b"%a\n", 4 * MB - 99),
-    "nested.yaml": filled(b"[", 4 * MB - 99),
-    "lists.json": filled(b"[],", start=b'{"a": [', end=b"[]]}"),
-    "numbers.json": filled(b"12345,", start=b'{"a": [', end=b"1]}"),
-    "mappings.json": filled(b'{"a":1},', start=b'{"a": [', end=b"1]}"),
-    "keys.json": many(b'"k%d":1,', 6 * MB, b"{", b'"":1}'),
     "cameras.json": many(b'"K%d":[5,0,3,0,5,2,0,0,1],', 6 * MB, b"{", b'"":1}'),
     "nested.json": filled(b'{"a":'),
     "digits.json": filled(b"9", start=b'{"fl_x": ', end=b"}"),
     "patterns.json": filled(b"coef", start=b'{"K": [5], "', end=b'\\n": [1]}'),
-    "escapes.json": filled(b"\\n", start=b'{"a": "', end=b'"}'),
     "words.xml": filled(b"1 ", start=b"<opencv_storage><K>", end=b"</K></opencv_storage>"),
-    "quotes.xml": filled(b'" ', start=b"<opencv_storage><K>", end=b"</K></opencv_storage>"),
-    "elements.xml": filled(b"<K/>", start=b"<opencv_storage>", end=b"</opencv_storage>"),
     "attributes.xml": many(b'a%d="" ', 6 * MB, b"<opencv_storage ", b"/>"),
-    "lines.xml": filled(b"\n", start=b"<opencv_storage>", end=b"</opencv_storage>"),
-    "nested.xml": filled(b"<a>", start=b"<opencv_storage>"),
-    "comments.xml": filled(b"<!---->", start=b"<opencv_storage>", end=b"</opencv_storage>"),
-    "size.json": filled(b" ", 16 * MB, b"{", b"}"),
     "entries.npz": b"PK\3\4" + filled(b"PK\1\2"),
 }
 COSTS = """
@@ -324,14 +301,10 @@ def costing_little(paths):
         yield loaded
 
 
-USUAL = ("numbers.txt", "lists.cameramodel", "keys.yaml", "cameras.json", "words.xml", "entries.npz")  # one a reader
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="no peak memory that can be reset")
-@pytest.mark.parametrize("names", [USUAL, [n for n in LARGE if n not in USUAL]], ids=len)
-def test_large_files_cost_little(names, tmp_path):
-    assert not any([*costing_little([written(tmp_path / name, LARGE[name]) for name in names])])
+def test_large_files_cost_little(tmp_path):
+    assert not any([*costing_little([written(tmp_path / name, content) for name, content in LARGE.items()])])
 
 
 def reconstruction(folder, suffix, images):
@@ -350,9 +323,6 @@ def test_poses_of_many_images_cost_little(tmp_path):
     folders = [
         reconstruction(tmp_path / "text", "txt", text),
         reconstruction(tmp_path / "binary", "bin", struct.pack("<Q", 20_000) + b"".join(parts)),
-        reconstruction(tmp_path / "comments", "txt", filled(b"#\n", 6 * MB)),
-        reconstruction(tmp_path / "blanks", "txt", filled(b"\n", 6 * MB)),
-        reconstruction(tmp_path / "comment", "txt", filled(b"#", 6 * MB)),
         reconstruction(tmp_path / "name", "txt", filled(b"a", 6 * MB, start=IMAGE.encode()[:18])),
         reconstruction(tmp_path / "points", "txt", filled(b"1 ", 6 * MB, start=IMAGE.encode()[:-1])),
     ]
