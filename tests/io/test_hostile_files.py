@@ -75,16 +75,6 @@ def test_damaged_bytes(tmp_path_factory, name, position, content, cut):
     loads_or_says_why(written(tmp_path_factory.getbasetemp() / name, whole[:start] + content + whole[start + cut :]))
 
 
-@settings(max_examples=60)
-@given(
-    content=st.binary(max_size=200) | st.text(max_size=100).map(lambda text: text.encode("utf-8", "surrogatepass")),
-    suffix=st.sampled_from(["yaml", "json", "xml", "txt", "bin", "cameramodel"]),
-    start=st.sampled_from([b"", b"{", b"<", b"{'lensmodel':", b"cam0:\n", b"1 PINHOLE 640 480 ", b"\x01" + b"\0" * 7]),
-)
-def test_random_bytes(tmp_path_factory, content, suffix, start):
-    loads_or_says_why(written(tmp_path_factory.getbasetemp() / f"bytes.{suffix}", start + content))
-
-
 junk = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.sampled_from(["1e400", "NaN"]),
     lambda inner: st.lists(inner, max_size=6) | st.dictionaries(st.sampled_from(["rows", "data", "cam0"]), inner),
@@ -140,20 +130,12 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.yaml", f"cam0: {CAM}\ncam0: {CAM}", "line 2: the key 'cam0' stands there twice"),
         ("a.yaml", f"cam0: {CAM}\ncam2: {CAM}", "not numbered from cam0 on: cam0, cam2"),
         ("a.yaml", f"cam0: {CAM.replace('pinhole', 'fish')}", "cam0: 'fish-none' is not known here; known are pin"),
-        (
-            "a.yaml",
-            f"cam0: {CAM.replace('[4, 4]', '[4, 1e30]')}",
-            r"cam0.resolution\[1\]: 1e\+30 is no number of pixels",
-        ),
+        ("a.yaml", f"cam0: {CAM.replace('[4, 4]', '[4, 1e30]')}", r"cam0.resolution\[1\]: 1e\+30 is no number of"),
         ("a.yaml", f"cam0: {CAM.replace('[1, 1,', '[1, .nan,')}", r"cam0.intrinsics\[1\]: '.nan' is no finite number"),
         ("a.json", '{"a":' * 10_000, "deep"),
         ("a.json", '{"camtorch": 1, "cameras": {}}', "cameras: none"),
         ("a.json", '{"camtorch": 2, "cameras": {}}', "2 is no version that this camtorch reads"),
-        (
-            "a.json",
-            '{"camtorch": 1, "cameras": {"a": {"model": "x", "intrinsics": [1]}}}',
-            "needs the camera model 'x'",
-        ),
+        ("a.json", '{"camtorch": 1, "cameras": {"a": {"model": "x", "intrinsics": [1]}}}', "needs the camera model"),
         ("a.json", '{"camtorch": 1, "cameras": {"a": 1, "a": 2}}', "the key 'a' stands there twice"),
         ("a.json", '{"camera_angle_x": 5e-324, "w": 4, "h": 4}', "camera_angle_x: 5e-324 is no angle"),
         ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
@@ -166,28 +148,16 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.yml", "".join(f"%TAG !{i:x}! b\n" for i in range(20_000)) + "---\na: 1\n", "too many YAML directives"),
         ("a.cameramodel", "{'lensmodel': __import__('os').system('true')}", "line 1"),
         ("a.cameramodel", "{'lensmodel': " + "[" * 100_000, "deep"),
-        (
-            "a.cameramodel",
-            "{'lensmodel': 'LENSMODEL_CAHVOR', 'imagersize': [4, 4]}",
-            "'LENSMODEL_CAHVOR' is not known here",
-        ),
+        ("a.cameramodel", "{'lensmodel': 'LENSMODEL_CAHVOR', 'imagersize': [4, 4]}", "'LENSMODEL_CAHVOR' is not known"),
         ("a.cameramodel", "{'lensmodel': 1, 'lensmodel': 2}", "stands there twice"),
         ("a.cameramodel", "{'lensmodel': [1, 2,],\n'b': (1, 2,), }\n#\n}", "line 4: Extra data"),
         ("a.cameramodel", "{'lensmodel': 1,\n'b': 'x'", "line 2: Expecting ',' delimiter"),
         ("a.cameramodel", "{'lensmodel': 1,\n'b': [1 + 2]}", "line 2: Expecting ',' delimiter"),
         ("cameras.txt", CAMERA * 2, "line 2: a second camera has the id 1"),
-        (
-            "cameras.txt",
-            CAMERA.replace("PINHOLE", "FISH"),
-            "the model 'FISH' is not known here; known are SIMPLE_PINHOLE",
-        ),
+        ("cameras.txt", CAMERA.replace("PINHOLE", "FISH"), "the model 'FISH' is not known here; known are"),
         ("cameras.txt", CAMERA.replace("240", ""), "line 1: 3 parameters; PINHOLE has 4"),
         ("cameras.txt", CAMERA.replace("240", "1e400"), "line 1.*'1e400' is no finite number"),
-        (
-            "cameras.bin",
-            struct.pack("<Q", 1 << 60),
-            "byte 0: 1152921504606846976 cameras, for which the file is too small",
-        ),
+        ("cameras.bin", struct.pack("<Q", 1 << 60), "byte 0: 1152921504606846976 cameras, for which the file is too"),
         ("cameras.bin", struct.pack("<QIiQQ", 1, 1, 99, 4, 4), "byte 8: the model 99 is not known here"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, math.nan, 1), "not finite"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 1 << 60, 4, 1, 1, 1, 1), "no number of pixels"),

@@ -8,11 +8,10 @@ import sys
 
 import pytest
 import torch
-from cameras import KEYS, make, one
+from cameras import each_kind, make, one
 from torch import nn
 
 import camtorch as ct
-from camtorch._portable import plus
 
 onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
@@ -159,30 +158,11 @@ def assert_agrees(camera, results, points, pixels):
         assert torch.equal(found[~valid & ~is_valid], expected[~valid & ~is_valid])
 
 
-class Floor(nn.Module):
-    """Numbers far beyond the range of float32, as charts have them in float64."""
-
-    def forward(self, squares):
-        return plus(squares, FLOOR).sqrt(), plus(squares, -FLOOR) < 0
-
-
-FLOOR = torch.finfo(torch.float64).tiny ** 0.5
-
-
-@pytest.mark.slow
-def test_numbers_below_float32_are_added_in_float64():
-    squares = torch.tensor([0.0, 1e-160, 3e-150, 1e-20, 0.3, 8.0], dtype=torch.float64)
-    _, run = to_onnx(Floor(), squares)
-    roots, is_below = run(squares)
-    torch.testing.assert_close(roots, (squares + FLOOR).sqrt(), rtol=1e-7, atol=0)
-    assert is_below.tolist() == [True, True, False, False, False, False]
-
-
 COUNT = {"points": {0: "count"}, "pixels": {0: "pixel_count"}}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", KEYS)
+@each_kind
 def test_a_camera_is_a_constant(key):
     camera = one(key).float().requires_grad_(False)
     points, pixels = inputs_of(camera)

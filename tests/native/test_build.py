@@ -144,6 +144,7 @@ ASK = "from camtorch.native.library import native_available as asked; print(aske
 
 
 @compiles
+@pytest.mark.slow
 def test_the_environment_turns_it_off(tmp_path):
     folder = write(copy(tmp_path))
     build(folder, sources=folder)
@@ -155,6 +156,7 @@ def test_the_environment_turns_it_off(tmp_path):
 
 
 @compiles
+@pytest.mark.slow
 @pytest.mark.parametrize("older", [DISPATCH, DISPATCH.replace("camtorch_sources", "no_number")])
 def test_a_library_of_other_sources_is_not_used_and_said_once(tmp_path, older):
     folder = write(copy(tmp_path))

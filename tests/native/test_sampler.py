@@ -610,32 +610,6 @@ def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
             torch.set_default_dtype(torch.float32)
 
 
-TRACE = """
-import warnings
-import torch
-from test_sampler import images_of_floats, warps
-import camtorch as ct
-
-warnings.simplefilter("ignore")  # a trace keeps sizes
-images = images_of_floats()
-for warp in warps():
-    expected = warp(images)
-    fresh = ct.Warp(warp.source, warp.target, tolerance=warp.tolerance)
-    traced = torch.jit.trace(fresh, images, check_trace=False)
-    junk = [torch.rand(2, 3, 120, 160) for _ in range(5)]  # lies where the trace's own results lay
-    torch.testing.assert_close(traced(images), expected, atol=1e-4, rtol=0)
-    torch.testing.assert_close(traced(2 * images), 2 * expected, atol=2e-4, rtol=0)
-"""
-
-
-@pytest.mark.slow
-def test_a_trace_holds_the_images():
-    command = [sys.executable, "-c", TRACE]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "2"}
-    done = subprocess.run(command, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
 def test_who_watches_sees_the_operators_of_torch():
     images = images_of_floats()
     for warp in warps():

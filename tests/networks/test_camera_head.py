@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 import torch
-from cameras import DISTINCT
+from cameras import DISTINCT, USUAL, slow_unless
 
 import camtorch as ct
 from camtorch.projection.rays import image_lattice
@@ -141,7 +141,7 @@ def test_one_moves_the_rim_by_a_tenth():
             assert 0.3 * most < moved < 1.05 * most, name
 
 
-@pytest.mark.parametrize("key", [k for k in QUICK if k != "pinhole"])
+@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, sorted(USUAL - PANORAMAS - {"pinhole"})))
 def test_gradients_are_those_of_what_it_computes(key):
     layer = head(key, shared_focal=False).double()
     generator = torch.Generator().manual_seed(2)
@@ -170,7 +170,7 @@ def test_gradients_do_not_vanish_far_out():
     assert (numbers.grad.abs() > 1e-3).all()
 
 
-@pytest.mark.parametrize("key", [k for k in QUICK if k != "pinhole"])
+@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, sorted(USUAL - PANORAMAS - {"pinhole"})))
 def test_all_numbers_make_finite_cameras_and_gradients(key):
     layer = head(key)
     count = 1000 if key in ("double_sphere", "mei") else 100
