@@ -1,6 +1,5 @@
 import sys
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,17 +16,6 @@ torch.set_num_threads(1)
 # the same examples on every machine and in every run; speed is not what these tests are about
 settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=10, database=None)
 settings.load_profile("camtorch")
-
-
-def pytest_addoption(parser):
-    parser.addoption("--messages", type=Path, metavar="FILE", help="write what camtorch raises and warns of to FILE")
-
-
-def pytest_configure(config):
-    if file := config.getoption("--messages"):
-        from messages import Recorder
-
-        config.pluginmanager.register(Recorder(file.absolute(), gathers=not hasattr(config, "workerinput")))
 
 
 @pytest.fixture(autouse=True)

@@ -188,7 +188,3 @@ def test_links_of_the_root_lead_somewhere():
         if not (ROOT / path).exists() or (anchor and anchor not in anchors):
             broken.append((page, target))
     assert not broken
-
-
-def test_the_readme_is_short():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 120

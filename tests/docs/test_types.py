@@ -99,13 +99,6 @@ def test_what_users_write_runs(tmp_path):
         del ct.MODELS["typed_quintic"]
 
 
-def test_errors_on_the_pages_of_a_library_are_errors():
-    assert is_of_others('pages/a.py:1: error: Module "albumentations" is untyped  [import-untyped]')
-    assert not is_of_others(
-        "pages/docs_coming_from_albumentations_9.py:1: error: Name 'x' is not defined  [name-defined]"
-    )
-
-
 @pytest.mark.slow
 def test_mypy_finds_what_is_wrong_and_no_error_on_any_page(project):
     said = mypy(project, *UNTYPED, "uses", "pages")

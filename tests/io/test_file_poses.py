@@ -140,35 +140,6 @@ def test_nerfstudio_of_instant_ngp(tmp_path):
         ct.load(path)
 
 
-@pytest.mark.parametrize("suffix", ["txt", "bin"])
-def test_colmap_images(suffix, tmp_path):
-    camera = ct.KannalaBrandt(float64([500, 501, 320, 240]), float64([0.1, 0, 0, 0]), image_size=(480, 640))
-    poses = {f"{i}.jpg": ct.Extrinsics(float64([0.3 * i, -0.7, 3.0]), float64([1, 2, i])) for i in range(3)}
-    rig = ct.Rig({"4": camera}, poses, images=dict.fromkeys(poses, "4"))
-    ct.save(rig, tmp_path / f"cameras.{suffix}")
-    first = ct.load(tmp_path)
-    for name, pose in poses.items():
-        assert torch.allclose(first.extrinsics[name].matrix(), pose.matrix(), rtol=0, atol=1e-14)
-    assert torch.equal(first.camera_of("2.jpg").intrinsics, camera.intrinsics)
-    ct.save(first, tmp_path / f"cameras.{suffix}")
-    assert_same(ct.load(tmp_path), first)
-
-
-def test_poses_of_images_learn_when_they_are_told_to(tmp_path):
-    poses = {f"{i}.jpg": ct.Extrinsics([0.3, 0.1, i], [1, 2, 3]) for i in range(3)}
-    rig = ct.Rig(
-        {"1": ct.Pinhole([500.0, 500, 320, 240], image_size=(480, 640))}, poses, images=dict.fromkeys(poses, "1")
-    )
-    for path in ("cameras.txt", "transforms.json", "own.json"):
-        ct.save(rig, tmp_path / path)
-        found = ct.load(tmp_path / path)
-        assert not any(p.requires_grad for p in found.parameters())
-        found.requires_grad_()
-        found.extrinsics["1.jpg"](float64(POINT)).sum().backward()
-        assert found.extrinsics.batch.translation.grad.tolist() == [[0, 0, 0], [1, 1, 1], [0, 0, 0]]
-        assert found.camera_of("1.jpg").intrinsics.requires_grad
-
-
 def test_colmap_points_are_not_lost(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
     images = "# list\n1 1 0 0 0 0 0 0 1 a.jpg\n10.5 11.5 -1\n2 1 0 0 0 0 0 1 1 b.jpg\n\n"

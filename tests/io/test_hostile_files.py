@@ -43,11 +43,10 @@ def loads_or_says_why(path):
     return True
 
 
-@pytest.mark.parametrize("step", [23, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SAMPLES)
-def test_truncated_anywhere(name, step, tmp_path):
+def test_truncated_anywhere(name, tmp_path):
     whole = (FILES / name).read_bytes()
-    for length in {*range(0, len(whole), step), *range(max(0, len(whole) - 5), len(whole))}:
+    for length in {*range(0, len(whole), 19), *range(max(0, len(whole) - 5), len(whole))}:
         loads_or_says_why(written(tmp_path / name, whole[:length]))
 
 
@@ -62,7 +61,7 @@ def test_images_truncated_at_every_byte(suffix, tmp_path):
         loads_or_says_why(tmp_path / f"cameras.{suffix}")
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(
     name=st.sampled_from(SAMPLES),
     position=st.floats(0, 1),
@@ -76,16 +75,6 @@ def test_damaged_bytes(tmp_path_factory, name, position, content, cut):
     loads_or_says_why(written(tmp_path_factory.getbasetemp() / name, whole[:start] + content + whole[start + cut :]))
 
 
-@settings(max_examples=200)
-@given(
-    content=st.binary(max_size=200) | st.text(max_size=100).map(lambda text: text.encode("utf-8", "surrogatepass")),
-    suffix=st.sampled_from(["yaml", "json", "xml", "txt", "bin", "cameramodel"]),
-    start=st.sampled_from([b"", b"{", b"<", b"{'lensmodel':", b"cam0:\n", b"1 PINHOLE 640 480 ", b"\x01" + b"\0" * 7]),
-)
-def test_random_bytes(tmp_path_factory, content, suffix, start):
-    loads_or_says_why(written(tmp_path_factory.getbasetemp() / f"bytes.{suffix}", start + content))
-
-
 junk = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.sampled_from(["1e400", "NaN"]),
     lambda inner: st.lists(inner, max_size=6) | st.dictionaries(st.sampled_from(["rows", "data", "cam0"]), inner),
@@ -94,7 +83,7 @@ junk = st.recursive(
 STRUCTURED = [name for name in SAMPLES if name.endswith(".json")]
 
 
-@settings(max_examples=250)
+@settings(max_examples=100)
 @given(data=st.data(), name=st.sampled_from(STRUCTURED))
 def test_wrong_values(tmp_path_factory, data, name):
     """One value of a good file, anywhere in it, becomes something else, or goes."""
@@ -141,20 +130,12 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.yaml", f"cam0: {CAM}\ncam0: {CAM}", "line 2: the key 'cam0' stands there twice"),
         ("a.yaml", f"cam0: {CAM}\ncam2: {CAM}", "not numbered from cam0 on: cam0, cam2"),
         ("a.yaml", f"cam0: {CAM.replace('pinhole', 'fish')}", "cam0: 'fish-none' is not known here; known are pin"),
-        (
-            "a.yaml",
-            f"cam0: {CAM.replace('[4, 4]', '[4, 1e30]')}",
-            r"cam0.resolution\[1\]: 1e\+30 is no number of pixels",
-        ),
+        ("a.yaml", f"cam0: {CAM.replace('[4, 4]', '[4, 1e30]')}", r"cam0.resolution\[1\]: 1e\+30 is no number of"),
         ("a.yaml", f"cam0: {CAM.replace('[1, 1,', '[1, .nan,')}", r"cam0.intrinsics\[1\]: '.nan' is no finite number"),
         ("a.json", '{"a":' * 10_000, "deep"),
         ("a.json", '{"camtorch": 1, "cameras": {}}', "cameras: none"),
         ("a.json", '{"camtorch": 2, "cameras": {}}', "2 is no version that this camtorch reads"),
-        (
-            "a.json",
-            '{"camtorch": 1, "cameras": {"a": {"model": "x", "intrinsics": [1]}}}',
-            "needs the camera model 'x'",
-        ),
+        ("a.json", '{"camtorch": 1, "cameras": {"a": {"model": "x", "intrinsics": [1]}}}', "needs the camera model"),
         ("a.json", '{"camtorch": 1, "cameras": {"a": 1, "a": 2}}', "the key 'a' stands there twice"),
         ("a.json", '{"camera_angle_x": 5e-324, "w": 4, "h": 4}', "camera_angle_x: 5e-324 is no angle"),
         ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
@@ -167,28 +148,16 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.yml", "".join(f"%TAG !{i:x}! b\n" for i in range(20_000)) + "---\na: 1\n", "too many YAML directives"),
         ("a.cameramodel", "{'lensmodel': __import__('os').system('true')}", "line 1"),
         ("a.cameramodel", "{'lensmodel': " + "[" * 100_000, "deep"),
-        (
-            "a.cameramodel",
-            "{'lensmodel': 'LENSMODEL_CAHVOR', 'imagersize': [4, 4]}",
-            "'LENSMODEL_CAHVOR' is not known here",
-        ),
+        ("a.cameramodel", "{'lensmodel': 'LENSMODEL_CAHVOR', 'imagersize': [4, 4]}", "'LENSMODEL_CAHVOR' is not known"),
         ("a.cameramodel", "{'lensmodel': 1, 'lensmodel': 2}", "stands there twice"),
         ("a.cameramodel", "{'lensmodel': [1, 2,],\n'b': (1, 2,), }\n#\n}", "line 4: Extra data"),
         ("a.cameramodel", "{'lensmodel': 1,\n'b': 'x'", "line 2: Expecting ',' delimiter"),
         ("a.cameramodel", "{'lensmodel': 1,\n'b': [1 + 2]}", "line 2: Expecting ',' delimiter"),
         ("cameras.txt", CAMERA * 2, "line 2: a second camera has the id 1"),
-        (
-            "cameras.txt",
-            CAMERA.replace("PINHOLE", "FISH"),
-            "the model 'FISH' is not known here; known are SIMPLE_PINHOLE",
-        ),
+        ("cameras.txt", CAMERA.replace("PINHOLE", "FISH"), "the model 'FISH' is not known here; known are"),
         ("cameras.txt", CAMERA.replace("240", ""), "line 1: 3 parameters; PINHOLE has 4"),
         ("cameras.txt", CAMERA.replace("240", "1e400"), "line 1.*'1e400' is no finite number"),
-        (
-            "cameras.bin",
-            struct.pack("<Q", 1 << 60),
-            "byte 0: 1152921504606846976 cameras, for which the file is too small",
-        ),
+        ("cameras.bin", struct.pack("<Q", 1 << 60), "byte 0: 1152921504606846976 cameras, for which the file is too"),
         ("cameras.bin", struct.pack("<QIiQQ", 1, 1, 99, 4, 4), "byte 8: the model 99 is not known here"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, math.nan, 1), "not finite"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 1 << 60, 4, 1, 1, 1, 1), "no number of pixels"),
@@ -246,41 +215,19 @@ def many(pattern, size, start=b"", end=b""):
 
 LARGE = {
     "blank.txt": filled(b"\n"),
-    "comments.txt": filled(b"#\n"),
     "numbers.txt": filled(b" 1", start=b"1 PINHOLE 640 480"),
-    "string.cameramodel": filled(b"a", start=b"{'lensmodel': '", end=b"'}"),
     "escapes.cameramodel": filled(b"\\n", start=b"{'lensmodel': '", end=b"'}"),
-    "spaces.cameramodel": filled(b" "),
-    "nothing.cameramodel": filled(b"#\n"),
-    "comments.cameramodel": filled(b"#\n", start=b"{'lensmodel': ", end=b"}"),
-    "words.cameramodel": filled(b"1 ", start=b"{'lensmodel': ", end=b"}"),
-    "additions.cameramodel": filled(b"1+", start=b"{'lensmodel': ", end=b"1}"),
     "lists.cameramodel": filled(b"[],", start=b"{'lensmodel': [", end=b"]}"),
-    "keys.cameramodel": many(b"%d:1,", 6 * MB, b"{'lensmodel': {", b"}}"),
-    "lists.yaml": filled(b"[],", 4 * MB - 99, b"a: [", b"]"),
     "keys.yaml": many(b"k%d: 1\n", 4 * MB - 99),
     "anchors.yaml": filled(b"&a [], *a,", 4 * MB - 99, b"a: [", b"]"),
     "documents.yaml": filled(b"---\n", 4 * MB - 99),
-    "comments.yaml": filled(b"#\n", 4 * MB - 99),
     "directives.yaml": filled(b"%a\n", 4 * MB - 99),
-    "nested.yaml": filled(b"[", 4 * MB - 99),
-    "lists.json": filled(b"[],", start=b'{"a": [', end=b"[]]}"),
-    "numbers.json": filled(b"12345,", start=b'{"a": [', end=b"1]}"),
-    "mappings.json": filled(b'{"a":1},', start=b'{"a": [', end=b"1]}"),
-    "keys.json": many(b'"k%d":1,', 6 * MB, b"{", b'"":1}'),
     "cameras.json": many(b'"K%d":[5,0,3,0,5,2,0,0,1],', 6 * MB, b"{", b'"":1}'),
     "nested.json": filled(b'{"a":'),
     "digits.json": filled(b"9", start=b'{"fl_x": ', end=b"}"),
     "patterns.json": filled(b"coef", start=b'{"K": [5], "', end=b'\\n": [1]}'),
-    "escapes.json": filled(b"\\n", start=b'{"a": "', end=b'"}'),
     "words.xml": filled(b"1 ", start=b"<opencv_storage><K>", end=b"</K></opencv_storage>"),
-    "quotes.xml": filled(b'" ', start=b"<opencv_storage><K>", end=b"</K></opencv_storage>"),
-    "elements.xml": filled(b"<K/>", start=b"<opencv_storage>", end=b"</opencv_storage>"),
     "attributes.xml": many(b'a%d="" ', 6 * MB, b"<opencv_storage ", b"/>"),
-    "lines.xml": filled(b"\n", start=b"<opencv_storage>", end=b"</opencv_storage>"),
-    "nested.xml": filled(b"<a>", start=b"<opencv_storage>"),
-    "comments.xml": filled(b"<!---->", start=b"<opencv_storage>", end=b"</opencv_storage>"),
-    "size.json": filled(b" ", 16 * MB, b"{", b"}"),
     "entries.npz": b"PK\3\4" + filled(b"PK\1\2"),
 }
 COSTS = """
@@ -324,14 +271,10 @@ def costing_little(paths):
         yield loaded
 
 
-USUAL = ("numbers.txt", "lists.cameramodel", "keys.yaml", "cameras.json", "words.xml", "entries.npz")  # one a reader
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="no peak memory that can be reset")
-@pytest.mark.parametrize("names", [USUAL, [n for n in LARGE if n not in USUAL]], ids=len)
-def test_large_files_cost_little(names, tmp_path):
-    assert not any([*costing_little([written(tmp_path / name, LARGE[name]) for name in names])])
+def test_large_files_cost_little(tmp_path):
+    assert not any([*costing_little([written(tmp_path / name, content) for name, content in LARGE.items()])])
 
 
 def reconstruction(folder, suffix, images):
@@ -350,9 +293,6 @@ def test_poses_of_many_images_cost_little(tmp_path):
     folders = [
         reconstruction(tmp_path / "text", "txt", text),
         reconstruction(tmp_path / "binary", "bin", struct.pack("<Q", 20_000) + b"".join(parts)),
-        reconstruction(tmp_path / "comments", "txt", filled(b"#\n", 6 * MB)),
-        reconstruction(tmp_path / "blanks", "txt", filled(b"\n", 6 * MB)),
-        reconstruction(tmp_path / "comment", "txt", filled(b"#", 6 * MB)),
         reconstruction(tmp_path / "name", "txt", filled(b"a", 6 * MB, start=IMAGE.encode()[:18])),
         reconstruction(tmp_path / "points", "txt", filled(b"1 ", 6 * MB, start=IMAGE.encode()[:-1])),
     ]

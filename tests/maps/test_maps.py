@@ -228,24 +228,6 @@ def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(step, tmp_path
     assert warp.save(tmp_path / "map.bin", format).max_error <= most
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("fov", [None, 100])
-def test_meshes_of_perspective_views_are_near(fov, tmp_path):
-    warp = ct.Dewarp(fisheye(), fov=fov)
-    assert warp.save(tmp_path / "map.bin", "ti_ldc").max_error <= 0.09
-    assert warp.save(tmp_path / "map.bin", "dw100").max_error <= 0.15
-    assert warp.save(tmp_path / "map.bin", "ti_ldc", step=16).max_error <= 0.15
-
-
-def test_vertices_are_the_exact_positions_but_for_a_fraction(tmp_path):
-    warp = small()
-    warp.save(tmp_path / "map.bin", "dw100")
-    words = np.fromfile(tmp_path / "map.bin", "<u4").reshape(13, 21)
-    wanted = positions(warp)[0][::16, ::16]
-    found = np.stack((words & 0xFFFF, words >> 16), -1)[:12, :20] / 16
-    assert np.abs(found - wanted.numpy()).max() < 1 / 16
-
-
 # -- onnx
 
 
@@ -319,11 +301,10 @@ def test_meshes_go_on_where_rays_end(format, tmp_path):
     assert max(float(moved.diff(dim=dim).abs().max()) for dim in (0, 1)) < 20
 
 
-@pytest.mark.parametrize("name", ["map.obj", pytest.param("map.glb", marks=pytest.mark.slow)])
-def test_triangles_that_show_nothing_are_left_out(name, tmp_path):
+def test_triangles_that_show_nothing_are_left_out(tmp_path):
     warp = partial()
-    report = warp.save(tmp_path / name, step=4)
-    read = ct.load_map(tmp_path / name)
+    report = warp.save(tmp_path / "map.obj", step=4)
+    read = ct.load_map(tmp_path / "map.obj")
     drawn = ~read.positions[..., 0].isnan()
     shown = warp.valid_mask()[0, 0]
     assert (drawn | ~shown).all()
@@ -623,14 +604,13 @@ def spoiled(content, random):
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "npz", "exr", "tif", "bin", "obj", "glb", "gltf", "onnx"])
-@pytest.mark.parametrize("times", [4, pytest.param(150, marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore")
-def test_spoiled_maps_are_one_kind_of_error(suffix, times, tmp_path):
+def test_spoiled_maps_are_one_kind_of_error(suffix, tmp_path):
     view = ct.Pinhole.from_fov(60, image_size=(40, 50)).double().requires_grad_(False)
     path = tmp_path / f"map.{suffix}"
     ct.Warp(view, view).save(path, "depthai" if suffix == "bin" else None)
-    content, random = path.read_bytes(), np.random.default_rng(times)
-    for _ in range(times):
+    content, random = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(10):
         path.write_bytes(spoiled(content, random))
         try:
             read = ct.load_map(path)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.native import memory, sampler
+from camtorch.native import memory
 
 LAYOUTS = (torch.contiguous_format, torch.channels_last)
 SHAPE = (2, 3, 640, 480)  # 7 MB of float32
@@ -85,15 +85,6 @@ def test_what_is_kept_has_a_limit():
     assert large.nbytes > memory.LIMIT
     del large
     assert not memory._idle
-
-
-def test_small_ones_are_not_kept():
-    images = torch.zeros(1, 3, 480, 640)
-    for count, size in ((1, (480, 640)), (0, (4800, 6400)), (1, (0, 640))):
-        assert sampler.empty(images, count, size).shape == (count, 3, *size)
-    assert not memory._idle
-    sampler.empty(images, 2, (480, 640))
-    assert memory._idle
 
 
 def test_it_can_be_copied_sent_and_shared():

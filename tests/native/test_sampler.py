@@ -1,21 +1,19 @@
 """Laws of the compiled sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
 
 import copy
-import gc
 import math
 import os
 import signal
 import subprocess
 import sys
 import threading
-import weakref
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
-from cameras import KEYS, drawn, slow_unless
+from cameras import KEYS, drawn
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -199,29 +197,11 @@ def test_every_image_is_sampled_as_torch_does(dtype, mode, padding):
             assert result.is_contiguous(memory_format=torch.channels_last) or not sampler.takes(dtype, mode)
 
 
-SIZES = [
-    (1, 1),
-    (1, 2),
-    (2, 1),
-    (2, 2),
-    (1, 9),
-    (9, 1),
-    (2, 3),
-    (3, 2),
-    (3, 3),
-    (4, 4),
-    (5, 7),
-    (8, 8),
-    (9, 17),
-    (17, 64),
-    (31, 33),
-]
+SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (1, 9), (9, 1), (3, 2), (5, 7), (8, 8), (31, 33)]
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    "dtype", slow_unless({torch.uint8}.__contains__, [torch.uint8, torch.float32, torch.uint16, torch.bool])
-)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_every_size_is_sampled_as_torch_does(dtype, mode):
     for i, source in enumerate(SIZES):
         for j, target in enumerate(SIZES):
@@ -241,13 +221,7 @@ def gentle(count, size, source, zoom=1.0, turn=0.1):
 
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    "dtype",
-    slow_unless(
-        (torch.uint8, torch.float32).__contains__,
-        [torch.uint8, torch.float32, torch.bool, torch.uint16, torch.int32],
-    ),
-)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_rows_that_read_rows_are_sampled_as_torch_does(dtype, mode, padding):
     """What is read of neighbouring pixels at once is theirs, at every zoom and turn."""
     cases = product(((48, 64), (33, 95)), (0.3217, 1.0, 1.7321), (0.0, 0.02, 1.6))
@@ -355,7 +329,7 @@ FUZZ = Path(__file__).parent / "sampler_fuzz.c"
 PLAIN = ("-DCAMTORCH_PLAIN",)
 
 
-def fuzz(folder, names, sanitizers, optimized, first, count):
+def fuzz(folder, names, sanitizers, first, count):
     """Build some variants of the sampler with sanitizers, and give them jobs by chance."""
     try:
         command = [*building._compiler(None), "-std=gnu11", "-g", "-Wno-psabi", f"-I{building._HERE}", *sanitizers]
@@ -368,7 +342,7 @@ def fuzz(folder, names, sanitizers, optimized, first, count):
     has = [f"-DHAS_{name.upper()}" for name in names]
     units = [["-O1", str(FUZZ), "-c", "-o", "driver.o", *has]]
     for name, options in flags.items():
-        units.append([*building._FLAGS, optimized, *options, f"-DVARIANT={name}"])
+        units.append([*building._FLAGS, "-O1", *options, f"-DVARIANT={name}"])
         units[-1] += [str(building._HERE / "kernel.c"), "-c", "-o", f"{name}.o"]
     compilers = [subprocess.Popen([*command, *unit], cwd=folder) for unit in units]
     assert all(compiler.wait() == 0 for compiler in compilers)
@@ -389,14 +363,9 @@ def runs_here():
 
 
 @pytest.mark.slow
-def test_no_read_outside(tmp_path):
-    fuzz(tmp_path, runs_here()[-1:], ["-fsanitize=address"], "-O1", 0, 1500)
-
-
-@pytest.mark.slow
 def test_no_read_outside_and_nothing_undefined_in_any_variant(tmp_path):
     sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-    fuzz(tmp_path, runs_here(), sanitizers, "-O1", 10_000, 3_000)
+    fuzz(tmp_path, runs_here(), sanitizers, 10_000, 2_000)
 
 
 # -- positions from a lattice
@@ -424,27 +393,6 @@ def measured(warp, exact):
     return (float(error.max()) if error.numel() else 0.0), error.numel()
 
 
-@contextmanager
-def classified():
-    """The cells of every lattice: how many there are, and how many of them torch finds to be others."""
-    counts = [0, 0]
-    with pytest.MonkeyPatch.context() as patch:
-        native = positions.classify
-
-        def checked(probed):
-            (cells, most), (expected, _) = native(probed), positions._classified(probed)
-            off = cells != expected
-            assert most == int((cells == sampler.TODO).sum((1, 2)).amax())
-            # of what is to be exact roundings may decide, not of what there is
-            assert torch.equal(cells == sampler.EMPTY, expected == sampler.EMPTY)
-            counts[0] += cells.numel()
-            counts[1] += int(off.sum())
-            return cells, most
-
-        patch.setattr(positions, "classify", checked)
-        yield counts
-
-
 def lost_in_single(exact, source, target, turned):
     """By how many pixels positions in float32 differ from those in float64, at most."""
     double = [copy.deepcopy(camera).double() for camera in (source, target)]
@@ -455,18 +403,12 @@ def lost_in_single(exact, source, target, turned):
     return float(off.norm(dim=-1).max())
 
 
-errors: dict[float, list[float]] = {}
-
-
 def check_lattice(source, target, turned):
     exact = ct.Warp(source, target, turned)._sampling()
     for tolerance in (0.1, 0.03, 0.01, 0.003, 0.001):
         warp = ct.Warp(source, target, turned, tolerance=tolerance)
-        with classified() as counts:
-            where = warp._kept(warp._inputs())
-        if not isinstance(where, Lattice):
+        if not isinstance(warp._kept(warp._inputs()), Lattice):
             continue
-        assert counts[1] <= 2 + counts[0] / 500
         error, count = measured(warp, exact)
         if not count:
             continue
@@ -475,7 +417,6 @@ def check_lattice(source, target, turned):
         if error > tolerance + rounding:  # near a fold it leaves less
             rounding += 2 * lost_in_single(exact, source, target, turned)
         assert error <= tolerance + rounding
-        errors.setdefault(tolerance, []).append(error / tolerance)
 
 
 SIDES = st.integers(64, 260)
@@ -545,17 +486,9 @@ def test_positions_of_lattices_keep_their_tolerance(pair):
 
 @pytest.mark.slow
 @given(pairs())
-@settings(max_examples=600)
+@settings(max_examples=150)
 def test_positions_of_more_lattices_keep_their_tolerance(pair):
     check_lattice(*pair)
-
-
-def test_the_largest_error_of_positions_is_told(capsys):
-    if not errors:
-        pytest.skip("the tests that measure it did not run in this process")
-    with capsys.disabled():
-        told = ", ".join(f"{max(parts):.2f} of {tolerance} px ({len(parts)})" for tolerance, parts in errors.items())
-        print(f"\nlargest errors of positions from lattices (of so many): {told}")
 
 
 def test_lattices_of_a_batch_of_cameras_and_images():
@@ -652,8 +585,10 @@ def test_zeros_by_declaration_are_zeros():
         assert not warp(torch._efficientzerotensor((2, 3, 120, 160))).any()
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float16])
+@pytest.mark.parametrize(
+    ("dtype", "mode"),
+    [*zip((torch.uint8, torch.float32, torch.float16), ("bilinear", "bicubic", "nearest"), strict=True)],
+)
 def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
     images = pixels(dtype, (2, 3, 120, 160))
     for warp, layout in product(warps(), ("contiguous", "channels last", "every other channel")):
@@ -673,34 +608,6 @@ def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
             assert torch.equal(fresh()(images), expected)
         finally:
             torch.set_default_dtype(torch.float32)
-
-
-TRACE = """
-import warnings
-import torch
-from test_sampler import images_of_floats, warps
-import camtorch as ct
-
-warnings.simplefilter("ignore")  # a trace keeps sizes
-images = images_of_floats()
-for warp in warps():
-    expected = warp(images)
-    fresh = ct.Warp(warp.source, warp.target, tolerance=warp.tolerance)
-    traced = torch.jit.trace(fresh, images, check_trace=False)
-    junk = [torch.rand(2, 3, 120, 160) for _ in range(5)]  # lies where the trace's own results lay
-    torch.testing.assert_close(traced(images), expected, atol=1e-4, rtol=0)
-    torch.testing.assert_close(traced(2 * images), 2 * expected, atol=2e-4, rtol=0)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_trace_holds_the_images(threads):
-    command = [sys.executable, "-c", TRACE]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    environment["OMP_NUM_THREADS"] = str(threads)
-    done = subprocess.run(command, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
 
 
 def test_who_watches_sees_the_operators_of_torch():
@@ -842,13 +749,11 @@ class Warped(torch.utils.data.Dataset):
         return self.warp(samples(1, i))[0], torch.get_num_threads()
 
 
-@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-def test_workers_of_a_loader(start):
-    if start not in torch.multiprocessing.get_all_start_methods():
-        pytest.skip(f"no {start} here")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_workers_of_a_loader():
     images = Warped()
     expected = [images[i][0] for i in range(len(images))]
-    loader = torch.utils.data.DataLoader(images, batch_size=2, num_workers=2, multiprocessing_context=start)
+    loader = torch.utils.data.DataLoader(images, batch_size=2, num_workers=2, multiprocessing_context="fork")
     batches = list(loader)
     assert torch.equal(torch.cat([batch for batch, _ in batches]), torch.stack(expected))
     assert {int(n) for _, counts in batches for n in counts} == {1}
@@ -888,32 +793,16 @@ for last in (False, True):
     for dtype in (torch.uint8, torch.float32):
         check("kept", 8, (720, 1280), dtype, 0.01, last, True)
         check("kept", 8, (720, 1280), dtype, 0.0, last, True)
-    check("fresh", 1, SIZE, torch.uint8, 0.01, last, False)
+    check("fresh", 1, (3000, 4000), torch.uint8, 0.01, last, False)
 """
 
 
-def test_positions_of_strips_go_with_them():
-    """What waits for the garbage collector is memory that a warp of a large image takes."""
-    warp = larger(0.01)
-    gc.disable()
-    try:
-        where = positions.on_lattice(warp.source, warp.target, None, 0.01, range(480), "zeros")
-        sampling.render(samples(1), where, "bilinear", "zeros", (0.0,))
-        seen = weakref.ref(where)
-        del where
-        assert seen() is None
-    finally:
-        gc.enable()
-
-
 @pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="the system does not tell how much was used")
-@pytest.mark.parametrize("size", [(3000, 4000), (9000, 12000)])
 @pytest.mark.slow
-def test_the_peak_of_memory_is_the_result(size):
+def test_the_peak_of_memory_is_the_result():
     # what is given back is not to count as room for what comes
     here = os.environ | {"MALLOC_TRIM_THRESHOLD_": "0", "MALLOC_MMAP_THRESHOLD_": "65536"}
-    script = PEAK.replace("SIZE", str(size))
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=here, check=True)
+    done = subprocess.run([sys.executable, "-c", PEAK], capture_output=True, text=True, env=here, check=True)
     parts = [float(line.split()[-1]) for line in done.stdout.splitlines()]
     assert len(parts) == 10
     assert max(parts) <= 1.1, done.stdout

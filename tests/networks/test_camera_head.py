@@ -6,10 +6,9 @@ import pickle
 
 import pytest
 import torch
-from cameras import DISTINCT
+from cameras import DISTINCT, USUAL, slow_unless
 
 import camtorch as ct
-from camtorch.networks.limits import Limits
 from camtorch.projection.rays import image_lattice
 
 SIZE = (480, 640)
@@ -60,13 +59,10 @@ def test_random_weights_give_cameras_with_a_ray_for_every_point_of_the_image(key
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", ["brown_conrady", "kannala_brandt", "fisheye624", "double_sphere", "division"])
-def test_ten_thousand_random_features(key):
-    count = 0
-    for camera in valid_cameras(key, 10_000):
+@pytest.mark.parametrize("key", ["brown_conrady", "fisheye624", "double_sphere"])
+def test_thousands_of_random_features(key):
+    for camera in valid_cameras(key, 4_000):
         assert bool(all_have_rays(camera, 5, 7).all())
-        count += len(camera)
-    assert count == 10_000
 
 
 @pytest.mark.parametrize("count", [5, 8, 14])
@@ -145,7 +141,7 @@ def test_one_moves_the_rim_by_a_tenth():
             assert 0.3 * most < moved < 1.05 * most, name
 
 
-@pytest.mark.parametrize("key", [k for k in QUICK if k != "pinhole"])
+@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, sorted(USUAL - PANORAMAS - {"pinhole"})))
 def test_gradients_are_those_of_what_it_computes(key):
     layer = head(key, shared_focal=False).double()
     generator = torch.Generator().manual_seed(2)
@@ -174,15 +170,14 @@ def test_gradients_do_not_vanish_far_out():
     assert (numbers.grad.abs() > 1e-3).all()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("key", [k for k in QUICK if k != "pinhole"])
-def test_all_numbers_make_finite_cameras_and_gradients(key, dtype):
-    layer = head(key).to(dtype)
+@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, sorted(USUAL - PANORAMAS - {"pinhole"})))
+def test_all_numbers_make_finite_cameras_and_gradients(key):
+    layer = head(key)
     count = 1000 if key in ("double_sphere", "mei") else 100
     ordinary = torch.randn(count, len(layer.names), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     large = [size * ordinary[:128] for size in (1e4, 1e6)]
     large += [size * ordinary[:16].sign() for size in (1e3, 1e4, 1e5, 1e6, 1e9, 1e30)]
-    for part in torch.cat((ordinary, 10 * ordinary[:50], *large)).to(dtype).split(500):
+    for part in torch.cat((ordinary, 10 * ordinary[:50], *large)).float().split(500):
         numbers = part.clone().requires_grad_()
         camera = layer.camera(numbers)
         assert bool(all_have_rays(camera, 3, 3).all())
@@ -266,16 +261,6 @@ def test_it_compiles_whole():
     features = torch.randn(3, 4)
     compiled = torch.compile(numbers, backend="eager", fullgraph=True)
     torch.testing.assert_close(compiled(features), numbers(features))
-
-
-def test_the_set_seen_from_a_lens_is_convex_for_polynomials():
-    limits = Limits(ct.ThinPrismFisheye, torch.zeros(8, dtype=torch.float64))
-    generator = torch.Generator().manual_seed(0)
-    direction = torch.randn(64, 8, generator=generator, dtype=torch.float64)
-    radius = torch.full((64, 1), 1.2, dtype=torch.float64)
-    ends = 0.999 * limits.along(direction, radius) * direction
-    middle = (ends[:32] + ends[32:]) / 2
-    assert (limits.along(middle, radius[:32]) > 1).all()
 
 
 @pytest.mark.parametrize(

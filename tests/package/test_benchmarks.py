@@ -7,30 +7,17 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from benchmarks import page
-from benchmarks.busy import Busy
-from benchmarks.options import Options
 from benchmarks.tables import Record
-from benchmarks.timing import measure, threads
+from benchmarks.timing import threads
 from benchmarks.verdict import Requirement, figures, times_faster, verdict
 
 ROOT = Path(__file__).resolve().parents[2]
-OPTIONS = Options(
-    size=100,
-    models=(),
-    device=torch.device("cpu"),
-    threads=1,
-    repeats=7,
-    seconds=0.0,
-    compile=False,
-    quick=True,
-)
 linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in Linux's /proc")
 
 
@@ -55,25 +42,6 @@ def test_a_quick_run_measures_everyone_and_writes_every_figure(subject, tmp_path
     assert all(math.isfinite(value) and value > 0 for value in times)
     peers = {"images": "OpenCV, float map", "stereo": "OpenCV, float map", "folders": "read + warp + write"}
     assert {"camtorch", peers.get(subject, "OpenCV")} <= {f["contestant"] for f in figures}
-
-
-def test_slow_contestants_take_fewer_rounds_and_those_that_fail_are_left_out(capsys):
-    calls = {"quick": 0, "slow": 0}
-
-    def count(name, seconds):
-        calls[name] += 1
-        time.sleep(seconds)
-
-    def fail():
-        raise RuntimeError("no such thing")
-
-    runs = {"quick": lambda: count("quick", 2.5e-3), "slow": lambda: count("slow", 0.1), "fails": fail}
-    records = measure("case", "operation", runs, replace(OPTIONS, seconds=0.2))
-    assert calls == {"quick": 2 + 7, "slow": 2 + 3}  # two calls before the rounds
-    assert "fails failed: RuntimeError: ['no such thing']" in capsys.readouterr().err
-    by_name = {(r.contestant, r.quantity): r.value for r in records}
-    assert {who for who, _ in by_name} == {"quick", "slow"}
-    assert by_name["slow", "seconds"] >= by_name["slow", "fastest"] >= 0.1
 
 
 def test_threads_are_as_before_after_an_error():
@@ -108,32 +76,7 @@ def test_times_faster_is_beside_the_fastest_of_the_others():
 
 
 @linux
-def test_busy_processes_spin_when_told_and_are_gone_after_an_error():
-    ids = []
-
-    def fail():
-        with Busy(2) as busy:
-            ids.extend(busy.ids)
-            busy.spin(1)
-            before = [_seconds(pid) for pid in ids]
-            time.sleep(1.0)
-            spun = [_seconds(pid) - start for pid, start in zip(ids, before, strict=True)]
-            assert spun[0] > 0.1
-            assert spun[1] < 0.05
-            busy.spin(0)
-            resting = _seconds(ids[0])
-            time.sleep(0.3)
-            assert _seconds(ids[0]) - resting < 0.05
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert len(ids) == 2
-    assert not any(map(_runs, ids))
-
-
-@linux
-@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
 def test_busy_processes_end_with_whoever_started_them(ending):
     code = """
 import signal, time
@@ -163,12 +106,6 @@ def _runs(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except (FileNotFoundError, ProcessLookupError):
         return False
-
-
-def _seconds(pid: int) -> float:
-    """Of the processor's time."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def test_the_page_shows_the_figures_of_one_run():

@@ -22,14 +22,7 @@ def python(code, *words, expect=0):
 
 @pytest.mark.parametrize(
     "words",
-    [
-        [],
-        ["--version"],
-        ["--help"],
-        ["dewarp", "--help"],
-        ["dewarp", "--fov", "x"],
-        ["x"],
-    ],
+    [["--version"], ["dewarp", "--help"], ["dewarp", "--fov", "x"]],
 )
 def test_the_command_answers_without_torch(words):
     code = """
@@ -45,6 +38,7 @@ print("loaded:", sorted(heavy & set(sys.modules)))
     assert "loaded: []" in python(code, *words)
 
 
+@pytest.mark.slow
 def test_names_come_at_first_use():
     code = """
 import sys
@@ -64,21 +58,10 @@ assert not hasattr(ct, "Pinhole2") and not hasattr(ct, "_public2")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "first",
-    [
-        "import camtorch as ct",
-        "from camtorch.camera import Camera",
-        "import camtorch.io as io",
-        "import torch",
-    ],
+    ["from camtorch.camera import Camera", "import camtorch.io as io"],
 )
 def test_all_models_are_there_whatever_comes_first(first):
     assert python(f"{first}\nimport camtorch as ct\nprint(*ct.MODELS)").split() == list(ct.MODELS)
-
-
-@pytest.mark.slow
-def test_a_part_has_the_models_that_it_needs():
-    code = "from camtorch.io import load\nfrom camtorch.camera import MODELS\nprint(*MODELS)"
-    assert python(code).split() == list(ct.MODELS)
 
 
 @pytest.mark.slow
@@ -89,8 +72,7 @@ def test_a_pickled_camera_needs_no_import(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("imports", ["from camtorch import Camera\nimport torch", "import torch\nimport camtorch"])
-def test_exported_programs_load(tmp_path, imports):
+def test_exported_programs_load(tmp_path):
     camera = ct.KannalaBrandt([300.0, 300, 320, 240], [0.02, -0.01, 0.003, -0.001]).requires_grad_(False)
 
     class Rays(torch.nn.Module):
@@ -105,7 +87,7 @@ def test_exported_programs_load(tmp_path, imports):
     assert any("camtorch" in str(node.target) for node in program.graph.nodes)
     torch.export.save(program, tmp_path / "rays.pt2")
     code = "\nimport sys\nprint(torch.export.load(sys.argv[1]).module()(torch.full((10, 2), 9.0))[1].all())"
-    assert "True" in python(imports + code, str(tmp_path / "rays.pt2"))
+    assert "True" in python("from camtorch import Camera\nimport torch" + code, str(tmp_path / "rays.pt2"))
 
 
 @pytest.mark.slow
@@ -120,12 +102,10 @@ print(function(torch.ones(3))[0].item())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_output_that_nobody_reads_is_no_error(unbuffered):
+def test_output_that_nobody_reads_is_no_error():
     code = "from camtorch.cli.main import main; import sys; sys.exit(main(['augment', '--list']))"
-    environment = ENVIRONMENT | {"PYTHONUNBUFFERED": unbuffered}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes) as process:
+    with subprocess.Popen([sys.executable, "-c", code], env=ENVIRONMENT, **pipes) as process:
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141
@@ -154,7 +134,6 @@ def test_an_interrupt_while_torch_is_imported_is_one_line():
 @pytest.mark.parametrize(
     "error",
     [
-        "MemoryError()",
         "ImportError('libtorch_cpu.so: failed to map segment from shared object')",
         'RuntimeError("DefaultCPUAllocator: can\'t allocate memory")',
     ],

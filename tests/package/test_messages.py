@@ -1,123 +1,13 @@
-"""What camtorch says where something is wrong: laws of its statements that raise, and what wrong calls are told.
+"""What wrong calls are told: who says it, what was passed and what is expected; of errors that no other test has."""
 
-`pytest --messages FILE` lists all statements, with what they said in a run of the tests.
-"""
-
-import ast
 import math
-import re
 
 import numpy as np
 import pytest
 import torch
-from messages import everything
 
 import camtorch as ct
 from camtorch.augment import kornia as adapter
-
-# -- laws of the statements
-
-STATEMENTS = everything()
-_TOLD_ELSEWHERE = (  # by whoever catches it, with the file and the place in it
-    *("io/npz", "boards/corners", "calibration/selection", "cli/coco", "cli/rle"),
-    *("maps/arrays", "maps/onnx", "maps/stmap", "maps/texture_mesh", "calibration/observations"),
-)
-_OF_NO_CALL = ("demo", "native", "jobs", "cli")  # which speak of files, options and machines
-_EXCEPTIONS = {
-    "module {__name__} has no attribute": "Python's words",
-    "MapReport of {": "Python's words",
-    "no {self._kind.__name__} is called": "a KeyError, which Python quotes",
-    "{str(error)}": "the message of another one",
-    "shapes {": "caught by whoever names them",
-    "no camera in the sample": "named by the caller, with the sample",
-    "what makes the warp of a camera": "named by the caller, with the sample",
-    "a board's type must be": "told by the caller, with the place in the file",
-    "a {kind.kind} has": "told by the caller, with the place in the file",
-    "the key {repeated": "told by the caller, with the file",
-}
-_LACKS = re.compile(r"\b(no|needs?|give|nothing|neither|empty)\b")  # what says what is missing shows nothing
-_NO_VALUE = {
-    "Compose: what comes after a rolling shutter": "of a whole chain",
-    "Compose: the colours or the light": "of a whole chain",
-    "Seeded: same_on_batch=True": "says it",
-    "Mixed: cameras must be a list of cameras; of a dict": "says it",
-    "{owner}: {name} is a list of tensors that require grad": "says it",
-    "{self._name}: image_size must be two integers (height, width); got None": "says it",
-    "RollingShutter: image_size must be two integers (height, width); got None": "says it",
-    "{self._name}: to go back": "says what is missing",
-}
-
-
-def text_of(expression: ast.expr) -> str:
-    """A message as its source has it, what it shows in braces."""
-    if isinstance(expression, ast.Constant):
-        return str(expression.value)
-    if isinstance(expression, ast.JoinedStr):
-        return "".join(map(text_of, expression.values))
-    if isinstance(expression, ast.FormattedValue):
-        return "{" + ast.unparse(expression.value) + "}"
-    if isinstance(expression, ast.BinOp) and isinstance(expression.op, ast.Add):
-        return text_of(expression.left) + text_of(expression.right)
-    return "{" + ast.unparse(expression) + "}"
-
-
-TEXTS = [(s, text_of(s.arguments[-1])) for s in STATEMENTS if s.arguments]
-OF_CALLS = [
-    (s, text)
-    for s, text in TEXTS
-    if s.kind in ("ValueError", "TypeError", "IndexError", "KeyError", "AttributeError", "warning")
-    and not s.file.startswith(tuple(f"camtorch/{room}/" for room in _OF_NO_CALL))
-    and s.file not in [f"camtorch/{file}.py" for file in _TOLD_ELSEWHERE]
-]
-
-
-def of(pairs):
-    return "\n".join(f"{s.place} {s.function}: {text}" for s, text in pairs)
-
-
-def test_there_are_statements():
-    assert len(STATEMENTS) > 800
-    assert len(OF_CALLS) > 400
-
-
-def test_messages_are_one_line_without_a_full_stop():
-    wrong = [(s, t) for s, t in TEXTS if s.kind != "BuildError" and (t.endswith((".", "!", " ")) or "\n" in t)]
-    assert not of(wrong)
-
-
-def test_nothing_in_braces_is_shown_as_it_stands():
-    """An f that lacks before the quotes."""
-    plain = re.compile(r"\{[a-z_]+[\w.()]*(![rs])?(:[^}]*)?\}")
-    wrong = []
-    for s in STATEMENTS:
-        constants = [c for a in s.arguments for c in ast.walk(a) if isinstance(c, ast.Constant)]
-        wrong += [(s, c.value) for c in constants if isinstance(c.value, str) and plain.search(c.value)]
-    assert not of(wrong)
-
-
-def test_what_is_raised_without_a_message_is_caught_where_it_is_raised():
-    silent = [s for s in STATEMENTS if not s.arguments and s.kind != "NotImplementedError"]
-    assert len(silent) >= 3
-    assert not [s.place for s in silent if not s.tried]
-
-
-def test_messages_of_calls_begin_with_who_says_it():
-    known = tuple(_EXCEPTIONS)
-    speaks = re.compile(r"^(?=\S)[\w.]*(\{[^}]*\})?[\w.]*: \S")
-    wrong = [(s, t) for s, t in OF_CALLS if not speaks.search(t) and not t.startswith(known)]
-    assert not of(wrong)
-
-
-def test_messages_of_calls_show_what_was_passed():
-    known = tuple(_NO_VALUE)
-    owners = re.compile(r"\{(owner|_OWNER|self\._name|self\.owner|cls\.__name__|type\(self\)\.__name__)\}")
-    wrong = [
-        (s, t) for s, t in OF_CALLS if "{" not in owners.sub("", t) and not (_LACKS.search(t) or t.startswith(known))
-    ]
-    assert not of(wrong)
-
-
-# -- what wrong calls are told, of errors that no other test asks for
 
 SIZE = (24, 32)
 CAMERA = ct.KannalaBrandt([20.0, 20.0, 15.5, 11.5], [0.02, -0.01, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
@@ -138,11 +28,7 @@ WRONG = [
     # what is no tensor, or not such a one
     (lambda: ct.Pinhole([LEAF] * 4), TypeError, r"Pinhole: intrinsics is a list of tensors that require grad"),
     (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points is a list of tensors that require grad; torch.stack"),
-    (
-        lambda: CAMERA.project(torch.ones(5, 3).to_sparse()),
-        TypeError,
-        r"points must be a dense tensor; got torch.sparse",
-    ),
+    (lambda: CAMERA.project(torch.ones(5, 3).to_sparse()), TypeError, r"points must be a dense tensor; got"),
     (lambda: CAMERA.project(META), ValueError, r"points must be on cpu, as KannalaBrandt; got meta"),
     (lambda: CAMERA.contains(torch.ones(3)), ValueError, r"pixels must be \(..., 2\); got shape \(3,\)"),
     (lambda: MIXED.explain(7), ValueError, r"Mixed: points must be \(\*B, \*N, 3\).* got shape \(\)"),
@@ -159,27 +45,15 @@ WRONG = [
     (lambda: augment.mount_rotation(None, 0, 0), TypeError, r"mount_rotation: yaw must be a tensor; got NoneType"),
     (lambda: augment.mount_rotation([1, 2], [1, 2, 3], 0), ValueError, r"of one shape .*yaw \(2,\), pitch \(3,\)"),
     (lambda: ct.losses.angles(7, [0, 0, 1]), ValueError, r"angles: first must be \(..., 3\); got shape \(\)"),
-    (
-        lambda: augment.RandomMount(camera=CAMERA)(image=np.array(["a"])),
-        TypeError,
-        r"image must be a tensor of real .*<U1",
-    ),
+    (lambda: augment.RandomMount(camera=CAMERA)(image=np.array(["a"])), TypeError, r"image must be a tensor of real"),
     # what is no number, flag, word, mapping
-    (
-        lambda: ct.Warp(CAMERA, CAMERA, antialias="False"),
-        TypeError,
-        r"Warp: antialias must be True or False; got 'False'",
-    ),
+    (lambda: ct.Warp(CAMERA, CAMERA, antialias="False"), TypeError, r"Warp: antialias must be True or False; got"),
     (lambda: ct.Warp(CAMERA, CAMERA, tolerance="0"), TypeError, r"Warp: tolerance must be a number; got '0'"),
     (lambda: ct.Warp(CAMERA, CAMERA, fill="0"), TypeError, r"fill must be a number or one for each channel; got '0'"),
     (lambda: ct.Warp(CAMERA, CAMERA, mode=np.zeros((2, 2))), ValueError, r"mode must be one of .*ndarray of shape"),
     (lambda: CAMERA.convert("mei", max_angle="90"), TypeError, r"convert: max_angle must be a number; got '90'"),
     (lambda: CAMERA.convert("mei", tolerance=None), TypeError, r"convert: tolerance must be a number; got None"),
-    (
-        lambda: ct.KannalaBrandt.from_matrix(np.eye(3), ignore_skew="no"),
-        TypeError,
-        r"ignore_skew must be True or False",
-    ),
+    (lambda: ct.KannalaBrandt.from_matrix(np.eye(3), ignore_skew="no"), TypeError, r"ignore_skew must be True or"),
     (lambda: BATCH["a"], TypeError, r"Pinhole: a batch is indexed by whole numbers, slices and masks; got 'a'"),
     (lambda: MIXED["a"], TypeError, r"Mixed: it is indexed by whole numbers, slices and masks; got 'a'"),
     (lambda: ct.Mixed([CAMERA], order="first"), TypeError, r"Mixed: order must be places among 1 cameras.*'first'"),
@@ -195,47 +69,23 @@ WRONG = [
     (lambda: ONE.camera_of(["a"]), ValueError, r"no camera and no image is called \['a'\]"),
     # views, stereo, planes
     (lambda: ct.views.ring(CAMERA, 3, fov="60"), TypeError, r"ring: fov must be a number; got '60'"),
-    (
-        lambda: ct.views.ring(CAMERA, 3, fov=200),
-        ValueError,
-        r"ring: fov must be in degrees, above 0 and below 180; got 200",
-    ),
+    (lambda: ct.views.ring(CAMERA, 3, fov=200), ValueError, r"ring: fov must be in degrees, above 0 and below 180;"),
     (lambda: ct.views.cube(BATCH), ValueError, r"cube: takes one camera; got batch_shape=\(2,\)"),
     (lambda: ct.views.cube(CAMERA, 0), ValueError, r"cube: size must be at least 1; got 0"),
-    (
-        lambda: ct.views.cube(CAMERA, 8).back(None),
-        ValueError,
-        r"Views: views must be a tensor \(B, 6, C, 8, 8\); got None",
-    ),
+    (lambda: ct.views.cube(CAMERA, 8).back(None), ValueError, r"Views: views must be a tensor \(B, 6, C, 8, 8\); got"),
     (lambda: ct.surround(ONE, CAMERA, distance="far"), TypeError, r"surround: distance must be a number; got 'far'"),
     (lambda: ct.surround(ONE, CAMERA, distance=0), ValueError, r"surround: distance must be positive; got 0.0"),
     (lambda: ct.surround(ONE, CAMERA, blend=math.inf), ValueError, r"surround: blend must be pixels, zero or more"),
     (lambda: ct.surround(ONE, CAMERA).warp("b"), ValueError, r"Surround: no camera is called 'b'; there are \['a'\]"),
     (lambda: ct.surround(ONE, CAMERA)(IMAGES), TypeError, r"Surround: images must be tensors .* got Tensor"),
-    (
-        lambda: ct.BirdsEye(CAMERA, DOWN, x=3, y=(0, 1), resolution=1),
-        TypeError,
-        r"BirdsEye: x must be \(from, to\).* got 3",
-    ),
+    (lambda: ct.BirdsEye(CAMERA, DOWN, x=3, y=(0, 1), resolution=1), TypeError, r"BirdsEye: x must be \(from, to\).*"),
     (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution="1"), TypeError, r"resolution must be a number"),
-    (
-        lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution=9),
-        ValueError,
-        r"at 9.0 units per pixel make no",
-    ),
+    (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution=9), ValueError, r"at 9.0 units per pixel make"),
     (lambda: ct.Reproject(GRID, CAMERA, POSE), ValueError, r"Reproject: cameras and extrinsics may have one batch dim"),
     (lambda: ct.RollingShutter(0.01, [0, 0, 0], samples=0), ValueError, r"samples and gamma must be positive; got 0"),
-    (
-        lambda: ct.RollingShutter(0.01, [0, 0, 0]).times([0, 0], None),
-        TypeError,
-        r"RollingShutter: image_size must be two",
-    ),
+    (lambda: ct.RollingShutter(0.01, [0, 0, 0]).times([0, 0], None), TypeError, r"RollingShutter: image_size must be"),
     (lambda: ct.rectify(GRID, GRID, POSE), ValueError, r"rectify: cameras and extrinsics may have one batch dim"),
-    (
-        lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(60, 60, 60)),
-        ValueError,
-        r"fov must be horizontal, or .*\(60, 60, 60\)",
-    ),
+    (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(60, 60, 60)), ValueError, r"fov must be horizontal, or .*\(60, 60,"),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, vertical="no"), TypeError, r"vertical must be True or False; got 'no'"),
     (lambda: PAIR.disparity_range(5, 1), ValueError, r"depths must be 0 < near < far; got near=5.0, far=1.0"),
     (lambda: PAIR.depth_range(5, 1), ValueError, r"disparities must be least < most; got least=5.0, most=1.0"),
@@ -257,11 +107,7 @@ WRONG = [
     (lambda: augment.Rotate90((3, 1)), ValueError, r"Rotate90: times must be \(least, most\), and step positive"),
     (lambda: augment.HorizontalFlip(landmarks=7), TypeError, r"HorizontalFlip: landmarks must be one of .*got 7"),
     (lambda: augment.HorizontalFlip(swap_sides="no"), TypeError, r"swap_sides must be True or False; got 'no'"),
-    (
-        lambda: augment.Compose([augment.RandomMount()], min_filled=1),
-        TypeError,
-        r"Compose: there is no min_filled here",
-    ),
+    (lambda: augment.Compose([augment.RandomMount()], min_filled=1), TypeError, r"Compose: there is no min_filled"),
     (lambda: augment.FaceNormalizer(image_size=None), TypeError, r"image_size must be two integers .*got None"),
     (lambda: augment.FaceNormalizer(focal="960"), TypeError, r"FaceNormalizer: focal must be a number; got '960'"),
     (lambda: augment.FaceNormalizer(axis=3), TypeError, r"FaceNormalizer: axis must be a pixel \(u, v\); got 3"),
@@ -272,52 +118,24 @@ WRONG = [
     (lambda: adapter.with_cameras([], BATCH), ValueError, r"params must be those of a camera augmentation; got \[\]"),
     # networks, data, calibration
     (lambda: ct.CameraHead(0, "mei", image_size=SIZE), ValueError, r"CameraHead: features must be at least 1; got 0"),
-    (
-        lambda: ct.CameraHead(8, "mei", image_size=SIZE, fov="wide"),
-        TypeError,
-        r"fov must be the least and .*got 'wide'",
-    ),
+    (lambda: ct.CameraHead(8, "mei", image_size=SIZE, fov="wide"), TypeError, r"fov must be the least and .*got"),
     (lambda: ct.CameraHead(8, "mei", image_size=SIZE, centre="a"), TypeError, r"centre must be a number; got 'a'"),
-    (
-        lambda: ct.CanonicalCamera(20.0).scale("camera"),
-        TypeError,
-        r"CanonicalCamera.scale: camera must be a Camera; got str",
-    ),
+    (lambda: ct.CanonicalCamera(20.0).scale("camera"), TypeError, r"CanonicalCamera.scale: camera must be a Camera;"),
     (lambda: ct.data.to_columns("camera"), TypeError, r"to_columns: camera must be a Camera; got str"),
-    (
-        lambda: ct.data.to_columns(ct.Pinhole([1, 1, 0, 0])),
-        ValueError,
-        r"must have an image_size .*got image_size None",
-    ),
+    (lambda: ct.data.to_columns(ct.Pinhole([1, 1, 0, 0])), ValueError, r"must have an image_size .*got image_size"),
     (lambda: ct.data.from_columns(7), TypeError, r"from_columns: columns must be a dict of columns; got int"),
     (lambda: ct.data.from_columns({}), ValueError, r"from_columns: camera_model, .* is missing"),
     (lambda: ct.data.MapBatches(WARP, key=7), TypeError, r"MapBatches: key must be the name of a column.*got 7"),
     (lambda: ct.data.MapBatches(WARP)({"image": 3}), TypeError, r"columns must be arrays or lists; got .*'int'"),
-    (
-        lambda: ct.data.MapBatches(ct.Warp(BATCH, BATCH)),
-        ValueError,
-        r"the warp must be a single one; got batch dims \(2,\)",
-    ),
+    (lambda: ct.data.MapBatches(ct.Warp(BATCH, BATCH)), ValueError, r"the warp must be a single one; got batch dims"),
     (lambda: ct.data.MapSamples(WARP, key=[]), TypeError, r"MapSamples: key must name an entry of a sample; got \[\]"),
-    (
-        lambda: ct.triangulate(7, [POSE] * 2, torch.ones(2, 5, 2)),
-        TypeError,
-        r"cameras must be Camera in a list; got a int",
-    ),
-    (
-        lambda: ct.fit("mei", PIXELS, RAYS, weights=torch.ones(3)),
-        ValueError,
-        r"weights must broadcast against the rays",
-    ),
+    (lambda: ct.triangulate(7, [POSE] * 2, torch.ones(2, 5, 2)), TypeError, r"cameras must be Camera in a list; got a"),
+    (lambda: ct.fit("mei", PIXELS, RAYS, weights=torch.ones(3)), ValueError, r"weights must broadcast against the"),
     (lambda: ct.fit("mei", PIXELS, RAYS, weights=-torch.ones(SIZE)), ValueError, r"weights must be .*got down to -1"),
     (lambda: ct.write_report(CAMERA, "a.html"), TypeError, r"calibration must be what calibrate returns; got Kannala"),
     # models, files, maps
     (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], image_size=None), ValueError, r"give its image_size=\(height"),
-    (
-        lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], 3, image_size=SIZE),
-        ValueError,
-        r"offset must be \(2,\) = cx_off",
-    ),
+    (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], 3, image_size=SIZE), ValueError, r"offset must be \(2,\) ="),
     (lambda: ct.io.opencv.read(None), TypeError, r"io.opencv.read: path must name a file; got None"),
     (lambda: ct.load_map("\0"), ct.CameraFileError, r"path: a NUL character, which no path has"),
     (lambda: WARP.save("a.npy", "depthai", order=["yx"]), ValueError, r"order must be 'yx' .*got \['yx'\]"),

@@ -74,8 +74,6 @@ def test_a_wheel_has_the_sampler_and_is_for_this_machine(checkout, tmp_path, hat
     ("environment", "reason"),
     [
         ({"PATH": "/nowhere"}, "no C compiler: none of cc, gcc, clang is on the PATH, and CC names none"),
-        ({"CC": "no-such-cc"}, "the C compiler 'no-such-cc', which CC or the caller names, is not there"),
-        ({"CC": "cc --no-such-option"}, "no-such-option"),
         ({"CAMTORCH_NATIVE": "0"}, "CAMTORCH_NATIVE=0 when it was installed"),
     ],
 )

@@ -56,7 +56,7 @@ def random_pair(seed, vertical=False):
 
 @pytest.mark.parametrize("vertical", [False, True])
 @pytest.mark.parametrize("projection", PROJECTIONS)
-@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 300), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 50), marks=pytest.mark.slow)])
 def test_rows_correspond_and_disparities_give_the_points(projection, vertical, seeds):
     axis, across = (1, 0) if vertical else (0, 1)
     refused = 0
@@ -171,14 +171,6 @@ def test_extrinsics_and_lenses_learn_through_both_images():
         torch.testing.assert_close(found.baseline, 2 * before)
 
 
-def test_what_does_not_learn_is_kept():
-    found = fisheyes()
-    assert found.left is found.left
-    with torch.no_grad():
-        found.extrinsics.translation *= 2
-    assert found.left is found.left
-
-
 def test_depth_and_disparity_ranges():
     for projection in PROJECTIONS:
         found = fisheyes(projection=projection, image_size=(240, 320))
@@ -272,10 +264,9 @@ def test_bad_input_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("learns", [True, False])
-def test_it_is_a_graph_and_has_a_shape_on_meta(learns):
+def test_it_is_a_graph_and_has_a_shape_on_meta():
     left, right, extrinsics = pair()
-    found = ct.rectify(left, right, extrinsics.requires_grad_(learns), image_size=(24, 32)).requires_grad_(learns)
+    found = ct.rectify(left, right, extrinsics, image_size=(24, 32))
     images = torch.rand(1, 1, 480, 640, dtype=torch.float64)
     expected = found(images, images)
     compiled = torch.compile(found, fullgraph=True, backend="eager")
@@ -297,15 +288,15 @@ def test_what_is_valid_may_be_an_array():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("projection", PROJECTIONS)
-def test_ten_thousand_rigs_have_positive_focal_lengths(projection):
+def test_a_thousand_rigs_have_positive_focal_lengths(projection):
     generator = torch.Generator().manual_seed(7)
-    turn = 0.2 * torch.randn(10000, 3, generator=generator, dtype=torch.float64)
-    shift = torch.randn(10000, 3, generator=generator, dtype=torch.float64) * torch.tensor([-1, 0.3, 0.3]).double()
+    turn = 0.2 * torch.randn(1000, 3, generator=generator, dtype=torch.float64)
+    shift = torch.randn(1000, 3, generator=generator, dtype=torch.float64) * torch.tensor([-1, 0.3, 0.3]).double()
     shift[:, 0] += shift[:, 0].sign()  # nobody looks along the baseline
     extrinsics = ct.Extrinsics(turn, shift).requires_grad_(False)
     found = ct.rectify(fisheye(), fisheye(), extrinsics, projection=projection, image_size=(48, 64))
     camera, frame = found.camera_left, found.frame
-    assert camera.intrinsics.shape == (10000, 4)
+    assert camera.intrinsics.shape == (1000, 4)
     assert camera.intrinsics.isfinite().all()
     assert (camera.intrinsics[:, :2] > 0).all()
     assert frame.left.isfinite().all()

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch import _threads
 from camtorch.warp import sampling, warp
 
 SIZE = (90, 120)
@@ -25,9 +24,14 @@ def images(dtype, count=1):
     return torch.randint(256, (count, 3, *SIZE), generator=generator).to(dtype)
 
 
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.int32])
-@pytest.mark.parametrize("mode", ["nearest", "bilinear", "bicubic"])
-@pytest.mark.parametrize("padding_mode", ["zeros", "border", "reflection"])
+@pytest.mark.parametrize(
+    ("mode", "padding_mode", "dtype"),
+    [
+        (mode, padding_mode, (torch.uint8, torch.float16, torch.int32)[(i + j) % 3])
+        for i, mode in enumerate(("nearest", "bilinear", "bicubic"))
+        for j, padding_mode in enumerate(("zeros", "border", "reflection"))
+    ],
+)
 def test_tiles_of_a_large_image_change_nothing(dtype, mode, padding_mode, monkeypatch):
     for options in ({}, {"fill": (9, 8, 7)}, {"antialias": True}):
         one = ct.Warp(*pair(), mode=mode, padding_mode=padding_mode, **options)
@@ -46,8 +50,7 @@ def test_tiles_of_a_large_image_change_nothing(dtype, mode, padding_mode, monkey
         assert (difference > rounding).double().mean() < (1e-3 if mode == "nearest" else 1e-5)
 
 
-@pytest.mark.parametrize("rows", [1, 7, 16, 1000, None])
-@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize(("rows", "antialias"), [(1, False), (7, True), (16, False), (None, True)])
 def test_strips_are_the_rows_of_the_whole(rows, antialias):
     one = ct.Warp(*pair(), antialias=antialias, fill=3.0)
     for given in (images(torch.uint8, 2), images(torch.float32)):
@@ -56,21 +59,6 @@ def test_strips_are_the_rows_of_the_whole(rows, antialias):
         assert [part.start for part, _, _ in strips] == [0, *(part.stop for part, _, _ in strips)][:-1]
         assert torch.equal(torch.cat([part for _, part, _ in strips], 2), one(given))
         assert torch.equal(torch.cat([valid for _, _, valid in strips], 2), one.valid_mask())
-
-
-def test_strips_agree_while_cores_come_and_go(monkeypatch):
-    """Kept pyramids are of the same parts of the images whether or not there are cores for torch's threads."""
-    crowded = iter([True, False] * 1000)
-    monkeypatch.setattr(_threads._crowd, "meets", lambda *_: next(crowded))
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        one = ct.Warp(*pair(), antialias=True, fill=3.0)
-        given = images(torch.uint8, 2)
-        strips = [part for _, part, _ in one.strips(given, rows=7)]
-        assert torch.equal(torch.cat(strips, 2), one(given))
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_strips_of_a_batch_of_cameras_and_of_one_image():
@@ -91,7 +79,6 @@ def test_long_grids_are_neither_made_at_once_nor_kept(monkeypatch):
     long = ct.Warp(*pair(), fill=2.0)
     assert torch.equal(long(given), expected)
     assert torch.equal(long.valid_mask(), mask)
-    assert all(memo._kept is None for memo in long._memos.values())
     differentiable = given.double().requires_grad_()
     long(differentiable).sum().backward()
     assert differentiable.grad.abs().sum() > 0
@@ -129,10 +116,8 @@ print(peak() - before)
 @pytest.mark.parametrize(
     ("act", "options", "count", "bound"),
     [
-        ("for _ in warp.strips(images, rows=64): pass", "tolerance=0.01", 1, 60),
         ("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60),
         # the result, the grid (96 MB, in float32), and what is made of one image
-        ("warp(images)", "fill=3, tolerance=0.01", 4, 4 * 36 + 96 + 150),
         ("warp(images)", "antialias=True, tolerance=0.01", 4, 4 * 36 + 96 + 48 + 400),
     ],
 )

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from cameras import PAIRS, slow_unless, spread
 
 import camtorch as ct
 
@@ -39,8 +38,7 @@ def alias_energy(image, shrunk_by):
     return (image[0, 0][too_fine] - 0.5).square().mean()
 
 
-@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
-@pytest.mark.parametrize("factor", [2, 4, 5.5])
+@pytest.mark.parametrize(("factor", "mode"), [(2, "bilinear"), (4, "bicubic"), (5.5, "bilinear")])
 def test_a_shrunk_zone_plate_shows_no_false_rings(factor, mode):
     plate = zone_plate()
     camera = pinhole((512, 512), focal=500.0)
@@ -117,7 +115,6 @@ def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
         ({"fill": "red"}, "fill must be a number"),
         ({"tolerance": -1}, "tolerance must be a number of pixels"),
         ({"tolerance": float("inf")}, "tolerance must be a number of pixels"),
-        ({"padding_mode": "wrap"}, "padding_mode must be one of"),
     ],
 )
 def test_bad_options_are_refused(options, text):
@@ -128,24 +125,6 @@ def test_bad_options_are_refused(options, text):
 
 
 # -- tolerance
-
-
-@pytest.mark.parametrize(("key", "other"), slow_unless(PAIRS[::3].__contains__, PAIRS))
-def test_maps_from_a_lattice_keep_their_tolerance(key, other):
-    cameras = [spread(k, torch.float32).requires_grad_(False).resize(*SIZE) for k in (key, other)]
-    rotation = torch.stack([turn(0, 0, 0), turn(25, -15, 40), turn(100, 0, 0)])
-    exact = ct.Warp(*cameras, rotation)
-    for tolerance in (0.1, 0.01):
-        close = ct.Warp(*cameras, rotation, tolerance=tolerance)
-        (grid, mapped), (other_grid, other_mapped) = (each._sampling()[:2] for each in (exact, close))
-        assert torch.equal(mapped, other_mapped)
-        on_image = (grid.abs() <= 1).all(-1) | (other_grid.abs() <= 1).all(-1)
-        error = ((grid - other_grid) * torch.tensor([SIZE[1] / 2, SIZE[0] / 2])).norm(dim=-1)[mapped & on_image]
-        assert error.numel() == 0 or error.max() <= tolerance
-        assert (
-            torch.equal(exact.valid_mask(), close.valid_mask())
-            or (exact.valid_mask() != close.valid_mask()).float().mean() < 1e-3
-        )
 
 
 def test_a_lattice_is_used_and_small_images_do_without():

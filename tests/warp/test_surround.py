@@ -171,8 +171,7 @@ def test_the_label_of_the_heaviest_view_wins(dtype):
         assert not result[~valid].any()
 
 
-@pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
-@pytest.mark.parametrize("mode", ["bilinear", "nearest"])
+@pytest.mark.parametrize(("mode", "dtype"), [("bilinear", torch.int64), ("nearest", torch.int32)])
 def test_the_largest_integers_do_not_wrap_around(mode, dtype):
     top = torch.iinfo(dtype).max
     for count, size, back, _ in wholes(mode):
@@ -181,8 +180,7 @@ def test_the_largest_integers_do_not_wrap_around(mode, dtype):
         assert int(result[valid].min()) >= top - (top * 1e-6 if mode == "bilinear" else 0)
 
 
-@pytest.mark.parametrize("bad", [math.inf, math.nan])
-@pytest.mark.parametrize("mode", ["bilinear", "nearest"])
+@pytest.mark.parametrize(("mode", "bad"), [("bilinear", math.inf), ("nearest", math.nan)])
 def test_a_view_without_weight_has_no_part(mode, bad):
     for count, size, back, weights in wholes(mode):
         images = torch.rand(1, count, 1, *size, generator=torch.Generator().manual_seed(0)).double()

@@ -7,10 +7,8 @@ import pickle
 
 import pytest
 import torch
-from cameras import slow_unless
 
 import camtorch as ct
-from camtorch.warp.grid import locate
 
 SIZE = (48, 64)
 
@@ -160,7 +158,7 @@ def lenses():
 
 @pytest.mark.parametrize(
     ("source", "target"),
-    slow_unless(lambda pair: pair[0] < pair[1] and pair[0] != "pinhole", [*itertools.product(lenses(), repeat=2)]),
+    [pair for pair in itertools.combinations(sorted(lenses()), 2) if pair[0] != "pinhole"],
 )
 def test_a_box_is_on_the_image_if_a_ray_of_the_image_comes_back_inside(source, target):
     generator = torch.Generator().manual_seed(len(source) * 100 + len(target))
@@ -239,18 +237,6 @@ def test_boxes_around_images_of_planes_and_of_moving_cameras_are_on_them():
         assert warp.inverse().transform_boxes(box)[1].tolist() == [True, False]
 
 
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64, torch.bool])
-def test_labels_keep_dtype_and_values(dtype):
-    warp = ct.Warp(fisheye(), pinhole(), turn(5), mode="nearest")
-    top = 2 if dtype == torch.bool else 250 if dtype == torch.uint8 else 30000 if dtype == torch.int16 else 2**31 - 2
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.randint(0, top, (2, 1, *SIZE), generator=generator).to(dtype)
-    warped = warp(labels)
-    assert warped.dtype == dtype
-    assert set(warped.unique().tolist()) <= set(labels.unique().tolist()) | {0}
-    assert torch.equal(ct.Warp(fisheye(), pinhole(), turn(5))(labels, mode="nearest"), warped)
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.uint8])
 def test_low_precision_images_are_sampled_in_float32(dtype):
     warp = ct.Warp(fisheye(), pinhole(), turn(5)).requires_grad_(False)
@@ -268,18 +254,6 @@ def test_bicubic_overshoot_stays_in_the_range_of_integers():
     assert smooth_version.min() < -1
     assert smooth_version.max() > 256
     assert torch.equal(warp(images), smooth_version.round().clamp(0, 255).to(torch.uint8))
-
-
-def test_pixels_without_a_ray_are_black_in_every_padding_mode():
-    # the target looks half behind the source, which sees the front alone
-    for padding_mode in ("zeros", "border", "reflection"):
-        warp = ct.Warp(pinhole(), fisheye(), turn(100), padding_mode=padding_mode).requires_grad_(False)
-        mapped = warp._sampling().mapped
-        assert (~mapped).any()
-        assert mapped.any()
-        warped = warp(torch.ones(1, 1, *SIZE))
-        assert warped[0, 0][~mapped[0]].abs().max() == 0
-    assert warped[0, 0][mapped[0]].min() > 0.999
 
 
 def test_per_sample_cameras_equal_a_loop():
@@ -321,23 +295,18 @@ def test_per_sample_cameras_equal_a_loop():
                 torch.testing.assert_close(batched[i], single, atol=2e-4, rtol=1e-5)
 
 
-def test_one_image_through_many_cameras():
-    warp = ct.Warp(fisheye(), pinhole(), torch.stack([turn(yaw) for yaw in (-10.0, 0.0, 15.0)]))
-    assert warp(smooth(dtype=torch.float32)).shape == (3, 3, *SIZE)
-
-
 def test_derivatives_reach_image_cameras_and_rotation():
     options = {"dtype": torch.float64, "requires_grad": True}
-    size = (12, 16)
+    size = (6, 8)
     images = smooth(size)[:, :1].requires_grad_()
-    k = torch.tensor([6.0, 6.5, 7.75, 5.75], **options)
+    k = torch.tensor([3.0, 3.25, 3.6, 2.6], **options)
     d = torch.tensor([0.02, -0.01, 0.004, -0.001], **options)
-    t = torch.tensor([8.0, 8.0, 3.5, 2.5], **options)
+    t = torch.tensor([4.0, 4.0, 1.5, 1.1], **options)
     r = torch.tensor([0.01, 0.05, -0.02], **options)
 
     def image(images, k, d, t, r):
         rotation = ct.Extrinsics(r, torch.zeros(3, dtype=torch.float64)).matrix()[:3, :3]
-        return ct.Warp(ct.KannalaBrandt(k, d, image_size=size), ct.Pinhole(t, image_size=(6, 8)), rotation)(images)
+        return ct.Warp(ct.KannalaBrandt(k, d, image_size=size), ct.Pinhole(t, image_size=(3, 4)), rotation)(images)
 
     # bilinear sampling is piecewise smooth: the step of the check must not cross a pixel boundary
     assert torch.autograd.gradcheck(image, (images, k, d, t, r), eps=1e-7, atol=1e-6, rtol=1e-5)
@@ -346,7 +315,6 @@ def test_derivatives_reach_image_cameras_and_rotation():
 def test_the_grid_is_kept_until_something_changes():
     warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
     first = warp.grid()
-    assert warp._sampling()[0] is warp._sampling()[0]
     warp.grid().zero_()
     warp.valid_mask().zero_()
     assert torch.equal(warp.grid(), first)
@@ -356,8 +324,6 @@ def test_the_grid_is_kept_until_something_changes():
     assert not torch.equal(second, first)
     warp.source.intrinsics.requires_grad_(True)
     assert warp.grid().requires_grad
-    with torch.no_grad():
-        assert warp._sampling()[0] is warp._sampling()[0]
     warp.load_state_dict(ct.Warp(fisheye(), pinhole()).state_dict(), strict=True)
     with torch.no_grad():
         assert torch.equal(warp.grid(), first)
@@ -468,21 +434,8 @@ def test_plain_rotations_are_copied():
         assert torch.equal(warp.grid(), before)
 
 
-def test_export_takes_any_batch_size():
-    warp = ct.Warp(fisheye(), pinhole(), turn(5)).requires_grad_(False)
-    images = smooth(batch=2, dtype=torch.float32)
-    exported = torch.export.export(warp, (images,), dynamic_shapes=({0: torch.export.Dim("b")},)).module()
-    many = smooth(batch=5, dtype=torch.float32)
-    torch.testing.assert_close(exported(many), warp(many), atol=1e-5, rtol=0)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "dim",
-    [torch.export.Dim("batch", min=1, max=4096), torch.export.Dim.AUTO],
-    ids=["named", "auto"],
-)
-def test_export_takes_any_number_of_cameras_that_are_inputs(dim, monkeypatch):
+def test_export_takes_any_number_of_cameras_that_are_inputs(monkeypatch):
     # as if images were so large that little is kept: a comparison with that would bound the batch
     for module in ("warp.warp", "camera"):
         monkeypatch.setattr(f"camtorch.{module}._MOST_KEPT", 10 * math.prod(SIZE))
@@ -498,17 +451,10 @@ def test_export_takes_any_number_of_cameras_that_are_inputs(dim, monkeypatch):
         images = smooth(dtype=torch.float32).expand(count, -1, -1, -1).contiguous()
         return images, pinhole().intrinsics.detach() * (1 + 0.2 * torch.linspace(0, 1, count)[:, None])
 
-    exported = torch.export.export(Seen(), given(3), dynamic_shapes=({0: dim},) * 2).module()
+    exported = torch.export.export(Seen(), given(3), dynamic_shapes=({0: torch.export.Dim.AUTO},) * 2).module()
     for count in (1, 2, 8, 200):
         # positions in float32 are rounded by 1e-5 px, and the image ends within one
         torch.testing.assert_close(exported(*given(count)), Seen()(*given(count)), atol=1e-4, rtol=0)
-
-
-def test_a_transform_leaves_no_trace():
-    warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
-    images = smooth(dtype=torch.float32)
-    torch.func.grad(lambda images: warp(images).sum())(images)
-    assert warp.grid().data_ptr()
 
 
 def test_forward_mode_through_a_kept_grid():
@@ -534,19 +480,6 @@ def test_the_largest_class_id_survives(mode):
     for dtype in (torch.int32, torch.int64):
         labels = torch.full((1, 1, *SIZE), torch.iinfo(dtype).max, dtype=dtype)
         assert ct.Warp(pinhole(), pinhole())(labels, mode=mode)[..., 5:-5, 5:-5].min() > 0
-
-
-@pytest.mark.parametrize("tolerance", [0.0, 0.01])
-def test_images_and_masks_with_paddings_of_their_own_keep_their_positions(tolerance, monkeypatch):
-    made = []
-    monkeypatch.setattr("camtorch.warp.warp.locate", lambda *a: made.append(a) or locate(*a))
-    source = ct.Pinhole([90.0, 90, 79.5, 59.5], image_size=(120, 160)).requires_grad_(False)
-    warp = ct.Warp(source, ct.Pinhole([70.0, 70, 79.5, 59.5], image_size=(120, 160)), tolerance=tolerance)
-    warp.requires_grad_(False)
-    for _ in range(3):
-        warp(torch.rand(1, 3, 120, 160), padding_mode="border")
-        warp(torch.zeros(1, 1, 120, 160), mode="nearest")
-    assert len(made) == (2 if tolerance else 1)
 
 
 def test_a_box_about_a_pole_encloses_it():
