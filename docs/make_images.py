@@ -19,9 +19,9 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))  # which have boards, 
 
 from drawings import augmentations, concepts, guides, models, views
 from drawings.pages import IMAGES
+from scenes import training, training_data
 
 from camtorch.cli.main import main
-from camtorch.demo import training, training_data
 from camtorch.plot.axes import COLOURS
 
 DEMOS = {

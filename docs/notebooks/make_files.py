@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 from PIL import Image
+from scenes import cabin, room
 
 import camtorch as ct
-from camtorch.demo import cabin, room
 
 HERE = Path(__file__).parent
 

@@ -151,7 +151,6 @@ def test_an_exchanged_width_and_height_is_not_scaled(folder, capsys):
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "nan", "-o", "o.png"], "--fov must be above 0"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "2.1", "-o", "o.png"], "2.1 seems to be radians"),
         (["dewarp", "in.png", "--camera", "camera.yml", "--fov", "0", "-o", "o.png"], "--fov must be above 0"),
-        (["demo", "-o", "in.png"], "in.png: exists already"),
     ],
 )
 def test_errors_are_one_line_and_leave_nothing(folder, capsys, words, text):

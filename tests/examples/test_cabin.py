@@ -1,9 +1,9 @@
 import pytest
 import torch
+from scenes import driver
+from scenes.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
 
 import camtorch as ct
-from camtorch.demo import driver
-from camtorch.demo.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
 
 
 def pinhole(focal: float, height: int, width: int, centre=None) -> ct.Pinhole:

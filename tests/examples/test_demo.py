@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import dewarping, room
 
 from camtorch import Pinhole
 from camtorch.cli.main import main
-from camtorch.demo import dewarping, room
 
 
 @pytest.fixture(scope="module")

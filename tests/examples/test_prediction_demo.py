@@ -5,9 +5,9 @@ import statistics
 
 import pytest
 import torch
+from scenes import prediction
 
 import camtorch as ct
-from camtorch.demo import prediction
 
 
 def test_lenses_are_drawn_within_their_field_of_view():

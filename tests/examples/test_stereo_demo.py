@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import car_park, room, stereo, surround
+from scenes.exposure import expose
+from scenes.walls import soft
 
 import camtorch as ct
 from camtorch.cli.main import main
-from camtorch.demo import car_park, room, stereo, surround
-from camtorch.demo.exposure import expose
-from camtorch.demo.walls import soft
 
 SQUARE = 0.25
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import cabin, training, training_data
+from scenes.faces import LENSES, NAMES, SIDE, SIZE, TRAINING_SETS, Photographs, Samples
 
 from camtorch.cli.main import main
-from camtorch.demo import cabin, training, training_data
-from camtorch.demo.training_data import LENSES, NAMES, SIDE, SIZE, TRAINING_SETS, Photographs, Samples
 
 
 @pytest.fixture(scope="module")

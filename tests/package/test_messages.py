@@ -22,7 +22,7 @@ _TOLD_ELSEWHERE = (  # by whoever catches it, with the file and the place in it
     *("io/npz", "calibration/corners", "calibration/selection", "cli/coco", "cli/rle"),
     *("maps/arrays", "maps/onnx", "maps/stmap", "maps/texture_mesh", "calibration/observations"),
 )
-_OF_NO_CALL = ("demo", "native", "jobs", "cli")  # which speak of files, options and machines
+_OF_NO_CALL = ("native", "jobs", "cli")  # which speak of files, options and machines
 _EXCEPTIONS = {
     "module {__name__} has no attribute": "Python's words",
     "MapReport of {": "Python's words",
