@@ -16,13 +16,13 @@ from scenes.exposure import expose
 from scenes.portrait import driver
 
 import camtorch as ct
-from camtorch._drawing import INK, PAPER
+from camtorch._drawing import INK, PAPER, shown
 from camtorch.calibration.boards import Chessboard
 from camtorch.cli import labelled_image, sheet
 from camtorch.cli.labelled_image import LabelledImage
 from camtorch.cli.labels import Labels
 from camtorch.rotations import mount_rotation
-from drawings.pages import IMAGES
+from drawings.pages import EXAMPLES, IMAGES
 from drawings.sheets import drawn, in_rows, tiles
 
 SEED = 4
@@ -133,13 +133,13 @@ def fields() -> Image.Image:
             for v, u in where.nonzero().tolist():
                 draw.rectangle((u - 1, v - 1, u, v), colour)
         _, up, seen = camera.perspective_field(down, stride=40)
-        for (u, v), (x, y), shown in zip(
+        for (u, v), (x, y), has_ray in zip(
             camera.pixel_grid(40).flatten(0, 1).tolist(),
             up.flatten(0, 1).tolist(),
             seen.flatten().tolist(),
             strict=True,
         ):
-            if shown:
+            if has_ray:
                 draw.line((u, v, u + 18 * x, v + 18 * y), INK, 2)
                 draw.ellipse((u - 3, v - 3, u + 3, v + 3), INK)
         found.append((tile.resize((320, 240), Image.Resampling.LANCZOS), title))
@@ -255,6 +255,16 @@ def calibration() -> Image.Image:
     return drawn(figure)
 
 
+def photograph_dewarped() -> Image.Image:
+    """What the first command of the README makes."""
+    folder = EXAMPLES / "photographs"
+    image = torch.from_numpy(np.array(Image.open(folder / "fisheye.jpg").convert("RGB"))).permute(2, 0, 1)
+    camera = ct.load(folder / "fisheye.yml").camera.requires_grad_(False)
+    after = ct.Dewarp(camera)(image[None])[0]
+    panels = [(image, "a photograph of a fisheye"), (after, "dewarped")]
+    return in_rows([(shown(part, 290, 464), title) for part, title in panels], 2)
+
+
 def learn() -> Image.Image:
     """A camera that learns from rays and pixels: the image that it dewarps, while it does."""
     truth = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
@@ -282,6 +292,7 @@ def learn() -> Image.Image:
 PICTURES = {
     "overview": overview,
     "overview-phone": functools.partial(overview, 2),
+    "photograph": photograph_dewarped,
     "dewarp": dewarp,
     "lenses": lenses,
     "shutter": shutters,
