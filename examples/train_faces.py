@@ -56,8 +56,7 @@ def by_camera(seen: Photographs, index: Tensor, generator: torch.Generator) -> S
 
     What it needs beyond `RandomCamera` is that the cut follows the face.
     """
-    options = {"yaw": YAW, "pitch": PITCH, "roll": ROLL, "crop": None, "min_filled": 0}
-    augment = ct.augment.RandomCamera("real", fov=(60, 160), **options)
+    augment = ct.augment.RandomCamera("real", fov=(60, 160), yaw=YAW, pitch=PITCH, roll=ROLL, crop=None, min_filled=0)
     change = augment.change(seen.camera, augment.draw(len(index), generator))
     camera, turn = change.target, change.rotation
     assert isinstance(camera, ct.Camera)

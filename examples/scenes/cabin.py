@@ -106,7 +106,6 @@ def _turn(angle: Tensor, axis: int) -> Tensor:
 # -- images
 
 
-@torch.no_grad()
 def _scan(rays: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
     """Colours (B, P, 3) and classes (B, P) of rays (B or 1, P, 3)."""
     count, size = len(scene.looks), rays.shape[1]
@@ -114,8 +113,8 @@ def _scan(rays: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
     turned = (rays @ scene.turn).flatten(0, 1)
     rays = rays.expand(count, -1, -1).flatten(0, 1)
     rows = torch.arange(count).repeat_interleave(size)
-    parts = zip(*(values.split(_CHUNK) for values in (rays, turned, rows)), strict=True)
-    colours, classes = zip(*(trace(*part, scene) for part in parts), strict=True)
+    parts = zip(rays.split(_CHUNK), turned.split(_CHUNK), rows.split(_CHUNK), strict=True)
+    colours, classes = zip(*(trace(ray, turn, row, scene) for ray, turn, row in parts), strict=True)
     return torch.cat(colours).unflatten(0, (count, size)), torch.cat(classes).unflatten(0, (count, size))
 
 

@@ -82,7 +82,7 @@ def points_of(drivers: cabin.Drivers) -> Tensor:
 
 def by_teacher(drivers: cabin.Drivers) -> Samples:
     """Faces of drivers before the `teacher`."""
-    return _faces(teacher(), drivers, *torch.zeros(2, len(drivers), 3))
+    return seen_by(teacher(), drivers, *torch.zeros(2, len(drivers), 3))
 
 
 def by_others(drivers: cabin.Drivers, generator: torch.Generator, *, rolling: bool = False) -> Samples:
@@ -92,7 +92,7 @@ def by_others(drivers: cabin.Drivers, generator: torch.Generator, *, rolling: bo
         camera = lens(name)
         mounts = _mounts(camera, drivers[rows], generator)
         rates = RATE * (2 * torch.rand(len(rows), 3, generator=generator) - 1) * rolling
-        parts.append(_faces(camera, drivers[rows], mounts, rates))
+        parts.append(seen_by(camera, drivers[rows], mounts, rates))
     return Samples(*map(torch.cat, zip(*parts, strict=True)))
 
 
@@ -146,12 +146,19 @@ def corner_rays(camera: Camera) -> Tensor:
     return torch.where(valid[..., None], rays, 0.0).float()
 
 
-def _faces(camera: Camera, drivers: cabin.Drivers, mounts: Tensor, rates: Tensor) -> Samples:
-    """What a camera, mounted so and turning at such rates (radians per second), sees of faces."""
+def seen_by(camera: Camera, drivers: cabin.Drivers, mounts: Tensor, rates: Tensor) -> Samples:
+    """What a camera sees of faces.
+
+    Args:
+        camera: without batch dims.
+        drivers: B of them.
+        mounts: (B, 3) degrees of yaw, pitch and roll, of the camera.
+        rates: (B, 3) radians per second, at which what it sees turns while it reads row after row.
+    """
     camera, mount = camera.double(), mount_rotation(*mounts.double().unbind(-1))
     points = points_of(drivers) @ mount.mT
     near, whole = cut(camera, *camera.project(points))
-    # the camera turns while it reads: each row of the square has a mount of its own
+    # each row of the square has a mount of its own
     seconds = READOUT / SIZE[0] * camera.fx / near.fx
     keypoints = near.project(points[:, : len(NAMES)])[0]
     for _ in range(8):  # the row of a point says when it was read, and that where it is
@@ -164,6 +171,6 @@ def _faces(camera: Camera, drivers: cabin.Drivers, mounts: Tensor, rates: Tensor
 
 
 def _in_rows(rates: Tensor, seconds: Tensor, rows: Tensor) -> Tensor:
-    """(B, N, 3, 3): how far a camera has turned by the time it reads rows (B, N), from the middle one on."""
+    """(B, N, 3, 3): how far all has turned by the time that rows (B, N) are read, from the middle one on."""
     times = seconds[:, None] * (rows - (SIDE - 1) / 2)
     return rotation_matrix(rates.double()[:, None] * times[..., None])
