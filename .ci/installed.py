@@ -11,7 +11,6 @@ FISHEYE = (
     "K: [28, 0, 47, 0, 28, 32, 0, 0, 1]\nD: [-0.02, 0.004, -0.003, 0.0006]\n"
 )
 OPTIONAL = {"camtorch.augment.albumentations": "albumentations", "camtorch.augment.torchvision": "torchvision"}
-WITHOUT_SCENES = "git clone https://github.com/camtorch/camtorch"
 
 
 def camtorch(*words: str) -> tuple[int, str, str]:
@@ -58,7 +57,7 @@ def look() -> None:
 
 
 def command(native: bool) -> str:
-    """What `camtorch --version` says, when other commands do their work too, or say what is missing for it."""
+    """What `camtorch --version` says, when another command does its work, and one says what it lacks."""
     from PIL import Image
 
     Image.new("RGB", (96, 64), "red").save("photo.jpg")
@@ -67,14 +66,9 @@ def command(native: bool) -> str:
     assert "kannala_brandt dewarped to perspective" in told
     with Image.open("out.png") as image:
         assert image.size == (96, 64)
-    for words, missing in (
-        (["show", "camera.yml", "-o", "plot.png"], "camtorch[plot]"),
-        (["demo"], WITHOUT_SCENES),
-        (["augment"], WITHOUT_SCENES),
-    ):
-        status, _, error = camtorch(*words)
-        assert (status, error.count("\n")) == (2, 1), (words, error)
-        assert missing in error, error
+    status, _, error = camtorch("show", "camera.yml", "-o", "plot.png")
+    assert (status, error.count("\n")) == (2, 1), error
+    assert "camtorch[plot]" in error, error
     assert {path.name for path in Path().iterdir()} == {"camera.yml", "photo.jpg", "out.png"}
     status, told, error = camtorch("--version")
     assert (status, error) == (0, ""), error

@@ -4,7 +4,9 @@
 `case-study` takes a quarter of an hour and is made by its name only.
 """
 
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import matplotlib
@@ -16,20 +18,16 @@ import torch
 from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))  # which have boards, and photographs of them
+sys.path.append(str(Path(__file__).parents[1] / "examples"))  # which have rendered scenes
 
+import train_faces
 from drawings import augmentations, concepts, guides, models, views
-from drawings.pages import IMAGES
+from drawings.pages import EXAMPLES, IMAGES
 
-from camtorch.cli.main import main
-from camtorch.demo import training, training_data
 from camtorch.plot.axes import COLOURS
 
-DEMOS = {
-    "augment": ["augment", *("--preset", "dms130", "--fov", "source", "--min-filled", "0.95", "-n", "5")],
-    "demo": ["demo"],
-    **{name: ["demo", name] for name in ("stereo", "surround", "camera")},
-}
-"""Name of the file -> the words of the command that draws it."""
+SCRIPTS = {"room": "dewarp_room", "stereo": "stereo_room", "surround": "birds_eye", "camera": "predict_camera"}
+"""Name of the file -> the example that draws it."""
 
 
 def save(image: Image.Image, name: str) -> None:
@@ -40,15 +38,17 @@ def save(image: Image.Image, name: str) -> None:
 
 def case_study(seeds: int = 3) -> None:
     """What networks find, how they come to it, and the medians over some seeds."""
-    runs = [training.run(lambda text: print(text, flush=True), seed=seed) for seed in range(seeds)]
-    save(training.drawing(runs[0]), "case-study")
+    runs, tests = zip(*(train_faces.run(seed=seed) for seed in range(seeds)), strict=True)
+    with tempfile.TemporaryDirectory() as folder:
+        train_faces.draw(runs[0], tests[0], f"{folder}/faces.png")
+        save(Image.open(f"{folder}/faces.png"), "case-study")
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for i, title in enumerate(training_data.TRAINING_SETS.values()):
-        curves = torch.tensor([run[i].curves["mounts"] for run in runs])  # (seeds, looks, 3)
+    for colour, (name, title) in zip(COLOURS, train_faces.TRAINING_SETS.items(), strict=False):
+        curves = torch.tensor([run[name].curves["mounts"] for run in runs])  # (seeds, looks, 3)
         for j, ax in enumerate(axes):
             values = curves[..., 1 + j] * (100 if j == 0 else 1)
-            ax.plot(curves[0, :, 0], values.median(0).values, color=COLOURS[i], label=title)
-            ax.fill_between(curves[0, :, 0], values.amin(0), values.amax(0), color=COLOURS[i], alpha=0.15, linewidth=0)
+            ax.plot(curves[0, :, 0], values.median(0).values, color=colour, label=title)
+            ax.fill_between(curves[0, :, 0], values.amin(0), values.amax(0), color=colour, alpha=0.15, linewidth=0)
     axes[0].set_title("landmarks, % of the distance between the eyes", fontsize="medium")
     axes[1].set_title("gaze, degrees", fontsize="medium")
     axes[1].legend(frameon=False, fontsize="small")
@@ -57,22 +57,23 @@ def case_study(seeds: int = 3) -> None:
         ax.set_ylim(0, top)
         ax.spines[["top", "right"]].set_visible(False)
     figure.savefig(IMAGES / "case-study-curves.png", dpi=110)
-    for results in zip(*runs, strict=True):
-        medians = torch.tensor([[e.medians() for e in result.errors.values()] for result in results])
-        print(f"{training_data.TRAINING_SETS[results[0].training_set]:<28}{medians.median(0).values.tolist()}")
+    for name, title in train_faces.TRAINING_SETS.items():
+        last = torch.tensor([[curve[-1][1:] for curve in run[name].curves.values()] for run in runs])
+        print(f"{title:<28}{last.median(0).values.tolist()}")
 
 
-def demos(names: list[str]) -> None:
-    """What the demos and `camtorch augment` draw, or some of it."""
-    for name in names or DEMOS:
-        path = IMAGES / f"{name}.jpg"
-        main([*DEMOS[name], "-o", str(path), "--force"])
-        save(Image.open(path), name)
+def examples(names: list[str]) -> None:
+    """What the examples draw, or some of it."""
+    for name in names or SCRIPTS:
+        with tempfile.TemporaryDirectory() as folder:
+            script = EXAMPLES / f"{SCRIPTS[name]}.py"
+            subprocess.run([sys.executable, script, "-o", f"{folder}/{name}.png"], check=True)
+            save(Image.open(f"{folder}/{name}.png"), name)
 
 
 PARTS = {
     "guides": guides.main,
-    "demos": demos,
+    "examples": examples,
     "models": models.main,
     "augmentations": augmentations.main,
     "views": views.main,

@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camtorch.cli.demo import GET_IT, installed
 from camtorch.cli.options import (
     add_jobs,
     add_output,
@@ -35,10 +34,9 @@ def add(commands: Commands) -> None:
     command = commands.add_parser(
         "augment",
         help="a sheet of an image with its labels, or a data set, as other cameras see them",
-        description="A sheet of an image with its labels as other cameras see them. Without IMAGE, in a checkout of "
-        "the repository, the image is a rendered driver. With --dataset a new data set: camtorch augment images/ "
-        "--dataset annotations.json --camera camera.yml -o new/. A RANGE is LOW,HIGH, as in --yaw=-5,20, or a number: "
-        "so far to either side of doing nothing, or just that --fov.",
+        description="A sheet of an image with its labels as other cameras see them. With --dataset a new data set: "
+        "camtorch augment images/ --dataset annotations.json --camera camera.yml -o new/. A RANGE is LOW,HIGH, as in "
+        "--yaw=-5,20, or a number: so far to either side of doing nothing, or just that --fov.",
         allow_abbrev=False,
     )
     command.set_defaults(run=run, prepare=prepare)
@@ -119,16 +117,18 @@ def run(arguments: argparse.Namespace) -> int:
 def _sheet(arguments: argparse.Namespace) -> None:
     from camtorch.cli import images, labelled_image, sheet
 
+    if arguments.image is None:
+        raise ValueError("which image? camtorch augment IMAGE --camera FILE")
     arguments.output = arguments.output or Path(_SHEET)
     arguments.n = _COUNT if arguments.n is None else arguments.n
     lens = labelled_image.lens(arguments.preset)
     ranges = checked_ranges(arguments)
-    for name, needed in {"from_model": "camera", "name": "camera", "labels": "image", "rescale": "image"}.items():
-        if getattr(arguments, needed) is None and getattr(arguments, name):
-            raise ValueError(f"--{name.replace('_', '-')} needs {'IMAGE' if needed == 'image' else '--camera FILE'}")
+    for name in ("from_model", "name"):
+        if arguments.camera is None and getattr(arguments, name):
+            raise ValueError(f"--{name.replace('_', '-')} needs --camera FILE")
     inputs = (arguments.image, arguments.camera, arguments.labels)
     images.check_target(arguments.output, force=arguments.force, inputs=inputs)
-    before = _scene(arguments) if arguments.image is None else _photograph(arguments)
+    before = _photograph(arguments)
     shown = [before]
     for new in labelled_image.augmented(
         before, lens, arguments.n, arguments.seed, arguments.size, arguments.min_filled, **ranges
@@ -167,23 +167,3 @@ def _photograph(arguments: argparse.Namespace) -> LabelledImage:
         note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
     known = None if arguments.labels is None else labels.read(arguments.labels, camera)
     return labelled_image.photograph(image, camera, known, arguments.image.name)
-
-
-def _scene(arguments: argparse.Namespace) -> LabelledImage:
-    """The rendered driver, as the camera given sees him."""
-    from camtorch.cli import cameras, labelled_image
-
-    if not installed():
-        raise ValueError(
-            "which image? camtorch augment IMAGE --camera FILE; the driver that is rendered without one comes with "
-            f"the repository: {GET_IT}"
-        )
-    camera = None
-    if arguments.camera is not None:
-        camera = cameras.read_camera(arguments.camera, arguments.name, arguments.from_model)
-        if camera.image_size is None:
-            raise ValueError(f"{arguments.camera} states no image size, which a rendered image needs")
-    # not before: what is installed may be without it
-    from camtorch.demo import example
-
-    return labelled_image.rendered(example.driver(camera))

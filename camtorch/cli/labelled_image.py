@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,9 +14,6 @@ from camtorch.augment import PRESETS, RandomCamera, mount_rotation
 from camtorch.camera import Camera
 from camtorch.cli import images
 from camtorch.cli.labels import Labels
-
-if TYPE_CHECKING:
-    from camtorch.demo.example import Example
 
 NEW_SIZE = (945, 1260)
 """(height, width) within which new images are made: thrice what a sheet shows, so that its edges are smooth."""
@@ -47,12 +44,6 @@ class LabelledImage:
 # -- what to augment
 
 
-def rendered(example: Example) -> LabelledImage:
-    """The driver that is shown where no image is given."""
-    labels = Labels(example.keypoints, example.boxes, example.eyes, example.gaze)
-    return _before(example.image, example.camera, labels, "a rendered driver")
-
-
 @torch.no_grad()
 def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str) -> LabelledImage:
     """An image, (C, H, W) as `images.read` has it; without labels, with a lattice of dots and a box."""
@@ -64,15 +55,11 @@ def photograph(image: Tensor, camera: Camera, labels: Labels | None, title: str)
         box = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]], dtype=torch.float64) - 0.5
         none = torch.zeros(0, 3, dtype=torch.float64)
         labels = Labels(torch.stack([x, y], -1).flatten(0, 1), box, none, none)
-    return replace(_before(images.in_colour(image, NOTHING), camera, labels, title), is_made_up=is_made_up)
-
-
-def _before(image: Tensor, camera: Camera, labels: Labels, title: str) -> LabelledImage:
-    height, width = camera.height, camera.width
     x1, y1, x2, y2 = labels.boxes.unbind(-1)
-    overlap = (x1 <= width - 0.5) & (x2 >= -0.5) & (y1 <= height - 0.5) & (y2 >= -0.5)
+    overlap = (x1 <= camera.width - 0.5) & (x2 >= -0.5) & (y1 <= camera.height - 0.5) & (y2 >= -0.5)
     caption = [f"before: {title}", f"{camera.key}, {_degrees(camera):.0f}° wide"]
-    return LabelledImage(image, camera, labels, caption, camera.contains(labels.keypoints), overlap)
+    shown, seen = images.in_colour(image, NOTHING), camera.contains(labels.keypoints)
+    return LabelledImage(shown, camera, labels, caption, seen, overlap, is_made_up=is_made_up)
 
 
 # -- augmenting

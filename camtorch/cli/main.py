@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
 from camtorch import __version__
-from camtorch.cli import augment, birdseye, board, calibrate, convert, demo, dewarp, lenses, map, rectify, show
+from camtorch.cli import augment, birdseye, board, calibrate, convert, dewarp, lenses, map, rectify, show
 from camtorch.cli.terminal import note, say
 from camtorch.jobs.pool import lacks_memory, reason
 from camtorch.native import library
@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
     parser.set_defaults(prepare=lambda arguments: None)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (dewarp, rectify, birdseye, augment, map, convert, show, lenses, calibrate, board, demo):
+    for command in (dewarp, rectify, birdseye, augment, map, convert, show, lenses, calibrate, board):
         command.add(commands)
     return parser
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import torch
 from PIL import Image, ImageDraw, ImageFilter
+from scenes import cabin, portrait
 
 import camtorch as ct
 from camtorch._drawing import INK, PAPER, Marks, font, shown
 from camtorch.cli.labelled_image import LabelledImage
 from camtorch.cli.labels import Labels
 from camtorch.cli.sheet import arrows
-from camtorch.demo import cabin, example
 from drawings.pages import IMAGES, code, sections
 from drawings.sheets import GAP, TILE, WIDTH, pair, put
 
@@ -26,7 +26,7 @@ SEEDS = {"mount": 3, "real": 7, "resized-crop": 4, "crop": 2, "camera": 4}
 def sample() -> dict[str, Any]:
     """The driver behind a fisheye, with labels."""
     lens = ct.KannalaBrandt.from_fov(130, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
-    found = example.driver(lens.double().requires_grad_(False))
+    found = portrait.driver(lens.double().requires_grad_(False))
     classes = cabin.render_classes(found.camera, found.drivers)[0]
     person = [cabin.CLASSES.index(name) for name in ("skin", "hair", "eye", "clothes")]
     return {

@@ -11,22 +11,29 @@ import numpy as np
 import torch
 from photographs import fisheye, photograph
 from PIL import Image, ImageDraw
+from scenes import room
+from scenes.exposure import expose
+from scenes.portrait import driver
 
 import camtorch as ct
-from camtorch._drawing import INK, PAPER
+from camtorch._drawing import INK, PAPER, shown
 from camtorch.boards.boards import Chessboard
-from camtorch.cli.labelled_image import LabelledImage, rendered
+from camtorch.cli import labelled_image, sheet
+from camtorch.cli.labelled_image import LabelledImage
 from camtorch.cli.labels import Labels
-from camtorch.cli.sheet import marked
-from camtorch.demo import room
-from camtorch.demo.example import driver
-from camtorch.demo.exposure import expose
 from camtorch.rotations import mount_rotation
-from drawings.pages import IMAGES
+from drawings.pages import EXAMPLES, IMAGES
 from drawings.sheets import drawn, in_rows, tiles
 
 SEED = 4
 PAGE = [value / 255 for value in PAPER]  # as matplotlib has colours
+
+
+def rendered(lens: ct.Camera | None = None) -> LabelledImage:
+    """A driver with labels, behind a lens."""
+    found = driver(lens)
+    labels = Labels(found.keypoints, found.boxes, found.eyes, found.gaze)
+    return labelled_image.photograph(found.image, found.camera, labels, "a rendered driver")
 
 
 def moved(before: LabelledImage, warp: ct.Warp) -> LabelledImage:
@@ -41,7 +48,7 @@ def moved(before: LabelledImage, warp: ct.Warp) -> LabelledImage:
 def overview(columns: int = 4) -> Image.Image:
     """A fisheye image, dewarped, and as other cameras would have seen it."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
-    fisheye = rendered(driver(lens.double().requires_grad_(False)))
+    fisheye = rendered(lens.double().requires_grad_(False))
     straight = moved(fisheye, ct.Dewarp(fisheye.camera, fov=100, image_size=(480, 640)))
     mount = {"yaw": 12, "pitch": 8, "roll": 20}
     new = ct.augment.RandomCamera("dms90", **mount, fov="source", min_filled=0.98, image_size=(480, 640))
@@ -59,7 +66,7 @@ def overview(columns: int = 4) -> Image.Image:
 
 def labelled(panels: list[tuple[LabelledImage, str]], columns: int) -> Image.Image:
     """Images with their labels, small, and titles."""
-    return in_rows([(marked(view, 300, 400), title) for view, title in panels], columns)
+    return in_rows([(sheet.marked(view, 300, 400), title) for view, title in panels], columns)
 
 
 def lenses() -> Image.Image:
@@ -126,24 +133,32 @@ def fields() -> Image.Image:
             for v, u in where.nonzero().tolist():
                 draw.rectangle((u - 1, v - 1, u, v), colour)
         _, up, seen = camera.perspective_field(down, stride=40)
-        for (u, v), (x, y), shown in zip(
+        for (u, v), (x, y), has_ray in zip(
             camera.pixel_grid(40).flatten(0, 1).tolist(),
             up.flatten(0, 1).tolist(),
             seen.flatten().tolist(),
             strict=True,
         ):
-            if shown:
+            if has_ray:
                 draw.line((u, v, u + 18 * x, v + 18 * y), INK, 2)
                 draw.ellipse((u - 3, v - 3, u + 3, v + 3), INK)
         found.append((tile.resize((320, 240), Image.Resampling.LANCZOS), title))
     return in_rows(found, len(found))
 
 
+def augment() -> Image.Image:
+    """What `camtorch augment` makes of a rendered driver."""
+    before = rendered()
+    after = labelled_image.augmented(before, "dms130", 5, 0, min_filled=0.95, fov="source")
+    title, origin = "One image, five other cameras", labelled_image.origin("dms130", before)
+    return sheet.drawing([before, *after], title, origin)
+
+
 def edits() -> Image.Image:
     """Edits of a fisheye image, and a chain of them with another lens."""
     augment = ct.augment
     lens = ct.KannalaBrandt.from_fov(130, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
-    before = rendered(driver(lens.double().requires_grad_(False)))
+    before = rendered(lens.double().requires_grad_(False))
     crop, flip = augment.RandomResizedCrop((480, 640), scale=(0.5, 0.5)), augment.HorizontalFlip(p=1.0)
     whole = augment.RandomResizedCrop((480, 640), scale=(0.85, 0.85))
     other = augment.RandomCamera("dms130", fov="source", min_filled=0.97, yaw=4, pitch=4, roll=(18, 18), crop=None)
@@ -170,7 +185,7 @@ def edits() -> Image.Image:
 def maps() -> Image.Image:
     """What meshes of a fisheye are off by: on the source, and over the target."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
-    fisheye = rendered(driver(lens.double().requires_grad_(False)))
+    fisheye = rendered(lens.double().requires_grad_(False))
     warp = ct.Dewarp(fisheye.camera, projection="cylindrical", fov=166, image_size=(480, 640))
     images = [image[0].permute(1, 2, 0) for image in (fisheye.image[None], warp(fisheye.image[None]))]
     with tempfile.TemporaryDirectory() as folder:
@@ -240,6 +255,16 @@ def calibration() -> Image.Image:
     return drawn(figure)
 
 
+def photograph_dewarped() -> Image.Image:
+    """What the first command of the README makes."""
+    folder = EXAMPLES / "photographs"
+    image = torch.from_numpy(np.array(Image.open(folder / "fisheye.jpg").convert("RGB"))).permute(2, 0, 1)
+    camera = ct.load(folder / "fisheye.yml").camera.requires_grad_(False)
+    after = ct.Dewarp(camera)(image[None])[0]
+    panels = [(image, "a photograph of a fisheye"), (after, "dewarped")]
+    return in_rows([(shown(part, 290, 464), title) for part, title in panels], 2)
+
+
 def learn() -> Image.Image:
     """A camera that learns from rays and pixels: the image that it dewarps, while it does."""
     truth = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
@@ -267,9 +292,11 @@ def learn() -> Image.Image:
 PICTURES = {
     "overview": overview,
     "overview-phone": functools.partial(overview, 2),
+    "photograph": photograph_dewarped,
     "dewarp": dewarp,
     "lenses": lenses,
     "shutter": shutters,
+    "augment": augment,
     "edits": edits,
     "fields": fields,
     "learn": learn,

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from PIL import Image, ImageDraw, ImageFont
+from scenes import room
 
 import camtorch as ct
-from camtorch.demo import room
 from camtorch.plot.axes import COLOURS, GREY, INK, NO_RAYS
 from camtorch.projection.rays import followed, image_lattice
 from drawings.pages import IMAGES, code, sections

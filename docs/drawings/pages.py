@@ -8,6 +8,7 @@ from pathlib import Path
 DOCS = Path(__file__).parent.parent
 GALLERY = DOCS / "gallery"
 IMAGES = DOCS / "images"
+EXAMPLES = DOCS.parent / "examples"
 
 
 def sections(page: str) -> dict[str, str]:

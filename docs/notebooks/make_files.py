@@ -4,13 +4,17 @@ Run it from the root of the repository: python docs/notebooks/make_files.py
 """
 
 import json
+import sys
 from pathlib import Path
 
 import torch
 from PIL import Image
 
+sys.path.append(str(Path(__file__).parents[2] / "examples"))  # rendered scenes
+
+from scenes import cabin, portrait, room
+
 import camtorch as ct
-from camtorch.demo import cabin, room
 
 HERE = Path(__file__).parent
 
@@ -19,26 +23,17 @@ def driver() -> None:
     """A driver as a wide camera on the steering column sees him, with all that is known of him."""
     camera = ct.KannalaBrandt.from_fov(165, image_size=(600, 800), distortion=[0.01, -0.004, 0.001, -0.0002])
     camera = camera.double().requires_grad_(False)
-    drivers = cabin.random_drivers(1, spread=0)
-    turn = torch.tensor(16.0, dtype=torch.float64).deg2rad()
-    drivers.pose[0, 0, 0] = drivers.pose[0, 2, 2] = turn.cos()
-    drivers.pose[0, 0, 2], drivers.pose[0, 2, 0] = turn.sin(), -turn.sin()
-    drivers.pose[0, :3, 3] = torch.tensor([0.03, -0.05, 0.42])
-    drivers.gaze = torch.nn.functional.normalize(torch.tensor([[-0.6, 0.25, -1.0]], dtype=torch.float64), dim=-1)
-    image = cabin.render(camera, drivers)[0]
-    points = drivers.landmarks()[0]
-    pixels = camera.project(points)[0]
-    box = camera.project(drivers.face_box_points()[0])[0]
+    found = portrait.driver(camera, yaw=16, place=(0.03, -0.05, 0.42), gaze=(-0.6, 0.25, -1.0))
     labels = {
         "names": list(cabin.LANDMARKS),
-        "keypoints": pixels.round(decimals=3).tolist(),
-        "points": points.round(decimals=6).tolist(),
-        "boxes": [torch.cat((box.amin(0), box.amax(0))).round(decimals=3).tolist()],
-        "gaze": drivers.gaze[0].tolist(),
-        "head_pose": drivers.pose[0].tolist(),
+        "keypoints": found.keypoints.round(decimals=3).tolist(),
+        "points": found.drivers.landmarks()[0].round(decimals=6).tolist(),
+        "boxes": found.boxes.round(decimals=3).tolist(),
+        "gaze": found.gaze[0].tolist(),
+        "head_pose": found.drivers.pose[0].tolist(),
         "camera": {"intrinsics": camera.intrinsics.tolist(), "distortion": camera.distortion.tolist()},
     }
-    Image.fromarray((255 * image).round().byte().permute(1, 2, 0).numpy()).save(HERE / "driver.jpg", quality=88)
+    Image.fromarray(found.image.permute(1, 2, 0).numpy()).save(HERE / "driver.jpg", quality=88)
     (HERE / "driver.json").write_text(json.dumps(labels) + "\n")
 
 

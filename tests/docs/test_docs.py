@@ -40,7 +40,7 @@ def blocks(language: str):
 def commands():
     for param in blocks("bash"):
         page, line, code = param.values
-        lines = [text for text in code.splitlines() if text.startswith("camtorch ") and " demo " not in text]
+        lines = [part for part in re.split(r"\n| && ", code) if part.startswith("camtorch ")]
         if lines:
             yield pytest.param(page, line, lines, id=param.id, marks=param.marks)
 
@@ -78,6 +78,7 @@ def folder(tmp_path, monkeypatch, request):
     """The current folder, with the files that the pages speak of."""
     torch.manual_seed(0)
     monkeypatch.chdir(tmp_path)
+    Path("examples").symlink_to(ROOT / "examples")
     shutil.copy(FILES / "opencv_fisheye.yml", "camera.yml")
     shutil.copy(FILES / "kalibr_camchain.yaml", "camchain.yaml")
     camera = ct.load("camera.yml").camera

@@ -42,7 +42,7 @@ def project(tmp_path_factory):
     folder = tmp_path_factory.mktemp("project")
     venv.create(folder / ".venv", symlinks=os.name != "nt")
     packages = next((folder / ".venv").rglob("site-packages"))
-    shutil.copytree(ROOT / "camtorch", packages / "camtorch", ignore=shutil.ignore_patterns("demo", "__pycache__"))
+    shutil.copytree(ROOT / "camtorch", packages / "camtorch", ignore=shutil.ignore_patterns("__pycache__"))
     (packages / "others.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
     for name in ("uses", "pages"):
         (folder / name).mkdir()

@@ -32,7 +32,7 @@ try:
     main(sys.argv[1:])
 except SystemExit:
     pass
-heavy = {"torch", "numpy", "PIL", "yaml", "kornia", "matplotlib", "camtorch.camera", "camtorch.demo"}
+heavy = {"torch", "numpy", "PIL", "yaml", "kornia", "matplotlib", "camtorch.camera"}
 print("loaded:", sorted(heavy & set(sys.modules)))
 """
     assert "loaded: []" in python(code, *words)

@@ -9,10 +9,10 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from cameras import DISTINCT, one, slow_unless
+from scenes import room
+from scenes.exposure import expose
 
 import camtorch as ct
-from camtorch.demo import room
-from camtorch.demo.exposure import expose
 
 RATES, READOUT = (0.8, 2.5, 1.6), 0.03
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch.demo.driver import Planes
-from camtorch.demo.paint import blend
-from camtorch.demo.walls import colour, soft
+from scenes.driver import Planes
+from scenes.paint import blend
+from scenes.walls import colour, soft
 
 # a point on each wall and where it faces; all the car is on that side of it
 WALLS = (

@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch.demo import driver
-from camtorch.demo.driver import LOOKS, Planes, Shape
-from camtorch.demo.walls import colour, soft
+from scenes import driver
+from scenes.driver import LOOKS, Planes, Shape
+from scenes.walls import colour, soft
 
 _SKINS = torch.cat([colour(c) for c in ("f3cdb4", "e8b696", "d69b74", "a96f4b", "6f4630", "4a2e22")], 1)
 _HAIRS = torch.cat([colour(c) for c in ("17130f", "2b1c14", "4f3020", "7a4a2a", "b98a4e", "9b958d")], 1)

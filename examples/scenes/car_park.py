@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.demo.exposure import expose
-from camtorch.demo.walls import colour, soft
 from camtorch.extrinsics import Extrinsics
 from camtorch.models import KannalaBrandt
 from camtorch.rig import Rig
+from scenes.exposure import expose, in_strips
+from scenes.walls import colour, soft
 
 LENGTH, WIDTH = 4.4, 1.8
 """Of the car whose cameras see."""
@@ -160,4 +160,8 @@ def render(camera: Camera, extrinsics: Extrinsics, *, samples: int = 6) -> Tenso
         samples: rays per pixel.
     """
     rotation, place = extrinsics.matrix()[:3, :3], extrinsics.position
-    return expose(camera, lambda rays: radiance(rays, place), rotation, samples=samples)
+
+    def strip(part: Camera, rows: slice) -> Tensor:
+        return expose(part, lambda rays: radiance(rays, place), rotation, samples=samples)
+
+    return in_strips(camera, strip)

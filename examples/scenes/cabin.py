@@ -6,22 +6,20 @@ and looks along z at the driver, who sits about 0.65 m before it. Images are (B,
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.demo import driver, landmarks
-from camtorch.demo.driver import FRIENDLY, LOOKS
-from camtorch.demo.landmarks import LANDMARKS
-from camtorch.demo.ray_tracing import BACKGROUND, CLASSES, Scene, trace
+from scenes import driver, landmarks
+from scenes.driver import FRIENDLY, LOOKS
+from scenes.exposure import corner_rays, in_strips, lattice
+from scenes.landmarks import LANDMARKS
+from scenes.ray_tracing import BACKGROUND, CLASSES, Scene, trace
 
 __all__ = ["CLASSES", "LANDMARKS", "LOOKS", "Drivers", "random_drivers", "render", "render_classes"]
 
-DOT = (0.0, 1.0, 0.0)
-"""The colour of dots; nothing else is as green."""
 _CHUNK = 1 << 18
 
 
@@ -108,65 +106,49 @@ def _turn(angle: Tensor, axis: int) -> Tensor:
 # -- images
 
 
-def _rays(corners: Tensor, across: float, down: float, turn: Tensor | None) -> Tensor:
-    """(B, P, 3) unit rays at a place within each pixel, from the rays of its corners (B, H + 1, W + 1, 3)."""
-    rows = torch.lerp(corners[..., :-1, :], corners[..., 1:, :], across)
-    rays = torch.lerp(rows[:, :-1], rows[:, 1:], down)
-    rays = (rays if turn is None else rays @ turn).flatten(1, 2)
-    unit: Tensor = rays / rays.norm(dim=-1, keepdim=True)
-    return unit
-
-
-def _by_rows(rotation: Tensor | None, rays: Tensor) -> Tensor | None:
-    """Rotations (3, 3), (B, 3, 3) or (B, H, 3, 3) as (B or 1, H or 1, 3, 3), of the rays' dtype."""
-    if rotation is None:
-        return None
-    rotation = rotation.to(rays)
-    return rotation if rotation.ndim == 4 else rotation.reshape(-1, 1, 3, 3)
-
-
-def _corners_of(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rays (B or 1, H + 1, W + 1, 3) of the pixels' corners, and which pixels have them, (B or 1, 1, H, W)."""
-    height, width = camera.height, camera.width
-    grid = camera.crop(0, 0, height + 1, width + 1).pixel_grid() - 0.5
-    corners, valid = camera.unproject(grid.expand(*camera.batch_shape, *grid.shape))
-    corners, valid = corners.reshape(-1, height + 1, width + 1, 3), valid.reshape(-1, 1, height + 1, width + 1)
-    valid = valid[..., 1:, 1:] & valid[..., 1:, :-1] & valid[..., :-1, 1:] & valid[..., :-1, :-1]
-    return corners, valid
-
-
-def _scan(rays: Tensor, scene: Scene, dots: Tensor | None, radius: float) -> tuple[Tensor, Tensor]:
+def _scan(rays: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
     """Colours (B, P, 3) and classes (B, P) of rays (B or 1, P, 3)."""
     count, size = len(scene.looks), rays.shape[1]
-    rays = rays.to(torch.float32)
-    turned = rays @ scene.turn
-    colours, classes = torch.empty(count, size, 3), torch.empty(count, size, dtype=torch.uint8)
-    for start in range(0, count * size, _CHUNK):
-        index = torch.arange(start, min(start + _CHUNK, count * size))
-        row = index // size
-        ray = rays[row if len(rays) > 1 else 0, index % size]
-        colours.view(-1, 3)[index], kind = trace(ray, turned.view(-1, 3)[index], row, scene)
-        classes.view(-1)[index] = kind.to(torch.uint8)
-    for dot in () if dots is None else dots.unbind(1):
-        toward = (dot / dot.norm(dim=-1, keepdim=True)).to(torch.float32)
-        # of small angles the chord knows more than the cosine
-        chord = (rays - toward[:, None]).square().sum(-1)
-        colours[chord < (2 * math.sin(radius / 2)) ** 2] = torch.tensor(DOT)
-    return colours, classes
+    rays = torch.nn.functional.normalize(rays, dim=-1).to(torch.float32)
+    turned = (rays @ scene.turn).flatten(0, 1)
+    rays = rays.expand(count, -1, -1).flatten(0, 1)
+    rows = torch.arange(count).repeat_interleave(size)
+    parts = zip(rays.split(_CHUNK), turned.split(_CHUNK), rows.split(_CHUNK), strict=True)
+    colours, classes = zip(*(trace(ray, turn, row, scene) for ray, turn, row in parts), strict=True)
+    return torch.cat(colours).unflatten(0, (count, size)), torch.cat(classes).unflatten(0, (count, size))
 
 
 @torch.no_grad()
-def render(
-    camera: Camera,
-    drivers: Drivers,
-    rotation: Tensor | None = None,
-    *,
-    samples: int = 4,
-    generator: torch.Generator | None = None,
-    dots: Tensor | None = None,
-    dot_radius: float = 0.01,
-    grey: bool = False,
-) -> Tensor:
+def _seen(
+    camera: Camera, drivers: Drivers, rotation: Tensor | None, places: list[tuple[float, float]]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the rays at some places in each pixel: the mean of their colours (B, 3, H, W), the classes (B, 1, H, W) of the
+    last ones; and which pixels have rays, (B or 1, 1, H, W).
+    """
+    corners, valid = corner_rays(camera)
+    corners, valid = (values.reshape(-1, *values.shape[len(camera.batch_shape) :]) for values in (corners, valid))
+    scene = Scene(drivers.pose, drivers.gaze, drivers.looks)
+    total = torch.zeros(())
+    for across, down in places:
+        rays = torch.lerp(corners[..., :-1, :], corners[..., 1:, :], across)
+        rays = torch.lerp(rays[:, :-1], rays[:, 1:], down)
+        if rotation is not None:
+            rays = rays @ rotation.to(rays)
+        colours, classes = _scan(rays.flatten(1, 2), scene)
+        total = total + colours
+    size = camera.height, camera.width
+    image = (total / len(places)).unflatten(1, size).permute(0, 3, 1, 2)
+    return image, classes.unflatten(1, size)[:, None], valid[:, None]
+
+
+def _by_rows(rotation: Tensor | None, height: int) -> Tensor | None:
+    """Rotations (3, 3), (B, 3, 3) or (B, H, 3, 3) as (B or 1, H, 3, 3)."""
+    if rotation is None or rotation.ndim == 4:
+        return rotation
+    return rotation.reshape(-1, 1, 3, 3).expand(-1, height, -1, -1)
+
+
+def render(camera: Camera, drivers: Drivers, rotation: Tensor | None = None, *, samples: int = 4) -> Tensor:
     """The images (B, 3, H, W) in [0, 1] that a camera takes of drivers; black where it has no rays.
 
     Args:
@@ -174,37 +156,18 @@ def render(
         drivers: B of them.
         rotation: (3, 3) or (B, 3, 3), turns the camera: what was at p is seen at `rotation @ p`; (B, H, 3, 3) while it
             reads row after row, one rotation each.
-        samples: rays per pixel, spread over it as a lattice; their mean is the pixel, as on a sensor.
-        generator: shifts the lattice at random; without it the same image comes out each time.
-        dots: (B, N, 3) points, not turned by `rotation`, that are painted over everything else in the colour `DOT`.
-        dot_radius: radians; a dot is all rays within that angle of the direction to its point.
-        grey: see as an infrared camera does that brings its own light.
+        samples: rays per pixel, whose mean is the pixel, as on a sensor.
     """
-    corners, valid = _corners_of(camera)
-    turn = _by_rows(rotation, corners)
-    scene = Scene(drivers.pose, drivers.gaze, drivers.looks, grey)
-    # the lattice's step is a golden section of its size: even over each axis and over the square
-    step = max(1, round(samples * 0.618))
-    while math.gcd(step, samples) > 1:
-        step += 1
-    shift = [0.5 / samples] * 2 if generator is None else torch.rand(2, generator=generator).tolist()
-    total = torch.zeros(())
-    # small images are seen several samples at a time: what costs is the number of calls
-    group = max(1, _CHUNK // (len(drivers) * camera.height * camera.width))
-    for some in torch.arange(samples).split(group):
-        places = [((i / samples + shift[0]) % 1, (i * step % samples / samples + shift[1]) % 1) for i in some.tolist()]
-        rays = torch.cat([_rays(corners, *place, turn) for place in places], 1)
-        total = total + _scan(rays, scene, dots, dot_radius)[0].unflatten(1, (len(places), -1)).sum(1)
-    image = (total / samples).unflatten(1, (camera.height, camera.width)).permute(0, 3, 1, 2)
-    return torch.where(valid, image, 0.0)
+    turns = _by_rows(rotation, camera.height)
+
+    def strip(part: Camera, rows: slice) -> Tensor:
+        image, _, valid = _seen(part, drivers, None if turns is None else turns[:, rows], lattice(samples))
+        return torch.where(valid, image, 0.0)
+
+    return in_strips(camera, strip)
 
 
-@torch.no_grad()
 def render_classes(camera: Camera, drivers: Drivers, rotation: Tensor | None = None) -> Tensor:
     """What is seen at the pixels' centres, (B, 1, H, W) uint8: indices of `CLASSES`; background has no ray."""
-    corners, valid = _corners_of(camera)
-    turn = _by_rows(rotation, corners)
-    classes = _scan(_rays(corners, 0.5, 0.5, turn), Scene(drivers.pose, drivers.gaze, drivers.looks, False), None, 0.0)[
-        1
-    ]
-    return torch.where(valid, classes.unflatten(1, camera.image_size)[:, None], BACKGROUND)
+    _, classes, valid = _seen(camera, drivers, _by_rows(rotation, camera.height), [(0.5, 0.5)])
+    return torch.where(valid, classes, BACKGROUND).to(torch.uint8)

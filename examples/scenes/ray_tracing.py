@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch.demo import driver, paint
-from camtorch.demo.car import BOXES, MOVING, WALLS, corners, cushion, seat_paint, slabs, wall_paint
-from camtorch.demo.driver import LOOKS, Neck, Planes, Shape
+from scenes import driver, paint
+from scenes.car import BOXES, MOVING, WALLS, corners, cushion, seat_paint, slabs, wall_paint
+from scenes.driver import LOOKS, Neck, Planes, Shape
 
 CLASSES = ("background", "skin", "hair", "eye", "clothes", "seat", "window", "cabin")
 BACKGROUND, SKIN, HAIR, EYE, CLOTHES, SEAT, WINDOW, CABIN = range(8)
@@ -19,7 +19,7 @@ BACKGROUND, SKIN, HAIR, EYE, CLOTHES, SEAT, WINDOW, CABIN = range(8)
 class Scene:
     """What the drivers decide, as float32 rows that rays pick from."""
 
-    def __init__(self, pose: Tensor, gaze: Tensor, looks: Tensor, grey: bool):
+    def __init__(self, pose: Tensor, gaze: Tensor, looks: Tensor):
         pose = pose.to(torch.float32)
         self.turn, place = pose[:, :3, :3], pose[:, :3, 3]
         self.looks = looks.to(torch.float32)
@@ -35,7 +35,7 @@ class Scene:
         look = dict(zip(LOOKS, self.looks.unbind(-1), strict=True))
         side = torch.stack([1.3 * look["sun"] - 0.75, torch.full_like(look["sun"], -0.62), -0.75 + 0 * look["sun"]], -1)
         self.sun = side / side.norm(dim=-1, keepdim=True)
-        self.day, self.upholstery, self.grey = 0.35 + 0.65 * look["day"], look["upholstery"], grey
+        self.day, self.upholstery = 0.35 + 0.65 * look["day"], look["upholstery"]
 
 
 def _columns(rows: Tensor) -> Planes:
@@ -103,7 +103,7 @@ def trace(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tens
     normal = driver.normals(driver.body, local, Neck._make(c[k] for c in scene.neck))
     albedo, bare, held = paint.body(local, scene.looks[k])
     shade = _under_head(p, normal, scene, k)
-    light[:, on_body] = _lit(albedo, normal, shade, p, tuple(c[on_body] for c in ray), scene, k, 0.02 * bare)
+    light[:, on_body] = _lit(albedo, normal, shade, tuple(c[on_body] for c in ray), scene, k, 0.02 * bare)
     classes[on_body] = torch.where(held, CABIN, torch.where(bare, SKIN, CLOTHES))
 
     here = (seat >= 0).nonzero()[:, 0]
@@ -112,7 +112,7 @@ def trace(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tens
     normal = way[:, here] / (way[:, here].norm(dim=0) + 1e-9)
     albedo = seat_paint(p, which, scene.upholstery[k])
     shade = _under_head(p, normal, scene, k) * corners(p)
-    light[:, here] = _lit(albedo, normal, shade, p, tuple(c[here] for c in ray), scene, k, 0.0)
+    light[:, here] = _lit(albedo, normal, shade, tuple(c[here] for c in ray), scene, k, 0.0)
     classes[here] = SEAT
 
     here = (best == torch.inf).nonzero()[:, 0]
@@ -124,12 +124,9 @@ def trace(rays: Tensor, turned: Tensor, row: Tensor, scene: Scene) -> tuple[Tens
     p = tuple(t * c for c in r)
     albedo, glow, glass = wall_paint(which, p, r, {"upholstery": scene.upholstery[k], "day": scene.day[k]})
     classes[here] = torch.where(glass, WINDOW, CABIN)
-    glow = 0.15 * glow if scene.grey else glow
     normal = facing[which, 1].T
-    light[:, here] = _lit(albedo, normal, corners(p), p, r, scene, k, 0.0) + glow
+    light[:, here] = _lit(albedo, normal, corners(p), r, scene, k, 0.0) + glow
 
-    if scene.grey:
-        light = light.mean(0, keepdim=True).expand(3, -1)
     return (1 - torch.exp(-1.3 * light)).pow(1 / 2.2).T, classes
 
 
@@ -165,7 +162,7 @@ def _trace_head(ray: Planes, turned: Planes, t: Tensor, here: Tensor, k: Tensor,
     turn = scene.turn.flatten(1).T[:, k].unflatten(0, (3, 3))
     normal = (turn * normal).sum(1)
     view = tuple(c[here] for c in ray)
-    return _lit(albedo, normal, hollow, tuple(t * c for c in view), view, scene, k, gloss), classes
+    return _lit(albedo, normal, hollow, view, scene, k, gloss), classes
 
 
 def _under_head(p: Planes, normal: Tensor, scene: Scene, k: Tensor) -> Tensor:
@@ -181,7 +178,6 @@ def _lit(
     albedo: Tensor,
     normal: Tensor,
     shade: Tensor,
-    p: Planes,
     ray: Planes,
     scene: Scene,
     k: Tensor,
@@ -190,12 +186,6 @@ def _lit(
     """(3, N): light from points: the sun through the windscreen, sky through the side windows, soft light around."""
     n = normal
     view = torch.stack(ray)
-    if scene.grey:
-        facing = -(n * view).sum(0).clamp(max=0)
-        fall = 0.42 / sum(c * c for c in p)
-        shine = torch.as_tensor(gloss)
-        shine = torch.where(shine > 0.5, 3 * facing**3000, 3 * shine * facing**60)
-        return albedo.mean(0, keepdim=True).pow(0.7) * shade * (0.04 + 1.3 * fall * facing) + fall * shine
     sun, day = scene.sun[k].T, scene.day[k]
     facing = (n * sun).sum(0)
     key = ((facing + 0.2) / 1.2).clamp(min=0)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch.demo import driver
-from camtorch.demo.driver import Shape
+from scenes import driver
+from scenes.driver import Shape
 
 LANDMARKS = (
     *("right_eye_outer", "right_eye_inner", "left_eye_inner", "left_eye_outer", "right_iris", "left_iris"),

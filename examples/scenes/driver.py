@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.demo.walls import soft
+from scenes.walls import soft
 
 Planes = tuple[Tensor, ...]
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from camtorch.camera import Camera
-from camtorch.demo import walls
-from camtorch.demo.exposure import expose
+from scenes import walls
+from scenes.exposure import expose, in_strips
 
 Planes = tuple[Tensor, ...]
 _CHUNK = 1 << 17
@@ -197,7 +197,11 @@ def render(
         samples: rays per pixel.
         rough: surfaces have a grain and reflect nothing, as those that stereo can measure.
     """
-    return expose(camera, lambda rays: radiance(rays, place, rough=rough), rotation, samples=samples)
+
+    def strip(part: Camera, rows: slice) -> Tensor:
+        return expose(part, lambda rays: radiance(rays, place, rough=rough), rotation, samples=samples)
+
+    return in_strips(camera, strip)
 
 
 def keypoints() -> Tensor:

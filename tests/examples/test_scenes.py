@@ -1,0 +1,165 @@
+"""The scenes: what is seen where, and that their labels are true."""
+
+import pytest
+import torch
+from scenes import car_park, driver, room
+from scenes.cabin import CLASSES, LANDMARKS, Drivers, random_drivers, render, render_classes
+
+import camtorch as ct
+from camtorch.rotations import mount_rotation
+
+
+def pinhole(focal: float, height: int, width: int) -> ct.Pinhole:
+    numbers = [focal, focal, (width - 1) / 2, (height - 1) / 2]
+    return ct.Pinhole(numbers, image_size=(height, width)).requires_grad_(False)
+
+
+def fisheye(side: int) -> ct.KannalaBrandt:
+    lens = [0.02, -0.01, 0.003, -0.001]
+    return ct.KannalaBrandt.from_fov(190, image_size=(side, side), distortion=lens).requires_grad_(False)
+
+
+def seeded(count: int, seed: int = 0, **options) -> Drivers:
+    return random_drivers(count, torch.Generator().manual_seed(seed), **options)
+
+
+def named(points: torch.Tensor, *names: str) -> torch.Tensor:
+    return points[..., [LANDMARKS.index(n) for n in names], :]
+
+
+def centroid(weight: torch.Tensor) -> torch.Tensor:
+    """(2) x and y of the middle of a weight (H, W)."""
+    weight = weight.double()
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in weight.shape), indexing="ij")
+    return torch.stack([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+
+
+def close_ups(points: torch.Tensor, focal: float, side: int) -> ct.Pinhole:
+    """Cameras whose images are around where they see points (N, 3)."""
+    centre = (side - 1) / 2 - focal * points[:, :2] / points[:, 2:]
+    numbers = torch.cat([torch.full_like(centre, focal), centre], -1)
+    return ct.Pinhole(numbers, image_size=(side, side)).requires_grad_(False)
+
+
+def test_drivers_are_plausible_and_their_seeds_decide():
+    drivers, again, other = seeded(60), seeded(60), seeded(60, 1)
+    for name in ("pose", "gaze", "looks"):
+        assert torch.equal(getattr(drivers, name), getattr(again, name))
+        assert not torch.equal(getattr(drivers, name), getattr(other, name))
+    pose, distance = drivers.pose[:, :3, :3], drivers.pose[:, 2, 3]
+    torch.testing.assert_close(pose @ pose.mT, torch.eye(3, dtype=torch.float64).expand_as(pose))
+    torch.testing.assert_close(drivers.gaze.norm(dim=-1), torch.ones(60, dtype=torch.float64))
+    assert distance.min() > 0.49
+    assert distance.max() < 0.86
+    # eyes turn no further than eyes can
+    assert (drivers.gaze * -pose[:, :, 2]).sum(-1).min() > 0.8
+
+
+def test_without_spread_all_are_the_driver_who_looks_into_the_camera():
+    drivers = seeded(3, spread=0)
+    assert torch.equal(drivers.pose[:, :3, :3], torch.eye(3, dtype=torch.float64).expand(3, 3, 3))
+    assert torch.equal(drivers.looks[0], drivers.looks[2])
+    torch.testing.assert_close(drivers.gaze[0], torch.tensor([0.0, 0, -1], dtype=torch.float64))
+
+
+@pytest.mark.slow
+def test_a_batch_is_its_images_one_by_one():
+    drivers, camera = seeded(2), fisheye(32)
+    both = render(camera, drivers, samples=1)
+    for i in range(2):
+        # a ray that grazes an edge may fall on either side
+        assert ((both[i] - render(camera, drivers[i], samples=1)[0]).abs() > 1e-4).float().mean() < 2e-3
+
+
+def test_every_ray_has_a_colour_and_no_ray_is_black_background():
+    camera, drivers = fisheye(100), seeded(1)
+    image, classes = render(camera, drivers, samples=1), render_classes(camera, drivers)
+    assert bool(image.isfinite().all())
+    assert image.min() >= 0
+    assert image.max() <= 1
+    no_ray = classes[0] == CLASSES.index("background")
+    assert no_ray.any()
+    assert torch.equal(no_ray, image[0].sum(0, keepdim=True) == 0)
+    assert {*classes.unique().tolist(), CLASSES.index("eye")} == set(range(len(CLASSES)))  # eyes are small
+
+
+def test_the_iris_is_where_the_pupil_is_seen():
+    drivers = random_drivers(1, spread=0)
+    drivers.gaze = torch.nn.functional.normalize(torch.tensor([[0.12, 0.05, -1]], dtype=torch.float64), dim=-1)
+    points = named(drivers.landmarks(), "right_iris", "left_iris").flatten(0, 1)
+    cameras = close_ups(points, 4000, 60)
+    images = render(cameras, drivers[[0, 0]], samples=2).amax(1)
+    for image, pixel in zip(images, cameras.project(points[:, None])[0], strict=True):
+        assert (centroid(image < 0.12) - pixel).abs().max() < 0.5
+
+
+def test_landmarks_are_on_the_surface_that_is_seen():
+    drivers = seeded(4, 3, spread=0.4)
+    front = ["right_eye_inner", "left_eye_inner", "nose_tip", "mouth_top", "mouth_bottom", "mouth_left", "mouth_right"]
+    points = named(drivers.landmarks(), *front).float()
+    local = (points - drivers.pose[:, None, :3, 3].float()) @ drivers.pose[:, :3, :3].float()
+    shape = driver.Shape._make(c[:, None].float() for c in driver.shape_of(drivers.looks))
+    assert driver.skin(tuple(local.unbind(-1)), shape).abs().max() < 5e-4
+    camera = pinhole(80, 80, 80)
+    classes, at = render_classes(camera, drivers)[:, 0], camera.project(points)[0].round().long()
+    kinds = torch.stack([c[p[:, 1], p[:, 0]] for c, p in zip(classes, at, strict=True)])
+    assert bool(((kinds == CLASSES.index("skin")) | (kinds == CLASSES.index("eye"))).all())
+    for low, marks in zip(camera.project(drivers.face_box_points())[0], camera.project(points)[0], strict=True):
+        assert bool(((marks > low.amin(0) - 1) & (marks < low.amax(0) + 1)).all())
+
+
+@pytest.mark.slow
+def test_a_turned_camera_sees_points_at_their_turned_place():
+    camera, drivers = fisheye(100), seeded(1)
+    turn = mount_rotation(*torch.tensor([17.0, 0.0, 17.0], dtype=torch.float64))
+    plain, turned = (render_classes(camera, drivers, r)[0, 0] for r in (None, turn))
+    rays = torch.linspace(-0.5, 0.5, 40, dtype=torch.float64)
+    rays = torch.stack([rays, 0.5 * rays.flip(0), torch.ones_like(rays)], -1)
+    (u, v), (x, y) = (camera.project(r)[0].round().long().T for r in (rays, rays @ turn.T))
+    assert (plain[v, u] == turned[y, x]).float().mean() > 0.85
+    # a rotation for each row, all of them the same
+    by_rows = render_classes(camera, drivers, turn.expand(1, 100, 3, 3))[0, 0]
+    assert (by_rows != turned).float().mean() < 1e-3
+
+
+def test_the_room_is_where_it_says():
+    # around every corner of the test chart opposite squares are alike and neighbours are not
+    camera = pinhole(400, 480, 640).double()
+    points = room.keypoints()
+    points = points[room.visible(points) & (points[:, 2] == points[:, 2].max())]
+    assert len(points) == 12
+    corners = camera.project(points)[0][:, None] + torch.tensor([[-3.0, -3.0], [3, -3], [3, 3], [-3, 3]]).double()
+    a, b, c, d = room.radiance(camera.unproject(corners)[0]).unbind(1)
+    assert (a - c).abs().max() < 0.1
+    assert (b - d).abs().max() < 0.1
+    assert (a - b).abs().amax(-1).min() > 0.3
+
+
+def test_the_room_from_another_place():
+    rays, _ = pinhole(60, 60, 80).double().rays()
+    ahead = (0.1, 0.05, 0.4)
+    far = room.distances(rays, ahead)
+    points = torch.tensor(ahead) + far[..., None] * rays
+    seen = far.isfinite()
+    assert 0.8 < seen.double().mean() < 1  # not the window
+    # what both places see is as far as it is
+    also = seen & room.visible(points)
+    assert also.double().mean() > 0.7
+    direct = room.distances(torch.nn.functional.normalize(points, dim=-1))
+    again = direct.isfinite() & also
+    off = (direct - points.norm(dim=-1))[again].abs()
+    assert (off < 4e-3).double().mean() > 0.999  # but for rays that graze an edge
+
+
+@pytest.mark.parametrize("scene", ["room", "car park"])
+def test_no_rays_no_light(scene):
+    # a fold of this lens lies inside the image
+    camera = ct.BrownConrady([100.0, 100, 79.5, 59.5], [-0.6, 0.0, 0.0, 0.0], image_size=(120, 160))
+    if scene == "room":
+        image = room.render(camera, samples=1)
+    else:
+        image = car_park.render(camera, car_park.rig().extrinsics["front"], samples=1)
+    _, valid = camera.rays()
+    assert not valid.all()
+    assert (image[:, ~valid] == 0).all()
+    assert (image[:, 60, 80] > 0).all()

@@ -1,0 +1,242 @@
+"""The scripts: what they measure can fail, what they learn from is labelled truly, and each writes its figure."""
+
+import math
+import statistics
+
+import birds_eye
+import dewarp_room
+import numpy as np
+import predict_camera
+import pytest
+import stereo_room
+import torch
+import train_faces
+from PIL import Image
+from scenes import cabin, faces, room
+from scenes.faces import NAMES, SIDE, SIZE, Photographs, Samples
+
+import camtorch as ct
+
+
+def is_a_figure(path):
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).std() > 20
+
+
+# -- dewarp_room
+
+
+def test_a_wrong_camera_is_noticed():
+    camera = ct.augment.PRESETS["dms90"].camera().double().requires_grad_(False).resize(80, 125)
+    found = dewarp_room.study(camera, 76, samples=2)
+    assert found.bends[0] > 0.3
+    assert max(found.bends[1], found.keypoint_error) < 1e-6
+    wrong = type(camera)(camera.intrinsics, 0.5 * camera.distortion, image_size=camera.image_size)
+    again = ct.Dewarp(wrong, fov=76, image_size=(270, 360), rotation=dewarp_room.TILT.T).requires_grad_(False)
+    off = (again(found.seen[None])[0] - found.truth)[:, found.valid].square().mean()
+    assert found.psnr + 10 * math.log10(float(off)) > 3
+
+
+@pytest.mark.slow
+def test_dewarped_is_what_the_target_would_have_seen(tmp_path, capsys):
+    studies = dewarp_room.main(str(tmp_path / "room.png"), samples=3)
+    assert is_a_figure(tmp_path / "room.png")
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == list(dewarp_room.LENSES)
+    for study in studies.values():
+        assert study.valid.float().mean() > 0.9
+        assert study.psnr > 31
+        assert len(study.keypoints) >= 12
+
+
+# -- stereo_room
+
+
+@pytest.mark.slow
+def test_the_room_is_measured(tmp_path):
+    pytest.importorskip("cv2")
+    for study in stereo_room.main(str(tmp_path / "pair.png"), 800, 3).values():
+        assert study.share > 0.85
+        assert study.median < 0.011
+    assert is_a_figure(tmp_path / "pair.png")
+    # the measurement must be able to fail: a baseline that is 3 % off
+    pose = stereo_room.POSE
+    wrong = ct.Extrinsics(pose.rotation, 1.03 * pose.translation).requires_grad_(False)
+    seen = stereo_room.photographs(800, 3)
+    assert stereo_room.study(*seen, "perspective", (110, 100), wrong).median > 0.015
+
+
+# -- birds_eye
+
+
+@pytest.mark.slow
+def test_the_car_park_comes_back(tmp_path):
+    study = birds_eye.study((400, 640), 0.05, 2)
+    assert study.valid.double().mean() > 0.95
+    assert study.error < 6
+    # as it does not where it is shifted by two pixels
+    off, shifted = ((truth - study.above)[:, study.valid] for truth in (study.truth, study.truth.roll(2, 1)))
+    assert shifted.square().mean() > off.square().mean()
+    birds_eye.draw(study, str(tmp_path / "above.png"))
+    assert is_a_figure(tmp_path / "above.png")
+
+
+# -- predict_camera
+
+
+def test_lenses_are_drawn_within_their_field_of_view():
+    cameras = predict_camera.lenses(200, torch.Generator().manual_seed(0))
+    assert 54 < cameras.fov[:, 0].min() < 60
+    assert 120 < cameras.fov[:, 0].max() < 126
+    assert bool(cameras.rays()[1].all())
+
+
+def test_photographs_are_what_their_cameras_see():
+    # of a panorama whose red is the height of the ray, in the frame in which it was taken
+    focal = 128 / math.pi
+    panorama = ct.Equirectangular([focal, focal, 127.5, 63.5], image_size=(128, 256)).requires_grad_(False)
+    rays, valid = panorama.rays()
+    height = torch.where(valid, rays[..., 1], 0.0).expand(1, 3, -1, -1)
+    cameras = predict_camera.lenses(4, torch.Generator().manual_seed(0))
+    images = predict_camera.photographs(panorama, height, cameras, torch.Generator().manual_seed(1))
+    # heights are a linear function of the rays of the camera, whatever it is turned by
+    rays = cameras.rays()[0].flatten(1, 2)
+    seen = images[:, 0].flatten(1).unsqueeze(-1)
+    down = torch.linalg.lstsq(rays, seen).solution
+    assert (rays @ down - seen).abs().max() < 0.01
+    torch.testing.assert_close(down.norm(dim=1), torch.ones(4, 1), atol=0.01, rtol=0)
+    assert down[:, 1].min() > math.cos(math.radians(25))
+
+
+@pytest.mark.slow
+def test_a_small_network_learns_focal_length_and_distortion_from_single_images(tmp_path):
+    # of lenses and places that it has not seen. After 700 steps chance decides much, and another processor is like
+    # another seed: of four 10 to 18 % and 4.3 to 7.7 degrees were measured. So the median of three is asked to be
+    # better than any prior, of which the least were 23 % and 8.9 degrees
+    results = [predict_camera.run(seed=seed) for seed in range(3)]
+    for result in results:
+        assert bool(result.found.rays()[1].all())
+    for measure, least in ((predict_camera.Result.focal, 0.23), (predict_camera.Result.corners, 8)):
+        before, after = (
+            [float(measure(result, cameras).median()) for result, cameras in pairs]
+            for pairs in ([(r, r.prior) for r in results], [(r, r.found) for r in results])
+        )
+        assert min(before) > least
+        assert statistics.median(after) < least
+    predict_camera.draw(results[0], str(tmp_path / "camera.png"))
+    assert is_a_figure(tmp_path / "camera.png")
+
+
+# -- train_faces
+
+
+@pytest.fixture(scope="module")
+def drivers() -> cabin.Drivers:
+    return cabin.random_drivers(10, torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def seen(drivers) -> Photographs:
+    return Photographs(torch.rand(len(drivers), 3, *SIZE), faces.points_of(drivers), drivers.gaze, faces.teacher())
+
+
+def learned_from(name: str, seen: Photographs) -> Samples:
+    torch.manual_seed(1)
+    index = torch.arange(len(seen.image))
+    return train_faces.AUGMENTATIONS[name](seen, index, torch.Generator().manual_seed(1))
+
+
+def looks_true(samples: Samples, drivers: cabin.Drivers) -> None:
+    """Landmarks lie as far from the gaze, by angle, as they do before the camera: whatever turned, all turned."""
+    whole = samples.weight > 0
+    assert whole.double().mean() > 0.4
+    there = torch.nn.functional.normalize(faces.points_of(drivers)[:, : len(NAMES)], dim=-1)
+    cosines = (there * drivers.gaze[:, None]).sum(-1).float()
+    # rays between those of the image's corners: of faces, within a degree
+    x, y = (samples.keypoints / (SIDE - 1))[..., None].unbind(-2)
+    a, b, c, d = samples.rays[:, None].unbind(2)
+    rays = torch.nn.functional.normalize((1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d), dim=-1)
+    assert (cosines - (rays * samples.gaze[:, None]).sum(-1))[whole].abs().max() < 0.03
+    assert bool(((samples.keypoints > -1) & (samples.keypoints < SIDE))[whole].all())
+
+
+@pytest.mark.parametrize("name", ["plain", "camtorch"])
+def test_labels_learned_from_are_true(name, seen, drivers):
+    looks_true(learned_from(name, seen), drivers)
+
+
+@pytest.mark.slow
+def test_labels_of_tests_are_true(drivers):
+    looks_true(faces.by_teacher(drivers), drivers)
+    still, rolling = (faces.by_others(drivers, torch.Generator().manual_seed(3), rolling=r) for r in (False, True))
+    looks_true(still, drivers)
+    assert bool((still.weight == 1).all())
+    assert torch.equal(still.rays, rolling.rays)
+    assert 0.5 < (still.keypoints - rolling.keypoints).abs().max() < 10
+
+
+@pytest.mark.slow
+def test_faces_before_a_rolling_shutter_are_those_that_a_warp_makes(drivers):
+    drivers, rates = drivers[:2], torch.tensor([[1.0, -2.0, 1.5], [-1.0, 1.5, 2.0]])
+    camera = faces.lens("dms90")
+    still, rolling = (faces.seen_by(camera, drivers, torch.zeros(2, 3), r) for r in (0 * rates, rates))
+    near, _ = faces.cut(camera, *camera.project(faces.points_of(drivers)))
+    readout = SIDE * faces.READOUT / SIZE[0] * camera.fx / near.fx
+    # a camera that turns sees the scene turn the other way
+    shutter = ct.RollingShutter(readout, -rates.double()).requires_grad_(False)
+    warp = ct.Warp(near, near, target_shutter=shutter, padding_mode="border")
+    moved, _ = warp.transform_points(still.keypoints.double())
+    assert (still.keypoints - rolling.keypoints).abs().max() > 0.5
+    torch.testing.assert_close(moved.float(), rolling.keypoints, atol=0.01, rtol=0)
+    off, before = ((image - rolling.image).square().mean() for image in (warp(still.image), still.image))
+    assert off < 0.2 * before
+
+
+def test_affine_turns_gaze_with_the_image(seen):
+    plain, turned = (learned_from(name, seen) for name in ("plain", "affine"))
+    torch.testing.assert_close(turned.gaze.norm(dim=-1), torch.ones(len(turned.gaze)))
+    torch.testing.assert_close(turned.gaze[:, 2], plain.gaze[:, 2])
+    assert (turned.gaze - plain.gaze).abs().max() > 0.05
+    # a line through the face and the projection of gaze turn by the same angle, but for shear
+    lines = [s.keypoints[:, 7] - s.keypoints[:, :4].mean(1) for s in (plain, turned)]
+    before, after = (torch.atan2(line[:, 1], line[:, 0]) for line in lines)
+    gaze = [torch.atan2(s.gaze[:, 1], s.gaze[:, 0]) for s in (plain, turned)]
+    apart = torch.remainder((after - before) - (gaze[1] - gaze[0]) + torch.pi, 2 * torch.pi) - torch.pi
+    assert apart.abs().max() < 0.25
+
+
+@pytest.mark.slow
+def test_a_small_run_is_reproducible_and_lowers_the_loss(tmp_path, seen):
+    first, again = (train_faces.run(images=8, count=10, steps=3, seed=2) for _ in range(2))
+    assert list(first[0]) == list(train_faces.TRAINING_SETS)
+    for name, result in first[0].items():
+        assert result.curves == again[0][name].curves
+    train_faces.draw(*first, str(tmp_path / "faces.png"))
+    assert is_a_figure(tmp_path / "faces.png")
+    torch.manual_seed(0)
+    test = learned_from("plain", seen)
+    network = train_faces.Network()
+    before = float(train_faces.loss_of(network(test), test))
+    train_faces.train("plain", network, seen, {"shutter": test}, 30, 0)
+    assert float(train_faces.loss_of(network(test), test)) < 0.7 * before
+
+
+def test_lenses_of_tests_are_of_several_models():
+    cameras = [faces.lens(name) for name in faces.LENSES]
+    assert {camera.image_size for camera in cameras} == {SIZE}
+    assert len({camera.key for camera in cameras}) == 3
+
+
+# -- the scenes and OpenCV
+
+
+@pytest.mark.slow
+def test_a_rendered_chart_is_found_where_it_is():
+    cv2 = pytest.importorskip("cv2")
+    camera = ct.Pinhole([1500.0, 1500, 0, 599.5], image_size=(1200, 1200)).double().requires_grad_(False)
+    image = (255 * room.render(camera, samples=8).mean(0)).round().byte().numpy()
+    points = room.keypoints()
+    truth = camera.project(points[points[:, 2] == points[:, 2].max()])[0].numpy().astype(np.float32)
+    start = truth + 0.6 * np.sin(np.arange(truth.size)).reshape(truth.shape).astype(np.float32)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+    found = cv2.cornerSubPix(image, start.reshape(-1, 1, 2).copy(), (6, 6), (-1, -1), stop)[:, 0]
+    assert np.linalg.norm(found - truth, axis=1).max() < 0.1
