@@ -106,7 +106,7 @@ CASES = {
     "augment": [
         ("augment", "which image? camtorch augment IMAGE --camera FILE"),
         ("augment in.png --model pinhole", "--from-model needs --camera FILE"),
-        ("augment in.png --preset fish", "no preset 'fish'. There are none, the image's own lens; webcam, a VGA camera"),
+        ("augment in.png --preset fish", "no preset 'fish'. There are none, the image's own lens; webcam"),
         ("augment in.png -n 101", "-n: '101' is not a whole number from 1 to 100"),
         ("augment in.png --seed -1", "--seed must be 0 or more"),
         ("augment in.png --camera camera.yml --min-filled 90", "--min-filled must be 0 to 1; got 90"),
