@@ -208,8 +208,6 @@ def _observed(
             raise ValueError(
                 f"{owner}: {labels[name]} must be (V, N, 2) or a list of (N_i, 2), one for each view; got shape {shape}"
             )
-        if all(rows is None for rows in given.rows):
-            raise ValueError(f"{owner}: {labels[name]} has no view with corners; got {shown(image_points[name])}")
     counts = {labels[name]: len(given.rows) for name, given in views.items()}
     board = _in_views(object_points, 3, "object_points", owner).rows
     if len(board) > 1 or any(rows is None for rows in board):

@@ -38,8 +38,6 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
 from camtorch.rotations import rotation_vector
 
-_LEAST = 4  # corners of a view that give a pose
-
 
 @dataclass(repr=False)
 class RigCalibration:
@@ -173,7 +171,7 @@ def calibrate_rig(
     ]
     device = sights[0].pixels.device
     free = Free(tuple(a.free.to(device) for a in asked), tuple(c > 0 for c in range(len(asked))), bend=bend)
-    first = _joined(names, sights, alone, free, owner)
+    first = _joined(sights, alone, free)
     told = None if progress is None else lambda number, cost: progress(number, float(cost))
     adjusted = adjust(sights, first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
     optima = []
@@ -253,7 +251,7 @@ def _alone(
     asked: Model, seen: Observations, loss: str | None, loss_scale: float, image_size: tuple[int, int]
 ) -> _Alone:
     """What one camera says."""
-    has_pose = seen.seen.sum(-1) >= _LEAST
+    has_pose = seen.seen.any(-1)
     some = seen.of(has_pose)
     first = first_state(some, asked, image_size, loss, loss_scale)
     free = Free((asked.free.to(some.pixels.device),), (False,))
@@ -264,24 +262,15 @@ def _alone(
     return _Alone(state.parameters[0][0], boards, has_pose)
 
 
-def _joined(names: list[str], sights: list[Sight], alone: list[_Alone], free: Free, owner: str) -> State:
-    """Where to start from: mounts by what two cameras say of the same boards, boards by the camera that says it best.
-
-    Raises:
-        ValueError: cameras that no board links.
-    """
-    mounts = Poses(*(t[0] for t in Poses.none(1, len(names), alone[0].parameters)))
+def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
+    """Where to start: mounts by what two cameras say of the same boards, boards by the camera that says it best."""
+    mounts = Poses(*(t[0] for t in Poses.none(1, len(alone), alone[0].parameters)))
     together = torch.stack([one.has_pose for one in alone]).double()
     together = together @ together.mT
     known = [0]
-    while len(known) < len(names):
-        rest = [c for c in range(len(names)) if c not in known]
+    while len(known) < len(alone):
+        rest = [c for c in range(len(alone)) if c not in known]
         links = together[known][:, rest]
-        if not bool((links > 0).any()):
-            raise ValueError(
-                f"{owner}: no board is seen both by {', '.join(names[c] for c in known)} and by "
-                f"{', '.join(names[c] for c in rest)}; take images at the same time in which both see one"
-            )
         i, j = divmod(int(links.argmax()), len(rest))
         a, b = known[i], rest[j]
         rotation, translation = _between(alone[a], alone[b])

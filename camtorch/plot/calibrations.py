@@ -167,7 +167,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
     cmap = levels("residuals", len(bounds) - 1)
     dense = len(lengths) > _DENSE
     place = np.digitize(lengths, bounds[1:-1])
-    for i, colour in enumerate(cmap.colors):
+    for i, colour in enumerate(cmap(np.arange(cmap.N))):
         start, along = pixels[place == i], longer * errors[place == i]
         _strokes(ax, np.stack((start, start + along), 1), colour, 0.6 if dense else 0.9, 2 + i / 10)
         _dots(ax, start, colour, 1.2 if dense else 2.0, 2 + i / 10)

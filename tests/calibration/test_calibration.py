@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from boards import STEREO, chessboard, opencv_left, ov_plane, seen_by, stereo
+from boards import chessboard, opencv_left, ov_plane, seen_by
 from cameras import KEYS, one, slow_unless
 from torch.testing import assert_close
 
@@ -61,6 +61,14 @@ def test_numbers_agree_with_the_residuals(left):
     assert valid.all()
     assert_close(left.residuals, (pixels - LEFT.image_points).detach(), rtol=0, atol=1e-9)
     assert left.inliers.all()
+
+
+def test_uncertainty_is_that_of_mrcal(left):
+    """Whose noise is the root of the mean square, which does not count the parameters."""
+    pixels, share = torch.tensor([(320.0, 240), (20, 20), (620, 460)]).double(), left.rms / math.sqrt(2) / left.sigma
+    for distance, expected in ((math.inf, (0.1353, 5.857, 2.640)), (0.5, (0.0462, 5.878, 2.651))):
+        found = share * left.uncertainty(pixels, distance)
+        assert_close(found, torch.tensor(expected).double(), rtol=1e-2, atol=0)
 
 
 def test_results_are_without_a_graph_but_go_on_learning(left):
@@ -265,38 +273,6 @@ def test_corners_without_noise_have_an_optimum(key, form):
         assert bool(((values(found) - truth).abs() <= precise + 6 * found.std).all())
     said = " ".join(found.warnings)
     assert not any(words in said for words in ("did not end", "pattern", "worse than", "outlier", "does not quite fit"))
-
-
-@slow
-def test_a_rig_of_two_cameras():
-    corners, right, rotation, translation = stereo()
-    unseen = right.isnan().all(-1).all(-1)
-    assert 0 < int(unseen.sum()) < 20
-    models = {name: type(camera) for name, camera in STEREO.items()}
-    sizes = {name: camera.image_size for name, camera in STEREO.items()}
-    points = {"right": [None if none else view for none, view in zip(unseen, right, strict=True)]}
-    points["left"] = corners.image_points
-    found = ct.calibrate_rig(models, corners.object_points, points, image_sizes=sizes)
-    assert list(found.rig) == ["left", "right"]
-    assert found.rms == pytest.approx(0.1 * math.sqrt(2), rel=0.05)
-    assert found.boards.batch_shape == (25,)
-    for name, truth in STEREO.items():
-        expected = torch.cat((truth.intrinsics, truth.distortion)).detach()
-        got = torch.cat((found.rig[name].intrinsics, found.rig[name].distortion)).detach()
-        assert bool(((got - expected).abs() < 4 * found.std[name]).all())
-    pose = found.rig.extrinsics["right"]
-    turn = rotation_matrix(pose.rotation).detach() @ rotation.mT
-    assert float((turn - torch.eye(3)).abs().max()) < 1e-3
-    assert_close(pose.translation.detach(), translation, rtol=0, atol=2e-4)
-    identity = found.rig.extrinsics["left"]
-    assert not identity.rotation.any()
-    assert not identity.translation.any()
-    assert isinstance(found.residuals["left"], torch.Tensor)
-    assert [bool(view.isnan().all()) for view in found.residuals["right"]] == unseen.tolist()
-    # every corner of both cameras, from one set of boards
-    held = found.boards(corners.object_points.expand(25, -1, -1))
-    pixels, _ = found.rig["right"].project(pose(held))
-    assert_close(torch.stack(found.residuals["right"]), (pixels - right).detach(), rtol=0, atol=1e-9, equal_nan=True)
 
 
 @pytest.mark.parametrize(

@@ -229,13 +229,6 @@ def check_pixels(problem, adjusted, values):
         check(along.flatten(1), sizes.sqrt().flatten().expand(len(errors), -1), slack=1.5)
 
 
-def test_refits_scatter_as_predicted():
-    found = scatter("kannala_brandt", 400, views=10)
-    check(*found[3:], slack=1.5)
-    check_pixels(*found[:3])
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "fixed"),
     [*((key, ()) for key in LENSES), ("fisheye624", ("cx", "cy", "s0")), ("double_sphere", ("fx", "xi"))],
@@ -261,7 +254,6 @@ def robustly(loss, scale, share, batch):
     return adjusted.state.parameters[0] - problem.parameters[0], values.std, noise
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "scale", "share"), [("huber", 1.0, 0.0), ("huber", 0.3, 0.05), ("cauchy", 0.5, 0.05)])
 def test_robust_refits_scatter_as_predicted(loss, scale, share):
     """Nearly: outliers come to views by chance, and the formulas know only their share."""
@@ -336,24 +328,6 @@ def test_projections_are_known_where_parameters_are_not():
     assert loose.std[0, 2] > 1e6 * loose.std[0, 0]
     for distance in (0.4, math.inf):
         assert torch.allclose(uncertainty(loose, PIXELS, distance), uncertainty(held, PIXELS, distance), rtol=1e-5)
-
-
-def test_of_calibrate():
-    corners, optima = opencv_left()
-    result = ct.calibrate("brown_conrady", corners.object_points, corners.image_points, image_size=corners.image_size)
-    assert torch.allclose(result.std, optima[5]["std"], rtol=1e-3)
-    # mrcal's noise is the root of the mean square, which does not count the parameters
-    share = result.rms / math.sqrt(2) / result.sigma
-    assert torch.allclose(share * result.uncertainty(PIXELS), torch.tensor([0.1353, 5.857, 2.640], **F64), rtol=1e-2)
-    assert torch.allclose(
-        share * result.uncertainty(PIXELS, 0.5), torch.tensor([0.0462, 5.878, 2.651], **F64), rtol=1e-2
-    )
-    held = ct.calibrate(
-        "brown_conrady", corners.object_points, corners.image_points, image_size=corners.image_size, fixed=("cx", "k3")
-    )
-    assert (held.std == 0).tolist() == [name in ("cx", "k3") for name in held.parameter_names]
-    assert not held.covariance[2].any()
-    assert bool((torch.linalg.eigvalsh(held.covariance) > -1e-12).all())
 
 
 def test_any_shape_of_pixels():

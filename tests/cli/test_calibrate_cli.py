@@ -206,9 +206,10 @@ def test_the_size_that_is_named_calibrates(photographs, capsys):
     assert "no --square is given: distances are in sides of a square" in capsys.readouterr().err
 
 
-def test_what_a_report_needs_is_asked_before_the_work(capsys, monkeypatch):
+@pytest.mark.parametrize("package", ["matplotlib", "jinja2"])
+def test_what_a_report_needs_is_asked_before_the_work(package, capsys, monkeypatch):
     write_corners(corners_of(), "corners.json")
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, package, None)
     words = "--corners", "corners.json", "--report", "report.html", "-o", "camera.yml"
     calibrate(*words, expect=2)
     captured = capsys.readouterr()
