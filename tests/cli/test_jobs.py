@@ -28,8 +28,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def found(*words, output="out"):
-    there = inputs.find(words, inputs.IMAGES, Path(output))
-    return {str(one.path): str(one.place) for one in there.files}, dict(there.faults)
+    files, faults = inputs.find(words, inputs.IMAGES, Path(output))
+    return {str(one.path): str(one.place) for one in files}, dict(faults)
 
 
 # -- inputs
