@@ -95,16 +95,16 @@ def _copies_of(place: Path, copies: int) -> list[Path]:
 
 def _by_files(folder: Path, labels: Path, output: Path, copies: int) -> tuple[list[Labelled], list[tuple[Path, str]]]:
     """The images of a folder, whose labels lie in files of the same names; and what could not be looked into."""
-    found = inputs.find([str(folder)], inputs.IMAGES, output)
+    found, faults = inputs.find([str(folder)], inputs.IMAGES, output)
     result = []
-    for one in found.files:
+    for one in found:
         places = [output / place for place in _copies_of(one.place, copies)]
         outputs = (*places, *(place.with_suffix(".json") for place in places))
         of_image = labels / one.place.with_suffix(".json")
         result.append(Labelled((one.path, of_image), outputs, place=one.place.as_posix()))
     if result and not any(item.inputs[1].is_file() for item in result):
         raise ValueError(f"{labels}: no labels; those of {result[0].place} would be in {result[0].inputs[1]}")
-    return result, found.faults
+    return result, faults
 
 
 def _by_entries(folder: Path, data: coco.DataSet, output: Path, copies: int) -> list[Labelled]:

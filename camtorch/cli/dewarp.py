@@ -172,12 +172,12 @@ def _many(arguments: argparse.Namespace) -> int:
     output, shard = many.output_folder(arguments.output), many.shard_of(arguments)
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
         raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
-    found = inputs.find(arguments.image, known, output)
-    everything = [_item(one, output, arguments.suffix) for one in found.files]
+    found, faults = inputs.find(arguments.image, known, output)
+    everything = [_item(one, output, arguments.suffix) for one in found]
     for item in everything:
         (videos if videos.is_video(item.inputs[0]) else images).check_kind(item.outputs[0])
     items.check(everything, [arguments.camera] if arguments.camera else [])
-    work = _dewarping(arguments, [one.path for one in found.files])
+    work = _dewarping(arguments, [one.path for one in found])
     mine = [videos.sized(item) for item in shard.of(everything)]
 
     def told(report: Report) -> str:
@@ -186,7 +186,7 @@ def _many(arguments: argparse.Namespace) -> int:
 
     return many.carry_out(
         mine,
-        found.faults if shard.rank == 0 else [],
+        faults if shard.rank == 0 else [],
         work,
         Manifest(output, "dewarp", work.settings(), shard),
         arguments,

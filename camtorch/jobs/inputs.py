@@ -6,7 +6,7 @@ import glob
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 
@@ -23,22 +23,13 @@ class Found:
     """Relative to the folder of outputs."""
 
 
-@dataclass
-class Inputs:
-    """What was found."""
-
-    files: list[Found] = field(default_factory=list)
-    faults: list[tuple[Path, str]] = field(default_factory=list)
-    """Folders that could not be looked into, and why."""
-
-
 def natural(path: Path) -> list[tuple[int, int, str]]:
     """A key to sort by that has 2 before 10."""
     parts = re.split(r"(\d+)", str(path))
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in parts]
 
 
-def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> Inputs:
+def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> tuple[list[Found], list[tuple[Path, str]]]:
     """Files, each once, in natural order.
 
     Args:
@@ -50,19 +41,21 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> Input
 
     Returns:
         Files with their places: below a folder that is read, or the folder before the first wildcard of a pattern, the
-        tree is kept; of several words folders keep their names as well.
+        tree is kept; of several words folders keep their names as well. And folders that could not be looked into, and
+        why.
 
     Raises:
         ValueError: a word that means no file.
     """
-    inputs = Inputs()
+    files: list[Found] = []
+    faults: list[tuple[Path, str]] = []
     for word in words:
         path, place = Path(word), Path()
         if path.is_dir():
             root, place = path, Path(path.resolve().name) if len(words) > 1 else place
-            paths = list(_below(path, output, lambda e: inputs.faults.append((Path(e.filename), e.strerror or ""))))
+            paths = list(_below(path, output, lambda e: faults.append((Path(e.filename), e.strerror or ""))))
         elif os.path.lexists(path):
-            inputs.files.append(Found(path, Path(path.name)))
+            files.append(Found(path, Path(path.name)))
             continue
         elif glob.has_magic(word):
             root = Path(*takewhile(lambda part: not glob.has_magic(part), path.parts))
@@ -73,12 +66,12 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> Input
         found = [p for p in paths if p.suffix.lower() in suffixes and (p.is_file() or not os.path.exists(p))]
         if not found and root is not path:
             raise ValueError(f"{word}: no file of a known type has such a name")
-        inputs.files += [Found(path, place / path.relative_to(root)) for path in found]
-    once = {os.path.abspath(found.path): found for found in inputs.files}
-    inputs.files = sorted(once.values(), key=lambda found: natural(found.path))
-    if not inputs.files and not inputs.faults:
+        files += [Found(path, place / path.relative_to(root)) for path in found]
+    once = {os.path.abspath(found.path): found for found in files}
+    files = sorted(once.values(), key=lambda found: natural(found.path))
+    if not files and not faults:
         raise ValueError(f"{', '.join(words)}: nothing in there ends in {', '.join(sorted(suffixes))}")
-    return inputs
+    return files, faults
 
 
 def _below(root: Path, output: Path, failed: Callable[[OSError], object]) -> Iterator[Path]:

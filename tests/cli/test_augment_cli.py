@@ -240,17 +240,17 @@ def test_a_photograph_without_labels_has_none_to_report(folder, capsys):
 
 
 def test_the_labels_of_a_data_set_are_those_of_an_image(folder, capsys):
-    for name, content in {"gaze": [0, 0, -1], "head_pose": np.eye(4).tolist(), "name": "a"}.items():
-        Path("images").mkdir(exist_ok=True)
-        Path("images/in.png").write_bytes(Path("in.png").read_bytes())
-        Path("images/in.json").write_text(json.dumps({"keypoints": [[20, 30], [60, 20]], name: content}))
-        augment("images", "--dataset", "images", "--camera", "camera.yml", "-o", f"new-{name}", "--jobs", 1)
-        capsys.readouterr()
-        augment("in.png", "--labels", "images/in.json", "--camera", "camera.yml", "-n", 1, "-o", f"{name}.png")
-        told = capsys.readouterr()
-        assert f'note: images/in.json: not shown: "{name}"' in told.err
-        assert " of 2 points" in told.out
-        # what a data set is written with states its camera, and what of it is valid
-        new = json.loads(Path(f"new-{name}/in.json").read_text())
-        augment(f"new-{name}/in.png", "--labels", f"new-{name}/in.json", "-n", 1, "-o", f"{name}-again.png")
-        assert f" of {sum(new['keypoints_valid'])} points" in capsys.readouterr().out
+    Path("images").mkdir()
+    Path("in.png").rename("images/in.png")
+    labels = {"keypoints": [[20, 30], [60, 20]], "gaze": [0, 0, -1], "head_pose": np.eye(4).tolist(), "name": "a"}
+    Path("images/in.json").write_text(json.dumps(labels))
+    augment("images", "--dataset", "images", "--camera", "camera.yml", "-o", "new", "--jobs", 1)
+    capsys.readouterr()
+    augment("images/in.png", "--labels", "images/in.json", "--camera", "camera.yml", "-n", 1)
+    told = capsys.readouterr()
+    assert 'note: images/in.json: not shown: "gaze", "head_pose", "name"; a gaze needs gaze_from' in told.err
+    assert " of 2 points" in told.out
+    # what a data set is written with states its camera, and what of it is valid
+    new = json.loads(Path("new/in.json").read_text())
+    augment("new/in.png", "--labels", "new/in.json", "-n", 1, "-o", "again.png")
+    assert f" of {sum(new['keypoints_valid'])} points" in capsys.readouterr().out

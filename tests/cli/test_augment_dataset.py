@@ -150,7 +150,7 @@ FOLDED = ct.BrownConrady([45.0, 45.0, 48.0, 36.0], [-0.5, 0.1, 0.0, 0.0], image_
 
 
 @pytest.mark.parametrize("source", [CAMERAS["pinhole"], FOLDED], ids=["all has a ray", "a circle has"])
-@pytest.mark.parametrize("box", [[8, 6, 80, 60], [-10, -10, 116, 92], [-10, 2, 60, 68], [2, 2, 90, 30]])
+@pytest.mark.parametrize("box", [[-10, -10, 116, 92], [-10, 2, 60, 68]])
 def test_what_is_larger_than_the_image_is_on_it(source, box):
     zoomed = ct.augment.RandomMount(zoom=(2, 2), yaw=(0, 0), pitch=(0, 0), roll=(20, 20))
     change = fixed(zoomed, source)

@@ -147,11 +147,7 @@ def test_two_shards_are_one_run(folder, capsys, monkeypatch):
     command(*WORDS, "--jobs", 1)
     whole = outputs()
     capsys.readouterr()
-    by_torchrun, by_srun = (
-        ("RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID"),
-        ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_STEP_ID"),
-    )
-    for names in (by_torchrun, by_srun, ()):
+    for names in (("RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID"), ()):
         place = names[0].lower() if names else "option"
         for rank in (0, 1):
             for name, value in zip(names, (rank, 2, 0), strict=False):

@@ -28,8 +28,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def found(*words, output="out"):
-    there = inputs.find(words, inputs.IMAGES, Path(output))
-    return {str(one.path): str(one.place) for one in there.files}, dict(there.faults)
+    files, faults = inputs.find(words, inputs.IMAGES, Path(output))
+    return {str(one.path): str(one.place) for one in files}, dict(faults)
 
 
 # -- inputs
@@ -147,28 +147,6 @@ def empty(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_job_goes_on(empty):
-    todo = jobs_of({"a": "1", "b": "fail", "c": "3", "d": "note"})
-    seen = []
-    report = carried_out(todo, watch=lambda done, kept: seen.append(done))
-    assert (report.made, report.kept) == (3, 0)
-    assert report.failed == [("in/b", "it says so")]
-    assert report.notes == {"is a note": ["in/d"]}
-    assert list(report.results.values()) == [{"size": 2}, {"size": 2}, {"size": 8}]
-    assert seen == sorted(seen)
-    assert (seen[0], seen[-1]) == (0.5, 4)
-    assert contents() == {"a": "11", "c": "33", "d": "notenote", "more/a": "11", "more/c": "33", "more/d": "notenote"}
-    with pytest.raises(FileExistsError, match="out/a: exists already, and 5 more of 8"):
-        carried_out(todo)
-    Path("in/b").write_text("2")
-    times = {name: Path("out", name).stat().st_mtime_ns for name in contents()}
-    report = carried_out(todo, resume=True)
-    assert (report.made, report.kept, report.failed) == (1, 3, [])
-    assert {name: Path("out", name).stat().st_mtime_ns for name in times} == times
-    assert list(report.results.values()) == [{"size": 2}, {"size": 2}, {"size": 2}, {"size": 8}]
-    assert contents()["b"] == "22"
-
-
 @pytest.mark.parametrize("change", ["input", "settings", "variant", "output", "gone", "account"])
 def test_what_has_changed_is_made_anew(empty, change):
     todo = jobs_of({"a": "1", "b": "2"})
@@ -209,16 +187,6 @@ def test_what_is_not_of_the_job_is_not_overwritten(empty):
     assert Path("out/a").read_text() == "11"
 
 
-def test_shards_know_of_each_other(empty):
-    todo = jobs_of({name: name for name in "abcde"})
-    for rank in range(2):
-        shard = Shard(rank, 2)
-        assert carried_out(shard.of(todo), shard=shard).failed == []
-    assert len(contents()) == 10
-    assert carried_out(todo, resume=True).kept == 5
-    assert carried_out(Shard(1, 3).of(todo), shard=Shard(1, 3), resume=True).kept == 2
-
-
 def test_nobody_does_the_same_at_the_same_time(empty):
     with Manifest(Path("out"), "doubling", 0):
         with pytest.raises(BlockingIOError, match="another process does this right now"):
@@ -253,6 +221,7 @@ def test_what_a_crash_left_is_removed(empty):
     assert len(contents()) == 4
 
 
+@pytest.mark.slow
 def test_processes_make_what_one_makes(empty):
     texts = {f"{i:02}": "1" for i in range(20)} | {"04": "fail", "05": "note"}
     todo = jobs_of(texts)

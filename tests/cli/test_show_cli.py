@@ -82,7 +82,9 @@ def test_convert_says_how_good_it_is(folder, capsys):
 
 
 def test_convert_keeps_poses(folder, capsys):
-    command("convert", FILES / "opencv_stereo.yml", "out.json", "--model", "fisheye62")
+    command(
+        "convert", FILES / "opencv_stereo.yml", "out.json", "--from-model", "kannala_brandt", "--model", "fisheye62"
+    )
     before, after = ct.load(FILES / "opencv_stereo.yml"), ct.load("out.json")
     assert [type(camera) for camera in after.cameras.values()] == [ct.Fisheye62] * 2
     for name, pose in before.extrinsics.items():
