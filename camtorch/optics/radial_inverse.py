@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -76,16 +76,17 @@ def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
     return torch.cat((inner, ends), -1).amin(-1).clamp(max=orientation.shape[-1])
 
 
-def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: float) -> Tensor:
+def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Tensor, most: float) -> Tensor:
     """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end.
 
-    radii: (RADII,) ascending, at which it is followed from the centre outwards.
+    sampled: makes the radii (RADII,), ascending, at which it is followed outwards where it has no closed form.
     most: the largest image that is a number to calculate with.
     """
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
     # of numbers that are not known, or that another runtime is to compute with, it is looked for
-    known = radii.dtype == torch.float64 and not radii.is_meta and not for_elsewhere()
+    k = radial.parameters[0]
+    known = k.dtype == torch.float64 and not k.is_meta and not for_elsewhere()
     if known and (fold := radial.closed_fold()) is not None:
         fold = fold.clamp(max=end)
         for _ in range(_LIMITING):
@@ -97,6 +98,8 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
             degree = 1 + 2 * fold * fold * slope / factor
             fold = torch.where(excess > 1, fold * excess ** (-1 / degree), fold)
         return fold
+
+    radii = sampled()
 
     def orientation(radius: Tensor) -> Tensor:
         found, image = radial.orientation(radius), radius * radial(radius * radius)
@@ -339,8 +342,12 @@ _tables = Memo(8)
 def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
     wide = k if for_elsewhere() else precise(k)  # ONNX Runtime has no arc tangent in float64
     radial = CLASSES[name](columns(wide))
-    radii = even_steps_and_ratios(RADII, end, end, wide, torch.positive)
-    fold = fold_of(radial, radii, end, torch.finfo(k.dtype).max ** 0.25)
+    fold = fold_of(
+        radial,
+        lambda: even_steps_and_ratios(RADII, end, end, wide, torch.positive),
+        end,
+        torch.finfo(k.dtype).max ** 0.25,
+    )
     return within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
 
 

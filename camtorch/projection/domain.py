@@ -204,7 +204,7 @@ class Domain:
         chart, lens = self.optics(columns(k))
         assert lens.radial is not None  # nobody asks for it otherwise
         return fold_of(
-            lens.radial, chart.radii(RADII, k), chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25
+            lens.radial, lambda: chart.radii(RADII, k), chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25
         )
 
     @_per_camera

@@ -159,7 +159,7 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool,
     return Found(a, b, torch.minimum(settled, reciprocal.abs()), torch.ones_like(a))
 
 
-def shown(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
+def has_ray(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
     """Bool (C, N): whether points of the sensor in focal lengths, planes, have a ray; see `Unproject`.
 
     Without that ray, and where the fold alone tells without the table to find it by. It looks at values.
@@ -176,11 +176,11 @@ def shown(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
         possible: Tensor = (torch.addcmul(p * p, q, q) <= most2) & (within > 0)
         return possible
     found = invert(domain, p, q, True)
-    has_ray = found.solved > 0
-    camera, point = (~has_ray & (found.possible > 0)).nonzero(as_tuple=True)
+    found_ray = found.solved > 0
+    camera, point = (~found_ray & (found.possible > 0)).nonzero(as_tuple=True)
     if len(camera):
-        has_ray[camera, point] = search(domain, camera, p[camera, point], q[camera, point])[2]
-    return has_ray
+        found_ray[camera, point] = search(domain, camera, p[camera, point], q[camera, point])[2]
+    return found_ray
 
 
 def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
