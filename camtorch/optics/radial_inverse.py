@@ -207,7 +207,7 @@ class InverseTable:
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
 
 
-class BriefTable:
+class SmallTable:
     """The same up to a radius, read off the factor at few radii: for few points of a camera that is about to change."""
 
     images: Tensor
@@ -231,27 +231,27 @@ class BriefTable:
 # -- the solution
 
 
-def solve(radial: RadialFactor, table: InverseTable | BriefTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
+def solve(radial: RadialFactor, table: InverseTable | SmallTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
     """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
 
     Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
     positive where the last step was so short that the next one would be nothing. looks: whether the steps may stop
     where that is so everywhere.
     """
-    scale, settled = table(r2), None
+    scale, converged = table(r2), None
     for count in range(1, MOST_STEPS + 1):
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
-        if settled is not None:  # what is settled stays, whatever else is in its batch
-            step = torch.where(settled > 0, 0.0, step)
+        if converged is not None:  # what is converged stays, whatever else is in its batch
+            step = torch.where(converged > 0, 0.0, step)
         scale = scale + step
         if count >= _STEPS[r2.dtype]:
-            settled = short(scale.dtype) * scale - step.abs()
-            if not looks or bool(settled.amin() > 0):
+            converged = short(scale.dtype) * scale - step.abs()
+            if not looks or bool(converged.amin() > 0):
                 break
-    assert settled is not None  # there are more steps than those before the first look
-    return scale, settled
+    assert converged is not None  # there are more steps than those before the first look
+    return scale, converged
 
 
 def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
@@ -353,8 +353,8 @@ def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
 
 def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
-    scale, settled = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not for_elsewhere())
-    camera, point = (~(settled > 0)).nonzero(as_tuple=True)
+    scale, converged = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not for_elsewhere())
+    camera, point = (~(converged > 0)).nonzero(as_tuple=True)
     if for_elsewhere() or len(camera):
         radial = CLASSES[name](of_points(k, camera))
         found = bracketed(radial, r2[camera, point], inner2[camera, 0])
