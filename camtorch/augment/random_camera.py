@@ -24,8 +24,8 @@ from camtorch.lenses.drawing import covering, drawn
 from camtorch.mixed import remade
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.domain import Domain, domain_of
-from camtorch.projection.rays import field_of_view, image_lattice
-from camtorch.projection.unproject import shown
+from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
+from camtorch.projection.unproject import has_ray
 from camtorch.rotations import mount_rotation
 from camtorch.warp.light import vignetting
 from camtorch.warp.shutter import RollingShutter
@@ -474,20 +474,20 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     given = camera.distortion.reshape(-1, count)
     p, q = (w.expand(len(steps), -1) for w in _rim(camera))
     own = domain_of(camera._model, given, camera.optics)
-    seen = shown(own, *(w.reshape(len(given), -1) for w in (p, q))).view_as(p)
+    seen = has_ray(own, *(w.reshape(len(given), -1) for w in (p, q))).view_as(p)
     # nothing is asked for where the old lens shows nothing
     p, q = torch.where(seen, p, 0.0), torch.where(seen, q, 0.0)
     given = given.expand_as(steps)
     candidate, defined = _defined(camera, given + steps, given)
     lenses = domain_of(camera._model, candidate, camera.optics)
-    fits = defined & shown(lenses, p, q).all(-1)
+    fits = defined & has_ray(lenses, p, q).all(-1)
     result = torch.where(fits.unsqueeze(-1), candidate, given)
     (left,) = (~fits).nonzero(as_tuple=True)
     if len(left):  # all that may come next at once: (parts, lenses left, n)
         given, parts = given[left].expand(len(_PARTS), -1, -1), steps.new_tensor(_PARTS)[:, None, None]
         candidate, defined = _defined(camera, given + parts * steps[left], given)
         others = Domain(camera.optics, candidate.flatten(0, 1))
-        fits = shown(others, *(w[left].repeat(len(_PARTS), 1) for w in (p, q))).all(-1).view_as(defined) & defined
+        fits = has_ray(others, *(w[left].repeat(len(_PARTS), 1) for w in (p, q))).all(-1).view_as(defined) & defined
         first = fits.to(torch.uint8).argmax(0) * len(left) + torch.arange(len(left), device=left.device)
         some = fits.any(0)
         result[left] = torch.where(some.unsqueeze(-1), others.k[first], given[0])
@@ -569,15 +569,10 @@ def _ends(camera: Camera, distortion: Tensor) -> Tensor:
     """(*B, K, 2): in focal lengths, the last point along every azimuth that the lens of these coefficients maps."""
     ones = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
     plane = remade(camera, ones, distortion.detach().double(), None)
-    azimuth = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1, None]
-    share = torch.linspace(0, 1, _ANGLES + 1, dtype=torch.float64, device=ones.device)
-    low, width = share.new_zeros(()), math.pi
-    for _ in range(2):  # the second time between the last angle that is mapped and the first that is not
-        angle = low + width * share
-        rays = torch.stack(
-            torch.broadcast_tensors(angle.sin() * azimuth.cos(), angle.sin() * azimuth.sin(), angle.cos()), -1
-        )
-        pixels, valid = plane.project(rays.expand(*plane.batch_shape, *rays.shape[-3:]))
-        last = (valid.long().cumprod(-1).sum(-1, keepdim=True) - 1).clamp(min=0)
-        low, width = angle.expand(valid.shape).gather(-1, last), width / _ANGLES
-    return pixels.gather(-2, last.unsqueeze(-1).expand(*last.shape, 2)).squeeze(-2)
+    azimuths = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1]
+
+    def seen(rays: Tensor) -> tuple[Tensor, Tensor]:
+        return plane.project(rays.expand(*plane.batch_shape, *rays.shape[-3:]))
+
+    ends = reach(lambda rays: seen(rays)[1], azimuths, steps=_ANGLES, rounds=2)
+    return seen(polar_rays(ends, azimuths).unsqueeze(-2))[0].squeeze(-2)

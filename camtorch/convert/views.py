@@ -11,18 +11,18 @@ from torch import Tensor
 from camtorch.convert.fitting import Observations
 from camtorch.projection.rays import (
     angles_from_axis,
-    followed,
     image_edges,
     pixel_lattice,
     polar_rays,
     ray_fan,
+    reach,
     slopes_at_axis,
 )
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
 
-_ANGLES, _AZIMUTHS, _RADII = 181, 16, 64  # at which a camera is looked at as a whole
+_ANGLES, _AZIMUTHS, _RADII = 180, 16, 64  # at which a camera is looked at as a whole
 _END_AHEAD = math.radians(87)  # of rays, for a camera without an image that does not see sideways
 
 
@@ -87,10 +87,10 @@ def lattice(camera: Camera, image_size: tuple[int, int] | None, side: int, limit
     """Over the part of the image that an angle leaves, its edges included; without an image, over all directions."""
     count = len(camera.intrinsics)
     if image_size is None:
-        reach = _reach(camera, limit)
+        most = _reach(camera, limit)
         # no node where panoramas are cut, and the last azimuth is next to the first one
-        first, last = (torch.full_like(reach, (i + 0.25) * 2 * math.pi / side) for i in (0, side - 1))
-        low, high = torch.cat((torch.zeros_like(reach), first), -1), torch.cat((reach, last), -1)
+        first, last = (torch.full_like(most, (i + 0.25) * 2 * math.pi / side) for i in (0, side - 1))
+        low, high = torch.cat((torch.zeros_like(most), first), -1), torch.cat((most, last), -1)
         return Lattice(low, high, side, False, limit)
     low, high = (corner.expand(count, 2) for corner in image_edges(image_size, camera.intrinsics))
     if limit < math.pi:
@@ -122,10 +122,13 @@ def sample_with_rings(camera: Camera, image_size: tuple[int, int] | None, side: 
 
 def _reach(camera: Camera, limit: float) -> Tensor:
     """(C, 1): the angle up to which a camera has rays on some azimuth."""
-    angles = torch.linspace(0, math.pi, _ANGLES, **_like(camera))
-    sees = followed(camera, angles.expand(len(camera.intrinsics), -1), _AZIMUTHS)[1].any(-1)
-    reach = (angles * sees).amax(-1, keepdim=True)
-    return torch.where(reach < math.pi / 2, reach.clamp(max=_END_AHEAD), reach).clamp(max=limit)
+    azimuths = (torch.arange(_AZIMUTHS).to(camera.intrinsics) + 0.25) * (2 * math.pi / _AZIMUTHS)
+
+    def covers(rays: Tensor) -> Tensor:
+        return camera.project(rays.expand(len(camera.intrinsics), *rays.shape[-3:]))[1]
+
+    ends = reach(covers, azimuths, steps=_ANGLES, rounds=1).amax(-1, keepdim=True)
+    return torch.where(ends < math.pi / 2, ends.clamp(max=_END_AHEAD), ends).clamp(max=limit)
 
 
 def focal_at_axis(camera: Camera) -> Tensor:

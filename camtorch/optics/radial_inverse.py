@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -76,16 +76,17 @@ def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
     return torch.cat((inner, ends), -1).amin(-1).clamp(max=orientation.shape[-1])
 
 
-def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: float) -> Tensor:
+def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Tensor, most: float) -> Tensor:
     """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end.
 
-    radii: (RADII,) ascending, at which it is followed from the centre outwards.
+    sampled: makes the radii (RADII,), ascending, at which it is followed outwards where it has no closed form.
     most: the largest image that is a number to calculate with.
     """
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
     # of numbers that are not known, or that another runtime is to compute with, it is looked for
-    known = radii.dtype == torch.float64 and not radii.is_meta and not for_elsewhere()
+    k = radial.parameters[0]
+    known = k.dtype == torch.float64 and not k.is_meta and not for_elsewhere()
     if known and (fold := radial.closed_fold()) is not None:
         fold = fold.clamp(max=end)
         for _ in range(_LIMITING):
@@ -97,6 +98,8 @@ def fold_of(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: floa
             degree = 1 + 2 * fold * fold * slope / factor
             fold = torch.where(excess > 1, fold * excess ** (-1 / degree), fold)
         return fold
+
+    radii = sampled()
 
     def orientation(radius: Tensor) -> Tensor:
         found, image = radial.orientation(radius), radius * radial(radius * radius)
@@ -204,7 +207,7 @@ class InverseTable:
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
 
 
-class BriefTable:
+class SmallTable:
     """The same up to a radius, read off the factor at few radii: for few points of a camera that is about to change."""
 
     images: Tensor
@@ -228,27 +231,27 @@ class BriefTable:
 # -- the solution
 
 
-def solve(radial: RadialFactor, table: InverseTable | BriefTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
+def solve(radial: RadialFactor, table: InverseTable | SmallTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
     """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
 
     Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
     positive where the last step was so short that the next one would be nothing. looks: whether the steps may stop
     where that is so everywhere.
     """
-    scale, settled = table(r2), None
+    scale, converged = table(r2), None
     for count in range(1, MOST_STEPS + 1):
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
-        if settled is not None:  # what is settled stays, whatever else is in its batch
-            step = torch.where(settled > 0, 0.0, step)
+        if converged is not None:  # what is converged stays, whatever else is in its batch
+            step = torch.where(converged > 0, 0.0, step)
         scale = scale + step
         if count >= _STEPS[r2.dtype]:
-            settled = short(scale.dtype) * scale - step.abs()
-            if not looks or bool(settled.amin() > 0):
+            converged = short(scale.dtype) * scale - step.abs()
+            if not looks or bool(converged.amin() > 0):
                 break
-    assert settled is not None  # there are more steps than those before the first look
-    return scale, settled
+    assert converged is not None  # there are more steps than those before the first look
+    return scale, converged
 
 
 def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
@@ -339,15 +342,19 @@ _tables = Memo(8)
 def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
     wide = k if for_elsewhere() else precise(k)  # ONNX Runtime has no arc tangent in float64
     radial = CLASSES[name](columns(wide))
-    radii = even_steps_and_ratios(RADII, end, end, wide, torch.positive)
-    fold = fold_of(radial, radii, end, torch.finfo(k.dtype).max ** 0.25)
+    fold = fold_of(
+        radial,
+        lambda: even_steps_and_ratios(RADII, end, end, wide, torch.positive),
+        end,
+        torch.finfo(k.dtype).max ** 0.25,
+    )
     return within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
 
 
 def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
-    scale, settled = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not for_elsewhere())
-    camera, point = (~(settled > 0)).nonzero(as_tuple=True)
+    scale, converged = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not for_elsewhere())
+    camera, point = (~(converged > 0)).nonzero(as_tuple=True)
     if for_elsewhere() or len(camera):
         radial = CLASSES[name](of_points(k, camera))
         found = bracketed(radial, r2[camera, point], inner2[camera, 0])

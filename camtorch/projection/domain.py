@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
 
 _RADII = 512
-_BRIEF, _LOOKS = 129, 2  # radii of a brief look, one of which each direction may take
+_STEPS, _UNTABULATED = 129, 2  # radii that few points are answered from, and how often
 # Stages after a radial one that change distances by less than a quarter, and so by less than that move what they are
 # given, are inverted by Newton's method from anywhere: a step comes nearer by a third at least
-_MILD, _WIDER = 0.75, 1.25
+_LEAST_SLOPE, _WIDER = 0.75, 1.25
 
 
 def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
@@ -48,10 +48,10 @@ def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
 class Domain:
     """The lenses of cameras (C,), graph-free, and their domains.
 
-    A point (a, b) of the chart's plane is in the domain if its lens is regular all the way from the centre. A radial
-    lens is followed to the root, and so is one whose other stages are mild on all that the radial one sends to them.
-    Of others it is known from bounds of their terms how far out they certainly are; the azimuths are followed only when
-    a point lies further out.
+    A point (a, b) of the chart's plane is in the domain if its lens is regular all the way from the centre: up to the
+    fold of a radial lens, and of one whose other stages change distances little on the image of the radial one. Of
+    others it is known from bounds of their terms how far out they certainly are; the azimuths are followed only when a
+    point lies further out.
     """
 
     optics: Optics
@@ -60,7 +60,7 @@ class Domain:
     cameras: slice
     chart: Chart
     lens: Lens
-    looks: int
+    untabulated: int
 
     def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice | None = None):
         """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points.
@@ -70,7 +70,7 @@ class Domain:
         self.optics, self.k, self.whole = optics, k, whole
         self.cameras = slice(None) if cameras is None else cameras
         self.chart, self.lens = optics(columns(k))
-        self.looks = 0
+        self.untabulated = 0
 
     def part(self, cameras: slice) -> Domain:
         """The domain of some of the cameras."""
@@ -92,17 +92,17 @@ class Domain:
         usual2 = inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
         inverse = InverseTable(table) if self.lens.radial else None
         self._set(inner2=inner2, usual2=usual2, limits2=limits2, inverse=inverse)
-        self._set(staged=None, all_staged=False)  # which takes a look
+        self._set(stagewise=None, all_stagewise=False)  # which takes a look
         return self
 
     def at_hand(self) -> Domain:
         """The same, with all tables that a graph may ask for: those of values that are known, or recorded with it."""
         if for_elsewhere():
             if self.lens.stages and not self.lens.is_radial:
-                staged = torch.isfinite(self.circle2) if self.lens.rest is not None else None
+                stagewise = torch.isfinite(self.circle2) if self.lens.rest is not None else None
                 limits2, outline = limits_and_outline(self.optics, self.k)
-                limits2 = limits2 if staged is None else torch.where(staged, 0.0, limits2)
-                self._set(staged=staged, all_staged=False, limits2=limits2, outline=outline)
+                limits2 = limits2 if stagewise is None else torch.where(stagewise, 0.0, limits2)
+                self._set(stagewise=stagewise, all_stagewise=False, limits2=limits2, outline=outline)
             return self
         # constants: none is a view of another
         made = Domain(self.optics, self.k.clone())
@@ -112,10 +112,10 @@ class Domain:
         tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]
         tables += [] if self.lens.is_radial else ["limits2"]
         made._set(**{name: getattr(self, name).clone() for name in tables})
-        made._set(staged=self.staged, all_staged=self.all_staged, inverse=None, outline=None)
+        made._set(stagewise=self.stagewise, all_stagewise=self.all_stagewise, inverse=None, outline=None)
         if self.inverse is not None:
             made.__dict__["inverse"] = InverseTable(self.table, is_constant=True)
-        if not (self.lens.is_radial or self.all_staged):
+        if not (self.lens.is_radial or self.all_stagewise):
             with torch.inference_mode(False):
                 made.outline = self.azimuths.outline(torch.arange(len(self.k), device=self.k.device))
         return made
@@ -142,8 +142,8 @@ class Domain:
     def circle2(self) -> Tensor:
         """(C, 1): the squared radius of a circle of the image beyond which there is nothing, infinite where unknown.
 
-        Where it is finite the domain ends at the fold of a first, radial stage: those after it are `_MILD` on all that
-        it sends to them. There the image has a limit that is found once, and the inverse goes stage by stage.
+        Where it is finite the domain ends at the fold of a first, radial stage: those after it keep `_LEAST_SLOPE` on
+        its image. There the image has a limit that is found once, and the inverse goes stage by stage.
         """
         if self.lens.rest is None:
             return self.k.new_full((self.k.shape[0], 1), torch.inf)
@@ -151,23 +151,23 @@ class Domain:
         _, lens = self.optics(columns(k))
         assert lens.rest is not None
         edge = self.edge2.to(k.dtype).sqrt()
-        steps = torch.linspace(0, _WIDER, _BRIEF, dtype=k.dtype, device=k.device)
+        steps = torch.linspace(0, _WIDER, _STEPS, dtype=k.dtype, device=k.device)
         least, furthest = lens.rest.lower_bound(edge * steps)
         # what changes less from radius to radius than it is large has no zero in between
         certain = least.amin(-1, keepdim=True) - least.diff(dim=-1).abs().amax(-1, keepdim=True)
-        sent = torch.where(steps <= 1 + steps[1], furthest, 0.0).amax(-1, keepdim=True)
-        return torch.where(certain > _MILD, sent * sent, torch.inf).to(self.k.dtype)
+        furthest_out = torch.where(steps <= 1 + steps[1], furthest, 0.0).amax(-1, keepdim=True)
+        return torch.where(certain > _LEAST_SLOPE, furthest_out * furthest_out, torch.inf).to(self.k.dtype)
 
     @cached_property
-    def staged(self) -> Tensor | None:
+    def stagewise(self) -> Tensor | None:
         """(C, 1) bool: whether the inverse goes stage by stage, see `circle2`; None where that is so for no camera."""
-        staged = torch.isfinite(self.circle2) if self.lens.rest is not None else None
-        return None if staged is None or not bool(staged.any()) else staged
+        stagewise = torch.isfinite(self.circle2) if self.lens.rest is not None else None
+        return None if stagewise is None or not bool(stagewise.any()) else stagewise
 
     @cached_property
-    def all_staged(self) -> bool:
+    def all_stagewise(self) -> bool:
         """Whether it goes so for all cameras."""
-        return self.staged is not None and bool(self.staged.all())
+        return self.stagewise is not None and bool(self.stagewise.all())
 
     @_per_camera
     def inner2(self) -> Tensor:
@@ -175,13 +175,13 @@ class Domain:
 
         It is one for radial lenses, and for those that are inverted stage by stage.
         """
-        if self.lens.is_radial or self.all_staged:
+        if self.lens.is_radial or self.all_stagewise:
             inner = self._fold.to(self.k.dtype)
         else:
             radii = self.chart.radii(_RADII, self.k)
             lost = first_loss(self.lens.lower_bound(radii.expand(self.k.shape[0], -1))[0])
             inner = radii[(lost - 1).floor().clamp(0, _RADII - 1).long()].unsqueeze(-1)
-            inner = inner if self.staged is None else torch.where(self.staged, self._fold.to(inner.dtype), inner)
+            inner = inner if self.stagewise is None else torch.where(self.stagewise, self._fold.to(inner.dtype), inner)
         return within(inner.clamp(max=self.chart.end(inner.dtype)))
 
     @_per_camera
@@ -191,7 +191,7 @@ class Domain:
         Zero where that is known of every radius.
         """
         limits2 = self.k.new_zeros(self.k.shape[0], AZIMUTHS)
-        wanted = limits2.new_ones(len(limits2), 1, dtype=torch.bool) if self.staged is None else ~self.staged
+        wanted = limits2.new_ones(len(limits2), 1, dtype=torch.bool) if self.stagewise is None else ~self.stagewise
         camera, index = wanted.expand_as(limits2).nonzero(as_tuple=True)
         if len(camera):
             limits2[camera, index] = self.azimuths.limits2(camera, index)
@@ -204,7 +204,7 @@ class Domain:
         chart, lens = self.optics(columns(k))
         assert lens.radial is not None  # nobody asks for it otherwise
         return fold_of(
-            lens.radial, chart.radii(RADII, k), chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25
+            lens.radial, lambda: chart.radii(RADII, k), chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25
         )
 
     @_per_camera
@@ -226,17 +226,21 @@ class Domain:
         inner2: Tensor = self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
         return inner2
 
-    def brief(self, furthest2: Tensor) -> Tensor | None:
-        """Radii (C, K) from the centre to the given ones, (C, 1) squared, if a brief look shows no fold before them.
+    def radii_without_fold(self, furthest2: Tensor) -> Tensor | None:
+        """Radii (C, K) from the centre to the given ones, (C, 1) squared, if few radii show no fold before them.
 
         What changes less from radius to radius than it is large has no zero in between. None where that is not so, and
         for a lens that has its tables, or is asked for often enough to make them.
         """
         radial = self.lens.radial
-        self.looks += 1
-        if self.looks > _LOOKS or "inner2" in self.__dict__ or (radial is not None and radial.fold is not None):
+        self.untabulated += 1
+        if (
+            self.untabulated > _UNTABULATED
+            or "inner2" in self.__dict__
+            or (radial is not None and radial.fold is not None)
+        ):
             return None
-        radii = furthest2.sqrt() * torch.linspace(0, 1, _BRIEF, dtype=self.k.dtype, device=self.k.device)
+        radii = furthest2.sqrt() * torch.linspace(0, 1, _STEPS, dtype=self.k.dtype, device=self.k.device)
         if radial is not None and self.lens.is_radial:
             least = radial.orientation(radii)
         else:
@@ -249,10 +253,10 @@ class Domain:
     def margin(self, a: Tensor, b: Tensor, t: Tensor, looks: bool) -> Tensor:
         """Positive for the plane points (C, N) in the domain; t = a^2 + b^2. looks: whether it may look at values."""
         inside = self.inner2 - t
-        if self.lens.is_radial or self.all_staged:
+        if self.lens.is_radial or self.all_stagewise:
             return inside
         if looks:  # at the azimuths on which something lies so far out, only
-            outside = ~(inside > 0) if self.staged is None else ~((inside > 0) | self.staged)
+            outside = ~(inside > 0) if self.stagewise is None else ~((inside > 0) | self.stagewise)
             camera, point = outside.nonzero(as_tuple=True)
             a, b, t = a[camera, point], b[camera, point], t[camera, point]
             first = self.cameras.start or 0

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values, columns, working_dtype
 from camtorch.optics.charts import floor_of
-from camtorch.projection.rays import angles_from_axis
+from camtorch.projection.rays import angles_from_axis, reach
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from camtorch.camera import Camera
 
-_STEPS = 257
+_STEPS = 256
 
 
 @torch.no_grad()
@@ -74,30 +74,21 @@ def _reason(camera: Camera, row: dict[str, Tensor], point: Tensor) -> str:
     angle = f"{math.degrees(theta):.2f} degrees from the optical axis"
     chart, _ = camera.optics(columns(camera.distortion[None]))
 
+    def last(covers: Callable[[Tensor], Tensor]) -> float:
+        """The angle up to which rays on this side are covered; those backwards have every azimuth."""
+        x, y = ray[:2].double()
+        azimuth = torch.atan2(y, x)[None]
+        return float(reach(lambda rays: covers(rays.to(ray.dtype)), azimuth, most=theta, steps=_STEPS, rounds=3))
+
     def covered(rays: Tensor) -> Tensor:
-        return (chart.margin(*rays.unbind(-1)) > 0).view(-1)
+        return chart.margin(*rays.unbind(-1)) > 0
 
     if not bool(covered(ray[None])):
-        end = _last(covered, ray, theta)
+        end = last(covered)
         backward = not bool(ray[:2].any())
         if backward and end > math.pi - 1e-3:
             return "the chart does not cover it: the backward direction, where all azimuths meet"
         what = "the backward direction" if backward else angle
         return f"the chart does not cover it: {what}; on this side it ends at {math.degrees(end):.2f} degrees"
-    fold = _last(lambda rays: camera.project(rays)[1], ray, theta)
+    fold = last(lambda rays: camera.project(rays)[1])
     return f"beyond the fold at {math.degrees(fold):.2f} degrees: {angle}"
-
-
-def _last(holds: Callable[[Tensor], Tensor], ray: Tensor, theta: float) -> float:
-    """The angle up to which something holds from the axis on towards a ray at the angle theta."""
-    across = ray[:2].double()
-    length = torch.linalg.vector_norm(across)
-    # the backward direction has every azimuth
-    across = across / length if length > 0 else across.new_tensor([1.0, 0.0])
-    low, high = 0.0, theta
-    for _ in range(3):
-        angles = torch.linspace(low, high, _STEPS, dtype=torch.float64, device=ray.device)
-        rays = torch.cat((angles.sin()[:, None] * across, angles.cos()[:, None]), -1).to(ray.dtype)
-        count = int(holds(rays).long().cumprod(0).sum())
-        low, high = float(angles[max(count - 1, 0)]), float(angles[min(count, _STEPS - 1)])
-    return low

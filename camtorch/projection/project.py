@@ -96,7 +96,7 @@ def see(
     usable: Tensor | None,
     order: int,
     looks: bool = False,
-    brief: bool = False,
+    few: bool = False,
 ) -> PlanePoints:
     """Where points, planes (C, N), are seen: the formula of every camera, and all that makes a point invalid.
 
@@ -108,7 +108,7 @@ def see(
         usable: the mask of the cameras whose parameters make a camera.
         order: of the derivatives that shall be exact.
         looks: whether a look at the values may find a shorter way, and no graph is recorded.
-        brief: whether the points are few, and the camera about to change: too few for tables.
+        few: whether the points are few, and the camera about to change: too few for tables.
     """
     x, y, z, shrink, mask = normalise(chart, *points, looks)
     is_plain = shrink is None and mask is None
@@ -117,7 +117,7 @@ def see(
     if lens.stages:
         t = torch.addcmul(a * a, b, b)
         inside = None
-        if not (brief and domain.brief(t.amax(-1, keepdim=True)) is not None):
+        if not (few and domain.radii_without_fold(t.amax(-1, keepdim=True)) is not None):
             inside = domain.inner2 - t.detach()
             if looks and bool(inside.amin() > 0):
                 inside = None
@@ -179,15 +179,13 @@ class Project(Function):
         valid = torch.ones(shape, dtype=torch.bool, device=points.device)
         scales = points.new_empty(shape if keeps and cameras.domain.chart.has_scale else (0, 0))
         looks = cameras.looks
-        brief = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
+        few = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
 
         def evaluate(block: Block) -> tuple[tuple[int, int], bool]:
             """Where it begins, and whether the formula took all of it as it came."""
             here, domain = block.here, block.domain
             x, y, z = planes_of(points[here])
-            a, b, mask, scale, is_plain = see(
-                (x, y, z), domain.chart, domain.lens, domain, block.usable, 1, looks, brief
-            )
+            a, b, mask, scale, is_plain = see((x, y, z), domain.chart, domain.lens, domain, block.usable, 1, looks, few)
             for plane, m, focal, centre in zip(pixels, (a, b), block.intrinsics[:2], block.intrinsics[2:], strict=True):
                 torch.add(focal * m, centre, out=plane[here])
                 if mask is not None:

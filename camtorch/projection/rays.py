@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
@@ -91,6 +92,31 @@ def ideal(camera: CameraT) -> CameraT:
     # that a chart or a table has a slope of its own is no distortion; rounding is no slope
     slopes = torch.where((slopes - 1).abs() > 1e-9, slopes, 1.0)
     return camera.with_tensors(intrinsics=torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), distortion=values)
+
+
+def reach(
+    covers: Callable[[Tensor], Tensor], azimuths: Tensor, *, most: float = math.pi, steps: int, rounds: int
+) -> Tensor:
+    """The angle from the axis, up to `most`, before which all rays towards an azimuth are covered: 0 if none is.
+
+    Args:
+        covers: from unit rays (*B or nothing, K, S, 3) to bool (*B, K, S).
+        azimuths: (K,) radians.
+        most: radians.
+        steps: to look at in a round, the first of which goes over everything.
+        rounds: each goes over the step of the one before in which the end lies.
+
+    Returns:
+        (*B, K).
+    """
+    share = torch.linspace(0, 1, steps + 1, dtype=azimuths.dtype, device=azimuths.device)
+    low, width = azimuths.new_zeros(len(azimuths), 1), most
+    for _ in range(rounds):
+        angles = (low + width * share).clamp(max=most)
+        covered = covers(polar_rays(angles, azimuths[:, None]))
+        last = (covered.long().cumprod(-1).sum(-1, keepdim=True) - 1).clamp(min=0)
+        low, width = angles.expand(covered.shape).gather(-1, last), width / steps
+    return low.squeeze(-1)
 
 
 def followed(camera: Camera, angles: Tensor, azimuths: int) -> tuple[Tensor, Tensor]:

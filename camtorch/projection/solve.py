@@ -24,7 +24,7 @@ _CLOSE = 0.02
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
 _CAMERAS = 32  # that are searched at a time
-_STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._MILD`
+_STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._LEAST_SLOPE`
 _FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
 
 
@@ -38,8 +38,8 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     if for_elsewhere():
         return _search_recorded(domain, camera, u, v)
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
-    staged = torch.zeros_like(found) if domain.staged is None else domain.staged[camera, 0]
-    for ways, way in ((staged, _by_stages), (~staged, _within_outlines)):
+    stagewise = torch.zeros_like(found) if domain.stagewise is None else domain.stagewise[camera, 0]
+    for ways, way in ((stagewise, _by_stages), (~stagewise, _within_outlines)):
         (some,) = ways.nonzero(as_tuple=True)
         if len(some):
             a[some], b[some], found[some] = way(domain, camera[some], u[some], v[some])
@@ -49,11 +49,11 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
 def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The same of lenses that are not radial, without a look at values."""
     by_stages = None
-    if domain.staged is not None:
-        sent, within = _sent(domain, camera, u, v)
-        a, b, there = _Search(domain, camera, is_circle=True)(u, v, sent)
+    if domain.stagewise is not None:
+        first, within = _first_image(domain, camera, u, v)
+        a, b, there = _Search(domain, camera, is_circle=True)(u, v, first)
         by_stages = a, b, there & within
-        if domain.all_staged:
+        if domain.all_stagewise:
             return by_stages
     outline = domain.outline
     assert outline is not None  # of a domain whose tables are at hand
@@ -62,16 +62,16 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tu
     found = a, b, there & within
     if by_stages is None:
         return found
-    assert domain.staged is not None  # as above
-    staged = domain.staged[camera, 0]
-    a, b = (torch.where(staged, *pair) for pair in zip(by_stages[:2], found[:2], strict=True))
-    return a, b, (staged & by_stages[2]) | (~staged & found[2])  # ONNX Runtime selects no bool
+    assert domain.stagewise is not None  # as above
+    stagewise = domain.stagewise[camera, 0]
+    a, b = (torch.where(stagewise, *pair) for pair in zip(by_stages[:2], found[:2], strict=True))
+    return a, b, (stagewise & by_stages[2]) | (~stagewise & found[2])  # ONNX Runtime selects no bool
 
 
 def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`search` where only the first stage, which is radial, has a limit: what it would have to reach tells at once."""
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
-    (p, q), within = _sent(domain, camera, u, v)
+    (p, q), within = _first_image(domain, camera, u, v)
     (some,) = within.nonzero(as_tuple=True)
     if len(some):
         alone = _Search(domain, camera[some], is_circle=True)
@@ -79,7 +79,7 @@ def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Te
     return a, b, found
 
 
-def _sent(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
+def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
     """Where the first stage has to send what later ones send to (u, v), and whether it can."""
     rest, table = domain.optics_of(camera)[1].rest, domain.inverse
     assert rest is not None  # or there would be no stages to go by
@@ -133,9 +133,9 @@ class _Search:
         self.limits2 = domain.limits2 if for_elsewhere() and not (is_circle or self.lens.is_radial) else None
         self.is_circle = is_circle or self.lens.is_radial
 
-    def __call__(self, u: Tensor, v: Tensor, sent: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """sent: where the first stage has to send the points, if the fold is a circle; by default to (u, v)."""
-        a, b = self.radial(*(sent or (u, v))) if self.is_circle else self.planar(u, v)
+    def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """first: where the first stage has to send the points, if the fold is a circle; by default to (u, v)."""
+        a, b = self.radial(*(first or (u, v))) if self.is_circle else self.planar(u, v)
         at = self.lens.at(a, b)
         (x, y), jacobian = at.value, at.jacobian
         valid = self.contains(a, b)

@@ -13,7 +13,7 @@ from camtorch._arguments import columns
 from camtorch._portable import for_elsewhere, times
 from camtorch._threads import on_one_thread
 from camtorch.optics.lens import newton_step
-from camtorch.optics.radial_inverse import MOST_STEPS, BriefTable, short, solve
+from camtorch.optics.radial_inverse import MOST_STEPS, SmallTable, short, solve
 from camtorch.projection.ops import order_of, positive, search_in_place, search_open, to_planes, without_keeping
 from camtorch.projection.rows import (
     FEW,
@@ -59,14 +59,14 @@ def invert(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     """
     if domain.lens.is_radial:
         return _invert_radial(domain, u, v, looks)
-    if domain.all_staged:
-        return _invert_staged(domain, u, v, looks)
+    if domain.all_stagewise:
+        return _invert_stagewise(domain, u, v, looks)
     found = _invert_planar(domain, u, v, looks)
-    if domain.staged is None:
+    if domain.stagewise is None:
         return found
     # each camera alike, whatever else is in its batch
-    pairs = zip(_invert_staged(domain, u, v, looks), found, strict=True)
-    return Found(*(torch.where(domain.staged, staged, planar) for staged, planar in pairs))
+    pairs = zip(_invert_stagewise(domain, u, v, looks), found, strict=True)
+    return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
 
 
 def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
@@ -82,20 +82,20 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     return found._replace(solved=torch.minimum(found.solved, inside))
 
 
-def _invert_staged(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     """The stages after the radial one first: only that one has a limit, and what it would have to reach tells at once.
 
     Pixels beyond the image of every ray are never solved for.
     """
-    sent, within = _sent(domain, u, v, looks)
-    found = _invert_radial(domain, sent.a, sent.b, looks)
-    known = sent.solved > 0
+    first, within = _first_image(domain, u, v, looks)
+    found = _invert_radial(domain, first.a, first.b, looks)
+    known = first.solved > 0
     possible = torch.minimum(torch.where(known, found.possible, 1.0), within)
     solved = torch.where(known, torch.minimum(found.solved, within), -1.0)
     return found._replace(solved=solved, possible=possible)
 
 
-def _sent(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> tuple[Found, Tensor]:
+def _first_image(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> tuple[Found, Tensor]:
     """Where the first stage has to send what later ones send to (u, v); and positive within the circle of the image."""
     rest = domain.lens.rest
     assert rest is not None
@@ -113,53 +113,53 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
     possible = times(table.most2, 1 + 8 * eps) - r2
     # what is beyond the fold would never settle
     r2 = torch.minimum(replace(to_mask(possible, looks), r2, 0.0, looks), table.most2)
-    scale, settled = solve(radial, table, r2, looks)
+    scale, converged = solve(radial, table, r2, looks)
     # a ray's rounding must not carry it across the fold
     inside = times(domain.inner2, 1 - 32 * eps) - r2 * scale * scale
-    return Found(u * scale, v * scale, torch.minimum(torch.minimum(settled, inside), possible), possible)
+    return Found(u * scale, v * scale, torch.minimum(torch.minimum(converged, inside), possible), possible)
 
 
-def invert_briefly(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
+def invert_few(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
     """The same without the tables of the domain, for few points; None where it takes those to tell."""
     a, b = domain.lens.start(u, v)
     r2 = torch.addcmul(a * a, b, b)
     # further out than the last point, for a lens that compresses
-    radii = domain.brief(2 * r2.amax(-1, keepdim=True) + 1e-6)
+    radii = domain.radii_without_fold(2 * r2.amax(-1, keepdim=True) + 1e-6)
     if radii is None or domain.lens.radial is None:
         return None
-    table = BriefTable(domain.lens.radial, radii)
+    table = SmallTable(domain.lens.radial, radii)
     if not bool((table.images[..., -1:] ** 2 - r2).amin() > 0):
         return None
     if domain.lens.is_radial:
-        scale, settled = solve(domain.lens.radial, table, r2, looks=True)
-        found = Found(u * scale, v * scale, settled, settled)
+        scale, converged = solve(domain.lens.radial, table, r2, looks=True)
+        found = Found(u * scale, v * scale, converged, converged)
     else:
         scale = table(r2)
         found = _newton(domain.lens, u, v, a * scale, b * scale, looks=True)
-        settled = torch.minimum(found.solved, radii[..., -1:] ** 2 - torch.addcmul(found.a**2, found.b, found.b))
-    return found if bool(settled.amin() > 0) else None
+        converged = torch.minimum(found.solved, radii[..., -1:] ** 2 - torch.addcmul(found.a**2, found.b, found.b))
+    return found if bool(converged.amin() > 0) else None
 
 
 def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool, near: bool = False) -> Found:
     """From (a, b) on, wherever that leads. near: whether most points begin a step nearer than from a table."""
-    short2, fewest, settled = short(u.dtype) ** 2, _STEPS[u.dtype] - near, None
+    short2, fewest, converged = short(u.dtype) ** 2, _STEPS[u.dtype] - near, None
     for count in range(1, MOST_STEPS + 1):
         at = lens.at(a, b)
         x, y = at.value
         da, db, reciprocal = newton_step(at.jacobian, u - x, v - y)
-        if settled is not None:  # what is settled stays, whatever else is in its batch
-            da, db = torch.where(settled > 0, 0.0, da), torch.where(settled > 0, 0.0, db)
+        if converged is not None:  # what is converged stays, whatever else is in its batch
+            da, db = torch.where(converged > 0, 0.0, da), torch.where(converged > 0, 0.0, db)
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
         if count >= fewest:
-            settled = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
-            if not looks or bool(settled.amin() > 0):
+            converged = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
+            if not looks or bool(converged.amin() > 0):
                 break
-    assert settled is not None  # there are more steps than those before the first look
-    return Found(a, b, torch.minimum(settled, reciprocal.abs()), torch.ones_like(a))
+    assert converged is not None  # there are more steps than those before the first look
+    return Found(a, b, torch.minimum(converged, reciprocal.abs()), torch.ones_like(a))
 
 
-def shown(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
+def has_ray(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
     """Bool (C, N): whether points of the sensor in focal lengths, planes, have a ray; see `Unproject`.
 
     Without that ray, and where the fold alone tells without the table to find it by. It looks at values.
@@ -167,20 +167,20 @@ def shown(domain: Domain, p: Tensor, q: Tensor) -> Tensor:
     if not domain.lens.stages or not p.numel():
         return domain.chart.on_plane(p, q) > 0
     within, known = torch.ones_like(p), True
-    if domain.all_staged:
-        sent, within = _sent(domain, p, q, True)
-        known = bool(sent.solved.amin() > 0)
-        p, q = (sent.a, sent.b) if known else (p, q)
-    if domain.lens.is_radial or (domain.all_staged and known):
+    if domain.all_stagewise:
+        first, within = _first_image(domain, p, q, True)
+        known = bool(first.solved.amin() > 0)
+        p, q = (first.a, first.b) if known else (p, q)
+    if domain.lens.is_radial or (domain.all_stagewise and known):
         most2 = domain.edge2 * (1 + 8 * torch.finfo(p.dtype).eps)
         possible: Tensor = (torch.addcmul(p * p, q, q) <= most2) & (within > 0)
         return possible
     found = invert(domain, p, q, True)
-    has_ray = found.solved > 0
-    camera, point = (~has_ray & (found.possible > 0)).nonzero(as_tuple=True)
+    found_ray = found.solved > 0
+    camera, point = (~found_ray & (found.possible > 0)).nonzero(as_tuple=True)
     if len(camera):
-        has_ray[camera, point] = search(domain, camera, p[camera, point], q[camera, point])[2]
-    return has_ray
+        found_ray[camera, point] = search(domain, camera, p[camera, point], q[camera, point])[2]
+    return found_ray
 
 
 def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
@@ -239,7 +239,7 @@ def solutions(
     usable: Tensor | None,
     finish: Callable[[Planes2, Found], Found] | None = None,
     looks: bool = False,
-    brief: bool = False,
+    few: bool = False,
 ) -> Solution:
     """Where pixels, planes (C, N), come from: graph-free, with all that makes a pixel invalid.
 
@@ -251,7 +251,7 @@ def solutions(
         usable: the mask of the cameras whose parameters make a camera.
         finish: adds to what was found at p, q what a search finds; by default that is left open.
         looks: whether a look at the values may find a shorter way.
-        brief: whether the points are few, and the camera about to change: too few for tables.
+        few: whether the points are few, and the camera about to change: too few for tables.
     """
     p, q, known = to_target(u, v, intrinsics, looks)
     known = known if usable is None else both(known, usable)
@@ -259,7 +259,7 @@ def solutions(
         p, q = replace(known, p, 0.0, looks), replace(known, q, 0.0, looks)
     target, left = Target(p, q, known), None
     if domain.lens.stages:
-        found = (invert_briefly(domain, p, q) if brief else None) or invert(domain, p, q, looks)
+        found = (invert_few(domain, p, q) if few else None) or invert(domain, p, q, looks)
         if finish is not None:
             found = finish((p, q), found)
         solved = to_mask(found.solved, looks)
@@ -334,7 +334,7 @@ class Unproject(Function):
         shape, looks = pixels.shape[:2], cameras.looks
         rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
-        brief = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
+        few = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
 
         all_valid = True
         left_open: list[tuple[Tensor, ...]] = []
@@ -343,7 +343,7 @@ class Unproject(Function):
             """Whether all is valid, and what is left open."""
             here, domain = block.here, block.domain
             u, v = planes_of(pixels[here])
-            a, b, mask, target, left = solutions(u, v, block.intrinsics, domain, block.usable, None, looks, brief)
+            a, b, mask, target, left = solutions(u, v, block.intrinsics, domain, block.usable, None, looks, few)
             made = domain.chart.to_ray(a, b, 1)
             for plane, w, axis in zip(rays, made, (0.0, 0.0, 1.0), strict=True):
                 plane[here] = replace(mask, w, axis, looks)

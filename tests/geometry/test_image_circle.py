@@ -67,7 +67,7 @@ def hard(camera, pixels, monkeypatch):
         return found._replace(solved=-torch.ones_like(u), possible=torch.ones_like(u))
 
     with monkeypatch.context() as patch:
-        patch.setattr(domain, "_MILD", math.inf)
+        patch.setattr(domain, "_LEAST_SLOPE", math.inf)
         patch.setattr(domain, "_domains", [])
         patch.setattr(unproject, "invert", nothing_solved)
         return type(camera)(camera.intrinsics, camera.distortion, image_size=camera.image_size).unproject(pixels)
@@ -100,8 +100,8 @@ def check(camera, monkeypatch):
 def test_most_lenses_of_stages_have_a_circle(key):
     """And a batch of them is answered as each alone."""
     camera = lenses(key, "mild")
-    staged = camera._cameras(camera.intrinsics, camera.distortion).domain.staged
-    assert staged.double().mean() > 0.3
+    stagewise = camera._cameras(camera.intrinsics, camera.distortion).domain.stagewise
+    assert stagewise.double().mean() > 0.3
     pixels = around(camera)
     rays, valid = camera.unproject(pixels)
     for i, single in enumerate(camera):
@@ -114,7 +114,7 @@ def test_a_tilted_sensor_behind_a_radial_lens(monkeypatch):
     intrinsics = torch.tensor([[210.0, 212.0, 322.0, 236.0]], dtype=torch.float64)
     distortion = torch.tensor([[-0.1, -0.02, 0.02, -0.03]], dtype=torch.float64)
     camera = Leaning(intrinsics, distortion, image_size=(480, 640)).requires_grad_(False)
-    assert camera._cameras(camera.intrinsics, camera.distortion).domain.all_staged
+    assert camera._cameras(camera.intrinsics, camera.distortion).domain.all_stagewise
     check(camera, monkeypatch)
 
 
