@@ -83,30 +83,12 @@ class Marks:
         marks = self._image.reduce(_SHARP)
         image.paste(marks, at, marks)
 
-    def circle(
-        self,
-        at: Sequence[float] | Tensor,
-        radius: float,
-        *,
-        fill: Colour | None = None,
-        outline: Colour | None = None,
-        width: float = 0.0,
-    ) -> None:
-        """A disc or a ring."""
-        x, y = self._place(at)
-        r = _SHARP * radius
-        self._draw.ellipse((x - r, y - r, x + r, y + r), fill, outline, round(_SHARP * width))
-
-    def line(
-        self, start: Sequence[float] | Tensor, end: Sequence[float] | Tensor, width: float, colour: Colour
-    ) -> None:
-        """A straight line."""
-        self._draw.line((*self._place(start), *self._place(end)), fill=colour, width=round(_SHARP * width))
-
     def point(self, at: Sequence[float] | Tensor, weight: float = 1.0) -> None:
         """A keypoint, on any ground; likewise boxes and arrows: the weight is that of lines."""
-        self.circle(at, 2.7 * weight, fill=WHITE)
-        self.circle(at, 1.9 * weight, fill=POINT)
+        x, y = self._place(at)
+        for radius, colour in ((2.7, WHITE), (1.9, POINT)):
+            r = _SHARP * radius * weight
+            self._draw.ellipse((x - r, y - r, x + r, y + r), colour)
 
     def box(self, edges: Sequence[float] | Tensor, weight: float = 1.0) -> None:
         """A box x1, y1, x2, y2."""

@@ -32,10 +32,10 @@ _WAVES = torch.nn.functional.normalize(torch.randn(12, 2, generator=torch.Genera
 _LENGTHS = torch.logspace(math.log10(0.05), math.log10(3.0), 12)
 
 
-def rig(size: tuple[int, int] = (800, 1280), degrees: float = 190) -> Rig:
-    """The car's four fisheyes, each with extrinsics, camera from ground."""
+def rig(size: tuple[int, int] = (800, 1280)) -> Rig:
+    """The car's four fisheyes of 190 degrees, each with extrinsics, camera from ground."""
     height, width = size
-    focal = width / math.radians(degrees)
+    focal = width / math.radians(190)
     values = torch.tensor([focal, focal, (width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
     lens = torch.tensor([0.015, -0.004, 0.0008, -0.0002], dtype=torch.float64)
     cameras, poses = {}, {}
