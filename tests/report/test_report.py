@@ -150,7 +150,7 @@ def test_plots_are_within(calibration, images, tmp_path):
         root = ElementTree.fromstring(plot)
         references = [value for element in root.iter() for key, value in element.items() if key.endswith("href")]
         assert root.tag.endswith("svg")
-        assert all(reference.startswith("#") for reference in references)
+        assert all(reference.startswith(("#", "data:image/png;base64,")) for reference in references)
 
 
 @pytest.mark.slow
