@@ -51,7 +51,7 @@ def together(cameras: Mapping[str, Sequence[Path]], how: str | None) -> tuple[di
     Raises:
         ValueError: other numbers of images where they are matched by their order, or no name in common.
     """
-    for words, key in (("file name", _stem), ("number in the file name", _last_number)):
+    for words, key in (("file name", lambda path: path.stem), ("number in the file name", _last_number)):
         keyed = {name: {key(path): path for path in paths} for name, paths in cameras.items()}
         whole = all(None not in of and len(of) == len(cameras[name]) for name, of in keyed.items())
         sets = [set(of) for of in keyed.values()]
@@ -73,10 +73,6 @@ def together(cameras: Mapping[str, Sequence[Path]], how: str | None) -> tuple[di
         )
     rows = zip(*cameras.values(), strict=True)
     return {str(i): dict(zip(cameras, row, strict=True)) for i, row in enumerate(rows)}, "by their order"
-
-
-def _stem(path: Path) -> str | None:
-    return path.stem
 
 
 def _last_number(path: Path) -> str | None:

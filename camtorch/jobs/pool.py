@@ -81,8 +81,8 @@ def _run_in_processes(
             if not at_work:
                 return
             finished = wait(at_work, timeout=0.1, return_when=FIRST_COMPLETED).done
-            add(done.value - seen)
-            seen = done.value
+            before, seen = seen, done.value
+            add(seen - before)
             for future in finished:
                 result = future.result()
                 yield at_work.pop(future), result

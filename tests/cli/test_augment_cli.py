@@ -163,7 +163,7 @@ def test_labels_move_with_the_image(folder, preset):
     known = labels.read(Path("labels.json"), camera())
     known.keypoints = torch.tensor([start, end], dtype=torch.float64)
     before = photograph(known, spot.byte().expand(3, -1, -1).contiguous())
-    for view in labelled_image.augmented(before, labelled_image.lens(preset), 3, 0):
+    for view in labelled_image.augmented(before, labelled_image.lens(preset), 2, 0):
         ((start, end),) = sheet.arrows(view)
         torch.testing.assert_close(view.labels.keypoints.tolist(), [start, end], rtol=0, atol=1e-2)
         weight = (view.image[0].double() - 128).clamp(min=0) * (view.image[0] == view.image[2])

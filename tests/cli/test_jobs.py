@@ -11,7 +11,7 @@ import pytest
 from copying import Doubling
 
 from camtorch.io.writing import all_left_over
-from camtorch.jobs import inputs, items
+from camtorch.jobs import inputs
 from camtorch.jobs.items import Item, Shard
 from camtorch.jobs.manifest import Manifest
 from camtorch.jobs.run import pending, run
@@ -73,17 +73,6 @@ def test_links(folder):
     lost = {"in/gone.jpg", "in/me.jpg"}
     assert found("in")[0].keys() == {"in/2.JPG", "in/10.jpg", "in/deep/1.png", "in/there/5.jpg", *lost}
     assert found("in/**/*.jpg")[0].keys() == {"in/10.jpg", "in/there/5.jpg", *lost}
-
-
-def test_outputs_that_would_be_lost(folder):
-    one, other = (Item((Path(name),), (Path("out/x.png"),)) for name in ("in/2.JPG", "in/10.jpg"))
-    with pytest.raises(ValueError, match=r"in/2.JPG and in/10.jpg would both be written to out/x.png"):
-        items.check([one, other])
-    Path("link").symlink_to("in")
-    with pytest.raises(ValueError, match=r"link/2.JPG: would overwrite in/2.JPG, which is read"):
-        items.check([Item((Path("in/2.JPG"),), (Path("link/2.JPG"),))])
-    with pytest.raises(ValueError, match=r"would overwrite in/10.jpg"):
-        items.check([Item((Path("in/2.JPG"),), (Path("in/10.jpg"),))], [Path("in/10.jpg")])
 
 
 # -- shards
