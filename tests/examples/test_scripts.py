@@ -166,6 +166,7 @@ def test_labels_learned_from_are_true(name, seen, drivers):
 
 @pytest.mark.slow
 def test_labels_of_tests_are_true(drivers):
+    drivers = drivers[:5]
     looks_true(faces.by_teacher(drivers), drivers)
     still, rolling = (faces.by_others(drivers, torch.Generator().manual_seed(3), rolling=r) for r in (False, True))
     looks_true(still, drivers)
