@@ -57,7 +57,7 @@ def draw(s: Study, output: str) -> None:
         layout="constrained",
     )
     for name, image in {**s.images, "above": s.above}.items():
-        axes[name].imshow(image.permute(1, 2, 0).clamp(0, 1), extent=(*X, *Y) if name == "above" else None)
+        axes[name].imshow(image.permute(1, 2, 0).clamp(0, 1).numpy(), extent=(*X, *Y) if name == "above" else None)
         axes[name].set_title(name)
         axes[name].set_axis_off()
     half, end = car_park.WIDTH / 2, car_park.LENGTH / 2

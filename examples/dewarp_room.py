@@ -85,9 +85,9 @@ def main(output: str, height: int = 480, samples: int = 6) -> dict[str, Study]:
         row[1].set_title(f"dewarped, and dots with it: {s.psnr:.1f} dB")
         row[2].set_title("off the true view, tenfold")
         for axis, image in zip(row, (s.seen.permute(1, 2, 0), s.dewarped.permute(1, 2, 0), off), strict=True):
-            axis.imshow(image, cmap="Greys", vmin=0, vmax=1)
+            axis.imshow(image.numpy(), cmap="Greys", vmin=0, vmax=1)
             axis.set_axis_off()
-        row[1].plot(*s.keypoints.T, ".", color="#e21d48", markersize=4)
+        row[1].plot(*s.keypoints.T.numpy(), ".", color="#e21d48", markersize=4)
     figure.savefig(output, dpi=100)
     plt.close(figure)
     return studies

@@ -133,10 +133,10 @@ def draw(result: Result, output: str) -> None:
             image = result.images[i]
             if cameras is not None:
                 image = ct.Dewarp(cameras[i], fov=69, image_size=SIZE)(image[None])[0]
-            axes[name].imshow(image.permute(1, 2, 0))
+            axes[name].imshow(image.permute(1, 2, 0).numpy())
             axes[name].set(xticks=[], yticks=[])
         axes[row[0]].set_ylabel(title)
-    axes["all"].plot(result.truth.fx, result.found.fx, ".", color="#e21d48")
+    axes["all"].plot(result.truth.fx.numpy(), result.found.fx.numpy(), ".", color="#e21d48")
     axes["all"].axline((15, 15), (70, 70), color="grey", linewidth=1)
     axes["all"].set(title="focal length in pixels", xlabel="true", ylabel="found", aspect="equal")
     figure.savefig(output, dpi=100)

@@ -80,19 +80,19 @@ def main(output: str, size: int = 960, samples: int = 5) -> dict[str, Study]:
         print(f"{projection:<12}{fov[0]} x {fov[1]} degrees: {found}", flush=True)
         distance = torch.where(s.error.isnan(), torch.nan, (s.points - torch.tensor(PLACE)).norm(dim=-1))
         for axis, image, side in zip(row, s.images, ("left", "right"), strict=False):
-            axis.imshow(image.permute(1, 2, 0))
+            axis.imshow(image.permute(1, 2, 0).numpy())
             axis.set_title(f"{side}, rectified to {projection}")
             for y in torch.linspace(0, image.shape[1], 11)[1:-1].tolist():
                 axis.axhline(y, color="#c4573a", linewidth=0.6)
-        shown = row[2].imshow(distance, cmap="viridis_r", vmin=0.8, vmax=5)
+        shown = row[2].imshow(distance.numpy(), cmap="viridis_r", vmin=0.8, vmax=5)
         figure.colorbar(shown, ax=row[2], shrink=0.7)
         row[2].set_title(f"distance in metres, {100 * s.share:.0f} % known")
-        shown = row[3].imshow(100 * s.error, cmap="Greys", vmin=0, vmax=5)
+        shown = row[3].imshow(100 * s.error.numpy(), cmap="Greys", vmin=0, vmax=5)
         figure.colorbar(shown, ax=row[3], shrink=0.7)
         row[3].set_title(f"off the truth in %, median {100 * s.median:.2f}")
         use = ~s.error.isnan() & (s.points[..., 1] > -1) & (s.points[..., 1] < 1)  # without ceiling and floor
         colours = s.images[0].permute(1, 2, 0)[use] / 255
-        row[4].scatter(s.points[use][:, 0], s.points[use][:, 2], 0.2, colours.numpy())
+        row[4].scatter(*s.points[use][:, ::2].T.numpy(), 0.2, colours.numpy())
         row[4].set(title="the points from above", xlim=(-3, 3), ylim=(-0.5, 5), aspect="equal")
         for axis in row:
             axis.set(xticks=[], yticks=[])

@@ -214,14 +214,14 @@ def draw(results: dict[str, Result], test: Samples, output: str, count: int = 6)
             axis.set_axis_off()
             if i >= len(samples.image):
                 continue
-            axis.imshow(samples.image[i].permute(1, 2, 0))
+            axis.imshow(samples.image[i].permute(1, 2, 0).numpy())
             looks = [(samples.keypoints[i], samples.gaze[i], "#1e64f0")]
             if samples is test:
                 looks.append((result.found[0][i], result.found[1][i], "#e21d48"))
             for keypoints, gaze, colour in looks:
                 start = samples.keypoints[i, :4].mean(0)
-                axis.plot(*keypoints.T, ".", color=colour, markersize=4)
-                axis.plot(*torch.stack((start, start + 0.45 * SIDE * gaze[:2])).T, color=colour)
+                axis.plot(*keypoints.T.numpy(), ".", color=colour, markersize=4)
+                axis.plot(*torch.stack((start, start + 0.45 * SIDE * gaze[:2])).T.numpy(), color=colour)
     figure.savefig(output, dpi=100)
     plt.close(figure)
 

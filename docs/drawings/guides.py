@@ -151,7 +151,9 @@ def augment() -> Image.Image:
     before = rendered()
     after = labelled_image.augmented(before, "dms130", 5, 0, min_filled=0.95, fov="source")
     title, origin = "One image, five other cameras", labelled_image.origin("dms130", before)
-    return sheet.drawing([before, *after], title, origin)
+    page = sheet.drawing([before, *after], title, origin)
+    page.thumbnail((960, 2000), Image.Resampling.LANCZOS)
+    return page
 
 
 def edits() -> Image.Image:

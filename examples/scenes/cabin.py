@@ -128,17 +128,23 @@ def _seen(
     corners, valid = corner_rays(camera)
     corners, valid = (values.reshape(-1, *values.shape[len(camera.batch_shape) :]) for values in (corners, valid))
     scene = Scene(drivers.pose, drivers.gaze, drivers.looks)
+    height, width = camera.height, camera.width
     total = torch.zeros(())
-    for across, down in places:
-        rays = torch.lerp(corners[..., :-1, :], corners[..., 1:, :], across)
-        rays = torch.lerp(rays[:, :-1], rays[:, 1:], down)
-        if rotation is not None:
-            rays = rays @ rotation.to(rays)
-        colours, classes = _scan(rays.flatten(1, 2), scene)
-        total = total + colours
-    size = camera.height, camera.width
-    image = (total / len(places)).unflatten(1, size).permute(0, 3, 1, 2)
-    return image, classes.unflatten(1, size)[:, None], valid[:, None]
+    # small images are seen at several places of each pixel at a time: what costs is the number of calls
+    group = max(1, _CHUNK // (len(drivers) * height * width))
+    for some in (places[i : i + group] for i in range(0, len(places), group)):
+        rays = torch.cat([_rays(corners, *place, rotation) for place in some], 1)
+        colours, classes = _scan(rays, scene)
+        total = total + colours.unflatten(1, (len(some), -1)).sum(1)
+    image = (total / len(places)).unflatten(1, (height, width)).permute(0, 3, 1, 2)
+    return image, classes[:, -height * width :].unflatten(1, (height, width))[:, None], valid[:, None]
+
+
+def _rays(corners: Tensor, across: float, down: float, rotation: Tensor | None) -> Tensor:
+    """(B or 1, P, 3): rays at a place within each pixel, from those of its corners."""
+    rays = torch.lerp(corners[..., :-1, :], corners[..., 1:, :], across)
+    rays = torch.lerp(rays[:, :-1], rays[:, 1:], down)
+    return (rays if rotation is None else rays @ rotation.to(rays)).flatten(1, 2)
 
 
 def _by_rows(rotation: Tensor | None, height: int) -> Tensor | None:
