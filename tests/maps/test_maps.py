@@ -683,6 +683,14 @@ def test_masks_stay_bool_and_large_integers_whole(tmp_path):
         assert found(labels, mode="nearest").equal(labels)
 
 
+def test_what_lies_within_the_outer_edges_of_pixels_is_valid():
+    inside = torch.tensor([[-0.5, 3.0], [8.5, 3.0], [4.0, -0.5], [4.0, 7.5], [0.2, 0.2]]).double()
+    beyond = inside[:4] + torch.tensor([[-0.1, 0], [0.1, 0], [0, -0.1], [0, 0.1]])
+    found = ct.LookupMap(torch.stack((inside[:4], beyond)), (8, 9), "test", {})
+    assert found.valid_mask().tolist() == [[[[True] * 4, [False] * 4]]]
+    assert ct.LookupMap(inside[None, 4:], (8, 9), "test", {}).valid_mask().all()
+
+
 @pytest.mark.parametrize("mode", ["nearest", "bilinear", "bicubic"])
 @pytest.mark.parametrize("padding_mode", ["zeros", "border", "reflection"])
 def test_positions_beyond_every_float32_are_finite(mode, padding_mode):

@@ -303,13 +303,6 @@ def test_half_is_true():
         assert result.all()
 
 
-def test_no_images_and_no_channels_are_none():
-    where = Sampling(spots(1, (5, 9), (7, 8)), torch.ones(1, 5, 9, dtype=torch.bool), None)
-    for shape in ((0, 3), (2, 0), (0, 0)):
-        for mode in MODES:
-            assert sampling.render(torch.zeros(*shape, 7, 8), where, mode, "zeros", (0.0,)).shape == (*shape, 5, 9)
-
-
 @pytest.mark.parametrize("source", [(3, 20000), (20000, 3), (1, 20000)])
 def test_wide_images(source):
     """Twenty thousand pixels along a side, where float32 holds a thousandth of one."""
