@@ -176,14 +176,14 @@ def test_integers_take_the_kept_grid_while_cameras_learn(dtype, mode):
     assert result.grad_fn is None
     assert not result.requires_grad
     assert torch.equal(result, frozen(given))
-    kept = learning._memos["zeros"]._kept
+    kept = learning._memos["zeros"].result
     assert kept is not None
     learning(given)
-    assert learning._memos["zeros"]._kept is kept
+    assert learning._memos["zeros"].result is kept
     assert learning.valid_mask().grad_fn is None
     with torch.no_grad():
         learning(given.float())
-    assert learning._memos["zeros"]._kept is kept
+    assert learning._memos["zeros"].result is kept
     # and a step of the optimizer is seen
     with torch.no_grad():
         learning.source.intrinsics.add_(3.0)

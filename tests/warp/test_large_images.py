@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch import _threads
 from camtorch.warp import sampling, warp
 
 SIZE = (90, 120)
@@ -58,21 +57,6 @@ def test_strips_are_the_rows_of_the_whole(rows, antialias):
         assert torch.equal(torch.cat([valid for _, _, valid in strips], 2), one.valid_mask())
 
 
-def test_strips_agree_while_cores_come_and_go(monkeypatch):
-    """Kept pyramids are of the same parts of the images whether or not there are cores for torch's threads."""
-    crowded = iter([True, False] * 1000)
-    monkeypatch.setattr(_threads._crowd, "meets", lambda *_: next(crowded))
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        one = ct.Warp(*pair(), antialias=True, fill=3.0)
-        given = images(torch.uint8, 2)
-        strips = [part for _, part, _ in one.strips(given, rows=7)]
-        assert torch.equal(torch.cat(strips, 2), one(given))
-    finally:
-        torch.set_num_threads(before)
-
-
 def test_strips_of_a_batch_of_cameras_and_of_one_image():
     source, target, _ = pair()
     turned = torch.stack([ct.augment.mount_rotation(*(torch.tensor(a) for a in (yaw, 0.0, 5.0))) for yaw in (0.0, 40)])
@@ -91,7 +75,7 @@ def test_long_grids_are_neither_made_at_once_nor_kept(monkeypatch):
     long = ct.Warp(*pair(), fill=2.0)
     assert torch.equal(long(given), expected)
     assert torch.equal(long.valid_mask(), mask)
-    assert all(memo._kept is None for memo in long._memos.values())
+    assert all(memo.result is None for memo in long._memos.values())
     differentiable = given.double().requires_grad_()
     long(differentiable).sum().backward()
     assert differentiable.grad.abs().sum() > 0
