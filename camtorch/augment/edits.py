@@ -86,7 +86,7 @@ class Edit(Augmentation):
         """What a draw does to images of a size: `edit`, where it applies; None where it never does."""
         applied = draw["apply"]
         matrix, new = self.edit(size, {name: value.double() for name, value in draw.items() if name != "apply"})
-        all_are = self.p == 1 or holds(applied)
+        all_are = holds(applied) or (self.p == 1 and not fails(applied))
         if new != size and (not all_are or 0 < self.p < 1):
             raise ValueError(
                 f"{self._name}: with p < 1 images must keep their size, so that all come out alike; here they "

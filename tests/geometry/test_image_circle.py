@@ -7,6 +7,7 @@ import torch
 from cameras import DISTINCT, KEYS, _limits, _summed, axis_slope, fan, make, one, pixel_lattice, slow_unless
 
 import camtorch as ct
+from camtorch._module import Memo
 from camtorch.augment.presets import PRESETS
 from camtorch.optics import Equidistant, Lens, Planar, Polynomial, Tilt
 from camtorch.projection import domain, unproject
@@ -68,7 +69,7 @@ def hard(camera, pixels, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(domain, "_LEAST_SLOPE", math.inf)
-        patch.setattr(domain, "_domains", [])
+        patch.setattr(domain, "_domains", Memo(24))
         patch.setattr(unproject, "invert", nothing_solved)
         return type(camera)(camera.intrinsics, camera.distortion, image_size=camera.image_size).unproject(pixels)
 
