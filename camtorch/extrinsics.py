@@ -19,7 +19,7 @@ from camtorch._arguments import (
     check_radians,
     columns,
 )
-from camtorch._module import BatchedModule, typed_as
+from camtorch._module import BatchedModule, learning_as, remade, typed_as
 from camtorch._tracing import is_concrete
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
@@ -130,7 +130,7 @@ class Extrinsics(BatchedModule):
         """World from camera."""
         # what learnt may be of any length
         rotation = -self.rotation.expand(*self.batch_shape, 3)
-        return self.with_tensors(rotation=rotation, translation=self.position).freeze_like(self)
+        return learning_as(remade(self, rotation=rotation, translation=self.position), self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""

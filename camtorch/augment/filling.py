@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
-from camtorch.augment.change import frozen, size_of
-from camtorch.camera import Camera, from_values
-from camtorch.mixed import remade
+from camtorch._module import remade
+from camtorch.camera import Camera, fixed_camera
+from camtorch.projection.ops import CLASSES
 from camtorch.rotations import rotation_matrix, rotation_vector, turn
 from camtorch.warp.warp import along_edges
 
@@ -36,7 +36,7 @@ def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
 
 def _points(camera: Camera) -> Tensor:
     """(N, 2): the pixels that `filled` looks at, those of the rim at the end."""
-    height, width = size_of(camera)
+    height, width = camera.height, camera.width
     steps = torch.arange(1, _POINTS + 1, dtype=torch.float64)[:, None]
     spread = (steps / torch.tensor([_ROOT, _ROOT**2], dtype=torch.float64)).frac()
     corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -67,7 +67,7 @@ def scaled(camera: Camera, factor: Tensor) -> Camera:
     """The camera with focal lengths times a factor (*B,)."""
     one = torch.ones_like(factor)
     scale = torch.stack((factor, factor, one, one), -1)
-    return remade(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
+    return remade(camera, intrinsics=camera.intrinsics * scale)
 
 
 def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -86,12 +86,12 @@ def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float
             rotation = torch.eye(3, dtype=target.intrinsics.dtype, device=target.intrinsics.device)
         if torch.compiler.is_compiling():
             numbers = (
-                (camera._model, camera.intrinsics, camera.distortion, list(size_of(camera)))
+                (camera._model, camera.intrinsics, camera.distortion, [camera.height, camera.width])
                 for camera in (source, target)
             )
             factor, rotation, found = _opaque_enough(*next(numbers), *next(numbers), rotation, share)
             return factor, rotation, found
-        return _enough(frozen(source, source.image_size), frozen(target, target.image_size), rotation, share)
+        return _enough(source.detach(), target.detach(), rotation, share)
 
 
 def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -148,8 +148,8 @@ def _opaque_enough(
     rotation: Tensor,
     share: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    before = from_values(source, source_intrinsics, source_distortion, source_size)
-    after = from_values(target, target_intrinsics, target_distortion, target_size)
+    before = fixed_camera(CLASSES[source], source_intrinsics, source_distortion, source_size)
+    after = fixed_camera(CLASSES[target], target_intrinsics, target_distortion, target_size)
     factor, turned, found = _enough(before, after, rotation, share)
     return factor.clone(), turned.clone(), found.clone()
 

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from camtorch.augment import RandomCamera
-from camtorch.augment.change import singles
 from camtorch.camera import Camera
 from camtorch.cli import cameras, coco, images
 from camtorch.data.samples import MapSamples
@@ -129,9 +128,7 @@ class Augmenting:
     ) -> tuple[Tensor, tuple[Json, list[Json | None]]]:
         augmentation.tell_of_empty_images(camera)
         change = augmentation.change(camera, augmentation.draw(1, generator(key, seed=self.seed)))
-        target = change.target
-        assert isinstance(target, Camera)
-        entry = {"camera": coco.parts_of(singles(target)[0]), "rotation": change.rotation[0].tolist()}
+        entry = {"camera": coco.parts_of(change.target[0]), "rotation": change.rotation[0].tolist()}
         new = change.images(image[None])[0]
         return new, (entry, coco.moved(annotations, change, listener.note))
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, singles, size_of
+from camtorch.augment.change import Change
 from camtorch.augment.sample import KINDS, moves
 from camtorch.camera import Camera
 from camtorch.cli import rle
@@ -98,7 +98,7 @@ def parts_of(camera: Camera) -> Json:
         "model": camera.key,
         "intrinsics": camera.intrinsics.detach().tolist(),
         "distortion": camera.distortion.detach().tolist(),
-        "image_size": list(size_of(camera)),
+        "image_size": [camera.height, camera.width],
     }
 
 
@@ -138,9 +138,8 @@ def moved(
     Raises:
         ValueError: what is not as COCO has it; the text names the annotation.
     """
-    target = singles(change.target)[0] if isinstance(change.target, Camera) else change.target[0]
-    source = singles(change.source)[0] if isinstance(change.source, Camera) else change.source[0]
-    sizes = size_of(source), size_of(target)
+    source, target = change.source[0], change.target[0]
+    sizes = (source.height, source.width), (target.height, target.width)
     parts = [_parts(one, sizes[0]) for one in annotations]
     points = [part.keypoints[:, :2] for part in parts if part.keypoints is not None]
     edges = [_along(polygon) for part in parts for polygon in part.polygons]
@@ -310,7 +309,7 @@ def _pulled_in(
     partly = [i for i, (_, own) in enumerate(moved) if not bool(own.all())]
     if not partly:
         return result
-    target = singles(change.target)[0] if isinstance(change.target, Camera) else change.target[0]
+    target = change.target[0]
     shown = change.inverse().points(target.pixel_grid()[::_COARSE, ::_COARSE].flatten(0, 1).double()[None])[0][0]
     shown = shown[(shown != -1).any(-1)]
     if not len(shown):

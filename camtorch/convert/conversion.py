@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_image_size, as_number, as_whole
+from camtorch._module import remade
 from camtorch.convert import views
 from camtorch.convert.least_squares import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
@@ -123,8 +124,7 @@ def convert(
 
 def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Camera:
     """A frozen camera of the source's model with these rows of numbers, even if they are none."""
-    rows = {"intrinsics": intrinsics, "distortion": distortion}
-    return source.with_tensors(**{name: nn.Parameter(value, requires_grad=False) for name, value in rows.items()})
+    return remade(source, intrinsics=intrinsics, distortion=distortion)
 
 
 class _Task(NamedTuple):

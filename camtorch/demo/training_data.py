@@ -14,7 +14,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from camtorch.augment import PRESETS, RandomCamera, camera_like, mount_rotation
+from camtorch.augment import PRESETS, RandomCamera, mount_rotation
 from camtorch.camera import Camera
 from camtorch.demo import cabin
 from camtorch.models import Pinhole
@@ -183,7 +183,7 @@ def cut(camera: Camera, pixels: Tensor, valid: Tensor, jitter: Tensor | None = N
     scale = SIDE / side
     intrinsics = torch.cat((focal * scale, (centre - middle) * scale + (SIDE - 1) / 2), -1)
     distortion = camera.distortion.expand(len(pixels), -1)
-    return camera_like(camera, intrinsics, distortion, (SIDE, SIDE)), whole
+    return camera.replace(intrinsics, distortion, (SIDE, SIDE)), whole
 
 
 def _faces(camera: Camera, drivers: cabin.Drivers, mounts: Tensor, rates: Tensor) -> Samples:
@@ -251,7 +251,7 @@ def _by_camera(seen: Photographs) -> Augment:
 
     def by_camera(index: Tensor, generator: torch.Generator) -> Samples:
         change = augment.change(seen.camera, augment.draw(len(index), generator))
-        camera, turn = cast(Camera, change.target), change.rotation
+        camera, turn = change.target, change.rotation
         jitter, rates = (2 * torch.rand(2, len(index), 3, generator=generator) - 1).unbind()
         near, whole = cut(camera, *camera.project(seen.points[index].to(turn) @ turn.mT), jitter)
         readout = SIDE * _READOUT / SIZE[0] * camera.fx / near.fx

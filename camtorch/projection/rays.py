@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._module import remade
 from camtorch._tracing import is_concrete
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def ideal(camera: CameraT) -> CameraT:
     slopes = slopes_at_axis(camera.optics, camera.distortion.detach()[None])[0]
     # that a chart or a table has a slope of its own is no distortion; rounding is no slope
     slopes = torch.where((slopes - 1).abs() > 1e-9, slopes, 1.0)
-    return camera.with_tensors(intrinsics=torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), distortion=values)
+    return remade(camera, intrinsics=torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), distortion=values)
 
 
 def followed(camera: Camera, angles: Tensor, azimuths: int) -> tuple[Tensor, Tensor]:

@@ -13,8 +13,9 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import Memo
 from camtorch._tracing import is_exporting
-from camtorch.camera import Camera, from_values
+from camtorch.camera import Camera, fixed_camera
 from camtorch.native.sampler import layout
+from camtorch.projection.ops import CLASSES
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
 
@@ -43,8 +44,8 @@ def _positions(
     padding: str,
 ) -> tuple[Tensor, Tensor]:
     """The positions: planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
-    source = from_values(source_model, source_intrinsics, source_distortion, sizes[:2])
-    target = from_values(target_model, target_intrinsics, target_distortion, sizes[2:])
+    source = fixed_camera(CLASSES[source_model], source_intrinsics, source_distortion, sizes[:2])
+    target = fixed_camera(CLASSES[target_model], target_intrinsics, target_distortion, sizes[2:])
     grid, mapped = tabulate(source, target, rotation, tolerance, padding=padding)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
@@ -148,8 +149,8 @@ def _warp(
     numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
 
     def positions() -> Sampling | Lattice:
-        source = from_values(source_model, *numbers[:2], sizes[:2])
-        target = from_values(target_model, *numbers[2:], sizes[2:])
+        source = fixed_camera(CLASSES[source_model], *numbers[:2], sizes[:2])
+        target = fixed_camera(CLASSES[target_model], *numbers[2:], sizes[2:])
         return locate(source, target, rotation, tolerance, antialias, range(sizes[2]), padding)
 
     inputs = [*numbers] if rotation is None else [*numbers, rotation]

@@ -141,7 +141,7 @@ class RollingShutter(GeometryModule):
         """What they depend on beside tensors."""
         return self.direction, self._moment
 
-    def rows_of(self, index: Tensor) -> RollingShutter:
+    def rows_of(self, index: list[int]) -> RollingShutter:
         """The shutter of these rows of a batch."""
         if not self.batch_shape:
             return self
