@@ -34,6 +34,9 @@ def slow_unless(quick, cases):
 
 
 RARE_ARE_SLOW = slow_unless(DISTINCT.__contains__, KEYS)
+every_model = pytest.mark.parametrize("key", KEYS)
+# for what has nothing to do with the model, and might with the kinds of chart and lens
+each_kind = pytest.mark.parametrize("key", sorted(DISTINCT))
 
 # Coefficients drawn, plausible and wild, by the first letters of their names: up to that size, or between two numbers
 RANGES = {

@@ -652,13 +652,9 @@ def test_copies_and_pickles():
 # -- compiled
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("cls", "p"),
-    [
-        pytest.param(adapter.RandomMount, 1.0, marks=pytest.mark.slow),
-        pytest.param(adapter.RandomLens, 1.0, marks=pytest.mark.slow),
-        (adapter.RandomCamera, 0.5),
-    ],
+    ("cls", "p"), [(adapter.RandomMount, 1.0), (adapter.RandomLens, 1.0), (adapter.RandomCamera, 0.5)]
 )
 def test_compiled_without_a_break(cls, p):
     torch.compiler.reset()

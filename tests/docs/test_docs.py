@@ -25,13 +25,16 @@ ROOT = Path(__file__).parents[2]
 FILES = ROOT / "tests" / "files"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
+FIRST = ("README.md", "getting-started.md", "concepts.md")  # the others are tried by the slow tests
+
 
 def blocks(language: str):
     for page in PAGES:
         for found in re.finditer(rf"^( *)```{language}\n(.*?)^ *```", page.read_text(), re.S | re.M):
             line = page.read_text()[: found.start()].count("\n") + 2
             code = re.sub(rf"^{found[1]}", "", found[2], flags=re.M)
-            yield pytest.param(page, line, code, id=f"{page.relative_to(ROOT)}:{line}")
+            marks = () if page.name in FIRST else pytest.mark.slow
+            yield pytest.param(page, line, code, id=f"{page.relative_to(ROOT)}:{line}", marks=marks)
 
 
 def commands():
@@ -39,7 +42,7 @@ def commands():
         page, line, code = param.values
         lines = [text for text in code.splitlines() if text.startswith("camtorch ") and " demo " not in text]
         if lines:
-            yield pytest.param(page, line, lines, id=param.id)
+            yield pytest.param(page, line, lines, id=param.id, marks=param.marks)
 
 
 @functools.cache

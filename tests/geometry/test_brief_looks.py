@@ -21,8 +21,8 @@ def both(key, dtype, calibration=one):
 
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("end", [20, 60, 179])
-@pytest.mark.parametrize("calibration", [one, spread])
+@pytest.mark.parametrize("end", [20, 179])
+@pytest.mark.parametrize("calibration", [spread])
 def test_few_points_of_a_learning_camera(key, dtype, end, calibration):
     frozen, learning = both(key, dtype, calibration)
     rays = fan(end, 20, 12).to(dtype)

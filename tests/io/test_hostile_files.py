@@ -76,7 +76,7 @@ def test_damaged_bytes(tmp_path_factory, name, position, content, cut):
     loads_or_says_why(written(tmp_path_factory.getbasetemp() / name, whole[:start] + content + whole[start + cut :]))
 
 
-@settings(max_examples=600)
+@settings(max_examples=200)
 @given(
     content=st.binary(max_size=200) | st.text(max_size=100).map(lambda text: text.encode("utf-8", "surrogatepass")),
     suffix=st.sampled_from(["yaml", "json", "xml", "txt", "bin", "cameramodel"]),
@@ -327,10 +327,9 @@ def costing_little(paths):
 USUAL = ("numbers.txt", "lists.cameramodel", "keys.yaml", "cameras.json", "words.xml", "entries.npz")  # one a reader
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="no peak memory that can be reset")
-@pytest.mark.parametrize(
-    "names", [USUAL, pytest.param([n for n in LARGE if n not in USUAL], marks=pytest.mark.slow)], ids=len
-)
+@pytest.mark.parametrize("names", [USUAL, [n for n in LARGE if n not in USUAL]], ids=len)
 def test_large_files_cost_little(names, tmp_path):
     assert not any([*costing_little([written(tmp_path / name, LARGE[name]) for name in names])])
 

@@ -238,7 +238,7 @@ def test_files_that_belong_together_change_together(function, at, reconstruction
             assert ct.load(folder).camera.intrinsics[0] == 600
 
 
-@pytest.mark.parametrize("at", slow_unless({1, 3}.__contains__, range(4)))
+@pytest.mark.parametrize("at", slow_unless({1}.__contains__, range(4)))
 def test_a_crash_leaves_no_mixture(at, reconstruction):
     """Where the process dies at one of the renames: the old or the new rig, or an error that says so."""
     folder, _, other = reconstruction
@@ -373,6 +373,7 @@ def test_rig():
     assert layer(float64(POINT))[0].shape == (2,)
 
 
+@pytest.mark.slow
 def test_import_is_light():
     heavy = ("yaml", "xml.etree", "cv2", "kornia")
     code = f"import sys, camtorch.augment; print([m for m in {heavy} if m in sys.modules])"

@@ -176,6 +176,7 @@ class Floor(nn.Module):
 FLOOR = torch.finfo(torch.float64).tiny ** 0.5
 
 
+@SLOW
 def test_numbers_below_float32_are_added_in_float64():
     squares = torch.tensor([0.0, 1e-160, 3e-150, 1e-20, 0.3, 8.0], dtype=torch.float64)
     _, run = to_onnx(Floor(), squares)
@@ -187,7 +188,8 @@ def test_numbers_below_float32_are_added_in_float64():
 COUNT = {"points": {0: "count"}, "pixels": {0: "pixel_count"}}
 
 
-@pytest.mark.parametrize("key", [key if key == "pinhole" else pytest.param(key, marks=SLOW) for key in KEYS])
+@SLOW
+@pytest.mark.parametrize("key", KEYS)
 def test_a_camera_is_a_constant(key):
     camera = one(key).float().requires_grad_(False)
     points, pixels = inputs_of(camera)

@@ -4,12 +4,11 @@ import copy
 
 import pytest
 import torch
-from cameras import KEYS, fan, make, one, spread
+from cameras import each_kind, every_model, fan, make, one, spread
 from torch.nn.utils import parametrize
 
 import camtorch as ct
 
-every_model = pytest.mark.parametrize("key", KEYS)
 POINTS = fan(40, 4, 3)
 
 
@@ -23,7 +22,7 @@ def predicted(key):
     return leaf, torch.where(bad == torch.inf, leaf, bad), camera.distortion.detach(), good
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize("graph", [True, False])
 def test_bad_rows_of_a_predicted_batch_are_invalid_and_the_others_live(key, graph):
     with torch.set_grad_enabled(graph):
@@ -76,7 +75,7 @@ def tied(key, **options):
     return make(key, intrinsics, camera.distortion.detach(), image_size=camera.image_size)
 
 
-@every_model
+@each_kind
 @PARAMETRIZATIONS
 def test_parametrized_cameras_are_the_same_and_copied(key, parametrization):
     plain, camera = tied(key), tied(key)
@@ -119,7 +118,7 @@ def test_training_never_leaves_the_positive(parametrization, batch):
 
 
 @PARAMETRIZATIONS
-@pytest.mark.parametrize("batch", [(), (2,)])
+@pytest.mark.parametrize("batch", [pytest.param((), marks=pytest.mark.slow), (2,)])
 def test_parametrized_cameras_are_of_their_model(parametrization, batch, tmp_path):
     intrinsics = torch.tensor([300.0, 300.0, 319.5, 239.5]).expand(*batch, 4)
     plain, camera = (ct.KannalaBrandt(intrinsics, [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)) for _ in "ab")
@@ -155,7 +154,7 @@ def test_tied_focal_lengths_are_the_geometric_mean():
 # -- what learning broke is said
 
 
-@every_model
+@each_kind
 def test_a_step_to_a_negative_focal_length_is_said_once(key):
     camera = spread(key)
     with torch.no_grad():

@@ -4,16 +4,12 @@ import copy
 
 import pytest
 import torch
-from cameras import KEYS, RARE_ARE_SLOW, fan
+from cameras import DISTINCT, fan, slow_unless
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import camtorch as ct
 
-every_model = pytest.mark.parametrize("key", KEYS)
-QUICK = ("pinhole", "kannala_brandt")
-some_models = pytest.mark.parametrize(
-    "key", [key if key in QUICK else pytest.param(key, marks=pytest.mark.slow) for key in KEYS]
-)
+some_models = pytest.mark.parametrize("key", slow_unless("kannala_brandt".__eq__, sorted(DISTINCT)))
 POINTS = fan(40, 4, 3).float()
 
 
@@ -54,7 +50,7 @@ def varied(layer):
     return layer
 
 
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@some_models
 @pytest.mark.parametrize("fill", ["to_empty", "assign"])
 def test_deferred_initialisation(key, fill):
     reference = varied(build(key))
@@ -83,7 +79,11 @@ def test_assigned_double_precision():
 
 
 @some_models
-@pytest.mark.parametrize("mode", [FakeTensorMode, lambda: torch.device("meta")], ids=["fake", "meta"])
+@pytest.mark.parametrize(
+    "mode",
+    [pytest.param(FakeTensorMode, marks=pytest.mark.slow), lambda: torch.device("meta")],
+    ids=["fake", "meta"],
+)
 def test_shapes_without_values(key, mode):
     expected = results(build(key))
     with mode():

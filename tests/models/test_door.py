@@ -6,11 +6,10 @@ from collections import UserList
 import numpy as np
 import pytest
 import torch
-from cameras import KEYS, make, spread
+from cameras import KEYS, every_model, make, spread
 
 import camtorch as ct
 
-every_model = pytest.mark.parametrize("key", KEYS)
 INTRINSICS = [300.0, 310.0, 320.0, 240.0]
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from cameras import (
     DISTINCT,
+    FEW_REAL,
     KEYS,
     NOT_ANALYTIC,
     RANGES,
@@ -15,6 +16,8 @@ from cameras import (
     axis_slope,
     constants,
     drawn,
+    each_kind,
+    every_model,
     fan,
     make,
     one,
@@ -34,16 +37,16 @@ from camtorch.optics.charts import CylinderChart, Perspective, SphereChart, Tran
 from camtorch.optics.lens import Lens
 
 EPS = torch.finfo(torch.float64).eps
-every_model = pytest.mark.parametrize("key", KEYS)
 distinct_models = pytest.mark.parametrize("key", RARE_ARE_SLOW)
 every_calibration = pytest.mark.parametrize(("key", "name"), REAL)
+few_calibrations = pytest.mark.parametrize(("key", "name"), FEW_REAL)
 drawn_models, few_drawn_models = (
     pytest.mark.parametrize(
         ("key", "wild"),
         slow_unless(quick, [(key, wild) for key in KEYS for wild in (False, True)[: 1 + (key in RANGES)]]),
         ids=lambda value: value if isinstance(value, str) else ("plausible", "wild")[value],
     )
-    for quick in (lambda case: True, lambda case: case[0] in DISTINCT or not case[1])
+    for quick in (lambda case: True, lambda case: case[0] in DISTINCT)
 )
 both_precisions = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
@@ -133,7 +136,7 @@ def test_round_trips_of_drawn_cameras(key, wild, data):
     check_rays_return(camera, fan(end_degrees(camera), angles=30, azimuths=12), lost=0.01 if wild else 0.0)
 
 
-@every_calibration
+@few_calibrations
 @pytest.mark.parametrize(("width", "limit"), [(1000, 1e-3), (4000, 1e-2)])
 def test_single_precision(key, name, width, limit):
     camera = real(key)[name]
@@ -200,7 +203,7 @@ def learning(camera, intrinsics, distortion):
 derivative_cameras = pytest.mark.parametrize(
     ("key", "camera_of"),
     slow_unless(
-        lambda case: case[0] in (USUAL if case[1] is spread else DISTINCT),
+        lambda case: case[0] in USUAL and case[1] is spread,
         [(key, of) for of in (one, spread) for key in KEYS],
     ),
 )
@@ -321,7 +324,7 @@ def test_bad_points(key, dtype):
 
 
 @every_model
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e30])
+@pytest.mark.parametrize("number", [math.nan, -math.inf, 1e30])
 def test_one_bad_number_among_good_ones(key, number):
     """Nothing else in the batch draws attention to it."""
     camera = one(key)
@@ -380,7 +383,7 @@ def test_pixels_far_beyond_every_image(key, dtype):
     for camera in (one(key).to(dtype), spread(key, dtype)):
         angle = torch.linspace(0, 2 * math.pi, 25, dtype=dtype)[:, None]
         ring = torch.cat((angle.cos(), angle.sin()), -1)
-        for distance in 10.0 ** torch.arange(3, 19):
+        for distance in 10.0 ** torch.arange(3, 19, 3):
             pixels = camera.intrinsics[2:].detach() + distance * ring
             rays, valid = camera.unproject(pixels)
             again, reachable = camera.project(rays)
@@ -402,7 +405,7 @@ def test_bad_pixels(key, dtype):
 @distinct_models
 @both_precisions
 @pytest.mark.parametrize("method", ["project", "unproject"])
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_any_number_gives_finite_results(key, dtype, method, data):
     """Also the largest and smallest numbers there are; an invalid row has no gradient."""
@@ -491,7 +494,7 @@ def check_no_shared_pixels(pixels, valid):
         assert ((apart > bound) | neighbours).all(), azimuth
 
 
-@every_calibration
+@few_calibrations
 def test_fold_of_calibrations(key, name):
     check_no_shared_pixels(*check_fold(real(key)[name]))
 
@@ -512,6 +515,7 @@ def test_fold_of_more_drawn_cameras(key, wild, data):
 
 
 @every_model
+@settings(max_examples=3)
 @given(data=st.data())
 def test_nothing_is_found_beyond_the_fold(key, data):
     """A pixel further out than the image of the fold of a radial lens has no ray."""
@@ -531,7 +535,7 @@ def test_nothing_is_found_beyond_the_fold(key, data):
         assert not camera.unproject(centre + outside * rim)[1].any()
 
 
-@every_calibration
+@few_calibrations
 @both_precisions
 def test_pixels_around_the_image_of_the_fold(key, name, dtype):
     """A hair inside or outside the last pixel that has a ray: invalid, or a ray that projects there."""
@@ -558,8 +562,7 @@ def test_pixels_around_the_image_of_the_fold(key, name, dtype):
 
 
 @every_model
-@pytest.mark.parametrize("batch", [(3,), (2, 3), (1,)])
-@pytest.mark.parametrize("dims", [(), (5,), (4, 2), (2, 1, 3)])
+@pytest.mark.parametrize(("batch", "dims"), [((3,), ()), ((2, 3), (4, 2)), ((1,), (2, 1, 3))])
 def test_batch_equals_loop(key, batch, dims):
     generator = torch.Generator().manual_seed(1)
     single = spread(key)
@@ -588,7 +591,7 @@ def test_batch_equals_loop(key, batch, dims):
         assert torch.equal(valid.reshape(count, *dims), torch.stack([v for _, v in loop]))
 
 
-@every_model
+@each_kind
 def test_batch_dims_of_one_broadcast(key):
     camera = spread(key)
     batched = make(key, camera.intrinsics.detach()[None], camera.distortion.detach()[None])
@@ -692,7 +695,7 @@ def test_quarter_turns(key, turns):
     torch.testing.assert_close(turned.rot90(-turns).distortion, camera.distortion, rtol=0, atol=0)
 
 
-@every_model
+@each_kind
 def test_edits_of_a_batch(key):
     camera = spread(key)
     batched = make(key, camera.intrinsics.detach().expand(2, 4), camera.distortion.detach(), image_size=(480, 640))
@@ -703,7 +706,7 @@ def test_edits_of_a_batch(key):
     torch.testing.assert_close(edited.distortion[1], single.distortion)
 
 
-@every_model
+@each_kind
 def test_an_edited_camera_keeps_its_gradient(key):
     intrinsics, distortion = leaves(spread(key))
     edited = make(key, intrinsics * 1, distortion * 1, image_size=(480, 640)).resize(240, 320).hflip()
@@ -715,7 +718,7 @@ def test_an_edited_camera_keeps_its_gradient(key):
 # -- matrix and image
 
 
-@every_model
+@each_kind
 def test_matrix(key):
     camera = spread(key)
     fx, fy, cx, cy = camera.intrinsics.tolist()
@@ -732,7 +735,7 @@ def test_matrix(key):
     assert batched.batch_shape == (2,)
 
 
-@every_model
+@each_kind
 def test_contains_the_outer_pixel_edges(key):
     camera = spread(key)
     inside = torch.tensor([[-0.5, -0.5], [639.5, 479.5], [0, 479.5], [300, 200]])
@@ -742,7 +745,7 @@ def test_contains_the_outer_pixel_edges(key):
     assert not camera.contains(camera.project(torch.tensor([[0.0, 0, 0], [math.nan, 1, 1]]))[0]).any()
 
 
-@every_model
+@each_kind
 def test_pixel_grid_and_rays(key):
     camera = spread(key).resize(6, 8)
     grid = camera.pixel_grid()
@@ -766,6 +769,7 @@ def test_pixel_grid_and_rays(key):
 
 
 @every_model
+@settings(max_examples=2)
 @given(data=st.data())
 def test_coefficients_left_out_are_zeros(key, data):
     """A camera with fewer coefficients is the one with zeros in their place."""

@@ -291,6 +291,7 @@ def test_one_model_costs_what_its_batch_does(direction, learns):
     assert counts[2] <= counts[0] + 2  # and one for each number, that joins them
 
 
+@pytest.mark.slow
 def test_compiled_where_the_groups_are_fixed():
     pinhole, *_, division = models()
     mixed, points = ct.Mixed([division, pinhole, division]), torch.randn(3, 3, 3)

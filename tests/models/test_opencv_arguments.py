@@ -195,6 +195,7 @@ def test_arrays_of_points():
     torch.testing.assert_close(camera.unproject(whole)[0], camera.unproject(whole.astype(np.float64))[0])
 
 
+@pytest.mark.slow
 def test_the_first_camera_does_not_import_sympy():
     code = """
 import sys, torch, camtorch as ct

@@ -4,11 +4,10 @@ import math
 
 import pytest
 import torch
-from cameras import KEYS, fan, make, one, spread
+from cameras import DISTINCT, each_kind, every_model, fan, make, one, spread
 
 import camtorch as ct
 
-every_model = pytest.mark.parametrize("key", KEYS)
 SIZE = (480, 640)
 
 
@@ -48,7 +47,7 @@ INDICES = {
 }
 
 
-@every_model
+@each_kind
 def test_parts_of_a_batch_are_its_cameras(key):
     batch = batch_of(key)
     points = fan(40, 4, 3)
@@ -133,7 +132,7 @@ def test_field_of_view_beyond_half_a_turn_and_up_to_the_fold():
     assert whole.field_of_view[:2].tolist() == pytest.approx([2 * math.pi, math.pi], abs=1e-3)
 
 
-@every_model
+@each_kind
 def test_field_of_view_of_a_batch_is_that_of_its_cameras(key):
     batch = batch_of(key)
     assert batch.field_of_view.shape == (2, 3, 3)
@@ -144,8 +143,7 @@ def test_field_of_view_of_a_batch_is_that_of_its_cameras(key):
 
 
 @every_model
-@pytest.mark.parametrize("axis", ["horizontal", "vertical", "diagonal"])
-@pytest.mark.parametrize("degrees", [25, 60.5, 95])
+@pytest.mark.parametrize(("axis", "degrees"), [("horizontal", 95), ("vertical", 25), ("diagonal", 60.5)])
 def test_a_camera_of_a_field_of_view(key, axis, degrees):
     camera = ct.MODELS[key].from_fov(degrees, image_size=SIZE, axis=axis)
     found = camera.double().field_of_view[("horizontal", "vertical", "diagonal").index(axis)]
@@ -156,7 +154,7 @@ def test_a_camera_of_a_field_of_view(key, axis, degrees):
     assert all(p.requires_grad for p in camera.parameters())
 
 
-@pytest.mark.parametrize("key", [key for key in KEYS if ct.MODELS[key].distortion_names])
+@pytest.mark.parametrize("key", [key for key in sorted(DISTINCT) if ct.MODELS[key].distortion_names])
 def test_with_the_distortion_of_a_lens(key):
     lens = one(key)
     degrees = math.degrees(float(lens.field_of_view[0])) / 2

@@ -144,7 +144,7 @@ ASK = "from camtorch.native.library import native_available as asked; print(aske
 
 
 @compiles
-@pytest.mark.parametrize("value", ["0", "off", "FALSE"])
+@pytest.mark.parametrize("value", ["0", *(pytest.param(value, marks=pytest.mark.slow) for value in ("off", "FALSE"))])
 def test_the_environment_turns_it_off(tmp_path, value):
     folder = write(copy(tmp_path))
     build(folder, sources=folder)

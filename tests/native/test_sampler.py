@@ -219,7 +219,9 @@ SIZES = [
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.uint16, torch.bool])
+@pytest.mark.parametrize(
+    "dtype", slow_unless({torch.uint8}.__contains__, [torch.uint8, torch.float32, torch.uint16, torch.bool])
+)
 def test_every_size_is_sampled_as_torch_does(dtype, mode):
     for i, source in enumerate(SIZES):
         for j, target in enumerate(SIZES):
@@ -248,17 +250,15 @@ def gentle(count, size, source, zoom=1.0, turn=0.1):
 )
 def test_rows_that_read_rows_are_sampled_as_torch_does(dtype, mode, padding):
     """What is read of neighbouring pixels at once is theirs, at every zoom and turn."""
-    cases = product(((48, 64), (33, 95)), (0.3217, 0.9113, 1.0, 1.7321), (0.0, 0.02, 0.3, 1.6, 3.14159))
+    cases = product(((48, 64), (33, 95)), (0.3217, 1.0, 1.7321), (0.0, 0.02, 1.6))
     for i, (source, zoom, turn) in enumerate(cases):
         target = (50, (64, 71, 95)[i % 3])
         grid = gentle(2, target, source, zoom, turn)
         if turn == 0.0:  # the rim, and pixels themselves
             grid = grid - grid[:, :1, :1] - (1 - 1 / torch.tensor(source[::-1], dtype=torch.float32))
         where = Sampling(grid, torch.ones(2, *target, dtype=torch.bool), None)
-        for channels in (1, 3, 4):
-            images = pixels(dtype, (2, channels, *source), i)
-            both(images, where, mode, padding, (1.0,))
-            both(hwc(images), where, mode, padding, (1.0,))
+        images = pixels(dtype, (2, (1, 3, 4)[i // 2 % 3], *source), i)
+        both(hwc(images) if i % 2 else images, where, mode, padding, (1.0,))
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
@@ -538,7 +538,7 @@ BENT = (
 @example(BENT)
 @example(MIRRORED)
 @example(STEPPED)
-@settings(max_examples=40)
+@settings(max_examples=10)
 def test_positions_of_lattices_keep_their_tolerance(pair):
     check_lattice(*pair)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from cameras import GOLDEN, RARE_ARE_SLOW, golden_camera, one
+from cameras import GOLDEN, KEYS, golden_camera, one, slow_unless
 
 import camtorch as ct
 
@@ -32,7 +32,7 @@ def drawn(ax):
     ax.figure.canvas.draw()
 
 
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@pytest.mark.parametrize("key", slow_unless({"fisheye624", "cylindrical"}.__contains__, KEYS))
 def test_every_model_has_a_portrait(key):
     camera = one(key)
     figure = plot.portrait(camera, camera.convert("kannala_brandt", count=4).camera)

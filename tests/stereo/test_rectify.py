@@ -271,7 +271,8 @@ def test_bad_input_is_refused():
         ct.rectify(left, right, extrinsics, projection="latlon").opencv()
 
 
-@pytest.mark.parametrize("learns", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("learns", [True, False])
 def test_it_is_a_graph_and_has_a_shape_on_meta(learns):
     left, right, extrinsics = pair()
     found = ct.rectify(left, right, extrinsics.requires_grad_(learns), image_size=(24, 32)).requires_grad_(learns)

@@ -1,5 +1,6 @@
 """Images whose channels come last in memory, as NumPy, OpenCV and Pillow have them: read and written where they lie."""
 
+import functools
 import re
 import warnings
 
@@ -183,16 +184,22 @@ LAYOUTS = {
 }
 
 
+@functools.cache
+def dewarp(mode, tolerance):
+    return ct.Dewarp(camera(), mode=mode, tolerance=tolerance)
+
+
 @pytest.mark.parametrize("name", LAYOUTS)
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
-@pytest.mark.parametrize("mode", ["bilinear", "bicubic", "nearest"])
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float16])
+@pytest.mark.parametrize("channels", [1, 3, 4, 5])
+@pytest.mark.parametrize(
+    ("mode", "dtype"),
+    [("bilinear", torch.uint8), ("bilinear", torch.float32), ("bicubic", torch.float16), ("nearest", torch.uint8)],
+)
 def test_channels_last_give_channels_last(name, channels, mode, dtype):
     images = LAYOUTS[name](channels).to(dtype).permute(0, 3, 1, 2)
     planes = images.contiguous()
     for tolerance in (0.0, 0.01):
-        warp = ct.Dewarp(camera(), mode=mode, tolerance=tolerance)
-        moved, expected = warp(images), warp(planes)
+        moved, expected = dewarp(mode, tolerance)(images), dewarp(mode, tolerance)(planes)
         assert moved.is_contiguous(memory_format=torch.channels_last)
         assert expected.is_contiguous()
         difference = (moved.double() - expected.double()).abs()

@@ -125,16 +125,15 @@ print(peak() - before)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("act", "options", "count", "bound"),
     [
         ("for _ in warp.strips(images, rows=64): pass", "tolerance=0.01", 1, 60),
-        pytest.param("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60, marks=pytest.mark.slow),
+        ("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60),
         # the result, the grid (96 MB, in float32), and what is made of one image
         ("warp(images)", "fill=3, tolerance=0.01", 4, 4 * 36 + 96 + 150),
-        pytest.param(
-            *("warp(images)", "antialias=True, tolerance=0.01", 4, 4 * 36 + 96 + 48 + 400), marks=pytest.mark.slow
-        ),
+        ("warp(images)", "antialias=True, tolerance=0.01", 4, 4 * 36 + 96 + 48 + 400),
     ],
 )
 def test_memory_beyond_the_images(act, options, count, bound):

@@ -161,6 +161,7 @@ def test_a_batch_goes_one_by_one():
         torch.testing.assert_close(moved[i], one.transform_points(pixels[i])[0])
 
 
+@pytest.mark.slow
 def test_it_is_kept_until_something_changes_and_compiles():
     source, target = pinholes()
     extrinsics = pose()

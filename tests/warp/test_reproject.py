@@ -62,8 +62,7 @@ def by_a_loop(images, depth, source, target, extrinsics, kind):
     return result, valid
 
 
-@pytest.mark.parametrize("kind", ["z", "distance"])
-@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize(("kind", "wide"), [("z", True), ("distance", False)])
 def test_it_is_what_a_loop_makes(kind, wide):
     source, target = (pinhole(), fisheye()) if wide else (fisheye(), pinhole())
     images, depth = smooth(2, 3, *source.image_size), depths(2, 1, *target.image_size)
@@ -98,7 +97,7 @@ def test_a_sweep_is_its_planes_one_by_one():
         assert torch.equal(valid[:, :, i], here)
 
 
-@pytest.mark.parametrize("kind", ["z", "distance"])
+@pytest.mark.parametrize("kind", ["z", pytest.param("distance", marks=pytest.mark.slow)])
 def test_gradients(kind):
     source, target = pinhole((6, 7)), fisheye(size=(5, 6))
     images, depth = smooth(1, 2, 6, 7), depths(1, 1, 5, 6)
