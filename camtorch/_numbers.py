@@ -64,12 +64,13 @@ def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Ten
     distortion = as_real(distortion, "distortion", owner)
     known = distortion.ndim > 0 and model.names_of(distortion.shape[-1]) is not None
     in_doubt = _is_column(model, distortion) and intrinsics.shape[:-1] != distortion.shape[:-1]
+    if known:
+        as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
     if not known or in_doubt:
         hint = _column_hint(distortion) if in_doubt else ""
         raise ValueError(
             f"{owner}: distortion must be (*B, n) with {model.counts_text()}; got shape {tuple(distortion.shape)}{hint}"
         )
-    as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
     if _is_given(distortion):
         defined = model.defined(distortion.unbind(-1))
         if defined is not None and not bool((defined > 0).all()):
