@@ -5,13 +5,11 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import torch
-from torch import Tensor, nn
-from torch.autograd import forward_ad
+from torch import Tensor
 from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
@@ -27,7 +25,8 @@ from camtorch._arguments import (
     shown,
 )
 from camtorch._editing import edited_by, quarter_turns
-from camtorch._module import BatchedModule, Memo, is_constant, remade, typed_as, with_values
+from camtorch._evaluation import evaluated, mapped
+from camtorch._module import BatchedModule, Memo, remade, typed_as
 from camtorch._numbers import (
     camera_of_fov,
     checked_distortion,
@@ -36,13 +35,12 @@ from camtorch._numbers import (
     replaced,
     warn_of_order,
 )
-from camtorch._portable import for_elsewhere
-from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, in_jit_trace, is_concrete, is_exporting, keeps_graph
+from camtorch._tracing import in_graph, is_concrete
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.projection.depth import as_depth, depth_scale
-from camtorch.projection.explanation import explain, unusable
+from camtorch.projection.explanation import explain
 from camtorch.projection.fields import local_pinhole, patch_centres, perspective_field, plucker
 from camtorch.projection.ops import register_camera
 from camtorch.projection.project import Project
@@ -177,8 +175,8 @@ class Camera(BatchedModule):
         self.image_size = size = as_image_size(image_size, owner)
         if size is not None:
             warn_of_order(intrinsics, size, owner)
-        self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
-        self._warned = is_predicted(intrinsics) or is_predicted(distortion)
+        self.memo, self._rays, self._fields = Memo(), Memo(), Memo()
+        self.warned = is_predicted(intrinsics) or is_predicted(distortion)
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, distortion.shape[-1]))
 
@@ -298,12 +296,12 @@ class Camera(BatchedModule):
         Raises:
             ValueError: the camera has no image size.
         """
-        return self._size("height")[0]
+        return self.size_for("height")[0]
 
     @property
     def width(self) -> int:
         """Of the image, in pixels; see `height`."""
-        return self._size("width")[1]
+        return self.size_for("width")[1]
 
     # -- what a model states
 
@@ -376,7 +374,7 @@ class Camera(BatchedModule):
             lies before the fold of the lens. Whether the pixel is on the image is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        return self._map(Project, points, "points", 3)
+        return mapped(self, Project, points, "points", 3)
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -388,32 +386,9 @@ class Camera(BatchedModule):
             rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
-        return self._map(Unproject, pixels, "pixels", 2)
+        return mapped(self, Unproject, pixels, "pixels", 2)
 
-    # -- how both are evaluated
-
-    def _map(
-        self, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
-    ) -> tuple[Tensor, Tensor]:
-        """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
-        batch, tensors = self.batch_shape, self._tensors
-        lead, dims = batch, len(batch)
-        if (
-            not isinstance(values, Tensor)
-            or any(t.dtype != values.dtype for t in tensors)
-            or values.device != tensors[0].device
-            or values.layout is not torch.strided
-            or values.ndim <= dims
-            or values.shape[-1] != size
-            or values.shape[:dims] != batch
-        ):
-            values, lead = as_points(values, name, size, batch, tensors, type(self).__name__)
-        shape = values.shape[:-1]
-        rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
-        planes, valid = self._evaluated(direction, rows, lead, tensors)
-        return planes.reshape((len(planes), *shape)).movedim(0, -1), valid.reshape(shape)
-
-    def _evaluated(
+    def evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -421,78 +396,16 @@ class Camera(BatchedModule):
         tensors: Sequence[Tensor],
         cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
-
-        Args:
-            direction: the way.
-            rows: points or pixels.
-            lead: the batch dims that C counts.
-            tensors: the cameras' intrinsics and distortion.
-            cameras_of: what is kept of those, if others than this module are meant.
-        """
-        if is_exporting() and cameras_of is None and is_constant(self) and all(isinstance(side, int) for side in lead):
-            with with_values(self):
-                intrinsics, distortion = (per_row(t, lead, rows) for t in self._tensors)
-                cameras = self._cameras(intrinsics, distortion)
-                cameras = cameras._replace(domain=cameras.domain.at_hand())
-            order = 1 if keeps_graph(rows) else 0
-            return direction.traced(type(self), rows, intrinsics, distortion, cameras, order)
-        intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
-        inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or self._cameras
-        if _is_plain(inputs):
-            if in_jit_trace() and torch.onnx.is_in_onnx_export():
-                raise RuntimeError(
-                    f"{type(self).__name__}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
-                    "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
-                    "requires_grad_(False) and called once before the export"
-                )
-            learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
-            keeps = learns and torch.is_grad_enabled()
-            cameras = cameras_of(intrinsics, distortion)
-            planes, valid = direction.apply(*inputs, cameras, type(self), keeps)  # type: ignore[no-untyped-call]
-            return planes, valid
-        # what is compiled has no derivatives of derivatives
-        order = 1 if torch.compiler.is_compiling() else 2
-        known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
-        if for_elsewhere() and not keeps_graph(*inputs):
-            inputs = rows, intrinsics.detach(), distortion.detach()
-        return direction.traced(type(self), *inputs, cameras_of(*inputs[1:]) if known else None, order)
-
-    def _cameras(self, intrinsics: Tensor, distortion: Tensor) -> Cameras:
-        """The rows' cameras, kept until a value changes."""
-        cameras: Cameras | None = self._memo.result
-        if cameras is None or not cameras.are(intrinsics, distortion):
-            cameras = new_cameras(self._memo, type(self), intrinsics, distortion)
-        if cameras.usable is not None and not self._warned:
-            self._warn_of_unusable(cameras, cameras.usable)
-        return cameras
-
-    def _warn_of_unusable(self, cameras: Cameras, usable: Tensor) -> None:
-        """Say once that learning drove Parameters of this module to where no camera is, and no gradient leads back."""
-        bad = (usable <= 0).flatten().nonzero()
-        found = unusable(self, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
-        if found is not None and isinstance(getattr(self, found[0]), nn.Parameter):
-            self._warned = True
-            name = parametrize.type_before_parametrizations(self).__name__
-            where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
-            keeps = (
-                "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
-                '"intrinsics", camtorch.PositiveFocal())'
-            )
-            keeps = keeps if found[0] == "intrinsics" else ""
-            warnings.warn(
-                f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
-                f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
-                stacklevel=2,
-            )
+        """Planes (size, C, N), and valid (C, N), of rows (C, N, size); see `camtorch._evaluation`."""
+        return evaluated(self, direction, rows, lead, tensors, cameras_of)
 
     @property
-    def _tensors(self) -> tuple[Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """All that the camera learns, or could."""
         return self.intrinsics, self.distortion
 
     @property
-    def _form(self) -> tuple[object, ...]:
+    def form(self) -> tuple[object, ...]:
         """What else it is: cameras of one form and equal tensors are the same."""
         return type(self), self.image_size
 
@@ -500,7 +413,7 @@ class Camera(BatchedModule):
 
     def contains(self, pixels: Numbers) -> Tensor:
         """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
-        height, width = self._size("contains")
+        height, width = self.size_for("contains")
         pixels = as_values(pixels, "pixels", type(self).__name__)
         if pixels.ndim == 0 or pixels.shape[-1] != 2:
             raise ValueError(f"{type(self).__name__}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
@@ -519,9 +432,9 @@ class Camera(BatchedModule):
                 the image is.
         """
         like = self.intrinsics.new_empty(0, dtype=torch.promote_types(self.intrinsics.dtype, torch.float32))
-        return patch_centres(self._size("pixel_grid"), stride, like, type(self).__name__)
+        return patch_centres(self.size_for("pixel_grid"), stride, like, type(self).__name__)
 
-    def _size(self, what: str) -> tuple[int, int]:
+    def size_for(self, what: str) -> tuple[int, int]:
         if self.image_size is None:
             raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
         return self.image_size
@@ -532,7 +445,7 @@ class Camera(BatchedModule):
         Those of up to half a million pixels or patches are kept while nothing that they depend on can learn or has
         changed.
         """
-        rays, valid = self._kept(self._rays, self._tensors, stride, lambda: self.unproject(self._all_pixels(stride)))
+        rays, valid = self._kept(self._rays, self.tensors, stride, lambda: self.unproject(self._all_pixels(stride)))
         return rays, valid
 
     def _all_pixels(self, stride: int) -> Tensor:
@@ -548,12 +461,12 @@ class Camera(BatchedModule):
             return compute()
         learns = torch.is_grad_enabled() and any(map(in_graph, inputs))
         count = (
-            math.prod((*self.batch_shape, *self._size("pixel_grid")))
+            math.prod((*self.batch_shape, *self.size_for("pixel_grid")))
             // max(as_whole(stride, "stride", "pixel_grid"), 1) ** 2
         )
         if learns or count > _MOST_KEPT:
             return compute()
-        options = (self._form, stride)
+        options = (self.form, stride)
         return tuple(t.clone() for t in memo(inputs, options, compute))
 
     def plucker(self, extrinsics: Extrinsics | None = None, stride: int = 1) -> tuple[Tensor, Tensor]:
@@ -586,7 +499,7 @@ class Camera(BatchedModule):
             and a skew where the image has one there. Both are exact, and identities where `unproject` is not valid.
         """
         pixels, _ = as_points(
-            pixels, "pixels", 2, self.batch_shape, self._tensors, f"{type(self).__name__}.local_pinhole"
+            pixels, "pixels", 2, self.batch_shape, self.tensors, f"{type(self).__name__}.local_pinhole"
         )
         return local_pinhole(self, pixels)
 
@@ -613,7 +526,7 @@ class Camera(BatchedModule):
         if is_concrete(down) and not bool((down != 0).any(-1).all()):
             raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
         down = down.to(self.intrinsics.device)
-        inputs = (*self._tensors, down)
+        inputs = (*self.tensors, down)
         latitude, up, valid = self._kept(
             self._fields, inputs, stride, lambda: perspective_field(self, down, self._all_pixels(stride))
         )
@@ -636,7 +549,7 @@ class Camera(BatchedModule):
             ValueError: another shape, integers, an unknown kind.
         """
         owner = f"{type(self).__name__}.backproject"
-        depth = as_depth(depth, kind, self._size("backproject"), owner, self.intrinsics.device)
+        depth = as_depth(depth, kind, self.size_for("backproject"), owner, self.intrinsics.device)
         count = self.batch_shape.numel()
         if self.batch_shape and (depth.ndim != 4 or len(self.batch_shape) > 1 or len(depth) not in (1, count)):
             shape = tuple(self.batch_shape)
@@ -691,26 +604,26 @@ class Camera(BatchedModule):
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """The camera of the image with that many more pixels on each side."""
-        height, width = self._size("pad")
+        height, width = self.size_for("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
         return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
 
     def resize(self, height: int, width: int) -> Self:
         """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False."""
-        old_height, old_width = self._size("resize")
+        old_height, old_width = self.size_for("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
         across, down = width / old_width, height / old_height
         return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
 
     def hflip(self) -> Self:
         """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
-        height, width = self._size("hflip")
+        height, width = self.size_for("hflip")
         return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
 
     def vflip(self) -> Self:
         """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
-        height, width = self._size("vflip")
+        height, width = self.size_for("vflip")
         return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
 
     def rot90(self, k: int = 1) -> Self:
@@ -721,7 +634,7 @@ class Camera(BatchedModule):
         Raises:
             ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
         """
-        size, turns = self._size("rot90"), as_whole(k, "k", "rot90") % 4
+        size, turns = self.size_for("rot90"), as_whole(k, "k", "rot90") % 4
         return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
 
     # -- another model
@@ -803,7 +716,7 @@ class Camera(BatchedModule):
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
         if not self.batch_shape and is_concrete(self.intrinsics):
             named = zip(
-                ("fx", "fy", "cx", "cy", *self.distortion_names), torch.cat(self._tensors, -1).tolist(), strict=True
+                ("fx", "fy", "cx", "cy", *self.distortion_names), torch.cat(self.tensors, -1).tolist(), strict=True
             )
             parts += [f"{name}={value:.6g}" for name, value in named]
         elif self.distortion_names:
@@ -843,32 +756,3 @@ def fixed_camera(
     usual = [torch.ones(4)] + [torch.tensor(model.ideal(n)) for n in distortion.shape[-1:] if n]
     size = None if image_size is None else (image_size[0], image_size[1])
     return remade(model(*usual), intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)
-
-
-def _is_plain(inputs: Sequence[Tensor]) -> bool:
-    """Whether nothing is traced and no transform is under way, of all that could be: asked once a call."""
-    if (
-        torch.compiler.is_compiling()
-        or torch._C._functorch.peek_interpreter_stack() is not None
-        or forward_ad._current_level >= 0
-        or torch._C._get_dispatch_mode(FAKE_MODE) is not None
-    ):
-        return False
-    return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)
-
-
-def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
-    """The cameras (C,) of one model, kept in a memo."""
-    inputs = intrinsics, distortion
-    cameras: Cameras = memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras.of(model, *inputs))
-    return cameras
-
-
-def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
-    """(*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
-    if parameters.dtype != rows.dtype:
-        parameters = parameters.to(rows.dtype)
-    if not lead:
-        return parameters.unsqueeze(0)
-    count = parameters.shape[-1]
-    return parameters.expand(*lead, count).reshape(rows.shape[0], count)

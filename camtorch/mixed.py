@@ -13,8 +13,10 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import Numbers, as_points, as_real, no_camera, shown, working_dtype
+from camtorch._evaluation import new_cameras, per_row
+from camtorch._evaluation import rows_of as camera_rows
 from camtorch._module import Memo, remade
-from camtorch.camera import Camera, new_cameras, per_row
+from camtorch.camera import Camera
 from camtorch.projection.project import Project
 from camtorch.projection.unproject import Unproject
 
@@ -115,7 +117,7 @@ class Mixed(Camera):
     def groups(self) -> list[tuple[list[int], Camera]]:
         """The rows of each model and number of coefficients, and their cameras as a batch; gradients go to all."""
         made = []
-        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self._tensors), strict=True):
+        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self.tensors), strict=True):
             first = self._member(group.members[0])
             if group.counts[1:] or group.counts[0] is None or group.taken is not None:
                 first = remade(first, intrinsics=intrinsics, distortion=distortion)
@@ -131,12 +133,12 @@ class Mixed(Camera):
         return torch.Size((len(self._places),))
 
     @property
-    def _tensors(self) -> tuple[Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """Intrinsics and distortion of each group."""
         tensors: list[Tensor] = []
         members = cast("list[Camera]", list(self.cameras._modules.values()))
         for group in self._groups:
-            pairs = [members[i]._tensors for i in group.members]
+            pairs = [members[i].tensors for i in group.members]
             tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
         if all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
@@ -148,13 +150,13 @@ class Mixed(Camera):
         return zip(tensors[::2], tensors[1::2], strict=True)
 
     @property
-    def _form(self) -> tuple[object, ...]:
+    def form(self) -> tuple[object, ...]:
         return type(self), self.image_size, tuple((group.model, group.rows) for group in self._groups)
 
     @property
     def intrinsics(self) -> Tensor:  # type: ignore[override]
         """(B, 4) fx, fy, cx, cy of all."""
-        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self._tensors[::2], strict=True)]
+        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self.tensors[::2], strict=True)]
         return parts[0] if len(parts) == 1 else self._in_order(torch.cat(parts))
 
     @property
@@ -179,7 +181,7 @@ class Mixed(Camera):
 
     # -- both directions
 
-    def _evaluated(
+    def evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -196,7 +198,7 @@ class Mixed(Camera):
                 index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
                 here, count = rows[index], torch.Size((len(group.rows),))
             of_model = self._member(group.members[0])
-            results.append(of_model._evaluated(direction, here, count, pair, self._watch(n)))
+            results.append(of_model.evaluate(direction, here, count, pair, self._watch(n)))
         if len(results) == 1:
             return results[0]
         planes, valid = zip(*results, strict=True)
@@ -212,9 +214,9 @@ class Mixed(Camera):
                 found = new_cameras(group.memo, group.model, intrinsics, distortion)
             if found.usable is not None:
                 for member in map(self._member, group.members):
-                    if not member._warned:
+                    if not member.warned:
                         lead = member.batch_shape
-                        member._cameras(*(per_row(t.to(intrinsics), lead, t) for t in member._tensors))
+                        camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member.tensors))
             return found
 
         return cameras

@@ -102,7 +102,7 @@ def convert(
 
     limit = math.pi if max_angle is None else min(math.pi, max_angle)
     batch = source.batch_shape
-    tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
+    tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source.tensors]
     parts = []
     for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True):
         rays = reference(_with_numbers(source, *numbers), image_size, limit)
@@ -141,7 +141,7 @@ class _Task(NamedTuple):
     def of(self, rows: Tensor) -> _Task:
         """Those of the rows."""
         camera = self.source.camera
-        return self._replace(source=self.source.of(_with_numbers(camera, *(t[rows] for t in camera._tensors)), rows))
+        return self._replace(source=self.source.of(_with_numbers(camera, *(t[rows] for t in camera.tensors)), rows))
 
 
 class _Result(NamedTuple):

@@ -216,7 +216,7 @@ class Warp(GeometryModule):
             options = self.tolerance, self.antialias, self._reach(sampled[1]), *sampled
             return compiled.warped(images, self.source, self.target, self.rotation, *options)
         if self._is_long() and not (learns or in_graph(images)):
-            result = empty(images, self._count(images), self.target._size("Warp"))
+            result = empty(images, self._count(images), self.target.size_for("Warp"))
             kept: dict[int, Pyramid] = {}
             for rows in self._rows(None):
                 with torch.no_grad():
@@ -281,9 +281,9 @@ class Warp(GeometryModule):
         """The options of one call, if they and the images are as they should be."""
         if not isinstance(images, Tensor) or images.is_complex():
             what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
-            hint = _way_in(images, self.source._size("Warp")) if hasattr(images, "__array_interface__") else ""
+            hint = _way_in(images, self.source.size_for("Warp")) if hasattr(images, "__array_interface__") else ""
             raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}{hint}")
-        shape, expected = tuple(images.shape), self.source._size("Warp")
+        shape, expected = tuple(images.shape), self.source.size_for("Warp")
         if images.ndim in (3, 4) and shape[-3:-1] == expected and shape[-2:] != expected:
             to = "(2, 0, 1)[None]" if len(shape) == 3 else "(0, 3, 1, 2)"
             raise ValueError(
@@ -331,7 +331,7 @@ class Warp(GeometryModule):
         where = where.pixels if isinstance(where, Lattice) else where
         grid = where.grid.detach()
         grid = grid if where.seam is None else where.seam.drawn_in(grid)
-        pixels = (grid + 1) * grid.new_tensor(self.source._size("Warp")[::-1]) / 2 - 0.5
+        pixels = (grid + 1) * grid.new_tensor(self.source.size_for("Warp")[::-1]) / 2 - 0.5
         return (where.mapped & self.source.contains(pixels)).unsqueeze(1)
 
     # -- where the images are sampled
@@ -372,7 +372,7 @@ class Warp(GeometryModule):
         if self._pinned is not None and (reach == self.padding_mode or isinstance(self._pinned, Sampling)):
             return self._pinned
         forms = [None if each is None else each.form for each in (self.shutter, self.target_shutter)]
-        options = (self.source._form, self.target._form, self.rotation is None, self.antialias, self.tolerance, *forms)
+        options = (self.source.form, self.target.form, self.rotation is None, self.antialias, self.tolerance, *forms)
         memo = self._memos[reach if self.tolerance else "zeros"]  # what is exact serves all
         kept: Sampling | Lattice = memo(inputs, options, lambda: self._whole(reach))
         return kept
@@ -407,7 +407,7 @@ class Warp(GeometryModule):
         if may and not is_exporting():
             where = self.source, self.target, self.rotation
             return self._with_scale(*compiled.positions(*where, self.tolerance, padding))
-        return self._strip(range(self.target._size("Warp")[0]), padding)
+        return self._strip(range(self.target.size_for("Warp")[0]), padding)
 
     def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
         """Of some rows of the target."""
@@ -429,7 +429,7 @@ class Warp(GeometryModule):
         return self.between(self.source, self.target, self.rotation, **self.options, **shutters)
 
     def _rows(self, count: int | None) -> Iterator[range]:
-        height, width = self.target._size("Warp")
+        height, width = self.target.size_for("Warp")
         step = count or max(_STRIP // (max(math.prod(self.batch_shape), 1) * width), 1)
         return (range(top, min(top + step, height)) for top in range(0, height, step))
 
@@ -438,7 +438,7 @@ class Warp(GeometryModule):
         # compared first, sizes that a program leaves open would be bounded in it
         if self._pinned is not None or torch.compiler.is_compiling():
             return False
-        if math.prod((*self.batch_shape, *self.target._size("Warp"))) <= _MOST_KEPT:
+        if math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
             return False
         return not in_transform() and all(t.is_cpu and is_concrete(t) for t in self._inputs())
 
@@ -456,7 +456,7 @@ class Warp(GeometryModule):
     def _inputs(self) -> list[Tensor]:
         turned = [] if self.rotation is None else [self.rotation]
         shutters = [t for each in (self.shutter, self.target_shutter) if each is not None for t in each.tensors]
-        return [*self.source._tensors, *self.target._tensors, *turned, *shutters]
+        return [*self.source.tensors, *self.target.tensors, *turned, *shutters]
 
     # -- labels
 
@@ -533,7 +533,7 @@ class Warp(GeometryModule):
 
         They find what encloses the whole image, or such parts of it as show the source, and has no outline there.
         """
-        height, width = self.target._size("Warp")
+        height, width = self.target.size_for("Warp")
         share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
         lattice = torch.cartesian_prod(share * width, share * height) - 0.5
         with torch.no_grad():

@@ -125,7 +125,11 @@ CAMERA = camera_of("kannala_brandt")
     ("call", "error", "said"),
     [
         (lambda: CAMERA.replace(intrinsics=[1.0, 2.0]), ValueError, r"KannalaBrandt: intrinsics must be \(\*B, 4\)"),
-        (lambda: CAMERA.replace([-1.0, 1.0, 0.0, 0.0]), ValueError, "focal lengths must be positive; got fx, fy = .-1.0"),
+        (
+            lambda: CAMERA.replace([-1.0, 1.0, 0.0, 0.0]),
+            ValueError,
+            "focal lengths must be positive; got fx, fy = .-1.0",
+        ),
         (lambda: CAMERA.replace(distortion=[[]]), ValueError, r"distortion must be \(\*B, n\)"),
         (lambda: CAMERA.replace([[1.0, 1.0, 0.0, 0.0]] * 2, [[0.0] * 4] * 3), ValueError, "do not fit together"),
         (lambda: CAMERA.replace(image_size=(0, 3)), ValueError, r"image_size must be positive .*\(0, 3\)"),
