@@ -45,7 +45,7 @@ def mapped(
     shape = values.shape[:-1]
     rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
     planes, valid = camera.evaluate(direction, rows, lead, tensors)
-    return planes.reshape((len(planes), *shape)).movedim(0, -1), valid.reshape(shape)
+    return planes.reshape((planes.shape[0], *shape)).movedim(0, -1), valid.reshape(shape)
 
 
 def evaluated(
@@ -151,4 +151,6 @@ def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
     if not lead:
         return parameters.unsqueeze(0)
     count = parameters.shape[-1]
+    if parameters.shape == (rows.shape[0], count):
+        return parameters
     return parameters.expand(*lead, count).reshape(rows.shape[0], count)

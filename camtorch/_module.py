@@ -60,16 +60,15 @@ class GeometryModule(nn.Module):
 
         Those keep their own shape, which broadcasts to `shape`: a lens shared by a batch of cameras stays one.
         """
-        wide = torch.promote_types(value.dtype, torch.float32)
         if shape[-1] == 0:  # an optimizer has nothing to learn here
             empty = value if value.shape == shape and not value.requires_grad else value.detach().expand(shape)
             self.register_buffer(name, empty, persistent=False)
         elif isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
         elif in_graph(value):
-            self.register_buffer(name, value.to(wide), persistent=False)
+            self.register_buffer(name, _widened(value), persistent=False)
         else:
-            self.register_parameter(name, nn.Parameter(value.detach().to(wide).expand(shape).clone()))
+            self.register_parameter(name, nn.Parameter(_widened(value.detach()).expand(shape).clone()))
 
     def freeze_like(self, *sources: nn.Module) -> Self:
         """Leave nothing to learn where the modules that this one was made from have nothing either."""
@@ -107,7 +106,7 @@ class GeometryModule(nn.Module):
         # network.half() must not round a principal point to whole pixels
         def at_least_float32(tensor: Tensor) -> Tensor:
             moved = fn(tensor)
-            if moved.is_floating_point() and torch.finfo(moved.dtype).bits < 32:
+            if moved.dtype.is_floating_point and torch.finfo(moved.dtype).bits < 32:
                 return tensor.to(moved.device)
             return moved
 
@@ -282,6 +281,11 @@ def remade(module: Made, **changes: Any) -> Made:
     for name, tensor in tensors.items():
         made.hold(name, tensor, tuple(tensor.shape))
     return made
+
+
+def _widened(value: Tensor) -> Tensor:
+    """In at least float32."""
+    return value if value.dtype.itemsize >= 4 else value.to(torch.float32)
 
 
 def learning_as(made: Made, source: BatchedModule) -> Made:

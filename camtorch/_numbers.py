@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 CameraT = TypeVar("CameraT", bound="Camera")
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
+_LOOKED_AT = 64  # cameras of a batch: numbers in a wrong order are so in all of them
 _CENTRED, _NEAR = 0.1, 0.05
 """Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
 
@@ -212,22 +213,23 @@ def camera_of_fov(
 
 def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
     """Warn of plain numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
-    if isinstance(intrinsics, nn.Parameter) or in_graph(intrinsics) or not intrinsics.numel():
+    if isinstance(intrinsics, nn.Parameter) or in_graph(intrinsics) or not _is_given(intrinsics):
         return
-    if not _is_given(intrinsics):
+    rows = intrinsics.reshape(-1, 4)[:_LOOKED_AT].tolist()
+    if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
         return
-    fx, fy, cx, cy = intrinsics.unbind(-1)
-    if bool((_off_centre(cx, cy, size) <= _CENTRED).any()):
-        return
-    given = f"fx, fy, cx, cy = {intrinsics.flatten()[:4].tolist()}"
+    given = f"fx, fy, cx, cy = {rows[0]}"
     cut_out = "The camera of a part of an image comes from camera.crop"
-    if bool((_off_centre(cx, cy, size[::-1]) <= _NEAR).all()):
+    if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
         warnings.warn(
             f"{owner}: image_size={size} is (height, width), as image.shape, and the principal point of {given} is the "
             f"middle of {size[::-1]}. OpenCV's (width, height) goes in turned round. {cut_out}",
             stacklevel=3,
         )
-    elif bool(((_off_centre(fy, cy, size) <= _NEAR) & (_apart(fx, cx) <= _NEAR) & (_apart(fx, fy) > _CENTRED)).all()):
+    elif all(
+        _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
+        for fx, fy, cx, cy in rows
+    ):
         warnings.warn(
             f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
             f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
@@ -235,11 +237,6 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
         )
 
 
-def _apart(a: Tensor, b: Tensor) -> Tensor:
-    return (b - a).abs() / a
-
-
-def _off_centre(cx: Tensor, cy: Tensor, size: tuple[int, int]) -> Tensor:
+def _off_centre(cx: float, cy: float, size: tuple[int, int]) -> float:
     """How far a point is from the middle of an image, the larger one of the parts of its height and width."""
-    across, down = ((c - (side - 1) / 2).abs() / side for c, side in zip((cx, cy), size[::-1], strict=True))
-    return torch.maximum(across, down)
+    return max(abs(c - (side - 1) / 2) / side for c, side in zip((cx, cy), size[::-1], strict=True))

@@ -105,11 +105,16 @@ def draw(
         values = {"apply": torch.rand(rows, generator=generator, device=device) < p}
     else:
         values = {"apply": torch.full((rows,), p >= 1, device=device)}
-    for name, interval in ranges.items():
-        shape = (rows,) if interval.size is None else (rows, interval.size)
-        # in float64, so that what is drawn is what every precision sees
-        share = torch.rand(shape, generator=generator, dtype=torch.float64, device=device)
-        values[name] = interval.low + (interval.high - interval.low) * share
+    # in float64, so that what is drawn is what every precision sees
+    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
+    shares = [torch.rand(size, generator=generator, dtype=torch.float64, device=device) for size in sizes]
+    if ranges:
+        pairs = zip(ranges.values(), sizes, strict=True)
+        each = [(interval.low, interval.high - interval.low) for interval, size in pairs for _ in range(size)]
+        low, extent = torch.tensor(each, dtype=torch.float64, device=device).reshape(-1, 2).unbind(-1)
+        drawn = (low + extent * torch.cat(shares)).split(sizes)
+        for (name, interval), value in zip(ranges.items(), drawn, strict=True):
+            values[name] = value if interval.size is None else value.view(rows, interval.size)
     if rows == count:
         return values
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}

@@ -192,6 +192,11 @@ class RandomCamera(Augmentation):
         zero = torch.zeros_like(angle)
         return self._target(source, values), mount_rotation(*(values.get(name, zero) for name in names))
 
+    def _warp(
+        self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
+    ) -> Warp:
+        return Warp(source, target, **self.options, target_shutter=shutter).turned_by(rotation)
+
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         shades = light = None
         if "chromatic" in values:

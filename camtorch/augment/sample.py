@@ -194,7 +194,7 @@ def _holds_reals(value: object) -> bool:
         return any(isinstance(item, float) or _holds_reals(item) for item in value)
     if isinstance(value, np.ndarray):
         return value.ndim > 0 and np.issubdtype(value.dtype, np.floating)
-    return isinstance(value, Tensor) and value.ndim > 0 and value.is_floating_point()
+    return isinstance(value, Tensor) and value.ndim > 0 and value.dtype.is_floating_point
 
 
 def moves(kind: str, value: Tensor) -> Move:
@@ -210,12 +210,12 @@ def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
     """
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         value = torch.from_numpy(value)
-    if not isinstance(value, Tensor) or value.is_complex():
+    if not isinstance(value, Tensor) or value.dtype.is_complex:
         what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
         raise TypeError(
             f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{_hint(name)}"
         )
-    if kind not in IMAGES and not value.is_floating_point():
+    if kind not in IMAGES and not value.dtype.is_floating_point:
         value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
     return value
 
@@ -541,7 +541,7 @@ class SampleTransform(nn.Module):
         result = moves(found, value)(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
-        return result.to(value.dtype) if value.is_floating_point() else result, valid
+        return result.to(value.dtype) if value.dtype.is_floating_point else result, valid
 
     def _put_valid(
         self, put: Callable[[str, Any], None], sample: Sample, name: str, valid: Tensor | list[Tensor], batched: bool

@@ -49,11 +49,9 @@ class MirrorWarp(Warp):
         **options: Any,
     ):
         super().__init__(source, target, None, antialias=bool(antialias), **options)
-        self._set_rotation(rotation)
+        self.turned_by(rotation)
         self._decides = antialias is None
         self._halvings: list[int] | None = None
-        if rotation is not None:
-            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
 
     def forward(
         self,

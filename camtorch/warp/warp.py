@@ -55,6 +55,8 @@ from camtorch.warp.sampling import (
 from camtorch.warp.shutter import RollingShutter, Shutters, averaged, in_motion
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from camtorch.maps.report import MapReport
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
@@ -180,6 +182,13 @@ class Warp(GeometryModule):
         else:
             self.register_buffer("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
 
+    def turned_by(self, rotation: Tensor | None) -> Self:
+        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
+        self._set_rotation(rotation)
+        if rotation is not None:
+            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
+        return self
+
     # -- images
 
     def forward(
@@ -211,7 +220,7 @@ class Warp(GeometryModule):
         if sampled[0] != "nearest" and self.target_shutter is not None and (moments := self._moments()):
             return averaged(images, [self._at(moment) for moment in moments], self.target_shutter.gamma, *sampled)
         inputs = self._inputs()
-        learns = images.is_floating_point() and self._learns(inputs)
+        learns = images.dtype.is_floating_point and self._learns(inputs)
         if self._is_operator() and not learns and compiled.takes(images, inputs):
             options = self.tolerance, self.antialias, self._reach(sampled[1]), *sampled
             return compiled.warped(images, self.source, self.target, self.rotation, *options)
@@ -279,7 +288,7 @@ class Warp(GeometryModule):
         self, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
     ) -> tuple[Mode, PaddingMode, tuple[float, ...]]:
         """The options of one call, if they and the images are as they should be."""
-        if not isinstance(images, Tensor) or images.is_complex():
+        if not isinstance(images, Tensor) or images.dtype.is_complex:
             what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
             hint = _way_in(images, self.source.size_for("Warp")) if hasattr(images, "__array_interface__") else ""
             raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}{hint}")
@@ -497,7 +506,7 @@ class Warp(GeometryModule):
         boxes = as_values(boxes, "boxes", "Warp", self.source.intrinsics.device)
         if boxes.ndim == 0 or boxes.shape[-1] != 4:
             raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
-        if not boxes.is_floating_point():
+        if not boxes.dtype.is_floating_point:
             boxes = boxes.to(self.source.intrinsics.dtype)
         if not is_predicted(boxes):
             check_boxes(boxes, "boxes", "Warp")
