@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, shown
+from camtorch._arguments import as_image_size, as_number, no_camera, shown
 from camtorch._module import remade, typed_as
 from camtorch._threads import as_cores_are_free
 from camtorch._tracing import is_concrete
@@ -148,7 +148,7 @@ class FaceNormalizer(SampleTransform):
         sample = self._given(sample, fields)
         named, batched, _, camera = self._batch(sample)
         if isinstance(camera, Listed):
-            raise TypeError(f"{self._name}: camera must be a Camera; got list")
+            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
         kinds = {name: value for name, (_, value) in named.items()}
         listed = [name for name in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(name), list)]
         if listed:
