@@ -489,7 +489,7 @@ class SampleTransform(nn.Module):
             target = target[0]
         if self.mirroring is not None:
             self._mirror(moved, named, change.mirrored, batched)
-        if not isinstance(target[0] if target.is_mixed else target, Unknown):
+        if not isinstance(change.parts[0].target, Unknown):
             # the change keeps cameras of its own, to go back by
             target = target.clone()
             moved["camera"] = list(target) if isinstance(target, Listed) else target
