@@ -39,9 +39,9 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
                 f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
             ) from None
     _check_real(value, name, owner)
-    if not value.is_floating_point():
+    if not value.dtype.is_floating_point:
         value = value.to(torch.get_default_dtype())
-    if is_concrete(value) and not is_predicted(value) and not bool(torch.isfinite(value).all()):
+    if is_concrete(value) and not is_predicted(value) and not _all_finite(value):
         raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
     return value
 
@@ -66,13 +66,20 @@ def as_own(value: Tensor) -> Tensor:
     return value if isinstance(value, nn.Parameter) or in_graph(value) else value.detach().clone()
 
 
+def _all_finite(value: Tensor) -> bool:
+    # of a few numbers that is asked sooner here than by torch
+    if value.ndim == 1 and value.shape[0] <= 64:
+        return all(map(math.isfinite, value.tolist()))
+    return bool(torch.isfinite(value).all())
+
+
 def _check_list(value: object, name: str, owner: str) -> None:
     if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
         raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
 
 
 def _check_real(value: Tensor, name: str, owner: str) -> None:
-    if value.is_complex() or value.dtype == torch.bool:
+    if value.dtype.is_complex or value.dtype == torch.bool:
         raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
     if value.layout is not torch.strided:
         raise TypeError(f"{owner}: {name} must be a dense tensor; got {value.layout}, of which .to_dense() makes one")
@@ -266,7 +273,7 @@ def check_boxes(boxes: Tensor, name: str, owner: str) -> None:
     """Raise a ValueError for plain boxes (..., 4) with x2 < x1 or y2 < y1, as x, y, width, height mostly have it."""
     if not may_look(boxes) or boxes.requires_grad:
         return
-    wide = boxes if boxes.is_floating_point() else boxes.double()
+    wide = boxes if boxes.dtype.is_floating_point else boxes.double()
     # not what rounding made of a box without extent
     turned = (wide[..., 2:] < wide[..., :2] - 8 * torch.finfo(wide.dtype).eps * wide[..., :2].abs()).any(-1)
     if bool(turned.any()):
@@ -335,7 +342,7 @@ def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
     """The dtype to compute in: the widest of all, at least float32; integer values take the parameters' dtype."""
     dtype = torch.float32
     for tensor in (values, *parameters):
-        if tensor.is_floating_point():
+        if tensor.dtype.is_floating_point and tensor.dtype != dtype:
             dtype = torch.promote_types(dtype, tensor.dtype)
     return dtype
 
@@ -373,7 +380,7 @@ def as_coordinates(
     values = as_values(values, name, owner, device)
     if values.ndim == 0 or values.shape[-1] != size:
         raise ValueError(f"{owner}: {name} must be ({form}, {size}){means}; got shape {tuple(values.shape)}")
-    return values if values.is_floating_point() else values.to(torch.get_default_dtype())
+    return values if values.dtype.is_floating_point else values.to(torch.get_default_dtype())
 
 
 def as_points(

@@ -60,15 +60,15 @@ class GeometryModule(nn.Module):
 
         Those keep their own shape, which broadcasts to `shape`: a lens shared by a batch of cameras stays one.
         """
-        wide = torch.promote_types(value.dtype, torch.float32)
         if shape[-1] == 0:  # an optimizer has nothing to learn here
-            self.register_buffer(name, value.detach().expand(shape), persistent=False)
+            empty = value if value.shape == shape and not value.requires_grad else value.detach().expand(shape)
+            self.register_buffer(name, empty, persistent=False)
         elif isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
         elif in_graph(value):
-            self.register_buffer(name, value.to(wide), persistent=False)
+            self.register_buffer(name, _widened(value), persistent=False)
         else:
-            self.register_parameter(name, nn.Parameter(value.detach().to(wide).expand(shape).clone()))
+            self.register_parameter(name, nn.Parameter(_widened(value.detach()).expand(shape).clone()))
 
     def freeze_like(self, *sources: nn.Module) -> Self:
         """Leave nothing to learn where the modules that this one was made from have nothing either."""
@@ -106,7 +106,7 @@ class GeometryModule(nn.Module):
         # network.half() must not round a principal point to whole pixels
         def at_least_float32(tensor: Tensor) -> Tensor:
             moved = fn(tensor)
-            if moved.is_floating_point() and torch.finfo(moved.dtype).bits < 32:
+            if moved.dtype.is_floating_point and torch.finfo(moved.dtype).bits < 32:
                 return tensor.to(moved.device)
             return moved
 
@@ -199,8 +199,8 @@ class BatchedModule(GeometryModule):
                 raise TypeError(
                     f"{type(self).__name__}: a batch is indexed by whole numbers, slices and masks; got {shown(index)}"
                 ) from None
-            tensors[name] = rows if in_graph(rows) else nn.Parameter(rows, requires_grad=False)
-        return self.with_tensors(**tensors)
+            tensors[name] = rows
+        return remade(self, **tensors)
 
     def __len__(self) -> int:
         """The size of the first batch dim."""
@@ -219,18 +219,89 @@ class BatchedModule(GeometryModule):
         if not self.batch_shape:
             raise TypeError(f"{type(self).__name__}: it has no batch dims, and cannot be {what}")
 
-    def with_tensors(self, **tensors: Tensor) -> Self:
-        """This module with other tensors, whose values are not checked; each is kept or registered as by `hold`."""
-        model: type[Self] = type_before_parametrizations(self)
-        made = model.__new__(model)
-        nn.Module.__init__(made)
-        for name, value in self.__dict__.items():
-            if name not in made.__dict__:
-                made.__dict__[name] = Memo(value.capacity) if isinstance(value, Memo) else value
-        made.training = self.training
-        for name, tensor in tensors.items():
-            made.hold(name, tensor, tuple(tensor.shape))
-        return made
+    # -- as a value
+
+    def detach(self) -> Self:
+        """The same values without a graph: it shares them with this one, and does not learn."""
+        return self.each(Tensor.detach)
+
+    def clone(self) -> Self:
+        """A copy whose tensors are its own.
+
+        As of a tensor, gradients of the copy go to this one where it learns; the copy of a fixed one is fixed.
+        `copy.deepcopy` makes Parameters that learn by themselves.
+        """
+        return self.each(torch.clone)
+
+    def expand(self, *batch: int | Sequence[int]) -> Self:
+        """The batch of shape `batch` that `torch.Tensor.expand` would give: nothing is copied, and -1 keeps a dim.
+
+        Raises:
+            ValueError: a shape that the batch dims do not expand to.
+        """
+        sizes: Any = batch[0] if len(batch) == 1 and isinstance(batch[0], Sequence) else batch
+        if tuple(sizes) == tuple(self.batch_shape):
+            return self
+        try:
+            return self.each(lambda t: t.expand(*self.batch_shape, t.shape[-1]).expand(*sizes, t.shape[-1]))
+        except (RuntimeError, TypeError):
+            raise ValueError(
+                f"{type(self).__name__}: batch dims {tuple(self.batch_shape)} do not expand to {shown(tuple(sizes))}"
+            ) from None
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """This module with every one of its tensors (*B, n) changed by the same function."""
+        return remade(self, **{name: change(getattr(self, name)) for name in self.tensor_names})
+
+
+Made = TypeVar("Made", bound=BatchedModule)
+
+
+def remade(module: Made, **changes: Any) -> Made:
+    """The module with other tensors and attributes, which are not checked: what camtorch computed needs no check.
+
+    A Parameter and a tensor of a graph are kept as they are. Any other tensor is held as it is, without a copy, by a
+    Parameter that does not learn.
+    """
+    model: type[Made] = type_before_parametrizations(module)
+    kept = {name: getattr(module, name) for name in module.tensor_names if name not in changes}
+    tensors = {name: fixed(tensor) for name, tensor in {**kept, **changes}.items() if name in module.tensor_names}
+    others = {name: value for name, value in changes.items() if name not in tensors}
+    if torch.compiler.is_compiling() and "image_size" in module.__dict__:
+        # the compiler follows a constructor, and nothing that does without
+        numbers = [tensors[name] for name in module.tensor_names if tensors[name].shape[-1]]
+        return model(*numbers, image_size=others.get("image_size", module.image_size))
+    made = model.__new__(model)
+    nn.Module.__init__(made)
+    for name, value in module.__dict__.items():
+        if name not in made.__dict__:
+            made.__dict__[name] = Memo(value.capacity) if isinstance(value, Memo) else value
+    made.training = module.training
+    made.__dict__.update(others)
+    for name, tensor in tensors.items():
+        made.hold(name, tensor, tuple(tensor.shape))
+    return made
+
+
+def _widened(value: Tensor) -> Tensor:
+    """In at least float32."""
+    return value if value.dtype.itemsize >= 4 else value.to(torch.float32)
+
+
+def learning_as(made: Made, source: BatchedModule) -> Made:
+    """What was made of a module while no graph was recorded, with Parameters that learn where those of `source` do."""
+    for name in source.tensor_names:
+        its = getattr(made, name)
+        if isinstance(its, nn.Parameter):
+            its.requires_grad_(getattr(source, name).requires_grad)
+    return made
+
+
+def fixed(tensor: Tensor) -> Tensor:
+    """A Parameter or a tensor of a graph as it is, and any other as a Parameter that does not learn, without a copy."""
+    if isinstance(tensor, nn.Parameter) or in_graph(tensor):
+        return tensor
+    return nn.Parameter(tensor, requires_grad=False)
 
 
 class Memo:

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera, from_values
+from camtorch._registry import CLASSES
+from camtorch.camera import Camera, fixed_camera
 
 Function = Callable[..., tuple[Tensor, ...]]
 
@@ -50,7 +51,7 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
                 if isinstance(argument, Camera):
                     kinds.append(f"camera {argument._model}")
                     tensors += [argument.intrinsics.detach(), argument.distortion.detach()]
-                    sizes += argument._size(name)
+                    sizes += argument.size_for(name)
                 elif isinstance(argument, Tensor):
                     kinds.append("tensor")
                     tensors.append(argument)
@@ -92,7 +93,10 @@ def _arguments(
 def _computed(
     name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float]
 ) -> list[Tensor]:
-    return list(_FUNCTIONS[name][0](*_arguments(kinds, tensors, sizes, floats, from_values)))
+    def camera(model: str, *numbers: Any) -> Camera:
+        return fixed_camera(CLASSES[model], *numbers)
+
+    return list(_FUNCTIONS[name][0](*_arguments(kinds, tensors, sizes, floats, camera)))
 
 
 @_computed.register_fake

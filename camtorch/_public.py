@@ -13,7 +13,7 @@ from camtorch.io import CameraFileError, load, save
 from camtorch.maps.formats import load_map
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.report import MapReport
-from camtorch.mixed import Mixed
+from camtorch.mixed import Mixed, cat
 from camtorch.models import *  # noqa: F403 (the list is there)
 from camtorch.native.library import native_available
 from camtorch.networks import losses
@@ -58,6 +58,7 @@ __all__ = [
     "augment",
     "calibrate",
     "calibrate_rig",
+    "cat",
     "data",
     "fit",
     "io",

@@ -5,42 +5,46 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import torch
-from torch import Tensor, nn
-from torch.autograd import forward_ad
+from torch import Tensor
 from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
     Numbers,
     as_batch,
-    as_flag,
     as_image_size,
     as_points,
-    as_real,
     as_values,
     as_vectors,
     as_whole,
     broadcast_shapes,
-    check_degrees,
     is_predicted,
     shown,
 )
-from camtorch._module import BatchedModule, Memo, is_constant, typed_as, with_values
-from camtorch._portable import for_elsewhere
-from camtorch._registry import CLASSES, register
-from camtorch._tracing import FAKE_MODE, has_tangent, in_graph, in_jit_trace, is_concrete, is_exporting, keeps_graph
+from camtorch._editing import edited_by, quarter_turns
+from camtorch._evaluation import evaluated, mapped
+from camtorch._module import BatchedModule, Memo, remade, typed_as
+from camtorch._numbers import (
+    camera_of_fov,
+    checked_distortion,
+    checked_intrinsics,
+    numbers_of_matrix,
+    replaced,
+    warn_of_order,
+)
+from camtorch._registry import register
+from camtorch._tracing import in_graph, is_concrete
 from camtorch.convert.conversion import CameraT, Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.projection.depth import as_depth, depth_scale
-from camtorch.projection.explanation import explain, unusable
+from camtorch.projection.explanation import explain
 from camtorch.projection.fields import local_pinhole, patch_centres, perspective_field, plucker
 from camtorch.projection.project import Project
-from camtorch.projection.rays import AXES, field_of_view, focal_for
+from camtorch.projection.rays import field_of_view
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
 
@@ -51,10 +55,6 @@ if TYPE_CHECKING:
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
-
-_OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
-_CENTRED, _NEAR = 0.1, 0.05
-"""Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
 
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 
@@ -164,40 +164,21 @@ class Camera(BatchedModule):
     ):
         super().__init__()
         owner = type(self).__name__
-        intrinsics = as_real(intrinsics, "intrinsics", owner)
-        if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
-            hint = f". For a matrix K use {owner}.from_matrix" if intrinsics.shape[-2:] == (3, 3) else ""
-            hint = ". A column goes in as intrinsics[..., 0]" if intrinsics.shape[-2:] == (4, 1) else hint
-            raise ValueError(
-                f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
-            )
-        if _is_given(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
-            raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
+        intrinsics = checked_intrinsics(type(self), intrinsics)
         if distortion is None:
             ideal = intrinsics.new_tensor(self.ideal(self.default_count))
             distortion = ideal.expand(*intrinsics.shape[:-1], self.default_count)
-        distortion = as_real(distortion, "distortion", owner)
-        names = self.names_of(distortion.shape[-1]) if distortion.ndim else None
-        in_doubt = self._is_column(distortion) and intrinsics.shape[:-1] != distortion.shape[:-1]
-        batch = None if names is None else as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
-        if names is None or batch is None or in_doubt:
-            hint = self._column_hint(distortion) if in_doubt else ""
-            raise ValueError(
-                f"{owner}: distortion must be (*B, n) with {self.counts_text()}; got shape {tuple(distortion.shape)}"
-                + hint
-            )
-        defined = self.defined(distortion.unbind(-1))
-        if defined is not None and _is_given(distortion) and not bool((defined > 0).all()):
-            raise ValueError(f"{owner}: the formula needs {self.defined_text}; got {distortion.tolist()}")
-        self.distortion_names = names
+        else:
+            distortion = checked_distortion(type(self), distortion, intrinsics)
+        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
+        self.distortion_names = self.names_of(distortion.shape[-1]) or ()
         self.image_size = size = as_image_size(image_size, owner)
-        plain = not (isinstance(intrinsics, nn.Parameter) or in_graph(intrinsics))
-        if plain and size is not None and intrinsics.numel() and _is_given(intrinsics):
-            _warn_of_order(intrinsics, size, owner)
-        self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
-        self._warned = is_predicted(intrinsics) or is_predicted(distortion)
+        if size is not None:
+            warn_of_order(intrinsics, size, owner)
+        self.memo, self._rays, self._fields = Memo(), Memo(), Memo()
+        self.warned = is_predicted(intrinsics) or is_predicted(distortion)
         self.hold("intrinsics", intrinsics, (*batch, 4))
-        self.hold("distortion", distortion, (*batch, len(names)))
+        self.hold("distortion", distortion, (*batch, distortion.shape[-1]))
 
     @classmethod
     def from_matrix(
@@ -221,45 +202,7 @@ class Camera(BatchedModule):
                 coefficients beside a batch of matrices; 5, 8, 12 or 14 coefficients, which are those of OpenCV's
                 calibrateCamera, for a fisheye.
         """
-        K = as_real(K, "K", cls.__name__)  # noqa: N806
-        if K.shape[-2:] != (3, 3):
-            raise ValueError(f"{cls.__name__}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
-        if is_concrete(K):
-            bottom = K[..., 2, :].detach()
-            if bool((bottom != bottom.new_tensor([0, 0, 1])).any()) or bool((K[..., 1, 0] != 0).any()):
-                raise ValueError(f"{cls.__name__}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
-            skew = K[..., 0, 1].detach()
-            if not as_flag(ignore_skew, "ignore_skew", cls.__name__) and bool((skew != 0).any()):
-                raise ValueError(
-                    f"{cls.__name__}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
-                    "ignore_skew=True drops it"
-                )
-        intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
-        if distortion is None:
-            return cls(intrinsics, image_size=image_size)
-        distortion = as_real(distortion, "distortion", cls.__name__)
-        if not cls.distortion_names:
-            raise ValueError(
-                f"{cls.__name__}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
-                "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
-            )
-        if K.ndim == 2 and distortion.numel() == max(distortion.shape, default=0):
-            distortion = distortion.flatten()
-        elif 2 < K.ndim == distortion.ndim and distortion.shape[-2] == 1:  # OpenCV's rows (1, n), stacked
-            distortion = distortion.squeeze(-2)
-        elif cls._is_column(distortion):
-            raise ValueError(
-                f"{cls.__name__}: distortion {tuple(distortion.shape)} beside K {tuple(K.shape)} leaves a doubt"
-                + cls._column_hint(distortion)
-            )
-        count = distortion.shape[-1] if distortion.ndim else 0
-        if count in _OF_CALIBRATE_CAMERA and (cls.names_of(count) or ())[:3] == ("k1", "k2", "k3"):
-            raise ValueError(
-                f"{cls.__name__}: distortion has {count} coefficients, as those of OpenCV's calibrateCamera, k1 k2 p1 "
-                f"p2 k3 ..., which are a BrownConrady's; those of its fisheye are 4. {cls.__name__}(intrinsics, "
-                "distortion) takes any number"
-            )
-        return cls(intrinsics, distortion, image_size=image_size)
+        return cls(*numbers_of_matrix(cls, K, distortion, ignore_skew), image_size=image_size)
 
     @classmethod
     def from_fov(
@@ -285,47 +228,29 @@ class Camera(BatchedModule):
             ValueError: a field of view that this lens does not reach, one that seems to be in radians (up to 2 pi), an
                 unknown axis.
         """
-        owner = f"{cls.__name__}.from_fov"
-        size = as_image_size(image_size, owner)
-        if size is None:
-            raise ValueError(f"{owner}: a field of view is one of an image; give its image_size=(height, width)")
-        if not isinstance(axis, str) or axis not in AXES:
-            raise ValueError(f"{owner}: axis must be one of {AXES}; got {shown(axis)}")
-        fov = torch.tensor(fov, dtype=torch.float64) if isinstance(fov, (int, float)) else fov
-        degrees = as_real(fov, "fov", owner).detach().double()
-        if is_concrete(degrees) and not bool(((degrees > 0) & (degrees <= 360)).all()):
-            raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
-        if is_concrete(degrees) and degrees.numel():
-            check_degrees(float(degrees.min()), degrees.tolist(), owner)
-        given = () if distortion is None else (as_real(distortion, "distortion", owner),)
-        plane = cls(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
-        degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
-        focal, reached = focal_for(plane, degrees.deg2rad(), size, axis)
-        centre = focal.new_tensor([(size[1] - 1) / 2, (size[0] - 1) / 2]).expand(*focal.shape, 2)
-        intrinsics = torch.cat((focal[..., None], focal[..., None], centre), -1)
-        intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
-        made = cls(intrinsics, *given, image_size=size)
-        if is_concrete(reached) and not bool(reached.all()):
-            widest = made.fov[..., AXES.index(axis)].flatten().tolist()
-            raise ValueError(
-                f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "
-                + ", ".join(f"{angle:.5g}" for angle in widest)
-            )
-        return made
+        return camera_of_fov(cls, fov, image_size, axis, distortion)
 
-    @classmethod
-    def _is_column(cls, distortion: Tensor) -> bool:
-        """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
-        count = max(distortion.shape[:-1], default=1) if distortion.shape[-1:] == (1,) else 1
-        return count > 1 and cls.names_of(count) is not None
+    def replace(
+        self,
+        intrinsics: Numbers | None = None,
+        distortion: Numbers | None = None,
+        image_size: Sequence[int] | None = None,
+    ) -> Self:
+        """The camera with other numbers or another image size; what is left out stays as it is, and is shared.
 
-    @staticmethod
-    def _column_hint(distortion: Tensor) -> str:
-        count = max(distortion.shape)
-        return (
-            f". The {count} coefficients of one lens, a column in OpenCV, are distortion[..., 0]; one coefficient of "
-            f"each of {count} cameras goes with intrinsics ({count}, 4)"
-        )
+        Values are taken and checked as by the constructor. Plain ones become Parameters that learn where those that
+        they replace do; lists and arrays take the camera's dtype and device. An image size alone leaves the numbers as
+        they are: `resize`, `crop` and `pad` give the camera of an edited image.
+
+        Args:
+            intrinsics: (*B, 4).
+            distortion: (*B, n), of any number of coefficients that the model takes.
+            image_size: (height, width) in pixels.
+
+        Raises:
+            ValueError, TypeError: as of the constructor.
+        """
+        return replaced(self, intrinsics, distortion, image_size)
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -371,12 +296,12 @@ class Camera(BatchedModule):
         Raises:
             ValueError: the camera has no image size.
         """
-        return self._size("height")[0]
+        return self.size_for("height")[0]
 
     @property
     def width(self) -> int:
         """Of the image, in pixels; see `height`."""
-        return self._size("width")[1]
+        return self.size_for("width")[1]
 
     # -- what a model states
 
@@ -449,7 +374,7 @@ class Camera(BatchedModule):
             lies before the fold of the lens. Whether the pixel is on the image is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        return self._map(Project, points, "points", 3)
+        return mapped(self, Project, points, "points", 3)
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -461,32 +386,9 @@ class Camera(BatchedModule):
             rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
-        return self._map(Unproject, pixels, "pixels", 2)
+        return mapped(self, Unproject, pixels, "pixels", 2)
 
-    # -- how both are evaluated
-
-    def _map(
-        self, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
-    ) -> tuple[Tensor, Tensor]:
-        """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
-        batch, tensors = self.batch_shape, self._tensors
-        lead, dims = batch, len(batch)
-        if (
-            not isinstance(values, Tensor)
-            or any(t.dtype != values.dtype for t in tensors)
-            or values.device != tensors[0].device
-            or values.layout is not torch.strided
-            or values.ndim <= dims
-            or values.shape[-1] != size
-            or values.shape[:dims] != batch
-        ):
-            values, lead = as_points(values, name, size, batch, tensors, type(self).__name__)
-        shape = values.shape[:-1]
-        rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
-        planes, valid = self._evaluated(direction, rows, lead, tensors)
-        return planes.reshape((len(planes), *shape)).movedim(0, -1), valid.reshape(shape)
-
-    def _evaluated(
+    def evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -494,78 +396,16 @@ class Camera(BatchedModule):
         tensors: Sequence[Tensor],
         cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
-
-        Args:
-            direction: the way.
-            rows: points or pixels.
-            lead: the batch dims that C counts.
-            tensors: the cameras' intrinsics and distortion.
-            cameras_of: what is kept of those, if others than this module are meant.
-        """
-        if is_exporting() and cameras_of is None and is_constant(self) and all(isinstance(side, int) for side in lead):
-            with with_values(self):
-                intrinsics, distortion = (per_row(t, lead, rows) for t in self._tensors)
-                cameras = self._cameras(intrinsics, distortion)
-                cameras = cameras._replace(domain=cameras.domain.at_hand())
-            order = 1 if keeps_graph(rows) else 0
-            return direction.traced(type(self), rows, intrinsics, distortion, cameras, order)
-        intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
-        inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or self._cameras
-        if _is_plain(inputs):
-            if in_jit_trace() and torch.onnx.is_in_onnx_export():
-                raise RuntimeError(
-                    f"{type(self).__name__}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
-                    "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
-                    "requires_grad_(False) and called once before the export"
-                )
-            learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
-            keeps = learns and torch.is_grad_enabled()
-            cameras = cameras_of(intrinsics, distortion)
-            planes, valid = direction.apply(*inputs, cameras, type(self), keeps)  # type: ignore[no-untyped-call]
-            return planes, valid
-        # what is compiled has no derivatives of derivatives
-        order = 1 if torch.compiler.is_compiling() else 2
-        known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
-        if for_elsewhere() and not keeps_graph(*inputs):
-            inputs = rows, intrinsics.detach(), distortion.detach()
-        return direction.traced(type(self), *inputs, cameras_of(*inputs[1:]) if known else None, order)
-
-    def _cameras(self, intrinsics: Tensor, distortion: Tensor) -> Cameras:
-        """The rows' cameras, kept until a value changes."""
-        cameras: Cameras | None = self._memo.result
-        if cameras is None or not cameras.are(intrinsics, distortion):
-            cameras = new_cameras(self._memo, type(self), intrinsics, distortion)
-        if cameras.usable is not None and not self._warned:
-            self._warn_of_unusable(cameras, cameras.usable)
-        return cameras
-
-    def _warn_of_unusable(self, cameras: Cameras, usable: Tensor) -> None:
-        """Say once that learning drove Parameters of this module to where no camera is, and no gradient leads back."""
-        bad = (usable <= 0).flatten().nonzero()
-        found = unusable(self, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
-        if found is not None and isinstance(getattr(self, found[0]), nn.Parameter):
-            self._warned = True
-            name = parametrize.type_before_parametrizations(self).__name__
-            where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
-            keeps = (
-                "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
-                '"intrinsics", camtorch.PositiveFocal())'
-            )
-            keeps = keeps if found[0] == "intrinsics" else ""
-            warnings.warn(
-                f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
-                f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
-                stacklevel=2,
-            )
+        """Planes (size, C, N), and valid (C, N), of rows (C, N, size); see `camtorch._evaluation`."""
+        return evaluated(self, direction, rows, lead, tensors, cameras_of)
 
     @property
-    def _tensors(self) -> tuple[Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """All that the camera learns, or could."""
         return self.intrinsics, self.distortion
 
     @property
-    def _form(self) -> tuple[object, ...]:
+    def form(self) -> tuple[object, ...]:
         """What else it is: cameras of one form and equal tensors are the same."""
         return type(self), self.image_size
 
@@ -573,7 +413,7 @@ class Camera(BatchedModule):
 
     def contains(self, pixels: Numbers) -> Tensor:
         """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
-        height, width = self._size("contains")
+        height, width = self.size_for("contains")
         pixels = as_values(pixels, "pixels", type(self).__name__)
         if pixels.ndim == 0 or pixels.shape[-1] != 2:
             raise ValueError(f"{type(self).__name__}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
@@ -592,9 +432,9 @@ class Camera(BatchedModule):
                 the image is.
         """
         like = self.intrinsics.new_empty(0, dtype=torch.promote_types(self.intrinsics.dtype, torch.float32))
-        return patch_centres(self._size("pixel_grid"), stride, like, type(self).__name__)
+        return patch_centres(self.size_for("pixel_grid"), stride, like, type(self).__name__)
 
-    def _size(self, what: str) -> tuple[int, int]:
+    def size_for(self, what: str) -> tuple[int, int]:
         if self.image_size is None:
             raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
         return self.image_size
@@ -605,7 +445,7 @@ class Camera(BatchedModule):
         Those of up to half a million pixels or patches are kept while nothing that they depend on can learn or has
         changed.
         """
-        rays, valid = self._kept(self._rays, self._tensors, stride, lambda: self.unproject(self._all_pixels(stride)))
+        rays, valid = self._kept(self._rays, self.tensors, stride, lambda: self.unproject(self._all_pixels(stride)))
         return rays, valid
 
     def _all_pixels(self, stride: int) -> Tensor:
@@ -621,12 +461,12 @@ class Camera(BatchedModule):
             return compute()
         learns = torch.is_grad_enabled() and any(map(in_graph, inputs))
         count = (
-            math.prod((*self.batch_shape, *self._size("pixel_grid")))
+            math.prod((*self.batch_shape, *self.size_for("pixel_grid")))
             // max(as_whole(stride, "stride", "pixel_grid"), 1) ** 2
         )
         if learns or count > _MOST_KEPT:
             return compute()
-        options = (self._form, stride)
+        options = (self.form, stride)
         return tuple(t.clone() for t in memo(inputs, options, compute))
 
     def plucker(self, extrinsics: Extrinsics | None = None, stride: int = 1) -> tuple[Tensor, Tensor]:
@@ -659,7 +499,7 @@ class Camera(BatchedModule):
             and a skew where the image has one there. Both are exact, and identities where `unproject` is not valid.
         """
         pixels, _ = as_points(
-            pixels, "pixels", 2, self.batch_shape, self._tensors, f"{type(self).__name__}.local_pinhole"
+            pixels, "pixels", 2, self.batch_shape, self.tensors, f"{type(self).__name__}.local_pinhole"
         )
         return local_pinhole(self, pixels)
 
@@ -686,7 +526,7 @@ class Camera(BatchedModule):
         if is_concrete(down) and not bool((down != 0).any(-1).all()):
             raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
         down = down.to(self.intrinsics.device)
-        inputs = (*self._tensors, down)
+        inputs = (*self.tensors, down)
         latitude, up, valid = self._kept(
             self._fields, inputs, stride, lambda: perspective_field(self, down, self._all_pixels(stride))
         )
@@ -709,7 +549,7 @@ class Camera(BatchedModule):
             ValueError: another shape, integers, an unknown kind.
         """
         owner = f"{type(self).__name__}.backproject"
-        depth = as_depth(depth, kind, self._size("backproject"), owner, self.intrinsics.device)
+        depth = as_depth(depth, kind, self.size_for("backproject"), owner, self.intrinsics.device)
         count = self.batch_shape.numel()
         if self.batch_shape and (depth.ndim != 4 or len(self.batch_shape) > 1 or len(depth) not in (1, count)):
             shape = tuple(self.batch_shape)
@@ -760,31 +600,31 @@ class Camera(BatchedModule):
     def crop(self, top: int, left: int, height: int, width: int) -> Self:
         """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside."""
         top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
-        return self._edited(((1, 0, -left), (0, 1, -top)), (height, width))
+        return edited_by(self, ((1, 0, -left), (0, 1, -top)), (height, width))
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """The camera of the image with that many more pixels on each side."""
-        height, width = self._size("pad")
+        height, width = self.size_for("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
-        return self._edited(((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
+        return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
 
     def resize(self, height: int, width: int) -> Self:
         """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False."""
-        old_height, old_width = self._size("resize")
+        old_height, old_width = self.size_for("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
         across, down = width / old_width, height / old_height
-        return self._edited(((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
+        return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
 
     def hflip(self) -> Self:
         """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
-        height, width = self._size("hflip")
-        return self._edited(((-1, 0, width - 1), (0, 1, 0)), (height, width))
+        height, width = self.size_for("hflip")
+        return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
 
     def vflip(self) -> Self:
         """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
-        height, width = self._size("vflip")
-        return self._edited(((1, 0, 0), (0, -1, height - 1)), (height, width))
+        height, width = self.size_for("vflip")
+        return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
 
     def rot90(self, k: int = 1) -> Self:
         """The camera that leans on its side: its image is this one's, turned counterclockwise k times, as torch.rot90.
@@ -794,71 +634,8 @@ class Camera(BatchedModule):
         Raises:
             ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
         """
-        size, turns = self._size("rot90"), as_whole(k, "k", "rot90") % 4
-        return self._edited(quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
-
-    def _edited(self, matrix: Sequence[Sequence[float]], size: tuple[int, int]) -> Self:
-        intrinsics, distortion = self._edited_numbers(self.intrinsics.new_tensor(matrix), turns=matrix[0][1] != 0)
-        edited = self.with_tensors(intrinsics=intrinsics, distortion=distortion)
-        edited.image_size = as_image_size(size, type(self).__name__)
-        for mine, its in ((self.intrinsics, edited.intrinsics), (self.distortion, edited.distortion)):
-            if isinstance(its, nn.Parameter) and not mine.requires_grad:
-                its.requires_grad = False
-        return edited
-
-    def _edited_numbers(self, matrix: Tensor, turns: bool | None = None) -> tuple[Tensor, Tensor]:
-        """Intrinsics (*B, 4) and distortion (*B, n) of the camera of an edited image.
-
-        Args:
-            matrix: (*B, 2, 3), from pixels (u, v, 1) to those of the edited image: a quarter turn clockwise or none,
-                flips, scales, and a shift.
-            turns: whether it is a quarter turn, where that is known without a look at values.
-
-        Raises:
-            ValueError: a quarter turn of a model that is not the same on its side.
-        """
-        dtype = torch.promote_types(matrix.dtype, self.intrinsics.dtype)
-        (a, b, left), (c, d, top) = (row.unbind(-1) for row in matrix.to(dtype).unbind(-2))
-        fx, fy, cx, cy = self.intrinsics.to(dtype).unbind(-1)
-        numbers = (
-            *(a.abs() * fx + b.abs() * fy, c.abs() * fx + d.abs() * fy),
-            *(a * cx + b * cy + left, c * cx + d * cy + top),
-        )
-        intrinsics = torch.stack(torch.broadcast_tensors(*numbers), -1).to(self.intrinsics.dtype)
-        if turns is None:
-            turns = not is_concrete(b) or bool((b != 0).any())
-        return intrinsics, self._edited_distortion(a - b, c + d, b != 0 if turns else None)
-
-    def _edited_distortion(self, across: Tensor, down: Tensor, on_side: Tensor | None) -> Tensor:
-        """Coefficients after a quarter turn clockwise where it is on its side, (*B,) bool, and flips by signs (*B,)."""
-        k, names = self.distortion, self.distortion_names
-        if on_side is not None:
-            k = torch.where(on_side.unsqueeze(-1), self._on_side(), k)
-        for sign, odd in ((across, self.odd_in_x), (down, self.odd_in_y)):
-            if not odd.isdisjoint(names):
-                is_odd = torch.tensor([name in odd for name in names], device=k.device)
-                k = torch.where(is_odd & (sign < 0).unsqueeze(-1), -k, k)
-        return k.clone() if k is self.distortion else k
-
-    def _on_side(self) -> Tensor:
-        """(*B, n): the coefficients when the image is turned clockwise by a quarter."""
-        names, turned = self.distortion_names, self.quarter_turn
-        if turned is None or not {*self.odd_in_x, *self.odd_in_y} <= turned.keys():
-            raise ValueError(
-                f"{type(self).__name__}: a quarter turn of the image has no camera of this model. "
-                "RandomMount(roll=...) turns the camera, and convert() gives one of another model"
-            )
-        if {"tau_x", "tau_y"} <= {*names} and is_concrete(self.distortion):
-            tilts = self.distortion[..., [names.index("tau_x"), names.index("tau_y")]]
-            if bool((tilts != 0).all(-1).any()):
-                raise ValueError(
-                    f"{type(self).__name__}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
-                    "quarter turn: the model tilts about one after the other"
-                )
-        source = [turned.get(name, name) for name in names]
-        index = [names.index(name.removeprefix("-")) for name in source]
-        sign = self.distortion.new_tensor([-1.0 if name.startswith("-") else 1.0 for name in source])
-        return self.distortion[..., index] * sign
+        size, turns = self.size_for("rot90"), as_whole(k, "k", "rot90") % 4
+        return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
 
     # -- another model
 
@@ -939,7 +716,7 @@ class Camera(BatchedModule):
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
         if not self.batch_shape and is_concrete(self.intrinsics):
             named = zip(
-                ("fx", "fy", "cx", "cy", *self.distortion_names), torch.cat(self._tensors, -1).tolist(), strict=True
+                ("fx", "fy", "cx", "cy", *self.distortion_names), torch.cat(self.tensors, -1).tolist(), strict=True
             )
             parts += [f"{name}={value:.6g}" for name, value in named]
         elif self.distortion_names:
@@ -969,94 +746,13 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     return model
 
 
-def from_values(model: str, intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int]) -> Camera:
-    """The frozen camera of a class and of values that are not checked: what operators get instead of a camera.
+def fixed_camera(
+    model: type[Camera], intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int] | None = None
+) -> Camera:
+    """The camera of a model and numbers (*B, 4) and (*B, n) that are not checked, without a graph to them.
 
-    Args:
-        model: the name of the class, a camera's `_model`.
-        intrinsics: (*B, 4).
-        distortion: (*B, n).
-        image_size: (height, width).
+    Bad numbers give results that are invalid, and no error.
     """
-    kind: type[Camera] = CLASSES[model]
-    # of any values, to be replaced; bad ones give results that are invalid, and no error
-    usual = [torch.ones(4)] + [torch.tensor(kind.ideal(n)) for n in distortion.shape[-1:] if n]
-    made: Camera = kind(*usual, image_size=(image_size[0], image_size[1]))
-    made = made.with_tensors(intrinsics=intrinsics.detach(), distortion=distortion.detach())
-    return made.requires_grad_(False)
-
-
-def _is_plain(inputs: Sequence[Tensor]) -> bool:
-    """Whether nothing is traced and no transform is under way, of all that could be: asked once a call."""
-    if (
-        torch.compiler.is_compiling()
-        or torch._C._functorch.peek_interpreter_stack() is not None
-        or forward_ad._current_level >= 0
-        or torch._C._get_dispatch_mode(FAKE_MODE) is not None
-    ):
-        return False
-    return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)
-
-
-def _is_given(values: Tensor) -> bool:
-    """Whether the values may be looked at, and bad ones are refused."""
-    return is_concrete(values) and not is_predicted(values)
-
-
-def _warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
-    """Warn of numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
-    fx, fy, cx, cy = intrinsics.unbind(-1)
-    if bool((_off_centre(cx, cy, size) <= _CENTRED).any()):
-        return
-    given = f"fx, fy, cx, cy = {intrinsics.flatten()[:4].tolist()}"
-    cut_out = "The camera of a part of an image comes from camera.crop"
-    if bool((_off_centre(cx, cy, size[::-1]) <= _NEAR).all()):
-        warnings.warn(
-            f"{owner}: image_size={size} is (height, width), as image.shape, and the principal point of {given} is the "
-            f"middle of {size[::-1]}. OpenCV's (width, height) goes in turned round. {cut_out}",
-            stacklevel=3,
-        )
-    elif bool(((_off_centre(fy, cy, size) <= _NEAR) & (_apart(fx, cx) <= _NEAR) & (_apart(fx, fy) > _CENTRED)).all()):
-        warnings.warn(
-            f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
-            f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
-            stacklevel=3,
-        )
-
-
-def _apart(a: Tensor, b: Tensor) -> Tensor:
-    return (b - a).abs() / a
-
-
-def _off_centre(cx: Tensor, cy: Tensor, size: tuple[int, int]) -> Tensor:
-    """How far a point is from the middle of an image, the larger one of the parts of its height and width."""
-    across, down = ((c - (side - 1) / 2).abs() / side for c, side in zip((cx, cy), size[::-1], strict=True))
-    return torch.maximum(across, down)
-
-
-def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, int], tuple[int, int, int]], ...]:
-    """From pixels (u, v, 1) to those of the image turned counterclockwise by 0, 1, 2 and 3 quarters: (2, 3) each."""
-    bottom, right = (side - 1 for side in image_size)
-    return (
-        ((1, 0, 0), (0, 1, 0)),
-        ((0, 1, 0), (-1, 0, right)),
-        ((-1, 0, right), (0, -1, bottom)),
-        ((0, -1, bottom), (1, 0, 0)),
-    )
-
-
-def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
-    """The cameras (C,) of one model, kept in a memo."""
-    inputs = intrinsics, distortion
-    cameras: Cameras = memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras.of(model, *inputs))
-    return cameras
-
-
-def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
-    """(*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
-    if parameters.dtype != rows.dtype:
-        parameters = parameters.to(rows.dtype)
-    if not lead:
-        return parameters.unsqueeze(0)
-    count = parameters.shape[-1]
-    return parameters.expand(*lead, count).reshape(rows.shape[0], count)
+    usual = [torch.ones(4)] + [torch.tensor(model.ideal(n)) for n in distortion.shape[-1:] if n]
+    size = None if image_size is None else (image_size[0], image_size[1])
+    return remade(model(*usual), intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)

@@ -21,7 +21,7 @@ from camtorch._arguments import (
     fails,
     values_of,
 )
-from camtorch._module import BatchedModule, typed_as
+from camtorch._module import BatchedModule, learning_as, remade, typed_as
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
 
@@ -131,7 +131,7 @@ class Extrinsics(BatchedModule):
         """World from camera."""
         # what learnt may be of any length
         rotation = -self.rotation.expand(*self.batch_shape, 3)
-        return self.with_tensors(rotation=rotation, translation=self.position).freeze_like(self)
+        return learning_as(remade(self, rotation=rotation, translation=self.position), self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""

@@ -6,16 +6,17 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import Numbers, as_points, no_camera, shown, working_dtype
-from camtorch._module import Memo
-from camtorch._tracing import in_graph
-from camtorch.camera import Camera, new_cameras, per_row
+from camtorch._arguments import Numbers, as_points, as_real, no_camera, shown, working_dtype
+from camtorch._evaluation import new_cameras, per_row
+from camtorch._evaluation import rows_of as camera_rows
+from camtorch._module import Memo, remade
+from camtorch.camera import Camera
 from camtorch.projection.project import Project
 from camtorch.projection.unproject import Unproject
 
@@ -63,15 +64,20 @@ class Mixed(Camera):
     """
 
     is_mixed = True
+    one_size: ClassVar[bool] = True
+    """Whether the images of all must be of one size."""
     cameras: nn.ModuleList
     """What it was made of: single cameras and batches."""
 
     def __init__(self, cameras: Iterable[Camera], *, order: Sequence[int] | None = None):
         members = _members(cameras)
+        if self.one_size:
+            _check_sizes(members, type(self).__name__)
         given = [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))]
         super(Camera, self).__init__()  # it has no numbers of its own
         self.cameras = nn.ModuleList(members)
-        self.image_size: tuple[int, int] | None = members[0].image_size
+        sizes = {camera.image_size for camera in members}
+        self.image_size: tuple[int, int] | None = members[0].image_size if len(sizes) == 1 else None
         self._places = tuple(given if order is None else [given[i] for i in _as_order(order, len(given))])
         self._rays, self._fields = Memo(), Memo()
         kinds: dict[tuple[object, ...], list[int]] = {}
@@ -111,10 +117,10 @@ class Mixed(Camera):
     def groups(self) -> list[tuple[list[int], Camera]]:
         """The rows of each model and number of coefficients, and their cameras as a batch; gradients go to all."""
         made = []
-        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self._tensors), strict=True):
+        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self.tensors), strict=True):
             first = self._member(group.members[0])
             if group.counts[1:] or group.counts[0] is None or group.taken is not None:
-                first = remade(first, intrinsics, distortion, self.image_size)
+                first = remade(first, intrinsics=intrinsics, distortion=distortion)
             made.append((list(group.rows), first))
         return made
 
@@ -127,12 +133,12 @@ class Mixed(Camera):
         return torch.Size((len(self._places),))
 
     @property
-    def _tensors(self) -> tuple[Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """Intrinsics and distortion of each group."""
         tensors: list[Tensor] = []
         members = cast("list[Camera]", list(self.cameras._modules.values()))
         for group in self._groups:
-            pairs = [members[i]._tensors for i in group.members]
+            pairs = [members[i].tensors for i in group.members]
             tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
         if all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
@@ -144,13 +150,13 @@ class Mixed(Camera):
         return zip(tensors[::2], tensors[1::2], strict=True)
 
     @property
-    def _form(self) -> tuple[object, ...]:
+    def form(self) -> tuple[object, ...]:
         return type(self), self.image_size, tuple((group.model, group.rows) for group in self._groups)
 
     @property
     def intrinsics(self) -> Tensor:  # type: ignore[override]
         """(B, 4) fx, fy, cx, cy of all."""
-        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self._tensors[::2], strict=True)]
+        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self.tensors[::2], strict=True)]
         return parts[0] if len(parts) == 1 else self._in_order(torch.cat(parts))
 
     @property
@@ -175,7 +181,7 @@ class Mixed(Camera):
 
     # -- both directions
 
-    def _evaluated(
+    def evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -192,7 +198,7 @@ class Mixed(Camera):
                 index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
                 here, count = rows[index], torch.Size((len(group.rows),))
             of_model = self._member(group.members[0])
-            results.append(of_model._evaluated(direction, here, count, pair, self._watch(n)))
+            results.append(of_model.evaluate(direction, here, count, pair, self._watch(n)))
         if len(results) == 1:
             return results[0]
         planes, valid = zip(*results, strict=True)
@@ -208,9 +214,9 @@ class Mixed(Camera):
                 found = new_cameras(group.memo, group.model, intrinsics, distortion)
             if found.usable is not None:
                 for member in map(self._member, group.members):
-                    if not member._warned:
+                    if not member.warned:
                         lead = member.batch_shape
-                        member._cameras(*(per_row(t.to(intrinsics), lead, t) for t in member._tensors))
+                        camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member.tensors))
             return found
 
         return cameras
@@ -228,8 +234,37 @@ class Mixed(Camera):
             raise TypeError(f"Mixed: change must be a function of a camera that returns a camera; got {shown(change)}")
         return type(self).of_groups([(rows, change(camera)) for rows, camera in self.groups])
 
-    def _edited(self, matrix: Sequence[Sequence[float]], size: tuple[int, int]) -> Self:
-        return self.by_groups(lambda camera: camera._edited(matrix, size))
+    def each(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The batch with all tensors (C, n) of each group changed by the same function."""
+        return self.by_groups(lambda group: group.each(change))
+
+    def expand(self, *batch: int | Sequence[int]) -> Self:
+        """As `Camera.expand`: a batch of one becomes one of many, any other one keeps its dim."""
+        sizes: Any = batch[0] if len(batch) == 1 and isinstance(batch[0], Sequence) else batch
+        count = len(self)
+        if len(sizes) == 1 and sizes[0] in (count, -1):
+            return self
+        if len(sizes) != 1 or count != 1 or not isinstance(sizes[0], int) or sizes[0] < 1:
+            raise ValueError(f"Mixed: batch dims ({count},) do not expand to {shown(tuple(sizes))}")
+        return type(self)([self.groups[0][1].expand(*sizes)])
+
+    def replace(
+        self,
+        intrinsics: Numbers | None = None,
+        distortion: Numbers | None = None,
+        image_size: Sequence[int] | None = None,
+    ) -> Self:
+        """The batch with other intrinsics (B, 4), or another image size; see `Camera.replace`."""
+        if distortion is not None:
+            self._refuse("distortion", "camera.by_groups(lambda group: group.replace(distortion=...)) replaces it")
+        if intrinsics is None:
+            return self.by_groups(lambda group: group.replace(image_size=image_size))
+        given = as_real(intrinsics, "intrinsics", "Mixed")
+        if given.shape not in ((4,), (1, 4), (len(self), 4)):
+            raise ValueError(f"Mixed: intrinsics must be ({len(self)}, 4) or (4,); got shape {tuple(given.shape)}")
+        given = given.expand(len(self), 4)
+        new = [(rows, group.replace(given[rows].to(group.intrinsics), None, image_size)) for rows, group in self.groups]
+        return type(self).of_groups(new)
 
     def __getitem__(self, index: Any) -> Camera:  # type: ignore[override]
         """Of an int, that camera, as it was given where it was given alone; else the `Mixed` of a part of the batch.
@@ -256,10 +291,6 @@ class Mixed(Camera):
         used, order = _among_used(members, places)
         return type(self)([members[i] for i in used], order=order)
 
-    def with_tensors(self, **tensors: Tensor) -> NoReturn:
-        """There are none to give."""
-        self._refuse("tensors", "camera.by_groups(change) changes batches of one model each")
-
     def convert(self, *_: Any, **__: Any) -> NoReturn:
         """Each group by itself: `camera.by_groups(lambda group: group.convert(model).camera)`."""
         self._refuse("conversion", "camera.by_groups(lambda group: group.convert(model).camera) converts them all")
@@ -284,6 +315,31 @@ class Mixed(Camera):
         return f"Mixed({named}, image_size={self.image_size})"
 
 
+class Listed(Mixed):
+    """The cameras of a list, whose images may be of several sizes: inside of augmentations, which give a list again."""
+
+    one_size = False
+
+
+def cat(cameras: Iterable[Camera]) -> Camera:
+    """One batch of cameras, one after the other, as `torch.cat` makes of tensors; a single camera is one row.
+
+    Of one model and number of coefficients it is a batch of that model, of several it is a `Mixed`. What is fixed stays
+    fixed, and gradients go to every camera that learns.
+
+    Args:
+        cameras: single cameras, batches of one dim, and `Mixed` ones, whose images are of one size.
+
+    Raises:
+        TypeError: what is no camera. ValueError: no cameras, more than one batch dim, images of different sizes,
+            different devices.
+    """
+    members = _members(cameras, "cat")
+    _check_sizes(members, "cat")
+    groups = Mixed(members).groups
+    return groups[0][1] if len(groups) == 1 else Mixed.of_groups(groups)
+
+
 def _count(camera: Camera) -> int:
     return len(camera) if camera.batch_shape else 1
 
@@ -298,20 +354,20 @@ def _among_used(
     return used, tuple(first[i] + row for i, row in places)
 
 
-def _members(cameras: Any) -> list[Camera]:
+def _members(cameras: Any, owner: str = "Mixed") -> list[Camera]:
     """What a batch is made of, as users pass it."""
     if isinstance(cameras, Camera):
         cameras = [cameras]
     if isinstance(cameras, Mapping):
-        raise TypeError("Mixed: cameras must be a list of cameras; of a dict, as rig.cameras, give list(d.values())")
+        raise TypeError(f"{owner}: cameras must be a list of cameras; of a dict, as rig.cameras, give list(d.values())")
     try:
         given = list(cameras)
     except TypeError:
-        raise TypeError(f"Mixed: cameras must be a list of cameras; got {type(cameras).__name__}") from None
+        raise TypeError(f"{owner}: cameras must be a list of cameras; got {type(cameras).__name__}") from None
     for i, camera in enumerate(given):
         if not isinstance(camera, Camera):
-            raise TypeError(f"Mixed: cameras[{i}] must be a Camera; got {no_camera(camera)}")
-    return _checked([one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))])
+            raise TypeError(f"{owner}: cameras[{i}] must be a Camera; got {no_camera(camera)}")
+    return _checked([one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))], owner)
 
 
 def _as_order(order: Sequence[int], count: int) -> list[int]:
@@ -324,47 +380,31 @@ def _as_order(order: Sequence[int], count: int) -> list[int]:
     return places
 
 
-def _checked(members: list[Camera]) -> list[Camera]:
+def _checked(members: list[Camera], owner: str) -> list[Camera]:
     if not any(map(_count, members)):
-        raise ValueError("Mixed: an empty list of cameras; it must hold at least one")
+        raise ValueError(f"{owner}: an empty list of cameras; it must hold at least one")
     for i, camera in enumerate(members):
         if len(camera.batch_shape) > 1:
             shape = tuple(camera.batch_shape)
-            raise ValueError(f"Mixed: cameras[{i}] has batch dims {shape}; cameras are single, or batches of one dim")
-    sizes = list(dict.fromkeys(camera.image_size for camera in members))
-    if len(sizes) > 1:
-        raise ValueError(
-            f"Mixed: the images of a batch are of one size; got cameras of {', '.join(map(str, sizes))} (height, "
-            "width). camera.resize, .crop and .pad give the camera of an edited image"
-        )
+            raise ValueError(f"{owner}: cameras[{i}] has batch dims {shape}; cameras are single, or batches of one dim")
     devices = list(dict.fromkeys(str(camera.intrinsics.device) for camera in members))
     if len(devices) > 1:
-        raise ValueError(f"Mixed: the cameras are on {' and '.join(devices)}; camera.to(device) brings them together")
+        raise ValueError(f"{owner}: the cameras are on {' and '.join(devices)}; camera.to(device) brings them together")
     return members
 
 
-# -- cameras as rows of a batch
+def _check_sizes(members: list[Camera], owner: str) -> None:
+    sizes = list(dict.fromkeys(camera.image_size for camera in members))
+    if len(sizes) > 1:
+        raise ValueError(
+            f"{owner}: the images of a batch are of one size; got cameras of {', '.join(map(str, sizes))} (height, "
+            "width). camera.resize, .crop and .pad give the camera of an edited image"
+        )
 
 
 def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
     """What cameras must have in common to be rows of one batch of one model."""
     return type_before_parametrizations(camera), camera.distortion.shape[-1], camera.image_size
-
-
-def remade(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: tuple[int, int] | None) -> Camera:
-    """A camera of the same model with these numbers, which need no check; nothing in it learns that is in no graph."""
-    intrinsics, distortion = held(intrinsics, distortion if distortion.shape[-1] else intrinsics[..., :0])
-    if torch.compiler.is_compiling():  # which follows a constructor, and nothing that does without
-        model: type[Camera] = type_before_parametrizations(camera)
-        return model(*((intrinsics, distortion) if distortion.shape[-1] else (intrinsics,)), image_size=image_size)
-    made = camera.with_tensors(intrinsics=intrinsics, distortion=distortion)
-    made.image_size = image_size
-    return made
-
-
-def held(*numbers: Tensor) -> list[Tensor]:
-    """Tensors of a graph as they are, and others as Parameters that do not learn."""
-    return [t if in_graph(t) else nn.Parameter(t.detach(), requires_grad=False) for t in numbers]
 
 
 def _joined(tensors: Sequence[Tensor], group: _Group) -> Tensor:

@@ -59,15 +59,17 @@ def vector_quaternion(rotation: Tensor) -> Tensor:
     return torch.cat((cos_root(angle2), sinc_root(angle2) * half), -1)
 
 
-def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...], whole: Tensor | None = None) -> tuple[Tensor, ...]:
     """Apply (*B, 3, 3) to three planes (*B, N): by components, which autocast leaves in their precision.
 
-    A point that is not finite becomes NaN, which has no part in the gradient of the matrix.
+    A point that is not finite becomes NaN, which has no part in the gradient of the matrix. `whole` is the tensor that
+    the planes are taken from, where there is one.
     """
     x, y, z = planes
-    rows = [row.unsqueeze(-1).unbind(-2) for row in matrix.unbind(-2)]
+    rows = [row.unbind(-2) for row in matrix.unsqueeze(-1).unbind(-3)]
     # a sum shows what is not finite: the whole planes are looked at once
-    if x.is_cpu and holds(torch.isfinite(x.detach().sum() + y.detach().sum() + z.detach().sum())):
+    given = planes if whole is None else (whole,)
+    if x.is_cpu and holds(torch.isfinite(torch.stack([plane.detach().sum() for plane in given]))):
         return tuple(torch.addcmul(torch.addcmul(a * x, b, y), c, z) for a, b, c in rows)
     finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
     x, y, z = (torch.where(finite, plane, 0.0) for plane in planes)
@@ -121,7 +123,7 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
         return rays
     rows, lead, restore = as_rows(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
     rotation = rotation.to(rows.dtype).expand(*lead, 3, 3).reshape(-1, 3, 3)
-    return restore(torch.stack(rotate_planes(rotation, rows.unbind(-1))))
+    return restore(torch.stack(rotate_planes(rotation, rows.unbind(-1), rows)))
 
 
 def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:

@@ -4,7 +4,7 @@
 """
 
 from camtorch.augment.augmentation import Augmentation, Range
-from camtorch.augment.change import Change, camera_like
+from camtorch.augment.change import Change
 from camtorch.augment.collate import collate
 from camtorch.augment.compose import Compose
 from camtorch.augment.edits import (
@@ -47,7 +47,6 @@ __all__ = [
     "Resize",
     "Rotate90",
     "VerticalFlip",
-    "camera_like",
     "collate",
     "from_pitch_yaw",
     "mount_rotation",

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from camtorch._arguments import GUESS_CAMERA, no_camera
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change, copied, singles, size_of
+from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
 from camtorch.augment.sample import Unknown, moves
 from camtorch.camera import Camera
@@ -162,7 +162,7 @@ class Transform(A.DualTransform):
         """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""
         before, after = (
             torch.tensor([[*size[::-1], *size[::-1]]], dtype=torch.float64)
-            for size in map(size_of, (change.parts[0].camera, self.apply_to_camera(None, change)))
+            for size in ((one.height, one.width) for one in (change.parts[0].camera, change.parts[0].target))
         )
         corners = torch.as_tensor(bboxes[:, :4], dtype=torch.float64) * before - 0.5
         moved, seen = change.boxes(corners[None])
@@ -171,8 +171,7 @@ class Transform(A.DualTransform):
 
     def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
         """The camera of the new image."""
-        target = change.target
-        return copied(singles(target)[0] if isinstance(target, Camera) else target[0])
+        return change.target[0].clone()
 
     def _mover(self, kind: str) -> Callable[..., np.ndarray]:
         def move(value: np.ndarray, change: Change, **params: Any) -> np.ndarray:

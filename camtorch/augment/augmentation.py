@@ -17,11 +17,11 @@ from camtorch._arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as
 from camtorch._module import typed_as
 from camtorch._threads import on_one_thread
 from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.change import Change, Part, alone, expanded, frozen, joined, rows_of, size_of
+from camtorch.augment.change import Change, Part, alone, as_one
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
-from camtorch.mixed import Mixed, kind
+from camtorch.mixed import Mixed
 from camtorch.warp.sampling import Options, as_options
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
@@ -105,11 +105,16 @@ def draw(
         values = {"apply": torch.rand(rows, generator=generator, device=device) < p}
     else:
         values = {"apply": torch.full((rows,), p >= 1, device=device)}
-    for name, interval in ranges.items():
-        shape = (rows,) if interval.size is None else (rows, interval.size)
-        # in float64, so that what is drawn is what every precision sees
-        share = torch.rand(shape, generator=generator, dtype=torch.float64, device=device)
-        values[name] = interval.low + (interval.high - interval.low) * share
+    # in float64, so that what is drawn is what every precision sees
+    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
+    shares = [torch.rand(size, generator=generator, dtype=torch.float64, device=device) for size in sizes]
+    if ranges:
+        pairs = zip(ranges.values(), sizes, strict=True)
+        each = [(interval.low, interval.high - interval.low) for interval, size in pairs for _ in range(size)]
+        low, extent = torch.tensor(each, dtype=torch.float64, device=device).reshape(-1, 2).unbind(-1)
+        drawn = (low + extent * torch.cat(shares)).split(sizes)
+        for (name, interval), value in zip(ranges.items(), drawn, strict=True):
+            values[name] = value if interval.size is None else value.view(rows, interval.size)
     if rows == count:
         return values
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
@@ -170,7 +175,7 @@ class Augmentation(SampleTransform):
                 one = torch.ones_like(values["zoom"])
                 scale = torch.stack((values["zoom"], values["zoom"], one, one), -1)
                 intrinsics = source.intrinsics * scale
-                return ct.augment.camera_like(source, intrinsics, source.distortion, source.image_size), None
+                return source.replace(intrinsics=intrinsics), None
 
     Args:
         ranges: name -> `Range`, in the order in which they are drawn.
@@ -261,7 +266,7 @@ class Augmentation(SampleTransform):
                 one dim, or none where one camera serves all samples.
 
         Returns:
-            A camera without batch dims or of *B, made for example by `camera_like`, and (3, 3) or (*B, 3, 3).
+            A camera without batch dims or of *B, made for example by `source.replace`, and (3, 3) or (*B, 3, 3).
         """
         raise NotImplementedError
 
@@ -298,64 +303,45 @@ class Augmentation(SampleTransform):
         if camera is None:
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
-        return self._change(camera, self._checked_draw(draw))
+        return self._change(as_one(camera), self._checked_draw(draw))
 
-    def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
-        applied = draw["apply"]
+    def _change(self, camera: Camera, draw: Mapping[str, Tensor]) -> Change:
+        applied, camera = draw["apply"], alone(camera)
         count = len(applied)
-        cameras = [alone(camera)] if isinstance(camera, Camera) else list(camera)
-        listed, (first, *_) = not isinstance(camera, Camera), cameras
-        before = {one.image_size for one in cameras}
+        groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
+        if isinstance(camera, Mixed):
+            groups = list(camera.groups)
+        before = {group.image_size for _, group in groups}
         if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
             raise ValueError(
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
             )
-        if isinstance(first, Mixed):
-            return self._change_each(first, draw)
-        if listed:
-            groups: dict[tuple[object, ...], list[int]] = {}
-            for i, one in enumerate(cameras):
-                groups.setdefault((*kind(one), bool(applied[i])), []).append(i)
-            members = [
-                (torch.tensor(rows), joined([expanded(cameras[i], 1) for i in rows])) for rows in groups.values()
-            ]
-        elif not (may_look(applied) or count == 0):
-            # traced: all rows move, and a gate chooses
-            return Change(count, [self._part(None, first, draw)], gate=None if self.p == 1 else applied)
-        elif bool(applied.all()):
-            return Change(count, [self._part(None, first, draw)])
-        else:
-            both = [(applied == value).nonzero()[:, 0] for value in (True, False)]
-            members = [(rows, rows_of(first, rows)) for rows in both if len(rows)]
-        parts = [self._part_of(rows, source, draw, bool(applied[rows[0]])) for rows, source in members]
-        sizes = {size_of(part.warp.target if part.warp else part.camera) for part in parts}
-        if len(sizes) > 1 and len(before) == 1:
-            text = f"samples of one batch would come out in the sizes {sorted(sizes)}; with p < 1 the size must stay"
-            raise ValueError(f"{self._name}: {text}")
-        return Change(count, parts, listed=listed)
-
-    def _change_each(self, camera: Mixed, draw: Mapping[str, Tensor]) -> Change:
-        """What a draw does to images of cameras of several models."""
-        applied = draw["apply"]
-        if not may_look(applied):  # traced: all rows move, and a gate chooses
-            parts = [self._part_of(torch.tensor(rows), group, draw, True) for rows, group in camera.groups]
-            mixed = [rows for rows, _ in camera.groups]
-            return Change(len(applied), parts, mixed=mixed, gate=None if self.p == 1 else applied)
-        parts, mixed, chosen = [], [], applied.tolist()
-        for rows, group in camera.groups:
+        batch_type = type(camera) if isinstance(camera, Mixed) else None
+        looks = may_look(applied) or count == 0
+        if not looks or bool(applied.all()):  # traced, all rows move, and a gate chooses
+            parts = [self._part_of(rows, group, draw, True) for rows, group in groups]
+            return Change(count, parts, batch_type=batch_type, gate=None if looks or self.p == 1 else applied)
+        parts, chosen = [], applied.tolist()
+        for rows, group in groups:
+            rows = list(range(count)) if rows is None else rows
             for moves in (True, False):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
                 if here:
-                    mixed.append([rows[n] for n in here])
-                    source = group if len(here) == len(rows) else rows_of(group, torch.tensor(here))
-                    parts.append(self._part_of(torch.tensor(mixed[-1]), source, draw, moves))
-        return Change(len(applied), parts, mixed=mixed)
+                    source = group[here] if group.batch_shape and len(here) < len(rows) else group
+                    parts.append(self._part_of([rows[n] for n in here], source, draw, moves))
+        sizes = {part.target.image_size for part in parts}
+        if len(sizes) > 1 and len(before) == 1:
+            found = sorted(map(str, sizes))
+            raise ValueError(
+                f"{self._name}: samples of one batch would come out in the sizes {found}; with p < 1 the size must stay"
+            )
+        return Change(count, parts, batch_type=batch_type)
 
-    def _part_of(self, rows: Tensor, source: Camera, draw: Mapping[str, Tensor], moves: bool) -> Part:
+    def _part_of(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor], moves: bool) -> Part:
         if not moves:
             return Part(rows, None, source)
-        return self._part(rows, source, {name: value[rows.to(value.device)] for name, value in draw.items()})
+        return self._part(rows, source, draw if rows is None else {name: value[rows] for name, value in draw.items()})
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         as_mapping(draw, "draw", self._name, "what draw() returns")
@@ -377,7 +363,7 @@ class Augmentation(SampleTransform):
                     raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {values[name].tolist()}")
         return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
 
-    def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         values = self._values(source, draw)
         target, rotation = self.new_camera(source, values)
         if self.min_filled:
@@ -425,15 +411,16 @@ class Augmentation(SampleTransform):
     def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
         """What `min_filled` made of a target: the factors (*B,) on its focal lengths, and the parts (*B,) filled."""
 
-    def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
+    def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
-        camera = camera if isinstance(camera, Camera) and not camera.is_mixed else camera[0]
+        camera = camera[0] if camera.is_mixed else camera
         if self.min_filled is not None or self._warned or self.p == 0 or not is_concrete(camera.intrinsics):
             return
         self._warned = True
         values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
-            first = rows_of(frozen(camera, camera.image_size), torch.zeros(_TRIES, dtype=torch.long))
+            first = camera.detach()
+            first = first[[0] * _TRIES] if first.batch_shape else first
             shares = filled(first, *self.new_camera(first, self._values(first, values)))
         if shares.mean() < _FEW:
             warnings.warn(

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import fails, holds
 from camtorch._dtypes import narrow, widen
+from camtorch._editing import edited
+from camtorch._module import remade
 from camtorch.camera import Camera
-from camtorch.mixed import Mixed, held, kind, remade
+from camtorch.mixed import Listed, Mixed
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shutter import Shutters
@@ -31,8 +32,8 @@ def _same(value: Tensor) -> Tensor:
 class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
-    rows: Tensor | None
-    """(n,) int64, or None for all."""
+    rows: list[int] | None
+    """Which samples of the batch, or None for all."""
     warp: Warp | None
     """None: nothing happens to these rows."""
     camera: Camera
@@ -42,9 +43,14 @@ class Part:
     light: Tensor | None = None
     """(n or 1, 1, H', W'): what the lens lets through."""
 
-    def take(self, index: Tensor) -> Part:
+    @property
+    def target(self) -> Camera:
+        """After the change."""
+        return self.camera if self.warp is None else self.warp.target
+
+    def take(self, index: list[int]) -> Part:
         """These rows of the part, as all there is."""
-        camera = rows_of(self.camera, index)
+        camera = _rows_of(self.camera, index)
         if self.warp is None:
             return Part(None, None, camera)
 
@@ -56,9 +62,14 @@ class Part:
         return Part(None, of(self.warp), camera, shades, light)
 
 
-def _rows_of_warp(warp: Warp, camera: Camera, index: Tensor) -> Warp:
+def _rows_of(camera: Camera, index: list[int]) -> Camera:
+    """The cameras of these rows; one without batch dims serves all of them."""
+    return camera[index] if camera.batch_shape else camera
+
+
+def _rows_of_warp(warp: Warp, camera: Camera, index: list[int]) -> Warp:
     """The warp of these rows, whose cameras before it are given."""
-    rotation, target = warp.rotation, rows_of(warp.target, index)
+    rotation, target = warp.rotation, _rows_of(warp.target, index)
     if rotation is not None and rotation.ndim == 3:
         rotation = rotation[index]
     if isinstance(warp, AffineWarp):
@@ -97,7 +108,7 @@ def _joined(a: Part, b: Part) -> Part:
 
         shades = None if b.shades is None else (of(b.shades[0]), of(b.shades[1]))
         return Part(a.rows, of(b.warp), a.camera, shades, b.light)
-    edit, size = b.warp.matrix, size_of(b.warp.target)
+    edit, size = b.warp.matrix, b.warp.target.image_size
     if isinstance(first, AffineWarp):
         matrix = after(edit, first.matrix)
         return Part(a.rows, AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation), a.camera)
@@ -138,15 +149,13 @@ class Change:
     Args:
         count: how many samples.
         parts: every sample is in one of them.
-        listed: cameras come as a list, for they may be of several models and sizes.
-        mixed: the rows of every part, where cameras come as a `Mixed`.
+        batch_type: `Mixed` or `Listed` if the cameras came so; None: as one camera, or a batch of one model.
         gate: (count,) bool, where values may not be looked at: which rows of the only part move.
     """
 
     count: int
     parts: list[Part]
-    listed: bool
-    mixed: Sequence[Sequence[int]] | None
+    batch_type: type[Mixed] | None
     gate: Tensor | None
 
     def __init__(
@@ -154,28 +163,25 @@ class Change:
         count: int,
         parts: Sequence[Part],
         *,
-        listed: bool = False,
-        mixed: Sequence[Sequence[int]] | None = None,
+        batch_type: type[Mixed] | None = None,
         gate: Tensor | None = None,
     ):
-        self.count, self.parts, self.listed, self.mixed, self.gate = count, list(parts), listed, mixed, gate
-        rows = [part.rows for part in self.parts if part.rows is not None]
+        self.count, self.parts, self.batch_type, self.gate = count, list(parts), batch_type, gate
+        rows = [row for part in self.parts for row in part.rows or ()]
         self._inverse: Change | None = None
-        self._order = torch.cat(rows).argsort() if rows else None
+        self._order: list[int] | None = sorted(range(len(rows)), key=rows.__getitem__) if rows else None
 
     @property
-    def source(self) -> Camera | list[Camera]:
-        """The cameras before: a batch, or a list of single ones."""
+    def source(self) -> Camera:
+        """The cameras before, a batch of all samples."""
         return self._cameras([part.camera for part in self.parts])
 
     @property
-    def target(self) -> Camera | list[Camera]:
+    def target(self) -> Camera:
         """The cameras after."""
-        after = [part.camera if part.warp is None else part.warp.target for part in self.parts]
+        after = [part.target for part in self.parts]
         if self.gate is not None:
-            gates = [
-                self.gate if part.rows is None else self.gate[part.rows.to(self.gate.device)] for part in self.parts
-            ]
+            gates = [self.gate if part.rows is None else self.gate[part.rows] for part in self.parts]
             after = [
                 _chosen(gate, camera, part.camera) for gate, camera, part in zip(gates, after, self.parts, strict=True)
             ]
@@ -188,15 +194,22 @@ class Change:
             torch.isclose(ours.double(), theirs.to(ours.device).double(), _ROUNDED)
         )
 
-    def _cameras(self, cameras: list[Camera]) -> Camera | list[Camera]:
-        counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]
-        batches = [expanded(camera, n) for camera, n in zip(cameras, counts, strict=True)]
-        if self.mixed is not None:
-            return Mixed.of_groups(list(zip(self.mixed, batches, strict=True)))
-        if not self.listed and len({kind(c) for c in batches}) == 1:
-            return batches[0] if self._order is None else joined(batches, self._order)
-        alone = [single for camera in batches for single in singles(camera)]
-        return alone if self._order is None else [alone[i] for i in self._order.tolist()]
+    def _cameras(self, cameras: list[Camera]) -> Camera:
+        batches = [camera.expand(n) for camera, n in zip(cameras, self._counts, strict=True)]
+        rows = [part.rows for part in self.parts if part.rows is not None]
+        if not rows:
+            return batches[0]
+        sizes = {camera.image_size for camera in cameras}
+        together = (self.batch_type or (Mixed if len(sizes) == 1 else Listed)).of_groups(
+            list(zip(rows, batches, strict=True))
+        )
+        groups = together.groups
+        return groups[0][1] if self.batch_type is None and len(groups) == 1 else together
+
+    @property
+    def _counts(self) -> list[int]:
+        """How many samples each part is."""
+        return [self.count if part.rows is None else len(part.rows) for part in self.parts]
 
     @property
     def rotation(self) -> Tensor:
@@ -207,7 +220,7 @@ class Change:
             turned = None if part.warp is None else part.warp.rotation
             return (eye if turned is None else turned).expand(n, 3, 3)
 
-        parts = [turned(part, self.count if part.rows is None else len(part.rows)) for part in self.parts]
+        parts = [turned(part, n) for part, n in zip(self.parts, self._counts, strict=True)]
         rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
         if self.gate is not None:
             eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
@@ -221,10 +234,9 @@ class Change:
         if all(turn is None for turn in turns):
             return None
         device = self.parts[0].camera.intrinsics.device
-        counts = [self.count if part.rows is None else len(part.rows) for part in self.parts]
         flags = [
             torch.zeros(n, dtype=torch.bool, device=device) if t is None else (_handedness(t) < 0).expand(n)
-            for t, n in zip(turns, counts, strict=True)
+            for t, n in zip(turns, self._counts, strict=True)
         ]
         rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
         return None if holds(~rows) else rows
@@ -236,25 +248,23 @@ class Change:
         """
         if self.gate is not None or second.gate is not None:
             raise ValueError("Compose: what is compiled needs p=1 of all but edits, as it may not look at draws")
-        listed = self.listed or second.listed
+        kinds = [kind for kind in (self.batch_type, second.batch_type) if kind is not None]
+        batch_type = Listed if Listed in kinds else Mixed if kinds else None
         if all(part.rows is None for part in (*self.parts, *second.parts)):
-            return Change(self.count, [_joined(self.parts[0], second.parts[0])], listed=listed)
-        parts, mixed = [], []
+            return Change(self.count, [_joined(self.parts[0], second.parts[0])], batch_type=batch_type)
+        parts = []
+        everyone = list(range(self.count))
         for a in self.parts:
             for b in second.parts:
-                own, its = (torch.arange(self.count) if part.rows is None else part.rows.cpu() for part in (a, b))
-                (of_a,) = torch.isin(own, its).nonzero(as_tuple=True)
-                if len(of_a):
-                    rows = own[of_a]
-                    of_b = (rows[:, None] == its).nonzero()[:, 1]
-                    one, other = (
-                        part if torch.equal(index, torch.arange(len(mine))) else part.take(index)
-                        for part, index, mine in ((a, of_a, own), (b, of_b, its))
-                    )
+                own, its = (everyone if part.rows is None else part.rows for part in (a, b))
+                place = {row: i for i, row in enumerate(its)}
+                of_a = [i for i, row in enumerate(own) if row in place]
+                if of_a:
+                    rows = [own[i] for i in of_a]
+                    one = a if len(rows) == len(own) else a.take(of_a)
+                    other = b if rows == its else b.take([place[row] for row in rows])
                     parts.append(replace(_joined(one, other), rows=rows))
-                    mixed.append(rows.tolist())
-        some = self.mixed is not None or second.mixed is not None
-        return Change(self.count, parts, listed=listed, mixed=mixed if some else None)
+        return Change(self.count, parts, batch_type=batch_type)
 
     def with_options(self, options: Options) -> Change:
         """The change with its warps made anew by other options."""
@@ -267,16 +277,13 @@ class Change:
                 shades = _optioned(shades[0], options), _optioned(shades[1], options)
             return replace(part, warp=_optioned(part.warp, options), shades=shades)
 
-        return Change(
-            self.count, [of(part) for part in self.parts], listed=self.listed, mixed=self.mixed, gate=self.gate
-        )
+        return Change(self.count, [of(part) for part in self.parts], batch_type=self.batch_type, gate=self.gate)
 
     def row(self, i: int) -> Change:
         """The change of one sample."""
         for part in self.parts:
-            where = [i] if part.rows is None else (part.rows == i).nonzero()[:, 0].tolist()
-            if where:
-                return Change(1, [part.take(torch.tensor(where))])
+            if part.rows is None or i in part.rows:
+                return Change(1, [part.take([i if part.rows is None else part.rows.index(i)])])
         raise IndexError(f"Change: no row {i}; it is of {self.count} samples")
 
     def inverse(self) -> Change:
@@ -289,7 +296,7 @@ class Change:
             else replace(part, warp=part.warp.inverse(), camera=part.warp.target, shades=None, light=None)
             for part in self.parts
         ]
-        self._inverse = Change(self.count, parts, listed=self.listed, mixed=self.mixed, gate=self.gate)
+        self._inverse = Change(self.count, parts, batch_type=self.batch_type, gate=self.gate)
         return self._inverse
 
     def each(
@@ -301,17 +308,15 @@ class Change:
         """
 
         def of(part: Part) -> Moved:
-            if part.rows is not None:
-                rows = value[part.rows.to(value.device)]
-            else:  # what comes out is never what went in, but a copy
-                rows = value.clone() if part.warp is None else value
+            # what comes out is never what went in, but a copy
+            rows = value[part.rows] if part.rows is not None else value.clone() if part.warp is None else value
             return stay(part.camera, rows) if part.warp is None else move(part, part.warp, rows)
 
         results = [of(part) for part in self.parts]
         gate, order = self.gate, self._order
         moved = results[0]
         if order is not None:
-            moved = _both(lambda pieces: torch.cat(pieces)[order.to(pieces[0].device)], *results)
+            moved = _both(lambda pieces: torch.cat(pieces)[order], *results)
         if gate is not None:
             moved = _both(lambda pair: _gated(gate, *pair), moved, stay(self.parts[0].camera, value))
         return moved
@@ -344,8 +349,9 @@ class Change:
     def valid_mask(self) -> Tensor:
         """(count, 1, H', W') bool: where the images show something."""
         camera = self.parts[0].camera
-        height, width = size_of(camera)
-        everywhere = torch.ones(self.count, 1, height, width, dtype=torch.bool, device=camera.intrinsics.device)
+        everywhere = torch.ones(
+            self.count, 1, camera.height, camera.width, dtype=torch.bool, device=camera.intrinsics.device
+        )
         return self.each(
             everywhere,
             lambda part, warp, rows: warp.pin().valid_mask().expand(len(rows), -1, -1, -1),
@@ -360,7 +366,7 @@ class Change:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
-            limits = rows.new_tensor(size_of(camera)[::-1]) - 0.5
+            limits = rows.new_tensor((camera.width, camera.height)) - 0.5
             on_image = (rows[..., :2] <= limits).all(-1) & (rows[..., 2:] >= -0.5).all(-1)
             return rows, on_image & in_order(rows) & torch.isfinite(rows).all(-1)
 
@@ -424,24 +430,25 @@ def _handedness(rotation: Tensor) -> Tensor:
     return triple
 
 
-def by_kinds(count: int, camera: Camera | Sequence[Camera], part: Callable[[Tensor | None, Camera], Part]) -> Change:
-    """The change of samples by one camera, a batch of them, or a list: `part` makes the part of each kind of camera.
+def by_kinds(count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part]) -> Change:
+    """The change of samples by one camera or a batch of them: `part` makes the part of each kind of camera.
 
     Its arguments are those rows, None for all, and their cameras.
     """
-    camera = alone(camera) if isinstance(camera, Camera) else camera
-    if isinstance(camera, Camera) and not isinstance(camera, Mixed):
+    camera = alone(camera)
+    if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)])
-    if isinstance(camera, Mixed):
-        groups = camera.groups
-        return Change(
-            count, [part(torch.tensor(rows), source) for rows, source in groups], mixed=[r for r, _ in groups]
-        )
-    kinds: dict[object, list[int]] = {}
-    for i, one in enumerate(camera):
-        kinds.setdefault(kind(one), []).append(i)
-    sources = ((rows, joined([expanded(camera[i], 1) for i in rows])) for rows in kinds.values())
-    return Change(count, [part(torch.tensor(rows), source) for rows, source in sources], listed=True)
+    return Change(count, [part(rows, source) for rows, source in camera.groups], batch_type=type(camera))
+
+
+def as_one(camera: Camera | Sequence[Camera]) -> Camera:
+    """One camera or a batch as it is, and a list of single ones as a batch."""
+    return camera if isinstance(camera, Camera) else Listed(camera)
+
+
+def alone(camera: Camera) -> Camera:
+    """A batch of one as the camera that it holds, which serves any number of samples."""
+    return camera[0] if tuple(camera.batch_shape) == (1,) else camera
 
 
 def _forward(camera: Camera, like: Tensor) -> Tensor:
@@ -461,11 +468,12 @@ def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
 
 def _chosen(gate: Tensor, target: Camera, source: Camera) -> Camera:
     """(n,) of two cameras of one kind, the target where the gate (n,) is open."""
-    source, target = (expanded(camera, len(gate)) for camera in (source, target))
-    moves = gate.to(target.intrinsics.device).unsqueeze(-1)
-    intrinsics = torch.where(moves, target.intrinsics, source.intrinsics)
-    distortion = torch.where(moves, target.distortion, source.distortion)
-    return remade(target, intrinsics, distortion, target.image_size)
+    gate = gate.to(target.intrinsics.device).unsqueeze(-1)
+    return remade(
+        target,
+        intrinsics=torch.where(gate, target.intrinsics, source.intrinsics),
+        distortion=torch.where(gate, target.distortion, source.distortion),
+    )
 
 
 def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Moved) -> Moved:
@@ -474,87 +482,3 @@ def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Moved) -> 
         first, second = (function(pieces) for pieces in zip(*results, strict=True))
         return first, second
     return function(results)
-
-
-# -- cameras as rows of a batch: made anew from other numbers, taken out, put together
-
-
-def camera_like(camera: Camera, intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int] | None) -> Camera:
-    """A camera of the same model with these numbers; nothing in it learns that is not part of a graph already."""
-    numbers = held(intrinsics, distortion)
-    model: type[Camera] = type_before_parametrizations(camera)
-    return model(*(numbers if distortion.shape[-1] else numbers[:1]), image_size=image_size)
-
-
-def numbers_by(camera: Camera, change: Callable[[Tensor], Tensor]) -> Camera:
-    """The camera with its intrinsics and its distortion changed, each by the same function."""
-    if isinstance(camera, Mixed):
-        return camera.by_groups(lambda group: numbers_by(group, change))
-    return remade(camera, change(camera.intrinsics), change(camera.distortion), camera.image_size)
-
-
-def frozen(camera: Camera, image_size: tuple[int, int] | None) -> Camera:
-    """A camera of the same numbers that does not learn."""
-    return remade(camera, camera.intrinsics.detach(), camera.distortion.detach(), image_size)
-
-
-def edited(camera: Camera, matrix: Tensor, image_size: tuple[int, int]) -> Camera:
-    """The camera of an image whose pixels move by (2, 3) or (B, 2, 3)."""
-    return remade(camera, *camera._edited_numbers(matrix), image_size)
-
-
-def copied(camera: Camera) -> Camera:
-    """A camera of the same numbers, whose tensors are its own."""
-    return numbers_by(camera, torch.clone)
-
-
-def on_device(camera: Camera, device: torch.device) -> Camera:
-    """The camera where the images are."""
-    return camera if camera.intrinsics.device == device else numbers_by(camera, lambda t: t.to(device))
-
-
-def size_of(camera: Camera) -> tuple[int, int]:
-    """The image_size of a camera that has one."""
-    return cast("tuple[int, int]", camera.image_size)
-
-
-def alone(camera: Camera) -> Camera:
-    """A batch of one as the camera that it holds, which serves any number of samples."""
-    return singles(camera)[0] if tuple(camera.batch_shape) == (1,) else camera
-
-
-def rows_of(camera: Camera, index: Tensor) -> Camera:
-    """The cameras of these rows; one without batch dims serves all of them."""
-    if isinstance(camera, Mixed):
-        return camera[index]
-    batch = camera.batch_shape
-    return numbers_by(camera, lambda t: t.expand(*batch, t.shape[-1])[index]) if batch else camera
-
-
-def expanded(camera: Camera, count: int) -> Camera:
-    """A batch of `count` rows."""
-    if tuple(camera.batch_shape) == (count,):
-        return camera
-    return numbers_by(camera, lambda t: t.expand(count, t.shape[-1]).clone())
-
-
-def singles(camera: Camera) -> list[Camera]:
-    """The cameras of a batch, one by one."""
-    if isinstance(camera, Mixed):
-        return list(camera)
-    intrinsics, distortion = (
-        t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)
-    )
-    rows = range(camera.batch_shape[0])
-    return [remade(camera, intrinsics[i], distortion[i], camera.image_size) for i in rows]
-
-
-def joined(cameras: Sequence[Camera], order: Tensor | None = None) -> Camera:
-    """One batch of cameras of one kind that have a batch dim each, in another order if wanted."""
-
-    def together(tensors: list[Tensor]) -> Tensor:
-        whole = torch.cat([t.expand(*c.batch_shape, t.shape[-1]) for t, c in zip(tensors, cameras, strict=True)])
-        return whole if order is None else whole[order]
-
-    intrinsics, distortion = together([c.intrinsics for c in cameras]), together([c.distortion for c in cameras])
-    return remade(cameras[0], intrinsics, distortion, cameras[0].image_size)

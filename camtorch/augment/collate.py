@@ -12,9 +12,8 @@ from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from camtorch._arguments import is_list
-from camtorch.augment.change import expanded, joined
 from camtorch.camera import Camera
-from camtorch.mixed import Mixed, kind
+from camtorch.mixed import cat
 
 
 def collate(samples: Sequence[object]) -> object:
@@ -50,9 +49,7 @@ def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> C
     """Single cameras as one batch, of several models if need be, or as a list where they are of several sizes."""
     if any(camera.batch_shape for camera in batch) or len({camera.image_size for camera in batch}) > 1:
         return list(batch)
-    if len({kind(camera) for camera in batch}) > 1:
-        return Mixed(batch).by_groups(lambda group: group)  # fewer tensors to leave a worker
-    return joined([expanded(camera, 1) for camera in batch])
+    return cat(batch)
 
 
 # Samples that hold cameras then go through a DataLoader as they are. torch documents this map for the purpose.

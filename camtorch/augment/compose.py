@@ -14,6 +14,7 @@ from camtorch.augment.change import Change
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
 from camtorch.camera import Camera
+from camtorch.mixed import Listed
 
 _OF_IMAGES = ("mode", "padding_mode", "fill", "tolerance")
 
@@ -152,17 +153,17 @@ class Compose(Augmentation):
         draw = {key: value.expand(count, *value.shape) if not value.ndim else value for key, value in values.items()}
         change = self._change(source, {"apply": torch.ones(count, dtype=torch.bool), **draw})
         target = change.target
-        if not isinstance(target, Camera):
+        if target.is_mixed:
             kinds = sorted({type(one).__name__ for one in target})
             raise ValueError(f"{self._name}: samples would come out with cameras of several models; got {kinds}")
         return target, change.rotation
 
-    def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
+    def tell_of_empty_images(self, camera: Camera) -> None:
         """What the augmentations tell of images of such a camera."""
         for part in self.parts:
             part.tell_of_empty_images(camera)
 
-    def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
+    def _change(self, camera: Camera, draw: Mapping[str, Tensor]) -> Change:
         total, options = None, {**self.options, "antialias": self.antialias}
         steps = self._steps(draw)
         while steps:
@@ -175,10 +176,11 @@ class Compose(Augmentation):
                 part, own = steps.pop(0)
                 step = part._change(camera, own)
             total = step if total is None else total.then(step)
-            camera = _alone(step)
+            (first, *others) = step.parts  # one camera for all where it is one
+            camera = step.target if others or first.rows is not None else first.target
         assert total is not None
-        sizes = {one.image_size for one in ([camera] if isinstance(camera, Camera) else camera)}
-        if len(sizes) > 1 and not total.listed:
+        sizes = {part.target.image_size for part in total.parts}
+        if len(sizes) > 1 and total.batch_type is not Listed:
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {sorted(map(str, sizes))}"
             )
@@ -196,11 +198,3 @@ class Compose(Augmentation):
         """The options."""
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
-
-
-def _alone(step: Change) -> Camera | list[Camera]:
-    """The cameras after a change, one for all where it is one."""
-    (first, *others) = step.parts
-    if others or first.rows is not None:
-        return step.target
-    return first.camera if first.warp is None else first.warp.target

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_whole, fails, holds
+from camtorch._editing import edited, quarter_turns
 from camtorch.augment.augmentation import Augmentation, EditOptions, Range, as_range
-from camtorch.augment.change import Change, Part, by_kinds, edited, size_of
+from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
-from camtorch.camera import Camera, quarter_turns
+from camtorch.camera import Camera
 from camtorch.warp.affine import AffineWarp, after, on_rays
 
 if TYPE_CHECKING:
@@ -73,13 +74,15 @@ class Edit(Augmentation):
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """The camera of the edited image, and the mirror or the turn; see `Augmentation.new_camera`."""
-        matrix, size = self.edit(size_of(source), {name: value.double() for name, value in values.items()})
+        matrix, size = self.edit(
+            (source.height, source.width), {name: value.double() for name, value in values.items()}
+        )
         return edited(source, matrix, size), _turn(matrix, source)
 
-    def tell_of_empty_images(self, camera: Camera | Sequence[Camera]) -> None:
+    def tell_of_empty_images(self, camera: Camera) -> None:
         """Nothing is empty that is not asked for."""
 
-    def _change(self, camera: Camera | Sequence[Camera], draw: Mapping[str, Tensor]) -> Change:
+    def _change(self, camera: Camera, draw: Mapping[str, Tensor]) -> Change:
         return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
 
     def map_of(self, draw: Mapping[str, Tensor], size: tuple[int, int]) -> tuple[Tensor | None, tuple[int, int]]:
@@ -104,15 +107,13 @@ class Edit(Augmentation):
         return super().extra_repr().replace(f"antialias={bool(self.antialias)}", f"antialias={self.antialias}")
 
 
-def change_by(
-    edits: Sequence[tuple[Edit, Mapping[str, Tensor]]], camera: Camera | Sequence[Camera], options: Mapping[str, Any]
-) -> Change:
+def change_by(edits: Sequence[tuple[Edit, Mapping[str, Tensor]]], camera: Camera, options: Mapping[str, Any]) -> Change:
     """What edits and their draws, one after the other, do to images of `camera`, by warps of these options."""
 
-    def part(rows: Tensor | None, source: Camera) -> Part:
-        matrix, size = None, size_of(source)
+    def part(rows: list[int] | None, source: Camera) -> Part:
+        matrix, size = None, (source.height, source.width)
         for edit, draw in edits:
-            here = draw if rows is None else {name: value[rows.to(value.device)] for name, value in draw.items()}
+            here = draw if rows is None else {name: value[rows] for name, value in draw.items()}
             one, size = edit.map_of(here, size)
             if one is not None:
                 matrix = one if matrix is None else after(one, matrix)

@@ -10,17 +10,21 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, fails, no_camera, shown
-from camtorch._module import typed_as
+from camtorch._module import remade, typed_as
 from camtorch._threads import on_one_thread
-from camtorch.augment.change import Change, Part, alone, camera_like, copied
+from camtorch.augment.change import Change, Part, alone
 from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
+from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import check_rotation, rotation_matrix
 from camtorch.warp.sampling import Options, as_options
 from camtorch.warp.warp import Warp
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
+
+
+_VIRTUAL = Pinhole([1.0, 1.0, 0.0, 0.0]).detach()
 
 
 class FaceNormalizer(SampleTransform):
@@ -129,7 +133,7 @@ class FaceNormalizer(SampleTransform):
         rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
         focal = (self.focal / self.distance * distance).expand(-1, 2)
         intrinsics = torch.cat((focal, focal.new_tensor(self.axis).expand(len(focal), 2)), -1)
-        target = camera_like(Pinhole([1.0, 1.0, 0.0, 0.0]), intrinsics, intrinsics[..., :0], self.image_size)
+        target = remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
     @on_one_thread
@@ -142,8 +146,8 @@ class FaceNormalizer(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, _, camera = self._batch(sample)
-        if not isinstance(camera, Camera):
-            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
+        if isinstance(camera, Listed):
+            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
         kinds = {name: value for name, (_, value) in named.items()}
         listed = [name for name in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(name), list)]
         if listed:
@@ -159,7 +163,7 @@ class FaceNormalizer(SampleTransform):
         moved = self._moved(sample, named, batched, change)
         scale = self.distance / centre.norm(dim=-1)
         moved["scale"] = scale if batched else scale.squeeze(0)
-        moved["source_camera"] = copied(camera)
+        moved["source_camera"] = camera.clone()
         if "rotation" in sample:  # of augmentations before
             moved["source_rotation"] = sample["rotation"].clone()
         return moved

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
+from camtorch._module import remade
 from camtorch._opaque import CameraNumbers, opaque
-from camtorch.augment.change import frozen, size_of
 from camtorch.camera import Camera
-from camtorch.mixed import remade
 from camtorch.rotations import rotation_matrix, rotation_vector, turn
 from camtorch.warp.warp import along_edges
 
@@ -37,7 +36,7 @@ def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
 
 def _points(camera: Camera) -> Tensor:
     """(N, 2): the pixels that `filled` looks at, those of the rim at the end."""
-    height, width = size_of(camera)
+    height, width = camera.height, camera.width
     steps = torch.arange(1, _POINTS + 1, dtype=torch.float64)[:, None]
     spread = (steps / torch.tensor([_ROOT, _ROOT**2], dtype=torch.float64)).frac()
     corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -68,7 +67,7 @@ def scaled(camera: Camera, factor: Tensor) -> Camera:
     """The camera with focal lengths times a factor (*B,)."""
     one = torch.ones_like(factor)
     scale = torch.stack((factor, factor, one, one), -1)
-    return remade(camera, camera.intrinsics * scale, camera.distortion, camera.image_size)
+    return remade(camera, intrinsics=camera.intrinsics * scale)
 
 
 def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -85,9 +84,7 @@ def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float
     with torch.no_grad():
         if rotation is None:
             rotation = torch.eye(3, dtype=target.intrinsics.dtype, device=target.intrinsics.device)
-        factor, turned, found = _enough(
-            frozen(source, source.image_size), frozen(target, target.image_size), rotation, share
-        )
+        factor, turned, found = _enough(source.detach(), target.detach(), rotation, share)
         return factor, turned, found
 
 

@@ -22,10 +22,10 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_part, shown
 from camtorch._dtypes import narrow, widen
-from camtorch._module import Memo
+from camtorch._module import Memo, remade
 from camtorch.augment import compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change, camera_like
+from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
 from camtorch.camera import Camera
@@ -185,7 +185,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         device = own[0].device if device is None else device
         intrinsics, distortion = (params.get(n, value).to(device) for n, value in zip(_NUMBERS, own, strict=True))
         same = intrinsics is own[0] and distortion is own[1]
-        return self.camera if same else camera_like(self.camera, intrinsics, distortion, self.camera.image_size)
+        return self.camera if same else remade(self.camera, intrinsics=intrinsics, distortion=distortion)
 
     # -- moving
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change, singles
+from camtorch.augment.change import Change
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, check, kind_of
 from camtorch.camera import Camera
@@ -130,10 +130,10 @@ class Transform:
             moved = move(inside, **{key: value for key, value in options.items() if value is not None})
         camera = moved.get("camera")
         if isinstance(camera, Camera) and camera.batch_shape:
-            camera = moved["camera"] = singles(camera)[0]
+            camera = moved["camera"] = camera[0]
         after: Any = camera
         if camera is None and isinstance(self.last, Change):
-            after = self.last.parts[0].camera if self.last.parts[0].warp is None else self.last.parts[0].warp.target
+            after = self.last.parts[0].target
         result = {}
         for name, (tensors, restore) in entries.items():
             if restore is not None and tensors.keys() <= moved.keys():

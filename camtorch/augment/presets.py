@@ -7,8 +7,7 @@ from typing import Literal
 
 import torch
 
-from camtorch.augment.change import frozen
-from camtorch.camera import Camera
+from camtorch.camera import Camera, fixed_camera
 from camtorch.models import MODELS
 
 
@@ -25,8 +24,8 @@ class Preset:
 
     def camera(self) -> Camera:
         """The camera, in float32, with nothing to learn."""
-        model = MODELS[self.model](torch.tensor(self.intrinsics), torch.tensor(self.distortion))
-        return frozen(model, self.image_size)
+        numbers = torch.tensor(self.intrinsics), torch.tensor(self.distortion)
+        return fixed_camera(MODELS[self.model], *numbers, self.image_size)
 
 
 PresetName = Literal["webcam", "dms60", "dms90", "dms130", "surround190", "tumvi", "aria", "aria_rgb"]

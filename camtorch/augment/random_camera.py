@@ -12,16 +12,14 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees, fails
-from camtorch._module import Memo
+from camtorch._module import Memo, remade
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph
 from camtorch.augment.augmentation import Augmentation, Range, as_range
-from camtorch.augment.change import frozen, numbers_by, size_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import covering, drawn
-from camtorch.mixed import remade
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
@@ -194,6 +192,11 @@ class RandomCamera(Augmentation):
         zero = torch.zeros_like(angle)
         return self._target(source, values), mount_rotation(*(values.get(name, zero) for name in names))
 
+    def _warp(
+        self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
+    ) -> Warp:
+        return Warp(source, target, **self.options, target_shutter=shutter).turned_by(rotation)
+
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         shades = light = None
         if "chromatic" in values:
@@ -240,14 +243,14 @@ class RandomCamera(Augmentation):
         )
 
     def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
-        size = self.image_size or size_of(source)
+        size = self.image_size or (source.height, source.width)
         base = source if self.like is None else self.like
         if self._is_real:
             intrinsics, k, reach = drawn(values["lens"], size, self._among)
-            base = remade(_ANY, intrinsics, k, size)
+            base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if any(t.dtype != dtype or t.device != device for t in (base.intrinsics, base.distortion)):
-            base = numbers_by(base, lambda t: t.to(device, dtype))
+            base = base.each(lambda t: t.to(device, dtype))
         jitters = "distortion" in values and base.distortion.shape[-1] > 0
         if self.fov == "source":
             intrinsics = usual = self._from_source(source, base, size)
@@ -266,12 +269,14 @@ class RandomCamera(Augmentation):
         distortion = base.distortion
         if jitters:
             intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
-            distortion = jittered(frozen(remade(base, intrinsics, distortion, size), size), values["distortion"], usual)
+            sized = remade(base, intrinsics=intrinsics, image_size=size).detach()
+            distortion = jittered(sized, values["distortion"], usual)
             if in_graph(base.distortion):
                 distortion = base.distortion + (distortion - base.distortion.detach())
         if "crop" in values:
             fx, fy, cx, cy = _cropped(fx, fy, cx, cy, size, values["crop"], values["place"])
-        return remade(base, torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1), distortion, size)
+        intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
+        return remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
 
     def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens before anything was drawn; graph-free."""
@@ -319,9 +324,9 @@ class RandomCamera(Augmentation):
         """The lens with its image on the plane of unit focal length; the last one is kept, with what it tabulated."""
         ones = base.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0])
         if in_graph(base.distortion):
-            return remade(base, ones, base.distortion, None)
+            return remade(base, intrinsics=ones)
         k = base.distortion
-        kept: Camera = self._plane((k,), (type(base),), lambda: remade(base, ones, k.clone(), None))
+        kept: Camera = self._plane((k,), (type(base),), lambda: remade(base, intrinsics=ones, distortion=k.clone()))
         return kept
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
@@ -329,7 +334,7 @@ class RandomCamera(Augmentation):
 
         def narrowed() -> Tensor:
             fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
-            whole = remade(base, self._sized(base, size, fov), base.distortion, size)
+            whole = remade(base, intrinsics=self._sized(base, size, fov), image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
         numbers = source.intrinsics, source.distortion, base.intrinsics, base.distortion
@@ -383,19 +388,18 @@ class RandomLens(RandomCamera):
         super().__init__(like, fov=fov, focal=focal, centre=centre, distortion=distortion, **none, **options)
 
 
-_ANY = frozen(KannalaBrandt([1.0, 1.0, 0.0, 0.0]), None)
+_ANY = KannalaBrandt([1.0, 1.0, 0.0, 0.0]).detach()
 
 
 def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
     if like is None or isinstance(like, Camera):
         if like is not None and like.batch_shape:
             raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
-        return None if like is None else frozen(like, like.image_size)
+        return None if like is None else like.detach()
     if isinstance(like, str) and like in PRESETS:
         return PRESETS[like].camera()
     if isinstance(like, str) and like in MODELS:
-        ideal = MODELS[like]([1.0, 1.0, 0.0, 0.0])
-        return frozen(ideal, None)
+        return MODELS[like]([1.0, 1.0, 0.0, 0.0]).detach()
     close = get_close_matches(like, [_REAL, *PRESETS, *MODELS], 1) if isinstance(like, str) else []
     raise ValueError(
         f"{owner}: like must be a Camera, 'real', a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
@@ -406,7 +410,7 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
 def _across(camera: Camera) -> Tensor:
     """(*B,) degrees between the left and the right edge of the image, at the height of the principal point."""
     cy = camera.intrinsics[..., 3].detach()
-    u = torch.stack((torch.full_like(cy, -0.5), torch.full_like(cy, size_of(camera)[1] - 0.5)), -1)
+    u = torch.stack((torch.full_like(cy, -0.5), torch.full_like(cy, camera.width - 0.5)), -1)
     pixels = torch.stack((u, cy[..., None].expand_as(u)), -1)
     with torch.no_grad():
         rays = camera.unproject(pixels.expand(*camera.batch_shape, 2, 2))[0]
@@ -429,7 +433,7 @@ def _cropped(
 
 def _light(camera: Camera, loss: Tensor) -> Tensor:
     """(B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance."""
-    height, width = size_of(camera)
+    height, width = camera.height, camera.width
     cx, cy = camera.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
     grid = camera.pixel_grid()
     square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
@@ -508,7 +512,7 @@ def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
 
     That moves the rim by its share of the distance from the centre to the corner.
     """
-    camera = remade(camera, nominal.detach().double(), distortion.detach().double(), camera.image_size)
+    camera = remade(camera, intrinsics=nominal.detach().double(), distortion=distortion.detach().double())
     pixels = image_lattice(camera, _SIDE, _SIDE).flatten(0, 1)
     batch, count = camera.batch_shape, camera.distortion.shape[-1]
     odd = camera.odd_in_x | camera.odd_in_y
@@ -522,11 +526,11 @@ def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
         given = camera.distortion.expand(*batch, count).unsqueeze(-2)
         distortion, _ = _defined(camera, given + change, given)
         intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, count, 4)
-        ends.append(remade(camera, intrinsics, distortion, camera.image_size).project(rays))
+        ends.append(remade(camera, intrinsics=intrinsics, distortion=distortion).project(rays))
     (before, valid), (after, also) = ends
     moved = (after - before).norm(dim=-1) / (2 * _STEP)
     most = torch.where(valid & also & seen.unsqueeze(-2), moved, 0.0).amax(-1)
-    height, width = size_of(camera)
+    height, width = camera.height, camera.width
     corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
     return share * torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
 
@@ -545,7 +549,7 @@ def _rim(camera: Camera) -> tuple[Tensor, Tensor]:
     Of both: the image's edges, and where the lens ends. What is mapped has no holes: a lens that is invertible on the
     outline is so inside.
     """
-    height, width = size_of(camera)
+    height, width = camera.height, camera.width
     corners = camera.intrinsics.new_tensor([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
     intrinsics = camera.intrinsics.reshape(-1, 1, 4)
     focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
@@ -568,7 +572,7 @@ def _rim(camera: Camera) -> tuple[Tensor, Tensor]:
 def _ends(camera: Camera, distortion: Tensor) -> Tensor:
     """(*B, K, 2): in focal lengths, the last point along every azimuth that the lens of these coefficients maps."""
     ones = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
-    plane = remade(camera, ones, distortion.detach().double(), None)
+    plane = remade(camera, intrinsics=ones, distortion=distortion.detach().double())
     azimuths = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1]
 
     def seen(rays: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,9 +24,10 @@ from camtorch._arguments import (
     fails,
     no_camera,
 )
-from camtorch.augment.change import Change, alone, copied, on_device, singles
+from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
+from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 
@@ -193,7 +194,7 @@ def _holds_reals(value: object) -> bool:
         return any(isinstance(item, float) or _holds_reals(item) for item in value)
     if isinstance(value, np.ndarray):
         return value.ndim > 0 and np.issubdtype(value.dtype, np.floating)
-    return isinstance(value, Tensor) and value.ndim > 0 and value.is_floating_point()
+    return isinstance(value, Tensor) and value.ndim > 0 and value.dtype.is_floating_point
 
 
 def moves(kind: str, value: Tensor) -> Move:
@@ -209,12 +210,12 @@ def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
     """
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         value = torch.from_numpy(value)
-    if not isinstance(value, Tensor) or value.is_complex():
+    if not isinstance(value, Tensor) or value.dtype.is_complex:
         what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
         raise TypeError(
             f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{_hint(name)}"
         )
-    if kind not in IMAGES and not value.is_floating_point():
+    if kind not in IMAGES and not value.dtype.is_floating_point:
         value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
     return value
 
@@ -332,7 +333,7 @@ class SampleTransform(nn.Module):
     needs_camera: bool = True
     """Whether samples, or it, need a camera; edits do not."""
 
-    def _camera_of(self, named: Named) -> Camera | list[Camera]:
+    def _camera_of(self, named: Named) -> Camera:
         """The camera of a sample that has none, nor the augmentation."""
         how = f"give one as sample['camera'] or {self._name}(camera=...)"
         if self.needs_camera:
@@ -345,7 +346,7 @@ class SampleTransform(nn.Module):
                     f"first, (B, C, H, W), and camtorch.augment.numpy takes arrays as they are. A camera tells: {how}"
                 )
             if found in IMAGES and isinstance(value, list):
-                return [Unknown.of((one.shape[-2], one.shape[-1])) for one in value]
+                return Listed([Unknown.of((one.shape[-2], one.shape[-1])) for one in value])
             if found in IMAGES:
                 return Unknown.of((value.shape[-2], value.shape[-1]))
         raise ValueError(
@@ -375,7 +376,7 @@ class SampleTransform(nn.Module):
                 named[name] = (found, value)
         return named
 
-    def _batch(self, sample: Sample, predicted: bool = False) -> tuple[Named, bool, int, Camera | list[Camera]]:
+    def _batch(self, sample: Sample, predicted: bool = False) -> tuple[Named, bool, int, Camera]:
         """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras.
 
         predicted: whether it may hold what networks made, whose values may be bad.
@@ -408,18 +409,19 @@ class SampleTransform(nn.Module):
         self._check_cameras(camera, count, named, batched)
         values = [v for _, value in named.values() for v in (value if isinstance(value, list) else [value])]
         device = values[0].device if values else torch.device("cpu")
-        many = isinstance(camera, (list, tuple))
-        camera = [on_device(one, device) for one in camera] if many else on_device(alone(camera), device)
+        camera = alone(as_one(camera))
+        camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
         return named, batched, count, camera
 
     def _check_cameras(self, camera: object, count: int, named: Named, batched: bool) -> None:
-        cameras = list(camera) if isinstance(camera, (list, tuple)) else [camera]
+        several = isinstance(camera, (list, tuple, Listed))
+        cameras: list[Any] = list(camera) if several else [camera]  # type: ignore[call-overload]
         if not cameras:
             raise ValueError(f"{self._name}: an empty list of cameras; no samples have one camera, too")
-        if isinstance(camera, (list, tuple)) and len(cameras) != count:
+        if several and len(cameras) != count:
             raise ValueError(f"{self._name}: {len(cameras)} cameras for {count} samples")
         for i, one in enumerate(cameras):
-            name = f"camera[{i}]" if isinstance(camera, (list, tuple)) else "camera"
+            name = f"camera[{i}]" if several else "camera"
             if not isinstance(one, Camera):
                 raise TypeError(f"{self._name}: {name} must be a Camera; got {no_camera(one)}")
             if one.image_size is None:
@@ -483,13 +485,14 @@ class SampleTransform(nn.Module):
         if "rotation" not in named:
             put("rotation", change.rotation.clone())
         target = change.target
-        if isinstance(target, Camera) and not batched:
-            target = singles(target)[0]
+        if not batched and target.batch_shape:
+            target = target[0]
         if self.mirroring is not None:
             self._mirror(moved, named, change.mirrored, batched)
-        if not isinstance(target if isinstance(target, Camera) else next(iter(target), None), Unknown):
+        if not isinstance(change.parts[0].target, Unknown):
             # the change keeps cameras of its own, to go back by
-            moved["camera"] = copied(target) if isinstance(target, Camera) else [copied(one) for one in target]
+            target = target.clone()
+            moved["camera"] = list(target) if isinstance(target, Listed) else target
         return moved
 
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
@@ -538,7 +541,7 @@ class SampleTransform(nn.Module):
         result = moves(found, value)(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
-        return result.to(value.dtype) if value.is_floating_point() else result, valid
+        return result.to(value.dtype) if value.dtype.is_floating_point else result, valid
 
     def _put_valid(
         self, put: Callable[[str, Any], None], sample: Sample, name: str, valid: Tensor | list[Tensor], batched: bool

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from camtorch._arguments import GUESS_CAMERA, no_camera
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change, singles
+from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
 from camtorch.augment.sample import Unknown
 from camtorch.camera import Camera
@@ -133,8 +133,7 @@ class Transform(v2.Transform):
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.change(camera, self.augmentation.draw(1))
             self.augmentation.last, self._flags = change, []
-            (camera,) = singles(cast(Camera, change.target))
-            return {"change": change, "camera": camera}
+            return {"change": change, "camera": change.target[0]}
 
     def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
         """Move one input of a sample by the `params` of `make_params`."""

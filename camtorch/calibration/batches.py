@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, _as_plain, as_values
-from camtorch._module import BatchedModule
+from camtorch._module import BatchedModule, remade
 from camtorch.camera import Camera
 
 
@@ -50,7 +50,7 @@ def rows_of(camera: Camera, batch: torch.Size) -> Camera:
         tensor = getattr(camera, name).double()
         count = tensor.shape[-1]
         tensors[name] = tensor.reshape(count) if shared else tensor.expand(*batch, count).reshape(-1, count)
-    return camera.with_tensors(**tensors)
+    return remade(camera, **tensors)
 
 
 def learns(modules: Sequence[BatchedModule], *tensors: Tensor) -> bool:

@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.camera import Camera, from_values
+from camtorch._module import remade
+from camtorch.camera import Camera, fixed_camera
 from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
@@ -232,7 +234,7 @@ class Bundle:
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
         ]
         self.fixed = [
-            camera.with_tensors(intrinsics=p[0, :4], distortion=p[0, 4:]) if shared else None
+            remade(camera, intrinsics=p[0, :4], distortion=p[0, 4:]) if shared else None
             for camera, p, shared in zip(self.cameras, state.parameters, self.are_shared, strict=True)
         ]
         self.learns_bend = free.bend
@@ -299,7 +301,7 @@ class Bundle:
         frames = self.points(c, state, sight)
         camera, parameters = self.fixed[c], state.parameters[c]
         if camera is None:
-            camera = self.cameras[c].with_tensors(intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
+            camera = remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
         pixels, valid = camera.project(frames[-1])
         seen = sight.weights > 0
         residuals = torch.where((valid & seen)[..., None], pixels - sight.pixels, 0.0)
@@ -425,6 +427,7 @@ class Bundle:
 
 def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     """A frozen camera of the model, for others that have its number of coefficients."""
-    made = from_values(model._model, parameters[0, :4], parameters[0, 4:], (1, 1))
-    made._warned = True  # a step that is refused may have gone anywhere
+    kind = model if isinstance(model, type) else type_before_parametrizations(model)
+    made = fixed_camera(kind, parameters[0, :4], parameters[0, 4:])
+    made.warned = True  # a step that is refused may have gone anywhere
     return made

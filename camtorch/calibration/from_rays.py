@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch._arguments import Numbers, as_image_size, as_values
 from camtorch._threads import on_one_thread
 from camtorch.calibration.calibrate import as_model
-from camtorch.camera import Camera, from_values
+from camtorch.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.convert.conversion import Conversion
 from camtorch.models import UCM
@@ -79,11 +79,11 @@ def fit(
     names = asked.kind.names_of(asked.count) or ()
     starts = asked.kind.fit_start(names, *views.radii(lens, slopes, reach.clamp(max=math.pi)))
     ideal = slopes.new_tensor(asked.kind.ideal(asked.count)).expand(len(slopes), -1)
-    template = from_values(asked.kind._model, slopes, ideal, size or (1, 1))
+    template = fixed_camera(asked.kind, slopes, ideal, size or (1, 1))
     parameters = fitting.fit(template, seen, starts, slopes)
     parts = parameters[:, :4].reshape(*batch, 4), parameters[:, 4:].reshape(*batch, asked.count)
     camera = asked.kind(*parts[: 1 + (asked.count > 0)], image_size=size)
-    found, valid = from_values(asked.kind._model, parameters[:, :4], parameters[:, 4:], (1, 1)).project(seen.rays)
+    found, valid = fixed_camera(asked.kind, parameters[:, :4], parameters[:, 4:]).project(seen.rays)
     counts = seen.weights > 0
     shown = valid & counts
     errors = torch.where(shown, torch.linalg.vector_norm(found - seen.pixels, dim=-1), 0.0)
@@ -148,7 +148,7 @@ def _unified(seen: fitting.Observations, owner: str) -> Camera:
             "Is their frame another one (OpenGL's looks along -z, y up), or are the pixels (row, column)?"
         )
     lens = torch.stack(lenses)[best, torch.arange(len(best), device=best.device)]
-    return from_values(UCM._model, lens[:, :4], lens[:, 4:], (1, 1))
+    return fixed_camera(UCM, lens[:, :4], lens[:, 4:], (1, 1))
 
 
 def _line(m: Tensor, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -152,7 +152,7 @@ class _Task(NamedTuple):
             raise ValueError(
                 f"{owner}: the batch dims of {shapes}{also} and the camera's {tuple(camera.batch_shape)} do not fit"
             ) from None
-        dtype = working_dtype(points, seen_at, *camera._tensors)
+        dtype = working_dtype(points, seen_at, *camera.tensors)
         points = points.double().expand(*batch, count, 3).reshape(-1, count, 3)
         seen_at = seen_at.double().expand(*batch, count, 2).reshape(-1, count, 2)
         given = seen_at.new_ones(count) if given is None else given.double()
@@ -236,7 +236,7 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor,
     if len(rows) == 0:
         return _Found(translations[:, 0], rotations, translations)
     points, pixels, weights = (t.detach()[rows, None] for t in task[1:4])
-    parameters = torch.cat(task.camera._tensors, -1).detach()
+    parameters = torch.cat(task.camera.tensors, -1).detach()
     parameters = parameters[None] if parameters.ndim == 1 else parameters[rows]
     start = State(
         (parameters,),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
 from camtorch.calibration.rays import poses_from_rays
-from camtorch.camera import Camera, from_values
+from camtorch.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
 from camtorch.projection.rays import angles_from_axis
@@ -243,7 +243,7 @@ def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
 
 
 def _camera(model: type[Camera], parameters: Tensor, image_size: tuple[int, int]) -> Camera:
-    return from_values(model._model, parameters[:, :4], parameters[:, 4:], image_size)
+    return fixed_camera(model, parameters[:, :4], parameters[:, 4:], image_size)
 
 
 def _few(observations: Observations, image_size: tuple[int, int]) -> Observations:

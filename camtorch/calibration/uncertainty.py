@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values
 from camtorch.calibration.bundle import Adjusted, robust
-from camtorch.camera import Camera, from_values
+from camtorch.camera import Camera, fixed_camera
 from camtorch.least_squares.equations import Equations
 from camtorch.least_squares.jacobians import sensor_jacobians
 
@@ -61,7 +61,7 @@ class Spread(NamedTuple):
 
     def _of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
         intrinsics, k = self.parameters[:, :4], self.parameters[:, 4:]
-        rays, valid = from_values(self.model._model, intrinsics, k, (1, 1)).unproject(pixels)
+        rays, valid = fixed_camera(self.model, intrinsics, k).unproject(pixels)
         found = sensor_jacobians(self.model, k, rays)
         points, zero, one = found.points, torch.zeros_like(rays[..., 0]), torch.ones_like(rays[..., 0])
         focal = intrinsics[:, None, :2, None]

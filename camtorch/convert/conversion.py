@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_image_size, as_number, as_whole
+from camtorch._module import remade
 from camtorch.convert import views
 from camtorch.convert.fitting import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
@@ -101,7 +102,7 @@ def convert(
 
     limit = math.pi if max_angle is None else min(math.pi, max_angle)
     batch = source.batch_shape
-    tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
+    tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source.tensors]
     parts = []
     for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True):
         rays = reference(_with_numbers(source, *numbers), image_size, limit)
@@ -123,8 +124,7 @@ def convert(
 
 def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Camera:
     """A frozen camera of the source's model with these rows of numbers, even if they are none."""
-    rows = {"intrinsics": intrinsics, "distortion": distortion}
-    return source.with_tensors(**{name: nn.Parameter(value, requires_grad=False) for name, value in rows.items()})
+    return remade(source, intrinsics=intrinsics, distortion=distortion)
 
 
 class _Task(NamedTuple):
@@ -141,7 +141,7 @@ class _Task(NamedTuple):
     def of(self, rows: Tensor) -> _Task:
         """Those of the rows."""
         camera = self.source.camera
-        return self._replace(source=self.source.of(_with_numbers(camera, *(t[rows] for t in camera._tensors)), rows))
+        return self._replace(source=self.source.of(_with_numbers(camera, *(t[rows] for t in camera.tensors)), rows))
 
 
 class _Result(NamedTuple):

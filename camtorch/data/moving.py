@@ -13,7 +13,7 @@ from torch import Tensor
 from camtorch._arguments import as_mapping
 from camtorch._module import Memo
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Part, frozen
+from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.numpy import Transform
 from camtorch.augment.sample import Sample, kind_of
@@ -39,14 +39,14 @@ class Always(Augmentation):
             raise TypeError(f"{owner}: {type(warp).__name__} moves images alone; call it on them, without their labels")
         if warp.batch_shape:
             raise ValueError(f"{owner}: the warp must be a single one; got batch dims {tuple(warp.batch_shape)}")
-        source, target = (frozen(camera, camera.image_size) for camera in (warp.source, warp.target))
+        source, target = warp.source.detach(), warp.target.detach()
         super().__init__(camera=source, fields=fields, min_filled=0)
         rotation = None if warp.rotation is None else warp.rotation.detach()
         first, last = warp.shutter, warp.target_shutter
         shutters: Shutters = {"shutter": first and first.detached(), "target_shutter": last and last.detached()}
         self.warp = Warp(source, target, rotation, **warp.options, **shutters)
 
-    def _part(self, rows: Tensor | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         return Part(rows, self.warp, self.warp.source)
 
 

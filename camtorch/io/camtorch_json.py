@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import broadcast_shapes
+from camtorch._module import remade
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
@@ -56,7 +57,7 @@ def parse(record: Record) -> Rig:
 def _pose(rotation: Tensor, translation: Tensor) -> Extrinsics:
     """Of vectors that are no matrices, and of any length, as they learnt."""
     pose = Extrinsics(torch.zeros_like(rotation[..., None]), translation)
-    return pose.with_tensors(rotation=rotation.expand(pose.rotation.shape), translation=pose.translation)
+    return remade(pose, rotation=nn.Parameter(rotation.expand(pose.rotation.shape).clone()))
 
 
 def _camera(record: Record) -> Camera:

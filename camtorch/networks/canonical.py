@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, no_camera, shown
+from camtorch._editing import edited
 from camtorch._module import typed_as
 from camtorch._threads import on_one_thread
-from camtorch.augment.change import Change, Part, alone, by_kinds, copied, edited, size_of
+from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.sample import Named, Sample, SampleTransform, without_graph_in_workers
 from camtorch.camera import Camera
-from camtorch.mixed import Mixed
+from camtorch.mixed import Listed, Mixed
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.warp.affine import AffineWarp
 from camtorch.warp.sampling import Options, as_options
@@ -120,7 +121,8 @@ class CanonicalCamera(SampleTransform):
             moved = self._scaled(sample, named, batched, scale)
         else:
             moved = self._resized(sample, named, batched, self._change(camera, count))
-            moved["source_camera"] = copied(camera) if isinstance(camera, Camera) else [copied(one) for one in camera]
+            own = camera.clone()
+            moved["source_camera"] = list(own) if isinstance(own, Listed) else own
         moved["scale"] = scale if batched else scale.squeeze(0)
         return moved
 
@@ -142,11 +144,9 @@ class CanonicalCamera(SampleTransform):
         source = sample.pop("source_camera", None)
         if source is None:
             raise ValueError(f"{self._name}: to go back, the sample needs source_camera as it came out")
-        several = len(source) if not isinstance(source, Camera) or source.batch_shape else 1
-        change = self._change(source, several)
-        target = change.target
-        if isinstance(source, Camera) and isinstance(target, Camera) and not source.batch_shape:
-            target = alone(target)  # a batch dim would say that the sample has one
+        source = as_one(source)
+        change = self._change(source, len(source) if source.batch_shape else 1)
+        target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
         named, batched, count, _ = self._batch({**sample, "camera": target}, predicted=True)
         change = change if change.count == count else self._change(source, count)
         return self._resized(sample, named, batched, change.inverse())
@@ -156,11 +156,9 @@ class CanonicalCamera(SampleTransform):
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
-    def _scale_of_each(self, camera: Camera | Sequence[Camera], count: int) -> Tensor:
+    def _scale_of_each(self, camera: Camera, count: int) -> Tensor:
         """(count,)."""
-        if isinstance(camera, Camera):
-            return self.scale(camera).expand(count)
-        return torch.stack([self.scale(one) for one in camera]).expand(count)
+        return self.scale(camera).expand(count)
 
     def _scaled(self, sample: Sample, named: Named, batched: bool, scale: Tensor) -> Sample:
         """The sample with every length of the camera's frame times a factor (B,)."""
@@ -193,12 +191,12 @@ class CanonicalCamera(SampleTransform):
             del moved["rotation"]
         return moved
 
-    def _change(self, camera: Camera | Sequence[Camera], count: int) -> Change:
+    def _change(self, camera: Camera, count: int) -> Change:
         """From the cameras to those with the focal length."""
 
-        def part(rows: Tensor | None, source: Camera) -> Part:
+        def part(rows: list[int] | None, source: Camera) -> Part:
             scale = self.scale(source).double()
-            height, width = size_of(source)
+            height, width = source.height, source.width
             size = self.image_size
             if size is None:
                 sizes = {(max(round(height * s), 1), max(round(width * s), 1)) for s in scale.flatten().tolist()}

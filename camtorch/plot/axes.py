@@ -57,7 +57,7 @@ def check_single(camera: Camera) -> None:
 def size_of(camera: Camera) -> tuple[int, int]:
     """(height, width) of a single camera that must have them."""
     check_single(camera)
-    return camera._size("a plot")
+    return camera.size_for("a plot")
 
 
 def draw_frame(ax: Axes, height: int, width: int) -> None:

@@ -172,7 +172,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
         ValueError: a batch, no image size, or two different ones. ImportError: no matplotlib.
     """
     compared = differences.difference(a, b, remove_rotation=remove_rotation)
-    height, width = a._size("a difference")
+    height, width = a.size_for("a difference")
     ax = axes_or_new(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
     draw_frame(ax, height, width)
@@ -268,7 +268,7 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
 
 
 def _shade_without_rays(ax: Axes, camera: Camera) -> None:
-    height, width = camera._size("a plot")
+    height, width = camera.size_for("a plot")
     valid = camera.unproject(image_lattice(camera, 200, 200))[1]
     shade = np.ma.masked_array(np.ones((200, 200)), valid.numpy(force=True))
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)

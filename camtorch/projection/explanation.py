@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values, columns, working_dtype
+from camtorch._module import remade
 from camtorch.optics.charts import floor_of
 from camtorch.projection.rays import angles_from_axis, reach
 
@@ -62,7 +63,7 @@ def unusable(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> tuple[st
 
 def _reason(camera: Camera, row: dict[str, Tensor], point: Tensor) -> str:
     """Why a camera of this model with a row of usable values has no pixel for a point (3,)."""
-    camera = camera.with_tensors(**row)
+    camera = remade(camera, **row)
     shown = ", ".join(f"{value:.6g}" for value in point.tolist())
     if not bool(torch.isfinite(point).all()):
         return f"not finite: ({shown})"

@@ -102,7 +102,7 @@ def tangents(camera: Camera, pixels: Tensor) -> Tangents:
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
         by_v: Any = torch.func.jvp(camera.unproject, (pixels,), (below,), has_aux=True)
         return Tangents(by_u[0], by_u[1], by_v[1], by_u[2])
-    learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera._tensors))
+    learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera.tensors))
     with torch.inference_mode(False), torch.enable_grad():
         given = pixels if learns and pixels.requires_grad else pixels.detach().clone().requires_grad_()
         rays, valid = camera.unproject(given)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
+from camtorch._module import remade
 from camtorch.optics.derivatives import jacobian_of
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def image_edges(image_size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tens
 
 def image_lattice(camera: Camera, rows: int, columns: int) -> Tensor:
     """(rows, columns, 2): pixels in even steps from outer edge to outer edge of the image."""
-    return pixel_lattice(*image_edges(camera._size("a lattice of pixels"), camera.intrinsics), rows, columns)
+    return pixel_lattice(*image_edges(camera.size_for("a lattice of pixels"), camera.intrinsics), rows, columns)
 
 
 def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
@@ -91,7 +92,7 @@ def ideal(camera: CameraT) -> CameraT:
     slopes = slopes_at_axis(camera.optics, camera.distortion.detach()[None])[0]
     # that a chart or a table has a slope of its own is no distortion; rounding is no slope
     slopes = torch.where((slopes - 1).abs() > 1e-9, slopes, 1.0)
-    return camera.with_tensors(intrinsics=torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), distortion=values)
+    return remade(camera, intrinsics=torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), distortion=values)
 
 
 def reach(
@@ -139,7 +140,7 @@ def field_of_view(camera: Camera) -> Tensor:
 
     From outer edge to outer edge, or as far as there are rays; 0 where there are none. Graph-free.
     """
-    low, high = image_edges(camera._size("field_of_view"), camera.intrinsics)
+    low, high = image_edges(camera.size_for("field_of_view"), camera.intrinsics)
     (left, top), (right, bottom) = low, high
     cx, cy = camera.intrinsics.expand(*camera.batch_shape, 4)[..., 2:].clamp(low, high).unbind(-1)
     lines = (left, cy, right, cy), (cx, top, cx, bottom), (left, top, right, bottom), (left, bottom, right, top)

@@ -182,7 +182,7 @@ class Rectification(GeometryModule):
         """
         owner = "disparity_to_points"
         camera = self.camera_left
-        size = camera._size(owner)
+        size = camera.size_for(owner)
         d = as_values(disparity, "disparity", owner, camera.intrinsics.device)
         shape, count = tuple(d.shape), self.extrinsics.batch_shape.numel()
         if d.ndim not in (2, 3, 4) or shape[-2:] != size or (d.ndim > 2 and shape[-3] != 1):
@@ -274,7 +274,7 @@ class Rectification(GeometryModule):
             camera = self.camera_left
             depths = []
             for d in (least, most):
-                like = camera.intrinsics.new_full((1, *camera._size("depth_range")), float(d))
+                like = camera.intrinsics.new_full((1, *camera.size_for("depth_range")), float(d))
                 points, good = self._points(self._pixels(), like)
                 depth = points[..., 2] if self.projection == "perspective" else self.distance(points)
                 depths.append(depth[good])
@@ -334,7 +334,7 @@ class Rectification(GeometryModule):
         """
         check_path(path, "Rectification.save")
         matrices, pose = self.opencv(), self.extrinsics.matrix()
-        height, width = self.camera_left._size("Rectification.save")
+        height, width = self.camera_left.size_for("Rectification.save")
         values: dict[str, Value] = {"image_width": width, "image_height": height}
         for name, matrix in {"R": pose[:3, :3], "T": pose[:3, 3:], **matrices}.items():
             values[name] = matrix.detach().double().tolist()

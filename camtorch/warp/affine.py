@@ -49,11 +49,9 @@ class MirrorWarp(Warp):
         **options: Any,
     ):
         super().__init__(source, target, None, antialias=bool(antialias), **options)
-        self._set_rotation(rotation)
+        self.turned_by(rotation)
         self._decides = antialias is None
         self._halvings: list[int] | None = None
-        if rotation is not None:
-            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
 
     def forward(
         self,
@@ -71,7 +69,7 @@ class MirrorWarp(Warp):
             if smooth and not self._is_long() and not self._learns(inputs) and is_concrete(self.target.intrinsics):
                 where = self._kept(inputs, sampled[1])
                 if self._halvings is None:
-                    self._halvings = _halvings(where, self.source._size("Warp"))
+                    self._halvings = _halvings(where, self.source.size_for("Warp"))
                 if any(self._halvings):
                     return self._smoothed(images, where, self._halvings, *sampled)
         return super().forward(images, mode=mode, padding_mode=padding_mode, fill=fill)
@@ -108,7 +106,7 @@ class MirrorWarp(Warp):
         return result
 
     def _empty(self, images: Tensor, count: int) -> Tensor:
-        size = self.target._size("Warp")
+        size = self.target.size_for("Warp")
         if images.requires_grad or not images.is_cpu:
             return images.new_empty(count, images.shape[1], *size)
         return sampler.empty(images, count, size)
@@ -172,13 +170,13 @@ class AffineWarp(MirrorWarp):
     def _is_inside(self) -> bool:
         """Whether the edited images show nothing but the image."""
         low, high = self._edges.amin(1), self._edges.amax(1)
-        size = self._edges.new_tensor(self.source._size("Warp")[::-1])
+        size = self._edges.new_tensor(self.source.size_for("Warp")[::-1])
         return bool((low > -_NEARLY).all() & (high < size + _NEARLY).all())
 
     @cached_property
     def _edges(self) -> Tensor:
         """(B or 1, 2, 2): where two opposite corners of the edited image lie, from the corner of the image's pixels."""
-        height, width = self.target._size("Warp")
+        height, width = self.target.size_for("Warp")
         back = inverted(self._maps.detach())
         ends = back.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
         return (back[:, None, :, :2] * ends[None, :, None]).sum(-1) + back[:, None, :, 2] + 0.5
@@ -189,7 +187,7 @@ class AffineWarp(MirrorWarp):
         linear = matrices[:, :, :2]
         if not bool((linear.abs().sum(-1) == 1).all() & ((matrices - matrices.round()).abs() < _WHOLE).all()):
             return None
-        height, width = self.target._size("Warp")
+        height, width = self.target.size_for("Warp")
         moves = [[tuple(map(round, row)) for row in matrix] for matrix in matrices.tolist()]
         if all(move == moves[0] for move in moves):
             result, rows = self._empty(images, len(images)), [(slice(None), moves[0])]
@@ -222,7 +220,7 @@ class AffineWarp(MirrorWarp):
         """
         if not (self.antialias or self._decides) or mode == "nearest" or images.dtype == torch.bool:
             return None
-        height, width = self.target._size("Warp")
+        height, width = self.target.size_for("Warp")
         back = inverted(self._maps)
         scale = back[:, :, :2].abs().sum(-1)
         if not bool((back[:, 0, 1] == 0).all() & (scale > (1 if self.antialias else SHRINKS)).any()):
@@ -259,12 +257,12 @@ class AffineWarp(MirrorWarp):
         return [self.matrix]
 
     def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
-        return self._strip(range(self.target._size("Warp")[0]), padding)
+        return self._strip(range(self.target.size_for("Warp")[0]), padding)
 
     def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
-        width = self.target._size("Warp")[1]
+        width = self.target.size_for("Warp")[1]
         back = inverted(self._maps)
-        side = back.new_tensor(self.source._size("Warp")[::-1])[:, None]
+        side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
         # pixels to positions: (2 u + 1) / W - 1
         back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)
         dtype = torch.promote_types(self.source.intrinsics.dtype, torch.float32)

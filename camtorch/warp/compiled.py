@@ -12,7 +12,8 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import Memo
 from camtorch._opaque import CameraNumbers, opaque
-from camtorch.camera import Camera, from_values
+from camtorch._registry import CLASSES
+from camtorch.camera import Camera, fixed_camera
 from camtorch.native.sampler import layout
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
@@ -77,7 +78,7 @@ def warped(
 ) -> Tensor:
     """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`."""
     cameras = [n for c in (source, target) for n in (c._model, c.intrinsics.detach(), c.distortion.detach())]
-    sizes = [side for camera in (source, target) for side in camera._size("Warp")]
+    sizes = [side for camera in (source, target) for side in camera.size_for("Warp")]
     last = layout(images) == torch.channels_last
     options = tolerance, antialias, padding, mode, padding_mode, list(fill), last
     turned = None if rotation is None else rotation.detach()
@@ -115,8 +116,8 @@ def _warp(
     numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
 
     def positions() -> Sampling | Lattice:
-        source = from_values(source_model, *numbers[:2], sizes[:2])
-        target = from_values(target_model, *numbers[2:], sizes[2:])
+        source = fixed_camera(CLASSES[source_model], *numbers[:2], sizes[:2])
+        target = fixed_camera(CLASSES[target_model], *numbers[2:], sizes[2:])
         return locate(source, target, rotation, tolerance, antialias, range(sizes[2]), padding)
 
     inputs = [*numbers] if rotation is None else [*numbers, rotation]

@@ -30,7 +30,7 @@ class SurfaceWarp(Warp):
         raise NotImplementedError
 
     def _learned(self) -> Sampling:
-        return self._of_rows(range(self.target._size("Warp")[0]))
+        return self._of_rows(range(self.target.size_for("Warp")[0]))
 
     def _whole(self, padding: PaddingMode) -> Sampling:
         return self._learned()
@@ -39,7 +39,7 @@ class SurfaceWarp(Warp):
         if not self.antialias:
             return self._of_rows(rows)
         # the scale is that between neighbours
-        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size("Warp")[0]))
+        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target.size_for("Warp")[0]))
         return self._of_rows(around).part(slice(rows.start - around.start, rows.stop - around.start))
 
     def _of_rows(self, rows: range) -> Sampling:
@@ -53,7 +53,7 @@ class SurfaceWarp(Warp):
             directions = directions.expand(count, *directions.shape[1:])
         seen, mapped = seen_by(self.source, directions)
         mapped = mapped & has_ray & met
-        grid = to_positions(seen, mapped, self.source._size("Warp"))
+        grid = to_positions(seen, mapped, self.source.size_for("Warp"))
         return self._with_scale(grid, mapped)
 
     def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:

@@ -56,6 +56,8 @@ from camtorch.warp.sampling import (
 from camtorch.warp.shutter import RollingShutter, Shutters, averaged, in_motion
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from camtorch.maps.report import MapReport
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
@@ -181,6 +183,13 @@ class Warp(GeometryModule):
         else:
             self.register_buffer("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
 
+    def turned_by(self, rotation: Tensor | None) -> Self:
+        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
+        self._set_rotation(rotation)
+        if rotation is not None:
+            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
+        return self
+
     # -- images
 
     def forward(
@@ -212,12 +221,12 @@ class Warp(GeometryModule):
         if sampled[0] != "nearest" and self.target_shutter is not None and (moments := self._moments()):
             return averaged(images, [self._at(moment) for moment in moments], self.target_shutter.gamma, *sampled)
         inputs = self._inputs()
-        learns = images.is_floating_point() and self._learns(inputs)
+        learns = images.dtype.is_floating_point and self._learns(inputs)
         if self._is_operator() and not learns and compiled.takes(images, inputs):
             options = self.tolerance, self.antialias, self._reach(sampled[1]), *sampled
             return compiled.warped(images, self.source, self.target, self.rotation, *options)
         if self._is_long() and not (learns or in_graph(images)):
-            result = empty(images, self._count(images), self.target._size("Warp"))
+            result = empty(images, self._count(images), self.target.size_for("Warp"))
             kept: dict[int, Pyramid] = {}
             for rows in self._rows(None):
                 with torch.no_grad():
@@ -280,11 +289,11 @@ class Warp(GeometryModule):
         self, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
     ) -> tuple[Mode, PaddingMode, tuple[float, ...]]:
         """The options of one call, if they and the images are as they should be."""
-        if not isinstance(images, Tensor) or images.is_complex():
+        if not isinstance(images, Tensor) or images.dtype.is_complex:
             what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
-            hint = _way_in(images, self.source._size("Warp")) if hasattr(images, "__array_interface__") else ""
+            hint = _way_in(images, self.source.size_for("Warp")) if hasattr(images, "__array_interface__") else ""
             raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}{hint}")
-        shape, expected = tuple(images.shape), self.source._size("Warp")
+        shape, expected = tuple(images.shape), self.source.size_for("Warp")
         if images.ndim in (3, 4) and shape[-3:-1] == expected and shape[-2:] != expected:
             to = "(2, 0, 1)[None]" if len(shape) == 3 else "(0, 3, 1, 2)"
             raise ValueError(
@@ -332,7 +341,7 @@ class Warp(GeometryModule):
         where = where.pixels if isinstance(where, Lattice) else where
         grid = where.grid.detach()
         grid = grid if where.seam is None else where.seam.drawn_in(grid)
-        pixels = (grid + 1) * grid.new_tensor(self.source._size("Warp")[::-1]) / 2 - 0.5
+        pixels = (grid + 1) * grid.new_tensor(self.source.size_for("Warp")[::-1]) / 2 - 0.5
         return (where.mapped & self.source.contains(pixels)).unsqueeze(1)
 
     # -- where the images are sampled
@@ -373,7 +382,7 @@ class Warp(GeometryModule):
         if self._pinned is not None and (reach == self.padding_mode or isinstance(self._pinned, Sampling)):
             return self._pinned
         forms = [None if each is None else each.form for each in (self.shutter, self.target_shutter)]
-        options = (self.source._form, self.target._form, self.rotation is None, self.antialias, self.tolerance, *forms)
+        options = (self.source.form, self.target.form, self.rotation is None, self.antialias, self.tolerance, *forms)
         memo = self._memos[reach if self.tolerance else "zeros"]  # what is exact serves all
         kept: Sampling | Lattice = memo(inputs, options, lambda: self._whole(reach))
         return kept
@@ -408,7 +417,7 @@ class Warp(GeometryModule):
         if may:
             where = self.source, self.target, self.rotation
             return self._with_scale(*compiled.positions(*where, self.tolerance, padding))
-        return self._strip(range(self.target._size("Warp")[0]), padding)
+        return self._strip(range(self.target.size_for("Warp")[0]), padding)
 
     def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
         """Of some rows of the target."""
@@ -430,7 +439,7 @@ class Warp(GeometryModule):
         return self.between(self.source, self.target, self.rotation, **self.options, **shutters)
 
     def _rows(self, count: int | None) -> Iterator[range]:
-        height, width = self.target._size("Warp")
+        height, width = self.target.size_for("Warp")
         step = count or max(_STRIP // (max(math.prod(self.batch_shape), 1) * width), 1)
         return (range(top, min(top + step, height)) for top in range(0, height, step))
 
@@ -439,7 +448,7 @@ class Warp(GeometryModule):
         # compared first, sizes that a program leaves open would be bounded in it
         if self._pinned is not None or torch.compiler.is_compiling():
             return False
-        if math.prod((*self.batch_shape, *self.target._size("Warp"))) <= _MOST_KEPT:
+        if math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
             return False
         return not in_transform() and all(t.is_cpu and is_concrete(t) for t in self._inputs())
 
@@ -457,7 +466,7 @@ class Warp(GeometryModule):
     def _inputs(self) -> list[Tensor]:
         turned = [] if self.rotation is None else [self.rotation]
         shutters = [t for each in (self.shutter, self.target_shutter) if each is not None for t in each.tensors]
-        return [*self.source._tensors, *self.target._tensors, *turned, *shutters]
+        return [*self.source.tensors, *self.target.tensors, *turned, *shutters]
 
     # -- labels
 
@@ -498,7 +507,7 @@ class Warp(GeometryModule):
         boxes = as_values(boxes, "boxes", "Warp", self.source.intrinsics.device)
         if boxes.ndim == 0 or boxes.shape[-1] != 4:
             raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
-        if not boxes.is_floating_point():
+        if not boxes.dtype.is_floating_point:
             boxes = boxes.to(self.source.intrinsics.dtype)
         if not is_predicted(boxes):
             check_boxes(boxes, "boxes", "Warp")
@@ -534,7 +543,7 @@ class Warp(GeometryModule):
 
         They find what encloses the whole image, or such parts of it as show the source, and has no outline there.
         """
-        height, width = self.target._size("Warp")
+        height, width = self.target.size_for("Warp")
         share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
         lattice = torch.cartesian_prod(share * width, share * height) - 0.5
         with torch.no_grad():

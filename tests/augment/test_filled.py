@@ -236,9 +236,7 @@ def test_as_much_of_a_lens_as_the_source_fills(like, degrees):
         assert (ratio > 1 - 1e-6).all()
         assert torch.allclose(ratio[..., 0], ratio[..., 1])
         if ratio.max() > 1:  # a little wider, and something is missing
-            wider = ct.augment.camera_like(
-                narrower, narrower.intrinsics * torch.tensor([0.97, 0.97, 1, 1]), narrower.distortion, SIZE
-            )
+            wider = narrower.replace(intrinsics=narrower.intrinsics * torch.tensor([0.97, 0.97, 1, 1]))
             assert not ct.Warp(augmentation.camera, wider).valid_mask().all()
 
 

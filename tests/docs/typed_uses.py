@@ -106,7 +106,7 @@ class Shifted(ct.augment.Augmentation):
     def new_camera(self, source: ct.Camera, values: Mapping[str, Tensor]) -> tuple[ct.Camera, Tensor | None]:
         zero = torch.zeros_like(values["shift"])
         moved = source.intrinsics + torch.stack((zero, zero, values["shift"], zero), -1)
-        return ct.augment.camera_like(source, moved, source.distortion, source.image_size), None
+        return source.replace(intrinsics=moved), None
 
 
 def augmentations(camera: ct.Camera) -> None:

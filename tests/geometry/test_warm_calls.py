@@ -1,16 +1,18 @@
-"""How many files and functions a warm call leads its reader through."""
+"""How many files and functions a warm call leads its reader through, and how many calls of torch it makes."""
 
+import statistics
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 from cameras import one
+from torch.overrides import TorchFunctionMode
 
 import camtorch as ct
 
 # files, functions; one of the files is `_portable`, whose functions do here what torch's do
-MOST = {"project": (9, 33), "unproject": (9, 40)}
+MOST = {"project": (10, 35), "unproject": (10, 42)}
 ROOT = Path(ct.__file__).parent
 
 
@@ -60,3 +62,46 @@ def test_a_warm_augmentation_is_a_short_way(like):
     files = {path for path, _ in entered(augmentation, sample)}
     assert len([path for path in files if path.startswith("augment/")]) <= OWN, sorted(files)
     assert len(files) <= AUGMENTED[like] + (not ct.native_available()), sorted(files)
+
+
+class Calls(TorchFunctionMode):
+    """Counts calls of torch but reads of properties."""
+
+    count = 0
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        self.count += func.__name__ != "__get__"
+        return func(*args, **(kwargs or {}))
+
+
+def median_of_calls(function):
+    counts = []
+    for _ in range(10):
+        with Calls() as calls:
+            function()
+        counts.append(calls.count)
+    return statistics.median(counts[1:])
+
+
+def warped(image):
+    camera = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.01, -0.002, 0.001, 0.0], image_size=(480, 640))
+    target = ct.Pinhole([300.0, 300.0, 319.5, 239.5], image_size=(480, 640))
+    return ct.Warp(camera.requires_grad_(False), target.requires_grad_(False))(image)
+
+
+needs_the_native_sampler = pytest.mark.skipif(not ct.native_available(), reason="needs the native sampler")
+
+
+@needs_the_native_sampler
+def test_a_new_camera_and_its_warp_take_few_calls_of_torch():
+    image = torch.rand(1, 3, 480, 640)
+    assert median_of_calls(lambda: warped(image)) <= 275
+
+
+@needs_the_native_sampler
+def test_an_augmentation_takes_few_calls_of_torch():
+    camera = ct.Pinhole([500.0, 500.0, 319.5, 239.5], image_size=(480, 640)).requires_grad_(False)
+    augmentation = ct.augment.RandomCamera("kannala_brandt", fov=(60, 70), camera=camera)
+    image = torch.zeros(8, 1, 480, 640, dtype=torch.uint8)
+    sample = {"image": image, "mask": image, "keypoints": torch.rand(8, 68, 2) * 400}
+    assert median_of_calls(lambda: augmentation(sample)) <= 980

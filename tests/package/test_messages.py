@@ -60,7 +60,6 @@ WRONG = [
     (lambda: ct.Mixed.of_groups([CAMERA]), TypeError, r"Mixed: groups must be pairs \(rows, cameras\)"),
     (lambda: MIXED.by_groups("mei"), TypeError, r"Mixed: change must be a function of a camera.*got 'mei'"),
     (lambda: MIXED.distortion_names, TypeError, r"Mixed: cameras of several models have no distortion in common"),
-    (lambda: MIXED.with_tensors(), TypeError, r"Mixed: cameras of several models have no tensors in common"),
     (lambda: ct.Rig(CAMERA), TypeError, r"Rig: cameras must be a dict, as \{'left': Camera\}; got KannalaBrandt"),
     (lambda: ct.Rig({"a": CAMERA}, POSE), TypeError, r"Rig: extrinsics must be a dict, as \{'left': Extrinsics\}"),
     (lambda: ct.Rig({"a": CAMERA}, (1, 2)), TypeError, r"Rig: extrinsics must be a dict, or \(names, a batch\)"),

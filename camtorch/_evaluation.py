@@ -1,0 +1,156 @@
+"""How cameras project and unproject: which way a call takes, and what of the cameras is kept for the next one."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+from torch.nn.utils import parametrize
+
+from camtorch._arguments import Numbers, as_points
+from camtorch._module import Memo, is_constant, with_values
+from camtorch._portable import for_elsewhere
+from camtorch._tracing import FAKE_MODE, has_tangent, in_jit_trace, is_concrete, is_exporting, keeps_graph
+from camtorch.projection.explanation import unusable
+from camtorch.projection.project import Project
+from camtorch.projection.rows import Cameras
+from camtorch.projection.unproject import Unproject
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+
+def mapped(
+    camera: Camera, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
+) -> tuple[Tensor, Tensor]:
+    """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
+    batch, tensors = camera.batch_shape, camera.tensors
+    lead, dims = batch, len(batch)
+    if (
+        not isinstance(values, Tensor)
+        or any(t.dtype != values.dtype for t in tensors)
+        or values.device != tensors[0].device
+        or values.layout is not torch.strided
+        or values.ndim <= dims
+        or values.shape[-1] != size
+        or values.shape[:dims] != batch
+    ):
+        values, lead = as_points(values, name, size, batch, tensors, type(camera).__name__)
+    shape = values.shape[:-1]
+    rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
+    planes, valid = camera.evaluate(direction, rows, lead, tensors)
+    return planes.reshape((planes.shape[0], *shape)).movedim(0, -1), valid.reshape(shape)
+
+
+def evaluated(
+    camera: Camera,
+    direction: type[Project] | type[Unproject],
+    rows: Tensor,
+    lead: torch.Size,
+    tensors: Sequence[Tensor],
+    cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
+
+    Args:
+        camera: of the model.
+        direction: the way.
+        rows: points or pixels.
+        lead: the batch dims that C counts.
+        tensors: the cameras' intrinsics and distortion.
+        cameras_of: what is kept of those, if others than this camera are meant.
+    """
+    if is_exporting() and cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
+        with with_values(camera):
+            intrinsics, distortion = (per_row(t, lead, rows) for t in camera.tensors)
+            cameras = rows_of(camera, intrinsics, distortion)
+            cameras = cameras._replace(domain=cameras.domain.at_hand())
+        order = 1 if keeps_graph(rows) else 0
+        return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
+    intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
+    inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or partial(rows_of, camera)
+    if _is_plain(inputs):
+        if in_jit_trace() and torch.onnx.is_in_onnx_export():
+            raise RuntimeError(
+                f"{type(camera).__name__}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
+                "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
+                "requires_grad_(False) and called once before the export"
+            )
+        learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
+        keeps = learns and torch.is_grad_enabled()
+        cameras = cameras_of(intrinsics, distortion)
+        planes, valid = direction.apply(*inputs, cameras, type(camera), keeps)  # type: ignore[no-untyped-call]
+        return planes, valid
+    # what is compiled has no derivatives of derivatives
+    order = 1 if torch.compiler.is_compiling() else 2
+    known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
+    if for_elsewhere() and not keeps_graph(*inputs):
+        inputs = rows, intrinsics.detach(), distortion.detach()
+    return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
+
+
+def rows_of(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> Cameras:
+    """The rows' cameras, kept until a value changes."""
+    cameras: Cameras | None = camera.memo.result
+    if cameras is None or not cameras.are(intrinsics, distortion):
+        cameras = new_cameras(camera.memo, type(camera), intrinsics, distortion)
+    if cameras.usable is not None and not camera.warned:
+        _warn_of_unusable(camera, cameras, cameras.usable)
+    return cameras
+
+
+def _warn_of_unusable(camera: Camera, cameras: Cameras, usable: Tensor) -> None:
+    """Say once that learning drove Parameters of this module to where no camera is, and no gradient leads back."""
+    bad = (usable <= 0).flatten().nonzero()
+    found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
+    if found is not None and isinstance(getattr(camera, found[0]), nn.Parameter):
+        camera.warned = True
+        name = parametrize.type_before_parametrizations(camera).__name__
+        where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
+        keeps = (
+            "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
+            '"intrinsics", camtorch.PositiveFocal())'
+        )
+        keeps = keeps if found[0] == "intrinsics" else ""
+        warnings.warn(
+            f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
+            f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
+            stacklevel=2,
+        )
+
+
+def _is_plain(inputs: Sequence[Tensor]) -> bool:
+    """Whether nothing is traced and no transform is under way, of all that could be: asked once a call."""
+    if (
+        torch.compiler.is_compiling()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+        or torch._C._get_dispatch_mode(FAKE_MODE) is not None
+    ):
+        return False
+    return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)
+
+
+def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
+    """The cameras (C,) of one model, kept in a memo."""
+    inputs = intrinsics, distortion
+    cameras: Cameras = memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras.of(model, *inputs))
+    return cameras
+
+
+def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
+    """(*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
+    if parameters.dtype != rows.dtype:
+        parameters = parameters.to(rows.dtype)
+    if not lead:
+        return parameters.unsqueeze(0)
+    count = parameters.shape[-1]
+    if parameters.shape == (rows.shape[0], count):
+        return parameters
+    return parameters.expand(*lead, count).reshape(rows.shape[0], count)

@@ -1,0 +1,242 @@
+"""The numbers that a camera is made of, as users give them: checked, and from a matrix or a field of view."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import type_before_parametrizations
+
+from camtorch._arguments import (
+    Numbers,
+    as_batch,
+    as_flag,
+    as_image_size,
+    as_real,
+    check_degrees,
+    is_predicted,
+    shown,
+)
+from camtorch._module import remade
+from camtorch._tracing import in_graph, is_concrete
+from camtorch.projection.rays import AXES, focal_for
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+CameraT = TypeVar("CameraT", bound="Camera")
+
+_OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
+_LOOKED_AT = 64  # cameras of a batch: numbers in a wrong order are so in all of them
+_CENTRED, _NEAR = 0.1, 0.05
+"""Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
+
+
+def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
+    """Intrinsics (*B, 4) as a tensor, of a camera of this model.
+
+    Raises:
+        ValueError, TypeError: as `Camera`.
+    """
+    owner = model.__name__
+    intrinsics = as_real(intrinsics, "intrinsics", owner)
+    if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
+        hint = f". For a matrix K use {owner}.from_matrix" if intrinsics.shape[-2:] == (3, 3) else ""
+        hint = ". A column goes in as intrinsics[..., 0]" if intrinsics.shape[-2:] == (4, 1) else hint
+        raise ValueError(
+            f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
+        )
+    if _is_given(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
+        raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
+    return intrinsics
+
+
+def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Tensor) -> Tensor:
+    """Distortion (*B, n) as a tensor, of a camera of this model and of these intrinsics.
+
+    Raises:
+        ValueError, TypeError: as `Camera`.
+    """
+    owner = model.__name__
+    distortion = as_real(distortion, "distortion", owner)
+    known = distortion.ndim > 0 and model.names_of(distortion.shape[-1]) is not None
+    in_doubt = _is_column(model, distortion) and intrinsics.shape[:-1] != distortion.shape[:-1]
+    if known:
+        as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
+    if not known or in_doubt:
+        hint = _column_hint(distortion) if in_doubt else ""
+        raise ValueError(
+            f"{owner}: distortion must be (*B, n) with {model.counts_text()}; got shape {tuple(distortion.shape)}{hint}"
+        )
+    if _is_given(distortion):
+        defined = model.defined(distortion.unbind(-1))
+        if defined is not None and not bool((defined > 0).all()):
+            raise ValueError(f"{owner}: the formula needs {model.defined_text}; got {distortion.tolist()}")
+    return distortion
+
+
+def replaced(
+    camera: CameraT, intrinsics: Numbers | None, distortion: Numbers | None, image_size: Sequence[int] | None
+) -> CameraT:
+    """The camera with what is given in place of its own; see `Camera.replace`."""
+    model: type[CameraT] = type_before_parametrizations(camera)
+    changes: dict[str, Any] = {}
+    if image_size is not None:
+        changes["image_size"] = as_image_size(image_size, model.__name__)
+    now, k = camera.intrinsics, camera.distortion
+    if intrinsics is not None:
+        now = changes["intrinsics"] = checked_intrinsics(model, _as_tensor_of(camera, intrinsics, "intrinsics"))
+    if distortion is not None:
+        k = changes["distortion"] = checked_distortion(model, _as_tensor_of(camera, distortion, "distortion"), now)
+        changes["distortion_names"] = model.names_of(k.shape[-1])
+    batch = as_batch(model.__name__, intrinsics=now.shape, distortion=k.shape)
+    for name in changes.keys() & {"intrinsics", "distortion"}:
+        value = changes[name]
+        if not isinstance(value, nn.Parameter) and not in_graph(value):
+            own = value.detach().expand(*batch, value.shape[-1]).clone()
+            changes[name] = nn.Parameter(own, requires_grad=getattr(camera, name).requires_grad)
+    return remade(camera, **changes)
+
+
+def _as_tensor_of(camera: Camera, value: Numbers, name: str) -> Tensor:
+    """What is no tensor takes the camera's dtype and device."""
+    if isinstance(value, Tensor):
+        return value
+    as_real(value, name, type_before_parametrizations(camera).__name__)
+    return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
+
+
+def _is_given(values: Tensor) -> bool:
+    """Whether the values may be looked at, and bad ones are refused."""
+    return is_concrete(values) and not is_predicted(values)
+
+
+def _is_column(model: type[Camera], distortion: Tensor) -> bool:
+    """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
+    count = max(distortion.shape[:-1], default=1) if distortion.shape[-1:] == (1,) else 1
+    return count > 1 and model.names_of(count) is not None
+
+
+def _column_hint(distortion: Tensor) -> str:
+    count = max(distortion.shape)
+    return (
+        f". The {count} coefficients of one lens, a column in OpenCV, are distortion[..., 0]; one coefficient of "
+        f"each of {count} cameras goes with intrinsics ({count}, 4)"
+    )
+
+
+def numbers_of_matrix(
+    model: type[Camera],
+    K: Numbers,  # noqa: N803
+    distortion: Numbers | None,
+    ignore_skew: bool,
+) -> tuple[Tensor] | tuple[Tensor, Tensor]:
+    """Intrinsics, and distortion where it is given, of a matrix K; see `Camera.from_matrix`."""
+    owner = model.__name__
+    K = as_real(K, "K", owner)  # noqa: N806
+    if K.shape[-2:] != (3, 3):
+        raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
+    if is_concrete(K):
+        bottom = K[..., 2, :].detach()
+        if bool((bottom != bottom.new_tensor([0, 0, 1])).any()) or bool((K[..., 1, 0] != 0).any()):
+            raise ValueError(f"{owner}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
+        skew = K[..., 0, 1].detach()
+        if not as_flag(ignore_skew, "ignore_skew", owner) and bool((skew != 0).any()):
+            raise ValueError(
+                f"{owner}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
+                "ignore_skew=True drops it"
+            )
+    intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
+    if distortion is None:
+        return (intrinsics,)
+    distortion = as_real(distortion, "distortion", owner)
+    if not model.distortion_names:
+        raise ValueError(
+            f"{owner}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
+            "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
+        )
+    if K.ndim == 2 and distortion.numel() == max(distortion.shape, default=0):
+        distortion = distortion.flatten()
+    elif 2 < K.ndim == distortion.ndim and distortion.shape[-2] == 1:  # OpenCV's rows (1, n), stacked
+        distortion = distortion.squeeze(-2)
+    elif _is_column(model, distortion):
+        raise ValueError(
+            f"{owner}: distortion {tuple(distortion.shape)} beside K {tuple(K.shape)} leaves a doubt"
+            + _column_hint(distortion)
+        )
+    count = distortion.shape[-1] if distortion.ndim else 0
+    if count in _OF_CALIBRATE_CAMERA and (model.names_of(count) or ())[:3] == ("k1", "k2", "k3"):
+        raise ValueError(
+            f"{owner}: distortion has {count} coefficients, as those of OpenCV's calibrateCamera, k1 k2 p1 "
+            f"p2 k3 ..., which are a BrownConrady's; those of its fisheye are 4. {owner}(intrinsics, "
+            "distortion) takes any number"
+        )
+    return intrinsics, distortion
+
+
+def camera_of_fov(
+    model: type[CameraT], fov: Numbers, image_size: Sequence[int], axis: str, distortion: Numbers | None
+) -> CameraT:
+    """The camera of a field of view in degrees; see `Camera.from_fov`."""
+    owner = f"{model.__name__}.from_fov"
+    size = as_image_size(image_size, owner)
+    if size is None:
+        raise ValueError(f"{owner}: a field of view is one of an image; give its image_size=(height, width)")
+    if not isinstance(axis, str) or axis not in AXES:
+        raise ValueError(f"{owner}: axis must be one of {AXES}; got {shown(axis)}")
+    fov = torch.tensor(fov, dtype=torch.float64) if isinstance(fov, (int, float)) else fov
+    degrees = as_real(fov, "fov", owner).detach().double()
+    if is_concrete(degrees) and not bool(((degrees > 0) & (degrees <= 360)).all()):
+        raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
+    if is_concrete(degrees) and degrees.numel():
+        check_degrees(float(degrees.min()), degrees.tolist(), owner)
+    given = () if distortion is None else (as_real(distortion, "distortion", owner),)
+    plane = model(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
+    degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
+    focal, reached = focal_for(plane, degrees.deg2rad(), size, axis)
+    centre = focal.new_tensor([(size[1] - 1) / 2, (size[0] - 1) / 2]).expand(*focal.shape, 2)
+    intrinsics = torch.cat((focal[..., None], focal[..., None], centre), -1)
+    intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
+    made = model(intrinsics, *given, image_size=size)
+    if is_concrete(reached) and not bool(reached.all()):
+        widest = made.fov[..., AXES.index(axis)].flatten().tolist()
+        raise ValueError(
+            f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "
+            + ", ".join(f"{angle:.5g}" for angle in widest)
+        )
+    return made
+
+
+def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
+    """Warn of plain numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
+    if isinstance(intrinsics, nn.Parameter) or in_graph(intrinsics) or not _is_given(intrinsics):
+        return
+    rows = intrinsics.reshape(-1, 4)[:_LOOKED_AT].tolist()
+    if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
+        return
+    given = f"fx, fy, cx, cy = {rows[0]}"
+    cut_out = "The camera of a part of an image comes from camera.crop"
+    if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
+        warnings.warn(
+            f"{owner}: image_size={size} is (height, width), as image.shape, and the principal point of {given} is the "
+            f"middle of {size[::-1]}. OpenCV's (width, height) goes in turned round. {cut_out}",
+            stacklevel=3,
+        )
+    elif all(
+        _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
+        for fx, fy, cx, cy in rows
+    ):
+        warnings.warn(
+            f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
+            f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
+            stacklevel=3,
+        )
+
+
+def _off_centre(cx: float, cy: float, size: tuple[int, int]) -> float:
+    """How far a point is from the middle of an image, the larger one of the parts of its height and width."""
+    return max(abs(c - (side - 1) / 2) / side for c, side in zip((cx, cy), size[::-1], strict=True))

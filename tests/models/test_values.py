@@ -1,0 +1,155 @@
+"""Cameras are values: replaced, detached, cloned, indexed, expanded, put together, for every model."""
+
+import pytest
+import torch
+from cameras import KEYS, one
+
+import camtorch as ct
+
+SIZE = (60, 80)
+
+
+def camera_of(key, dtype=torch.float32, learns=True):
+    return one(key).to(dtype).replace(image_size=SIZE).requires_grad_(learns)
+
+
+def numbers(camera):
+    return torch.cat([t.expand(*camera.batch_shape, t.shape[-1]) for t in (camera.intrinsics, camera.distortion)], -1)
+
+
+MADE = {
+    "replace": lambda camera: camera.replace(image_size=SIZE),
+    "clone": lambda camera: camera.clone(),
+    "expand": lambda camera: camera.expand(2),
+    "index": lambda camera: camera.expand(3)[1],
+    "cat": lambda camera: ct.cat([camera, camera]),
+    "detach": lambda camera: camera.detach(),
+}
+
+
+@pytest.mark.parametrize("learns", [False, True])
+@pytest.mark.parametrize("way", MADE)
+@pytest.mark.parametrize("key", KEYS)
+def test_what_is_made_of_a_camera_has_its_numbers_and_learns_where_it_does(key, way, learns):
+    camera = camera_of(key, torch.float64, learns)
+    made = MADE[way](camera)
+    assert type(made) is type(camera)
+    assert made.image_size == SIZE
+    assert made.distortion_names == camera.distortion_names
+    assert made.intrinsics.dtype == torch.float64
+    assert torch.equal(numbers(made), numbers(camera).expand_as(numbers(made)))
+    assert made.intrinsics.requires_grad == (learns and way != "detach")
+    if made.intrinsics.requires_grad:
+        made.intrinsics.sum().backward()
+        assert torch.equal(camera.intrinsics.grad, torch.full((4,), float(made.batch_shape.numel())).double())
+    points = torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64)
+    seen = made.project(points.expand(*made.batch_shape, 3))[0]
+    assert torch.equal(seen, camera.project(points)[0].expand_as(seen))
+
+
+@pytest.mark.parametrize("learns", [False, True])
+@pytest.mark.parametrize("key", KEYS)
+def test_numbers_are_replaced(key, learns):
+    camera = camera_of(key, torch.float64, learns)
+    new = camera.replace(intrinsics=[30.0, 31.0, 40.0, 28.0], distortion=camera.distortion.tolist())
+    assert new.intrinsics.tolist() == [30.0, 31.0, 40.0, 28.0]
+    assert new.intrinsics.dtype == torch.float64
+    assert new.intrinsics.requires_grad == learns
+    assert torch.equal(new.distortion, camera.distortion)
+    batch = camera.replace(intrinsics=torch.ones(3, 4, dtype=torch.float64))
+    assert batch.batch_shape == (3,)
+    predicted = torch.full((2, 4), 30.0, dtype=torch.float64, requires_grad=True) * 2
+    assert camera.replace(predicted).intrinsics is predicted
+    assert camera.replace(predicted).distortion is camera.distortion
+
+
+def test_other_numbers_of_coefficients():
+    camera = ct.BrownConrady([50.0, 50.0, 39.5, 29.5], [0.1, 0.0, 0.0, 0.0], image_size=SIZE)
+    assert camera.replace(distortion=[0.1, 0.0, 0.0, 0.0, 0.2]).distortion_names[-1] == "k3"
+
+
+def test_a_copy_is_its_own_and_what_is_shared_is_not():
+    camera = camera_of("kannala_brandt", learns=False)
+    clone, shared = camera.clone(), camera.detach()
+    camera.intrinsics.data[0] = 33.0
+    assert clone.fx != 33.0
+    assert shared.fx == 33.0
+    assert not clone.clone().intrinsics.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("index", "rows"),
+    [
+        (slice(1, None), [1, 2]),
+        (-1, 2),
+        ([True, False, True], [0, 2]),
+        (torch.tensor([2, 0]), [2, 0]),
+        (torch.tensor([False, True, True]), [1, 2]),
+    ],
+)
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_batch_is_indexed_as_a_tensor(mixed, index, rows):
+    keys = ("kannala_brandt", "pinhole", "kannala_brandt") if mixed else ("kannala_brandt",) * 3
+    batch = ct.cat([camera_of(key).replace([30.0 + i, 30.0, 40.0, 30.0]) for i, key in enumerate(keys)])
+    assert isinstance(batch, ct.Mixed) == mixed
+    assert torch.equal(batch[index].intrinsics, batch.intrinsics[rows])
+
+
+def test_a_mixed_batch_is_a_value():
+    members = [camera_of("pinhole"), camera_of("mei", learns=False)]
+    mixed = ct.cat(members)
+    for made in (mixed.clone(), mixed.detach(), mixed.replace(image_size=(6, 8)), mixed.expand(2), ct.cat([mixed])):
+        assert isinstance(made, ct.Mixed)
+        assert torch.equal(made.intrinsics, mixed.intrinsics)
+        assert [type(one) for one in made] == [type(one) for one in members]
+    assert mixed.replace(image_size=(6, 8))[1].image_size == (6, 8)
+    assert not mixed.detach().intrinsics.requires_grad
+    assert torch.equal(mixed.replace(torch.ones(2, 4)).intrinsics, torch.ones(2, 4))
+    mixed.clone().intrinsics.sum().backward()
+    assert torch.equal(members[0].intrinsics.grad, torch.ones(4))
+    assert ct.cat([mixed, members[0]]).batch_shape == (3,)
+    assert mixed[:1].expand(4).batch_shape == (4,)
+
+
+def test_a_pose_is_a_value():
+    pose = ct.Extrinsics([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
+    assert torch.equal(pose.expand(2, 3).matrix(), pose.matrix().expand(2, 3, 4, 4))
+    assert not pose.detach().rotation.requires_grad
+    assert pose.clone().rotation.requires_grad
+
+
+CAMERA = camera_of("kannala_brandt")
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "said"),
+    [
+        (lambda: CAMERA.replace(intrinsics=[1.0, 2.0]), ValueError, r"KannalaBrandt: intrinsics must be \(\*B, 4\)"),
+        (
+            lambda: CAMERA.replace([-1.0, 1.0, 0.0, 0.0]),
+            ValueError,
+            "focal lengths must be positive; got fx, fy = .-1.0",
+        ),
+        (lambda: CAMERA.replace(distortion=[[]]), ValueError, r"distortion must be \(\*B, n\)"),
+        (lambda: CAMERA.replace([[1.0, 1.0, 0.0, 0.0]] * 2, [[0.0] * 4] * 3), ValueError, "do not fit together"),
+        (lambda: CAMERA.replace(image_size=(0, 3)), ValueError, r"image_size must be positive .*\(0, 3\)"),
+        (lambda: CAMERA.replace(intrinsics="f"), TypeError, "intrinsics must be numbers"),
+        (lambda: CAMERA.expand(2).expand(3), ValueError, r"batch dims \(2,\) do not expand to \(3,\)"),
+        (lambda: ct.cat([]), ValueError, "cat: an empty list"),
+        (lambda: ct.cat([CAMERA, 3]), TypeError, r"cat: cameras\[1\] must be a Camera; got int"),
+        (
+            lambda: ct.cat([CAMERA, CAMERA.crop(0, 0, 5, 5)]),
+            ValueError,
+            r"cat: .* one size; got .*\(60, 80\), \(5, 5\)",
+        ),
+        (lambda: ct.cat([CAMERA.expand(2, 2)]), ValueError, r"cat: cameras\[0\] has batch dims \(2, 2\)"),
+        (
+            lambda: ct.cat([CAMERA, camera_of("pinhole")]).replace(distortion=[0.0]),
+            TypeError,
+            "no distortion in common",
+        ),
+    ],
+)
+def test_errors_name_what_is_wrong(call, error, said):
+    with pytest.raises(error, match=said):
+        call()
