@@ -7,6 +7,7 @@ import torch
 from cameras import DISTINCT, KEYS, _limits, _summed, axis_slope, fan, make, one, pixel_lattice, slow_unless
 
 import camtorch as ct
+from camtorch._evaluation import rows_of
 from camtorch._module import Memo
 from camtorch.augment.presets import PRESETS
 from camtorch.optics import Equidistant, Lens, Planar, Polynomial, Tilt
@@ -101,7 +102,7 @@ def check(camera, monkeypatch):
 def test_most_lenses_of_stages_have_a_circle(key):
     """And a batch of them is answered as each alone."""
     camera = lenses(key, "mild")
-    stagewise = camera._cameras(camera.intrinsics, camera.distortion).domain.stagewise
+    stagewise = rows_of(camera, camera.intrinsics, camera.distortion).domain.stagewise
     assert stagewise.double().mean() > 0.3
     pixels = around(camera)
     rays, valid = camera.unproject(pixels)
@@ -115,7 +116,7 @@ def test_a_tilted_sensor_behind_a_radial_lens(monkeypatch):
     intrinsics = torch.tensor([[210.0, 212.0, 322.0, 236.0]], dtype=torch.float64)
     distortion = torch.tensor([[-0.1, -0.02, 0.02, -0.03]], dtype=torch.float64)
     camera = Leaning(intrinsics, distortion, image_size=(480, 640)).requires_grad_(False)
-    assert camera._cameras(camera.intrinsics, camera.distortion).domain.all_stagewise
+    assert rows_of(camera, camera.intrinsics, camera.distortion).domain.all_stagewise
     check(camera, monkeypatch)
 
 
@@ -134,7 +135,7 @@ def test_corners_without_a_ray_are_searched_for_once(dtype, monkeypatch):
     rays, valid = camera.rays()
     assert 0.3 < valid.double().mean() < 0.9
     assert sum(searched) < 0.001 * valid.numel()
-    lens = camera._cameras(camera.intrinsics[None], camera.distortion[None]).domain
+    lens = rows_of(camera, camera.intrinsics[None], camera.distortion[None]).domain
     assert "azimuths" not in lens.__dict__
     assert torch.isfinite(rays).all()
 

@@ -244,25 +244,6 @@ def test_predicted_cameras_inside():
     assert torch.allclose(by_weight, wanted, rtol=1e-4)
 
 
-def test_calls_are_as_many_as_models(monkeypatch):
-    calls = []
-    evaluated = ct.Camera._evaluated
-    monkeypatch.setattr(ct.Camera, "_evaluated", lambda self, *a: calls.append(type(self)) or evaluated(self, *a))
-    chosen = [camera for camera in one_of_each() if camera.key in EIGHT]
-    cameras = [copy.deepcopy(chosen[i % 8]) for i in range(64)]
-    mixed, points = ct.Mixed(cameras), values(3, 64)
-    pixels, _ = mixed.project(points)
-    assert len(calls) == len(set(calls)) == 8
-    assert torch.equal(pixels[13], cameras[13].project(points[13])[0])
-    calls.clear()
-    mixed.resize(24, 32).hflip().unproject(values(2, 64))
-    assert len(calls) == 8
-    target = copy.deepcopy(chosen[0]).requires_grad_(False)
-    calls.clear()
-    ct.Warp(mixed.requires_grad_(False), target)(torch.rand(64, 1, *SIZE, dtype=torch.float64))
-    assert len(calls) == 1 + 8
-
-
 class Counting(TorchDispatchMode):
     """Counts torch's operations."""
 

@@ -242,12 +242,13 @@ def test_it_is_a_module_like_others(tmp_path):
 
 def test_rows_are_independent_and_a_bad_one_is_alone():
     layer = random(head("kannala_brandt", 8), 1.0, torch.Generator().manual_seed(0))
-    features = torch.randn(4, 8)
+    features = torch.randn(4, 8, generator=torch.Generator().manual_seed(1))
     whole = layer(features)
-    torch.testing.assert_close(layer(features[2:3]).distortion, whole.distortion[2:3], rtol=1e-6, atol=1e-9)
+    # a product of matrices rounds by its size, and float32 keeps 1e-7 of numbers from which others are taken
+    torch.testing.assert_close(layer(features[2:3]).distortion, whole.distortion[2:3], rtol=1e-5, atol=1e-9)
     features[1, 0] = torch.nan
     assert all_have_rays(layer(features)).tolist() == [True, False, True, True]
-    assert bool(all_have_rays(layer(1e30 * torch.randn(4, 8))).all())
+    assert bool(all_have_rays(layer(1e30 * features[2:].flip(0))).all())
 
 
 @pytest.mark.slow
