@@ -239,7 +239,7 @@ def _observed(
     corners = {name: torch.where(seen[name], torch.view_as_complex(of), torch.inf) for name, of in pixels.items()}
     ordered = np.concatenate([np.sort(of.numpy(force=True) + 0.0, 1) for of in corners.values()], 1)
     first: dict[bytes, int] = {}
-    copy = has & torch.tensor([first.setdefault(row.tobytes(), i) != i for i, row in enumerate(ordered)]).to(device)
+    copy = has & torch.tensor([first.setdefault(row.tobytes(), i) != i for i, row in enumerate(ordered)], device=device)
     if bool(copy.any()):
         words = f"{owner}: left out, as the corners are those of another view in {_named(copy)}"
         warnings.warn(words, UserWarning, stacklevel=5)

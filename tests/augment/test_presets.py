@@ -38,7 +38,8 @@ def test_every_draw_around_a_preset_has_a_ray_for_every_point_of_its_image(name,
         assert target.unproject(edge.expand(64, -1, -1))[1].all()
 
 
-@pytest.mark.parametrize("amount", [pytest.param(0.02, marks=pytest.mark.slow), 0.2])
+@pytest.mark.slow
+@pytest.mark.parametrize("amount", [0.02, 0.2])
 def test_a_drawn_lens_loses_no_pixel_that_its_like_has(amount):
     """Where a calibrated lens itself ends within the image, too."""
     size, none = (240, 320), {"focal": (1, 1), "centre": (0, 0)}

@@ -5,7 +5,7 @@ from math import radians
 
 import pytest
 import torch
-from cameras import GOLDEN, KEYS, RARE_ARE_SLOW, drawn, golden_camera, make, one, pixel_lattice, slow_unless
+from cameras import GOLDEN, KEYS, RARE_ARE_SLOW, drawn, each_kind, golden_camera, make, one, pixel_lattice, slow_unless
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -61,7 +61,7 @@ def check(source, result):
 # -- every model
 
 
-@pytest.mark.parametrize("key", KEYS)
+@each_kind
 def test_to_the_same_model_is_a_copy(key):
     source = one(key)
     result = source.convert(key)
@@ -124,7 +124,7 @@ CLOSE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("make_source", "target", "options", "limit"), slow_unless(CLOSE[::3].__contains__, CLOSE))
+@pytest.mark.parametrize(("make_source", "target", "options", "limit"), slow_unless(CLOSE[::6].__contains__, CLOSE))
 def test_close_conversions(make_source, target, options, limit):
     source = make_source()
     result = source.convert(target, **options)
@@ -263,9 +263,10 @@ def test_models_say_what_they_generalise(monkeypatch):
 # -- batches
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "options"),
-    [("brown_conrady", {"max_angle": 0.8, "count": 5}), pytest.param("equirectangular", {}, marks=pytest.mark.slow)],
+    [("brown_conrady", {"max_angle": 0.8, "count": 5}), ("equirectangular", {})],
 )
 def test_a_batch_is_its_rows_one_by_one(target, options):
     source = fisheye((4, 8))

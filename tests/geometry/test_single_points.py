@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)])
 def test_a_pixel_is_valid_alone_as_in_a_batch(key, dtype):
     """The images of rays around the fold, where it is hard to tell, and pixels far from any ray."""
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, real
+from cameras import DISTINCT, KEYS, each_kind, real
 from test_mixed import one_of_each
 
 import camtorch as ct
@@ -140,7 +140,7 @@ def missed(camera, distance):
     return (again - around).norm(dim=-1)[clear].mean().item()
 
 
-@pytest.mark.parametrize("key", KEYS)
+@each_kind
 def test_local_pinholes_miss_by_the_square_of_the_distance(key):
     camera = next(iter(real(key).values()))
     camera.image_size = camera.image_size or (480, 640)

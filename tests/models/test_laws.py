@@ -12,7 +12,6 @@ from cameras import (
     RANGES,
     RARE_ARE_SLOW,
     REAL,
-    USUAL,
     axis_slope,
     constants,
     drawn,
@@ -203,7 +202,7 @@ def learning(camera, intrinsics, distortion):
 derivative_cameras = pytest.mark.parametrize(
     ("key", "camera_of"),
     slow_unless(
-        lambda case: case[0] in USUAL and case[1] is spread,
+        lambda case: case[0] in DISTINCT | {"brown_conrady"} and case[1] is spread,
         [(key, of) for of in (one, spread) for key in KEYS],
     ),
 )
@@ -323,7 +322,7 @@ def test_bad_points(key, dtype):
     check_bad_rows(camera, "project", near_and_far_rays().to(dtype), torch.tensor(bad_points(camera), dtype=dtype))
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize("number", [math.nan, -math.inf, 1e30])
 def test_one_bad_number_among_good_ones(key, number):
     """Nothing else in the batch draws attention to it."""
@@ -341,7 +340,7 @@ def test_one_bad_number_among_good_ones(key, number):
             torch.testing.assert_close(result[others], expected[others], rtol=1e-13, atol=1e-13)
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize("again", [False, True])
 def test_cotangents_of_invalid_rows_may_be_anything(key, again):
     """The root of a pixel of -1, or of the radius of the axis: an invalid row is left out later, not before."""
@@ -405,7 +404,7 @@ def test_bad_pixels(key, dtype):
 @distinct_models
 @both_precisions
 @pytest.mark.parametrize("method", ["project", "unproject"])
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(data=st.data())
 def test_any_number_gives_finite_results(key, dtype, method, data):
     """Also the largest and smallest numbers there are; an invalid row has no gradient."""
@@ -561,7 +560,7 @@ def test_pixels_around_the_image_of_the_fold(key, name, dtype):
 # -- batches
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize(("batch", "dims"), [((3,), ()), ((2, 3), (4, 2)), ((1,), (2, 1, 3))])
 def test_batch_equals_loop(key, batch, dims):
     generator = torch.Generator().manual_seed(1)
@@ -640,7 +639,7 @@ def check_same_view(edited, camera, mirror, move):
     torch.testing.assert_close(moved, rays * torch.tensor(mirror, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize("name", EDITS)
 def test_edits(key, name):
     edit, move, size = EDITS[name]
@@ -651,7 +650,7 @@ def test_edits(key, name):
     check_same_view(edited, camera, (1, 1, 1), move)
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize("name", FLIPS)
 def test_flips(key, name):
     flip, mirror, move = FLIPS[name]

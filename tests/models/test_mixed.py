@@ -370,7 +370,8 @@ def test_what_it_cannot_be_is_told():
         mixed.project(torch.rand(3, 5, 3))
 
 
-@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 2])
 def test_training_on_samples_from_eight_models(workers):
     """Samples, batches, augmentation, rays, network and loss: where a spot lies, as a direction, is learned."""
     cameras = [camera.float().requires_grad_(False) for camera in one_of_each() if camera.key in EIGHT]

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from cameras import fan
+from cameras import fan, slow_unless
 from torch.autograd import gradcheck, gradgradcheck
 
 import camtorch as ct
@@ -137,7 +137,7 @@ def check_derivatives(function, inputs):
     assert gradgradcheck(function, inputs, atol=1e-4, fast_mode=True)
 
 
-@every_camera
+@pytest.mark.parametrize("model", slow_unless({Waved, Backwards}.__contains__, list(CAMERAS)))
 def test_derivatives(model):
     camera = camera_of(model)
     leaves = [p.detach().clone().requires_grad_() for p in camera.parameters()]

@@ -142,7 +142,7 @@ def test_field_of_view_of_a_batch_is_that_of_its_cameras(key):
 # -- from a field of view
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize(("axis", "degrees"), [("horizontal", 95), ("vertical", 25), ("diagonal", 60.5)])
 def test_a_camera_of_a_field_of_view(key, axis, degrees):
     camera = ct.MODELS[key].from_fov(degrees, image_size=SIZE, axis=axis)

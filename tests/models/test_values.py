@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cameras import KEYS, one
+from cameras import KEYS, each_kind, one
 
 import camtorch as ct
 
@@ -29,7 +29,7 @@ MADE = {
 
 @pytest.mark.parametrize("learns", [False, True])
 @pytest.mark.parametrize("way", MADE)
-@pytest.mark.parametrize("key", KEYS)
+@each_kind
 def test_what_is_made_of_a_camera_has_its_numbers_and_learns_where_it_does(key, way, learns):
     camera = camera_of(key, torch.float64, learns)
     made = MADE[way](camera)
