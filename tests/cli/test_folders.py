@@ -15,7 +15,7 @@ import pytest
 from command_line import MATRIX, command, opened, refused, write_photograph
 from PIL import Image
 
-TRIALS = int(os.environ.get("CAMTORCH_TRIALS", "3"))
+TRIALS = int(os.environ.get("CAMTORCH_TRIALS", "1"))
 WORDS = ["dewarp", "in", "--camera", "camera.yml", "-o", "out/"]
 
 

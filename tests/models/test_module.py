@@ -84,7 +84,13 @@ def test_compile_to_machine_code():
     assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
 
 
-@few_models
+@pytest.mark.parametrize(
+    ("key", "method"),
+    slow_unless(
+        ("kannala_brandt", "project").__eq__,
+        [case for case in BOTH_WAYS if case[0] in ("fisheye624", "kannala_brandt", "f_theta_backward")],
+    ),
+)
 def test_export(key, method):
     module, values = module_and_input(key, method)
     count = torch.export.Dim("count", min=2)
