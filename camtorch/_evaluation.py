@@ -97,10 +97,10 @@ def evaluated(
 
 def rows_of(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The rows' cameras, kept until a value changes."""
-    cameras: Cameras | None = camera.memo.result
+    cameras: Cameras | None = camera._memo.result
     if cameras is None or not cameras.are(intrinsics, distortion):
-        cameras = new_cameras(camera.memo, type(camera), intrinsics, distortion)
-    if cameras.usable is not None and not camera.warned:
+        cameras = new_cameras(camera._memo, type(camera), intrinsics, distortion)
+    if cameras.usable is not None and not camera._warned:
         _warn_of_unusable(camera, cameras, cameras.usable)
     return cameras
 
@@ -110,7 +110,7 @@ def _warn_of_unusable(camera: Camera, cameras: Cameras, usable: Tensor) -> None:
     bad = (usable <= 0).flatten().nonzero()
     found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
     if found is not None and isinstance(getattr(camera, found[0]), nn.Parameter):
-        camera.warned = True
+        camera._warned = True
         name = parametrize.type_before_parametrizations(camera).__name__
         where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
         keeps = (

@@ -175,8 +175,8 @@ class Camera(BatchedModule):
         self.image_size = size = as_image_size(image_size, owner)
         if size is not None:
             warn_of_order(intrinsics, size, owner)
-        self.memo, self._rays, self._fields = Memo(), Memo(), Memo()
-        self.warned = is_predicted(intrinsics) or is_predicted(distortion)
+        self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
+        self._warned = is_predicted(intrinsics) or is_predicted(distortion)
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, distortion.shape[-1]))
 
