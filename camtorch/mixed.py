@@ -214,7 +214,7 @@ class Mixed(Camera):
                 found = new_cameras(group.memo, group.model, intrinsics, distortion)
             if found.usable is not None:
                 for member in map(self._member, group.members):
-                    if not member.warned:
+                    if not member._warned:
                         lead = member.batch_shape
                         camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member.tensors))
             return found

@@ -429,5 +429,5 @@ def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     """A frozen camera of the model, for others that have its number of coefficients."""
     kind = model if isinstance(model, type) else type_before_parametrizations(model)
     made = fixed_camera(kind, parameters[0, :4], parameters[0, 4:])
-    made.warned = True  # a step that is refused may have gone anywhere
+    made._warned = True  # a step that is refused may have gone anywhere
     return made
