@@ -5,7 +5,7 @@ from math import radians
 
 import pytest
 import torch
-from cameras import GOLDEN, KEYS, RARE_ARE_SLOW, drawn, each_kind, golden_camera, make, one, pixel_lattice, slow_unless
+from cameras import GOLDEN, KEYS, drawn, each_kind, golden_camera, make, one, pixel_lattice, slow_unless
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +14,10 @@ import camtorch as ct
 F64 = {"dtype": torch.float64}
 SIZE = (480, 640)
 ROUNDING = 1e-11  # px
+
+few_models = pytest.mark.parametrize(
+    "key", slow_unless({"fisheye624", "kannala_brandt", "division"}.__contains__, KEYS)
+)
 
 
 def golden(name):
@@ -73,7 +77,7 @@ def test_to_the_same_model_is_a_copy(key):
     assert result.camera.intrinsics is not source.intrinsics
 
 
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@few_models
 def test_from_every_model_as_the_numbers_say(key):
     source = one(key)
     result = source.convert(ct.KannalaBrandt, count=4)
@@ -84,7 +88,7 @@ def test_from_every_model_as_the_numbers_say(key):
     assert float(use.sum() / valid.sum()) == pytest.approx(float(result.valid_fraction), abs=0.03)
 
 
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@few_models
 def test_to_every_model_as_the_numbers_say(key):
     source = ct.KannalaBrandt([300.0, 305, 321, 238], [0.02, -0.01, 0.003, -0.001], image_size=SIZE)
     result = source.convert(key, max_angle=radians(40))
@@ -96,7 +100,7 @@ def test_to_every_model_as_the_numbers_say(key):
     assert float(result.max_error) < (60 if not one(key).distortion_names else 20)
 
 
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@few_models
 def test_a_conversion_back_finds_the_camera(key):
     source = one(key)
     there = source.convert(ct.Fisheye624, max_angle=radians(35))
@@ -448,7 +452,7 @@ def test_nothing_between_the_nodes_of_drawn_cameras_is_worse(key, data):
         assert largest(source, result) <= margin * float(result.max_error) + 1e-9
 
 
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@few_models
 @given(data=st.data())
 @settings(max_examples=1)
 def test_wild_cameras_become_something_finite(key, data):

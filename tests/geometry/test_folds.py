@@ -3,6 +3,7 @@
 import mpmath
 import pytest
 import torch
+from cameras import slow_unless
 
 import camtorch as ct
 from camtorch import lenses
@@ -78,7 +79,7 @@ def valid_at(key, coefficients, radius):
     return camera.project(torch.stack(rays, -1).unsqueeze(1))[1].squeeze(1)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", slow_unless({"kannala_brandt", "rational", "f_theta_backward"}.__contains__, MODELS))
 def test_a_lens_is_valid_up_to_the_first_root(name):
     key, spread, polynomials, of_squares, furthest = MODELS[name]
     draws = torch.randn(COUNT, len(spread), generator=torch.Generator().manual_seed(7), dtype=torch.float64)

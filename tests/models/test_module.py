@@ -59,10 +59,10 @@ def parameters_of(module):
 
 # tracing takes seconds
 BOTH_WAYS = [(key, method) for key in sorted(DISTINCT) for method in ("project", "unproject")]
-few_models = pytest.mark.parametrize(("key", "method"), slow_unless(("kannala_brandt", "project").__eq__, BOTH_WAYS))
 
 
-@few_models
+@pytest.mark.slow
+@pytest.mark.parametrize(("key", "method"), BOTH_WAYS)
 def test_compile_without_graph_breaks(key, method):
     module, values = module_and_input(key, method)
     compiled = torch.compile(module, fullgraph=True, backend="aot_eager")
