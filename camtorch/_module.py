@@ -299,9 +299,16 @@ def learning_as(made: Made, source: BatchedModule) -> Made:
 
 def fixed(tensor: Tensor) -> Tensor:
     """A Parameter or a tensor of a graph as it is, and any other as a Parameter that does not learn, without a copy."""
-    if isinstance(tensor, nn.Parameter) or in_graph(tensor):
+    if isinstance(tensor, nn.Parameter) or (in_graph(tensor) and not _is_cut_off(tensor)):
         return tensor
     return nn.Parameter(tensor, requires_grad=False)
+
+
+def _is_cut_off(tensor: Tensor) -> bool:
+    """Whether it is a view, taken without a graph, of what learns: torch says that it learns, and it does not."""
+    if torch.compiler.is_compiling() or not tensor.is_leaf or tensor._base is None:
+        return False
+    return tensor._base.requires_grad
 
 
 class Memo:

@@ -89,20 +89,21 @@ def replaced(
         changes["image_size"] = as_image_size(image_size, model.__name__)
     now, k = camera.intrinsics, camera.distortion
     if intrinsics is not None:
-        now = changes["intrinsics"] = checked_intrinsics(model, _as_tensor_of(camera, intrinsics, "intrinsics"))
+        now = changes["intrinsics"] = checked_intrinsics(model, as_numbers_of(camera, intrinsics, "intrinsics"))
     if distortion is not None:
-        k = changes["distortion"] = checked_distortion(model, _as_tensor_of(camera, distortion, "distortion"), now)
+        k = changes["distortion"] = checked_distortion(model, as_numbers_of(camera, distortion, "distortion"), now)
         changes["distortion_names"] = model.names_of(k.shape[-1])
     batch = as_batch(model.__name__, intrinsics=now.shape, distortion=k.shape)
     for name in changes.keys() & {"intrinsics", "distortion"}:
         value = changes[name]
         if not isinstance(value, nn.Parameter) and not in_graph(value):
             own = value.detach().expand(*batch, value.shape[-1]).clone()
+            own = own.float() if own.dtype.itemsize < 4 else own
             changes[name] = nn.Parameter(own, requires_grad=getattr(camera, name).requires_grad)
     return remade(camera, **changes)
 
 
-def _as_tensor_of(camera: Camera, value: Numbers, name: str) -> Tensor:
+def as_numbers_of(camera: Camera, value: Numbers, name: str) -> Tensor:
     """What is no tensor takes the camera's dtype and device."""
     if isinstance(value, Tensor):
         return value

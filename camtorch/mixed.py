@@ -12,10 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import Numbers, as_points, as_real, no_camera, shown, working_dtype
+from camtorch._arguments import Numbers, as_points, no_camera, shown, working_dtype
 from camtorch._evaluation import new_cameras, per_row
 from camtorch._evaluation import rows_of as camera_rows
 from camtorch._module import Memo, remade
+from camtorch._numbers import as_numbers_of
 from camtorch.camera import Camera
 from camtorch.projection.project import Project
 from camtorch.projection.unproject import Unproject
@@ -66,6 +67,8 @@ class Mixed(Camera):
     is_mixed = True
     one_size: ClassVar[bool] = True
     """Whether the images of all must be of one size."""
+    one_dtype: ClassVar[bool] = True
+    """Whether the numbers of all become those of the widest dtype."""
     cameras: nn.ModuleList
     """What it was made of: single cameras and batches."""
 
@@ -82,10 +85,15 @@ class Mixed(Camera):
         self._rays, self._fields = Memo(), Memo()
         kinds: dict[tuple[object, ...], list[int]] = {}
         for row, (i, _) in enumerate(self._places):
-            kinds.setdefault(kind(members[i]), []).append(row)
+            kinds.setdefault(self._kind(members[i]), []).append(row)
         self._groups = tuple(self._group(members, rows) for rows in kinds.values())
         places_in_groups = {row: n for n, row in enumerate(row for group in self._groups for row in group.rows)}
         self._order = tuple(places_in_groups[row] for row in range(len(self._places)))
+
+    @staticmethod
+    def _kind(camera: Camera) -> tuple[object, ...]:
+        """What the cameras of a group have in common."""
+        return kind(camera)
 
     def _group(self, members: Sequence[Camera], rows: Sequence[int]) -> _Group:
         places = [self._places[row] for row in rows]
@@ -140,7 +148,7 @@ class Mixed(Camera):
         for group in self._groups:
             pairs = [members[i].tensors for i in group.members]
             tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
-        if all(t.dtype == tensors[0].dtype for t in tensors):
+        if not self.one_dtype or all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
         wide = working_dtype(tensors[0], *tensors)
         return tuple(t.to(wide) for t in tensors)
@@ -259,11 +267,21 @@ class Mixed(Camera):
             self._refuse("distortion", "camera.by_groups(lambda group: group.replace(distortion=...)) replaces it")
         if intrinsics is None:
             return self.by_groups(lambda group: group.replace(image_size=image_size))
-        given = as_real(intrinsics, "intrinsics", "Mixed")
+        given = as_numbers_of(self, intrinsics, "intrinsics")
         if given.shape not in ((4,), (1, 4), (len(self), 4)):
             raise ValueError(f"Mixed: intrinsics must be ({len(self)}, 4) or (4,); got shape {tuple(given.shape)}")
         given = given.expand(len(self), 4)
-        new = [(rows, group.replace(given[rows].to(group.intrinsics), None, image_size)) for rows, group in self.groups]
+        learns = [self._member(i).intrinsics.requires_grad for i, _ in self._places]
+        new = []
+        for rows, group in self.groups:
+            for state in (False, True):
+                here = [n for n, row in enumerate(rows) if learns[row] == state]
+                if here:
+                    part = group if len(here) == len(rows) else group[here]
+                    made = part.replace(given[[rows[n] for n in here]], None, image_size)
+                    if isinstance(made.intrinsics, nn.Parameter):  # of plain numbers
+                        made.intrinsics.requires_grad_(state)
+                    new.append(([rows[n] for n in here], made))
         return type(self).of_groups(new)
 
     def __getitem__(self, index: Any) -> Camera:  # type: ignore[override]
@@ -316,9 +334,16 @@ class Mixed(Camera):
 
 
 class Listed(Mixed):
-    """The cameras of a list, whose images may be of several sizes: inside of augmentations, which give a list again."""
+    """The cameras of a list, inside of augmentations, which give a list again.
 
-    one_size = False
+    Their images may be of several sizes, and each keeps its dtype and whether it learns.
+    """
+
+    one_size = one_dtype = False
+
+    @staticmethod
+    def _kind(camera: Camera) -> tuple[object, ...]:
+        return *kind(camera), *((t.dtype, t.requires_grad) for t in camera.tensors)
 
 
 def cat(cameras: Iterable[Camera]) -> Camera:

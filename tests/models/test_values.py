@@ -153,3 +153,43 @@ CAMERA = camera_of("kannala_brandt")
 def test_errors_name_what_is_wrong(call, error, said):
     with pytest.raises(error, match=said):
         call()
+
+
+def test_numbers_of_narrow_dtypes_are_widened():
+    camera = camera_of("kannala_brandt", torch.float32, True)
+    assert camera.replace(camera.intrinsics.detach().half()).intrinsics.dtype == torch.float32
+    assert camera.replace(distortion=camera.distortion.detach().bfloat16()).distortion.dtype == torch.float32
+
+
+def test_a_mixed_batch_keeps_precision_and_what_is_fixed():
+    learning, pinhole = camera_of("kannala_brandt", torch.float64, True), camera_of("pinhole", torch.float64, True)
+    numbers = [[30.1, 31.0, 31.5, 23.5]] * 3
+    made = ct.Mixed([learning.detach(), learning, pinhole]).replace(numbers)
+    assert made.intrinsics.tolist() == numbers
+    assert [camera.intrinsics.requires_grad for camera in made] == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    "make", [lambda c: c.expand(3, 2), lambda c: c[0], lambda c: c.clone()], ids=["expand", "[]", "clone"]
+)
+def test_what_is_made_without_a_graph_is_fixed(make):
+    batch = ct.Pinhole([[30.0, 31.0, 31.5, 23.5]] * 2, image_size=SIZE)
+    with torch.no_grad():
+        made = make(batch)
+    assert isinstance(made.intrinsics, torch.nn.Parameter)
+    assert not made.intrinsics.requires_grad
+    leaf = torch.arange(30.0, 38.0)[:4].requires_grad_()
+    ct.Pinhole(leaf, image_size=SIZE).crop(1, 2, 20, 30).project(torch.ones(3))[0].sum().backward()
+    assert leaf.grad.any()
+
+
+@pytest.mark.parametrize("p", [0.0, 0.5, 1.0])
+def test_cameras_of_a_list_keep_their_dtype_and_what_is_fixed(p):
+    learning, other = camera_of("kannala_brandt", torch.float32, True), camera_of("brown_conrady", torch.float64, True)
+    cameras = [learning, learning.detach(), other]
+    sample = {"camera": cameras, "image": [torch.rand(1, *SIZE)] * 3}
+    torch.manual_seed(0)
+    found = ct.augment.RandomCamera(yaw=10, p=p, min_filled=0)(sample)["camera"]
+    for made, camera in zip(found, cameras, strict=True):
+        assert made.intrinsics.dtype == camera.intrinsics.dtype
+        assert made.intrinsics.requires_grad == camera.intrinsics.requires_grad
