@@ -458,6 +458,17 @@ def before_fold(camera, rays, samples, azimuths):
     return before
 
 
+def within_reach(camera, rays, samples, azimuths):
+    """(samples, azimuths): up to 10,000 focal lengths from the principal point.
+
+    Further out, where no sensor is, powers of a radius decide by rounding, and azimuths between the sampled ones fold.
+    """
+    chart, lens = optics(camera)
+    if not chart.has_scale or isinstance(chart, Inverted):
+        return torch.ones(samples, azimuths, dtype=torch.bool)
+    return (torch.hypot(*lens(*chart.to_plane(*rays.unbind(-1)))) < 1e4).view(samples, azimuths).cummin(0).values
+
+
 def check_fold(camera, azimuths=12, samples=900):
     """Valid exactly from the axis to the fold; where it ends abruptly, up to the nearer one of two azimuths."""
     rays = fan(end_degrees(camera), samples, azimuths)
@@ -475,8 +486,10 @@ def check_fold(camera, azimuths=12, samples=900):
     for limit in (most, least):
         here = limit ^ torch.cat((limit[1:], limit[-1:]))
         edge |= here | torch.cat((here[:1], here[:-1]))
-    assert not (wrong & ~edge).any(), rays.view(samples, azimuths, 3)[wrong & ~edge][:3].tolist()
-    return pixels, valid
+    near = within_reach(camera, rays, samples, azimuths)
+    wrong &= near & ~edge
+    assert not wrong.any(), rays.view(samples, azimuths, 3)[wrong][:3].tolist()
+    return pixels, valid & near
 
 
 def check_no_shared_pixels(pixels, valid):
