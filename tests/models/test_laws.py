@@ -461,7 +461,7 @@ def before_fold(camera, rays, samples, azimuths):
 def within_reach(camera, rays, samples, azimuths):
     """(samples, azimuths): up to 10,000 focal lengths from the principal point.
 
-    Further out, where no sensor is, these samples miss folds, and a wild Fisheye624 is known to be valid again behind its
+    Further out, where no sensor is, these samples miss folds, and a wild Fisheye624 is valid again behind its
     own: k5 = 0.5, s1 = s3 = 0.03125, from 100,000 focal lengths on.
     """
     chart, lens = optics(camera)
