@@ -470,13 +470,27 @@ def within_reach(camera, rays, samples, azimuths):
     return (torch.hypot(*lens(*chart.to_plane(*rays.unbind(-1)))) < 1e4).view(samples, azimuths).cummin(0).values
 
 
+def turned_little(camera, rays, samples, azimuths):
+    """(samples, azimuths): up to where the lens, still regular, turns directions of the plane by a quarter.
+
+    From there on it may count as turned over, which has a positive determinant too.
+    """
+    chart, lens = optics(camera)
+    if not chart.has_scale or not lens.stages:
+        return torch.ones(samples, azimuths, dtype=torch.bool)
+    a, b = chart.to_plane(*rays.unbind(-1))
+    one, zero = torch.ones_like(a), torch.zeros_like(a)
+    (ua, _), (_, vb) = (jvp(lens, (a, b), along)[1] for along in ((one, zero), (zero, one)))
+    return (ua + vb > 0).view(samples, azimuths).cummin(0).values
+
+
 def check_fold(camera, azimuths=12, samples=900):
     """Valid exactly from the axis to the fold; where it ends abruptly, up to the nearer one of two azimuths."""
     rays = fan(end_degrees(camera), samples, azimuths)
     pixels, valid = camera.project(rays)
     valid, pixels = valid.view(samples, azimuths), pixels.detach().view(samples, azimuths, 2)
     most = before_fold(camera, rays, samples, azimuths)
-    least = most.clone()
+    least = most & turned_little(camera, rays, samples, azimuths)
     # a finger of what lies beyond the fold may be narrower than the wedge
     for turn in (share * 2 * math.pi / 256 for share in (-1, -0.5, -0.25, 0.25, 0.5, 1)):
         about_z = torch.linalg.matrix_exp(torch.tensor([[0, -turn, 0], [turn, 0, 0], [0, 0, 0]], dtype=rays.dtype))
