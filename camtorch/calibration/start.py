@@ -62,7 +62,6 @@ def start_from_nothing(
     model: type[Camera],
     count: int,
     image_size: tuple[int, int],
-    *,
     fixed: Collection[str] = (),
     loss: str | None = None,
     loss_scale: float = 1.0,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -106,10 +105,8 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) 
     return Spread(model, parameters.expand(len(factor), -1), factor)
 
 
-def noise_under(
-    loss: str | None, loss_scale: float, residuals: Sequence[Tensor], seen: Sequence[Tensor], free: int
-) -> Tensor:
-    """(B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
+def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Tensor, free: int) -> Tensor:
+    """(*B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
 
     Without a loss it is sqrt(sum of squares / (2 N - free)). A robust loss with weights w of squares pulls with the
     force w r, which gives way by the mean of w + s dw/ds where residuals of squared length s move, and by the mean of w
@@ -120,22 +117,19 @@ def noise_under(
     Args:
         loss: as `adjust` takes it.
         loss_scale: likewise.
-        residuals: of each camera (B, V, N, 2).
-        seen: of each camera (B or 1, V, N) bool.
+        residuals: (*B, V, N, 2).
+        seen: (*B, V, N) bool.
         free: how many parameters were free, poses included.
     """
-    force = weight = slope = count = residuals[0].new_zeros(())
-    for moved, here in zip(residuals, seen, strict=True):
-        squares = moved.square().sum(-1)
-        _, weights = robust(loss, loss_scale, squares)
-        change = torch.zeros_like(weights)
-        if loss == "huber":
-            change = torch.where(weights < 1, -weights / 2, 0.0)
-        elif loss == "cauchy":
-            change = weights * (weights - 1)
-        terms = weights.square() * squares, weights, weights + change, torch.ones_like(weights)
-        sums = [(term * here).sum((-1, -2)) for term in terms]
-        force, weight, slope, count = (t + new for t, new in zip((force, weight, slope, count), sums, strict=True))
+    squares = residuals.square().sum(-1)
+    _, weights = robust(loss, loss_scale, squares)
+    change = torch.zeros_like(weights)
+    if loss == "huber":
+        change = torch.where(weights < 1, -weights / 2, 0.0)
+    elif loss == "cauchy":
+        change = weights * (weights - 1)
+    terms = weights.square() * squares, weights, weights + change, torch.ones_like(weights)
+    force, weight, slope, count = ((term * seen).sum((-1, -2)) for term in terms)
     return (force / (2 * count - free).clamp(min=1) * weight * count).sqrt() / slope.clamp(min=1)
 
 

@@ -306,8 +306,9 @@ def test_cameras_of_a_rig_see_the_same_boards():
     left[2, 5] = np.nan
     points = {"right": right, "left": left}  # in another order than the models
     with pytest.warns(UserWarning, match="left out.* view 4$"):
-        observations, layouts = as_rig_observations(BOARD, points, SIZES, MODELS, OWNER)
-    assert list(observations) == list(layouts) == ["left", "right"]
+        found = as_rig_observations(BOARD, points, SIZES, MODELS, OWNER)
+    assert list(found) == ["left", "right"]
+    observations, layouts = ({name: pair[i] for name, pair in found.items()} for i in range(2))
     for of in observations.values():
         assert of.points.tolist() == REPEATED[:4].tolist()
     assert observations["left"].seen.sum(-1).tolist() == [54, 54, 53, 54]
@@ -355,7 +356,7 @@ def test_bad_rigs(changes, words):
 def test_a_rig_is_made_of_mappings():
     with refuses("image_points", "names of cameras", "list", error=TypeError):
         as_rig_observations(BOARD, [VIEWS, VIEWS], SIZES, MODELS, OWNER)
-    with refuses("names of cameras must be strings", "0, 1", error=TypeError):
+    with refuses("names of cameras", "0", error=TypeError):
         as_rig_observations(BOARD, {0: VIEWS, 1: VIEWS}, {0: SIZE, 1: SIZE}, {0: None, 1: None}, OWNER)
 
 
@@ -365,5 +366,5 @@ def test_cameras_linked_by_another():
         "b": [None, None, *VIEWS[2:4]],
         "c": [None, VIEWS[1], VIEWS[2], None],
     }
-    observations, _ = as_rig_observations(BOARD, points, dict.fromkeys("abc", SIZE), dict.fromkeys("abc"), OWNER)
-    assert [of.seen.any(-1).sum().item() for of in observations.values()] == [2, 2, 2]
+    found = as_rig_observations(BOARD, points, dict.fromkeys("abc", SIZE), dict.fromkeys("abc"), OWNER)
+    assert [of.seen.any(-1).sum().item() for of, _ in found.values()] == [2, 2, 2]

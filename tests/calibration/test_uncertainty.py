@@ -249,7 +249,7 @@ def robustly(loss, scale, share, batch):
     push = 40 * (torch.rand(sight.pixels.shape, generator=generator, **F64) - 0.5)
     sight = sight._replace(pixels=sight.pixels + bad[..., None] * push)
     adjusted = adjust([sight], problem.state(batch), free, loss=loss, loss_scale=scale, steps=200)
-    noise = noise_under(loss, scale, adjusted.residuals, [problem.seen[0][None]], problem.unknowns(free))
+    noise = noise_under(loss, scale, adjusted.residuals[0], problem.seen[0][None], problem.unknowns(free))
     values = spread(adjusted, ct.KannalaBrandt, 0, noise)
     return adjusted.state.parameters[0] - problem.parameters[0], values.std, noise
 
@@ -267,7 +267,7 @@ def test_without_a_loss_noise_is_sigma():
     problem = Problem(lens("kannala_brandt"))
     free = problem.free()
     adjusted = adjust(problem.sights(3), problem.state(3), free)
-    noise = noise_under(None, 1.0, adjusted.residuals, [problem.seen[0][None]], problem.unknowns(free))
+    noise = noise_under(None, 1.0, adjusted.residuals[0], problem.seen[0][None], problem.unknowns(free))
     assert torch.allclose(noise, problem.sigma(adjusted, free), rtol=1e-12)
 
 
