@@ -50,6 +50,18 @@ class Poses(NamedTuple):
         """(B, P, N, 3)."""
         return points @ self.rotations.mT + self.translations.unsqueeze(-2)
 
+    def of(self, index: Tensor | slice, dim: int = 0) -> Poses:
+        """Some of them, by batch row or by view."""
+        return Poses(*(t[index] if dim == 0 else t[:, index] for t in self))
+
+    def expand(self, batch: int) -> Poses:
+        """A batch of the same."""
+        return Poses(*(t.expand(batch, *t.shape[1:]) for t in self))
+
+    def with_views(self, index: Tensor, other: Poses) -> Poses:
+        """With others for some of the views."""
+        return Poses(*(t.index_copy(1, index, new) for t, new in zip(self, other, strict=True)))
+
     @classmethod
     def none(cls, batch: int, count: int, like: Tensor) -> Poses:
         """That leave points where they are."""
@@ -72,8 +84,9 @@ class State(NamedTuple):
 
     def of(self, rows: Tensor) -> State:
         """Those of some problems, given by numbers."""
-        mounts, boards = (Poses(*(t[rows] for t in poses)) for poses in (self.mounts, self.boards))
-        return State(tuple(p[rows] for p in self.parameters), mounts, boards, self.bend[rows])
+        return State(
+            tuple(p[rows] for p in self.parameters), self.mounts.of(rows), self.boards.of(rows), self.bend[rows]
+        )
 
 
 class Free(NamedTuple):
@@ -204,22 +217,6 @@ class _Look(NamedTuple):
 class Bundle:
     """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
 
-    free: Free
-    loss: str | None
-    loss_scale: float
-    sights: list[Sight]
-    cameras: list[Camera]
-    are_shared: list[bool]
-    fixed: list[Camera | None]
-    learns_bend: bool
-    columns: tuple[tuple[int, int], ...]
-    width: int
-    unknowns: int
-    rounding: Tensor
-    low: Tensor
-    high: Tensor
-    is_bounded: bool
-
     def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
         batch = state.boards.translations.shape[0]
@@ -282,18 +279,15 @@ class Bundle:
 
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
         """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
-        points = (
-            bent(sight.points, state.bend)[0] if self.learns_bend or bool((state.bend != 0).any()) else sight.points
-        )
+        points = sight.points
+        if self.learns_bend or bool((state.bend != 0).any()):
+            points = bent(points, state.bend)[0]
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
         if c == 0:
             return turned, first, first
-        return (
-            turned,
-            first,
-            first @ state.mounts.rotations[:, c, None].mT + state.mounts.translations[:, c, None, None],
-        )
+        mounts = state.mounts
+        return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
 
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
         """What a camera makes of a state."""
@@ -404,9 +398,8 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            boards = Poses(
-                rotation_matrix(of_views[..., :3]) @ boards.rotations, boards.translations + of_views[..., 3:]
-            )
+            turned = rotation_matrix(of_views[..., :3]) @ boards.rotations
+            boards = Poses(turned, boards.translations + of_views[..., 3:])
         elif self.width == 3:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = [p.clone() for p in state.parameters]
