@@ -68,14 +68,9 @@ class Layout(NamedTuple):
     """The numbers of the views, of those that were passed, that are no new evidence: see `_observed` and `repeats`."""
 
     def restore(self, values: Tensor) -> Any:
-        """Results of the observations in the form of the image points, NaN (of bool: False) where nothing was seen.
+        """Results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) where nothing was seen:
 
-        Args:
-            values: (V, N, k) or (V, N).
-
-        Returns:
-            (V', *, k) for one tensor of V' views, or a list of a tensor (*, k) for each view; k is missing where it is
-            in the values.
+        (V', *, k) for one tensor of V' views, or a list of a tensor (*, k) for each view.
         """
         empty = False if values.dtype == torch.bool else torch.nan
         rest = values.shape[2:]
@@ -145,13 +140,7 @@ def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Ten
 
     Where the noise of two views is independent, corners differ by at least as much as both are wrong by; in such a pair
     they differ by less than a third of that. Images taken one after the other from a tripod have noise of their own.
-
-    Args:
-        cameras: what each saw of the same views.
-        residuals: of each, (V, N, 2).
-
-    Returns:
-        (R,) all but the first of each group that is alike.
+    Returned are all but the first of each group that is alike, (R,). residuals: of each camera (V, N, 2).
     """
     seen = torch.cat([one.seen for one in cameras], -1)
     pixels = torch.cat([one.pixels for one in cameras], 1)
@@ -242,13 +231,11 @@ def _in_views(value: Points, size: int, name: str, owner: str) -> _Views:
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = list(value)
     parts: list[Tensor | None]
-    if listed := isinstance(value, (list, tuple)):
+    listed, single = isinstance(value, (list, tuple)), False
+    if listed:
         parts = [None if p is None else _as_float64(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
-        if any(part is not None for part in parts) and all(p is None or (p.ndim == 1 and len(p)) for p in parts):
-            listed, parts = False, [_as_float64(value, size, name, owner)]  # rows of numbers
-            single = True
-        else:
-            single = False
+        if any(p is not None for p in parts) and all(p is None or (p.ndim == 1 and len(p)) for p in parts):
+            listed, single, parts = False, True, [_as_float64(value, size, name, owner)]  # rows of numbers
     else:
         whole = _as_float64(value, size, name, owner)
         # (N, 1, size) is OpenCV's form of one set of points

@@ -42,8 +42,7 @@ class Spread(NamedTuple):
     @property
     def std(self) -> Tensor:
         """(B, P)."""
-        deviations: Tensor = torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
-        return deviations
+        return torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
 
     def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
         """(B, M, 2, 2) covariances, in px^2, of where points are seen that lie at pixels; NaN where one has no ray.
@@ -76,14 +75,7 @@ class Spread(NamedTuple):
 
 
 def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) -> Spread:
-    """That of one camera at an optimum.
-
-    Args:
-        adjusted: the optimum.
-        model: the camera's class.
-        camera: which of the cameras it is.
-        noise: (B,) of the corners, px per coordinate.
-    """
+    """That of one camera, by its number, at an optimum; noise: (B,) of the corners, px per coordinate."""
     equations, state = adjusted.equations, adjusted.state
     parameters, mounts = state.parameters[camera], state.mounts
     shared = shared_factor(equations)
@@ -199,15 +191,7 @@ def worst(covariances: Tensor) -> Tensor:
 
 @torch.no_grad()
 def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -> Tensor:
-    """The standard deviation in px, in its worst direction, of where a calibrated camera sees what is at a pixel.
-
-    Args:
-        spread: of a single problem.
-        pixels: (..., 2).
-        distance: of what is seen, from the camera in units of the board: one, or for each pixel (...).
-
-    Returns:
-        (...) float64; NaN where a pixel has no ray.
+    """`Calibration.uncertainty` of a single problem.
 
     Raises:
         ValueError: pixels of another shape, distances that are not positive or do not fit the pixels.
@@ -218,13 +202,13 @@ def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -
         as_values(value, name, owner, like.device).detach().to(like)
         for value, name in ((pixels, "pixels"), (distance, "distance"))
     )
+    shape = pixels.shape[:-1]
     if pixels.ndim == 0 or pixels.shape[-1] != 2:
         raise ValueError(f"{owner}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
     if not bool((distance > 0).all()):
         raise ValueError(
             f"{owner}: distance must be positive, in the unit of the board, or math.inf; got {distance.tolist()}"
         )
-    shape = pixels.shape[:-1]
     try:
         distance = distance.expand(shape)
     except RuntimeError:

@@ -207,11 +207,9 @@ class Survey:
         furthest: radians, an angle beyond which they count as unknown.
         """
         known, angles = self.uncertainty.nan_to_num(torch.inf), self.angles
-        bad = angles[~((known <= limit) & (angles <= furthest))]
-        angle = float(bad[~bad.isnan()].amin()) if bool((~bad.isnan()).any()) else math.inf
-        within = angles < angle
-        found = float(angles[within].amax()) if bool(within.any()) else 0.0
-        return found, float(within.double().mean())
+        bad = ~((known <= limit) & (angles <= furthest)) & ~angles.isnan()
+        within = angles < torch.where(bad, angles, torch.inf).amin()
+        return float(torch.where(within, angles, 0.0).amax()), float(within.double().mean())
 
     @cached_property
     def normals(self) -> Tensor | None:

@@ -1,10 +1,10 @@
-"""Covariances and projection uncertainty: mrcal's numbers, brute force, and what repeated calibrations scatter by."""
+"""Covariances and projection uncertainty: by brute force, and by what repeated calibrations scatter by."""
 
 import math
 
 import pytest
 import torch
-from boards import opencv_left, seen_by
+from boards import seen_by
 
 import camtorch as ct
 from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
@@ -84,45 +84,6 @@ class Problem:
 def lens(key):
     intrinsics, distortion = LENSES[key]
     return ct.MODELS[key](torch.tensor(intrinsics, **F64), torch.tensor(distortion, **F64), image_size=(480, 640))
-
-
-def real_views(bend):
-    """OpenCV's thirteen views, adjusted, with the noise that mrcal assumes: the root of the mean square."""
-    corners, optima = opencv_left()
-    optimum = optima[5]
-    parameters = torch.cat((optimum["intrinsics"], optimum["distortion"]))[None]
-    middle = (corners.object_points.amax(0) + corners.object_points.amin(0)) / 2
-    rotations = rotation_matrix(optimum["rotations"].view(-1, 3))
-    translations = optimum["translations"].view(-1, 3) + rotations @ middle
-    points = (corners.object_points - middle).expand(1, *corners.image_points.shape[:-1], 3)
-    sight = Sight(ct.BrownConrady, points, corners.image_points[None], torch.ones(points.shape[:-1], **F64))
-    boards = Poses(rotations[None], translations[None])
-    state = State((parameters,), Poses.none(1, 1, parameters), boards, torch.zeros(1, 2, **F64))
-    adjusted = adjust([sight], state, Free((torch.ones(9, dtype=torch.bool),), (False,), bend=bend))
-    assert bool(adjusted.converged)
-    noise = (adjusted.cost / corners.image_points.numel()).sqrt()
-    return adjusted, spread(adjusted, ct.BrownConrady, 0, noise), optimum["std"], noise
-
-
-@pytest.mark.parametrize(
-    ("bend", "infinity", "near"),
-    [
-        # drcal 0.0.0 (mrcal) on the same corners: LENSMODEL_OPENCV5, without regularisation, mean-pcam
-        (None, (0.13531484, 5.85650548, 2.64013932), (0.04614336, 5.88096998, 2.65341868)),
-        ((2.92625783e-05, -1.75310142e-04), (0.13034116, 5.24030511, 2.44796354), (0.04433168, 5.25551759, 2.4513902)),
-    ],
-    ids=["flat", "bent"],
-)
-def test_is_that_of_mrcal(bend, infinity, near):
-    adjusted, values, std, noise = real_views(bend is not None)
-    if bend:
-        assert torch.allclose(adjusted.state.bend[0], torch.tensor(bend, **F64), rtol=1e-5)
-    # their optima agree to a part of their standard deviations
-    for distance, expected in ((math.inf, infinity), (0.5, near)):
-        assert torch.allclose(uncertainty(values, PIXELS, distance), torch.tensor(expected, **F64), rtol=1e-5)
-    if not bend:  # and OpenCV's standard deviations are those of the sigma that counts the parameters
-        unbiased = noise * math.sqrt(1404 / (1404 - 87))
-        assert torch.allclose(values.std[0] * unbiased / noise, std, rtol=1e-4)
 
 
 def test_of_a_rig_is_that_of_mrcal_by_brute_force():
@@ -263,59 +224,6 @@ def test_robust_refits_scatter_as_predicted(loss, scale, share):
         assert torch.allclose(noise, noise.new_full((), NOISE), rtol=0.1)
 
 
-def test_without_a_loss_noise_is_sigma():
-    problem = Problem(lens("kannala_brandt"))
-    free = problem.free()
-    adjusted = adjust(problem.sights(3), problem.state(3), free)
-    noise = noise_under(None, 1.0, adjusted.residuals[0], problem.seen[0][None], problem.unknowns(free))
-    assert torch.allclose(noise, problem.sigma(adjusted, free), rtol=1e-12)
-
-
-@pytest.mark.parametrize("boards", ["positions", ""])
-def test_poses_that_are_known_move_nothing(boards):
-    problem = Problem(lens("kannala_brandt"))
-    adjusted = adjust(problem.sights(noise=0.0), problem.state(), problem.free(boards=boards), steps=0)
-    noise = torch.tensor([NOISE], **F64)
-    free = adjust(problem.sights(noise=0.0), problem.state(), problem.free(), steps=0)
-    known, found = (spread(a, ct.KannalaBrandt, 0, noise) for a in (adjusted, free))
-    assert bool((known.std < found.std).all())
-    # and at infinity the frame does not turn: what is left is the lens
-    camera = problem.cameras[0]
-    slopes = torch.autograd.functional.jacobian(
-        lambda p: ct.KannalaBrandt(p[:4], p[4:]).project(camera.unproject(PIXELS[0])[0].detach())[0],
-        problem.parameters[0],
-    )
-    covariance = slopes @ known.covariance[0] @ slopes.mT
-    assert torch.allclose(uncertainty(known, PIXELS[0]), torch.linalg.eigvalsh(covariance)[-1].sqrt(), rtol=1e-9)
-
-
-def test_views_of_nothing_do_not_count():
-    problem = Problem(lens("kannala_brandt"))
-    whole = adjust(problem.sights(noise=0.0), problem.state(), problem.free(), steps=0)
-    (sight,), state = problem.sights(noise=0.0), problem.state()
-    more = Sight(sight.model, *(torch.cat((t, 0 * t[:, :2]), 1) for t in sight[1:]))
-    boards = Poses(*(torch.cat((t, t[:, :2]), 1) for t in state.boards))
-    padded = adjust([more], state._replace(boards=boards), problem.free(), steps=0)
-    noise = torch.tensor([NOISE], **F64)
-    results = [uncertainty(spread(a, ct.KannalaBrandt, 0, noise), PIXELS, 0.5) for a in (whole, padded)]
-    assert torch.allclose(*results, rtol=1e-9)
-
-
-def test_what_is_undetermined_is_huge_and_finite():
-    """A single view of a plane leaves focal lengths and principal point open."""
-    problem = Problem(lens("kannala_brandt"), views=1, tilt=5.0)
-    free = problem.free("k1", "k2", "k3", "k4")
-    problem.points[:, :2] *= 1e-3  # so small that nothing is seen of its perspective
-    with torch.no_grad():
-        points = problem.boards.moved(problem.points[None, None])[0]
-        problem.pixels[0] = problem.cameras[0].project(points)[0]
-    adjusted = adjust(problem.sights(noise=0.0), problem.state(), free, steps=0)
-    std = spread(adjusted, ct.KannalaBrandt, 0, torch.tensor([NOISE], **F64)).std[0]
-    assert bool(torch.isfinite(std).all())
-    assert bool((std[:4] > 1e3).all())
-    assert not std[4:].any()
-
-
 def test_projections_are_known_where_parameters_are_not():
     """A panorama that looks elsewhere, with its middle elsewhere, is the same camera."""
     camera = ct.Cylindrical(torch.tensor([120.0, 120, 320, 240], **F64), image_size=(480, 640))
@@ -328,41 +236,3 @@ def test_projections_are_known_where_parameters_are_not():
     assert loose.std[0, 2] > 1e6 * loose.std[0, 0]
     for distance in (0.4, math.inf):
         assert torch.allclose(uncertainty(loose, PIXELS, distance), uncertainty(held, PIXELS, distance), rtol=1e-5)
-
-
-def test_any_shape_of_pixels():
-    problem = Problem(lens("double_sphere"))
-    adjusted = adjust(problem.sights(), problem.state(), problem.free())
-    values = spread(adjusted, ct.DoubleSphere, 0, torch.tensor([NOISE], **F64))
-    grid = torch.stack(torch.meshgrid(torch.arange(0, 640, 40), torch.arange(0, 480, 40), indexing="xy"), -1)
-    whole = uncertainty(values, grid)
-    assert whole.shape == (12, 16)
-    assert whole.dtype == torch.float64
-    assert torch.equal(whole[3, 5], uncertainty(values, (200, 120)))
-    assert uncertainty(values, torch.zeros(0, 2)).shape == (0,)
-    distances = torch.full((12, 16), math.inf)
-    distances[3, 5] = 0.3
-    mixed = uncertainty(values, grid.float(), distances)
-    assert mixed[3, 5] == uncertainty(values, (200, 120), 0.3) != whole[3, 5]
-    distances[3, 5] = math.inf
-    assert torch.equal(uncertainty(values, grid, distances).nan_to_num(), whole.nan_to_num())
-    # where the lens ends there is no ray
-    assert torch.equal(whole.isnan(), ~problem.cameras[0].unproject(grid.double())[1])
-    assert uncertainty(values, (1e5, 0.0)).isnan()
-
-
-@pytest.mark.parametrize(
-    ("pixels", "distance", "words"),
-    [
-        ((1.0, 2.0, 3.0), 1.0, r"pixels must be \(\.\.\., 2\); got shape \(3,\)"),
-        ((1.0, 2.0), 0.0, "distance must be positive"),
-        ((1.0, 2.0), math.nan, "distance must be positive"),
-        ([(1.0, 2.0)], (1.0, 2.0), r"one for each pixel \(1,\); got shape \(2,\)"),
-    ],
-)
-def test_bad_arguments(pixels, distance, words):
-    problem = Problem(lens("double_sphere"), views=4)
-    adjusted = adjust(problem.sights(), problem.state(), problem.free(), steps=0)
-    values = spread(adjusted, ct.DoubleSphere, 0, torch.ones(1, **F64))
-    with pytest.raises(ValueError, match=words):
-        uncertainty(values, pixels, distance)
