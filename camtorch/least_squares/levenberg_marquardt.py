@@ -8,30 +8,13 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from camtorch.least_squares.equations import System
+
 State = tuple[Tensor, ...]
 """What is looked for: tensors (B, ...), a row for each problem."""
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-15, 1e8
 _GOOD, _FAIR = 0.75, 0.25  # parts of what a step promised that were kept
-
-
-class System(Protocol):
-    """Problems linearised at a state."""
-
-    decrement: Tensor
-    """(R,) by how much their costs would fall, were they linear."""
-
-    @property
-    def firm_decrement(self) -> Tensor:
-        """(R,) likewise, but for combinations of unknowns that hardly matter, along which no problem is linear."""
-        ...
-
-    def step(self, damping: Tensor) -> tuple[State, Tensor]:
-        """The damped step of Gauss and Newton, zero where there is none, and (R,) by how much the linear costs fall.
-
-        damping: (R,), in units of squared columns.
-        """
-        ...
 
 
 class Problem(Protocol):
