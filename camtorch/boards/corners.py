@@ -143,9 +143,8 @@ def _record(image: ImageCorners, folder: Path) -> dict[str, Any]:
     record |= {name: text for name in ("camera", "view", "hash", "reason") if (text := getattr(image, name))}
     if image.image_size is not None:
         record |= {"width": image.image_size[1], "height": image.image_size[0]}
-    return record | {
-        "corners": [[i, *pixel] for i, pixel in enumerate(image.pixels.tolist()) if math.isfinite(pixel[0])]
-    }
+    seen = np.flatnonzero(np.isfinite(image.pixels[:, 0])).tolist()
+    return record | {"corners": [[i, *image.pixels[i].tolist()] for i in seen]}
 
 
 def image_points(images: Sequence[ImageCorners | None], count: int) -> NDArray[np.float64]:

@@ -92,8 +92,8 @@ class State(NamedTuple):
 class Free(NamedTuple):
     """What learns.
 
-    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: "poses", "positions" for their
-    translations alone, or "" for neither. bend: the shape of the board.
+    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: "poses", or "positions" for their
+    translations alone. bend: the shape of the board.
     """
 
     parameters: tuple[Tensor, ...]
@@ -240,7 +240,7 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
-        self.width = {"poses": 6, "positions": 3, "": 0}[free.boards]
+        self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
         self.unknowns = len(self.columns) + self.width * int(views)
@@ -369,8 +369,7 @@ class Bundle:
         columns = []
         if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
-        if self.width:
-            columns.append(by_first)
+        columns.append(by_first)
         at = []
         zero, one = torch.zeros_like(a), torch.ones_like(a)
         usual = ((a, zero), (zero, b), (one, zero), (zero, one))
@@ -400,7 +399,7 @@ class Bundle:
         if self.width == 6:
             turned = rotation_matrix(of_views[..., :3]) @ boards.rotations
             boards = Poses(turned, boards.translations + of_views[..., 3:])
-        elif self.width == 3:
+        else:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = [p.clone() for p in state.parameters]
         turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)

@@ -232,7 +232,7 @@ def _in_views(value: Points, size: int, name: str, owner: str) -> _Views:
         value = list(value)
     parts: list[Tensor | None]
     listed, single = isinstance(value, (list, tuple)), False
-    if listed:
+    if isinstance(value, (list, tuple)):
         parts = [None if p is None else _as_float64(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
         if any(p is not None for p in parts) and all(p is None or (p.ndim == 1 and len(p)) for p in parts):
             listed, single, parts = False, True, [_as_float64(value, size, name, owner)]  # rows of numbers

@@ -192,8 +192,8 @@ def _solved(task: _Task) -> tuple[Tensor, Tensor]:
         found = found.or_better(rows, _refined(task, rows, *other, steps))
     # of so few points on a plane the other minimum may be one of pixels, and none of rays
     (rows,) = (few & starts.valid[:, 0] & ~starts.valid[:, 1]).nonzero(as_tuple=True)
-    flat, *mirrored = _mirrored(points[rows], weights[rows], found.rotations[rows], found.translations[rows])
-    found = found.or_better(rows[flat], _refined(task, rows[flat], *(t[flat] for t in mirrored)))
+    flat, turned, moved = _mirrored(points[rows], weights[rows], found.rotations[rows], found.translations[rows])
+    found = found.or_better(rows[flat], _refined(task, rows[flat], turned[flat], moved[flat]))
     return torch.cat((rotation_vector(found.rotations), found.translations), -1), torch.isfinite(found.costs)
 
 

@@ -276,4 +276,5 @@ def _nearest_rotation(matrices: Tensor) -> Tensor:
     """(..., 3, 3) rotations."""
     u, _, v = torch.linalg.svd(matrices)
     last = u[..., 2:] * torch.linalg.det(u @ v)[..., None, None]
-    return torch.cat((u[..., :2], last), -1) @ v
+    rotation: Tensor = torch.cat((u[..., :2], last), -1) @ v
+    return rotation

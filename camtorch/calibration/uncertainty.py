@@ -42,7 +42,7 @@ class Spread(NamedTuple):
     @property
     def std(self) -> Tensor:
         """(B, P)."""
-        return torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
+        return self.factor[:, : self.parameters.shape[-1]].norm(dim=-1)
 
     def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
         """(B, M, 2, 2) covariances, in px^2, of where points are seen that lie at pixels; NaN where one has no ray.
@@ -148,31 +148,22 @@ def _frame_factor(equations: Equations, translations: Tensor, shared: Tensor) ->
 
     A view's own step is -R11^-1 (R12 s + e), where s are the shared unknowns and e noise that is independent of them.
     """
-    view, batch, count = equations.view, len(shared), shared.shape[-1]
-    width = view.shape[-2]
-    if not width:
-        return shared.new_zeros(batch, 6, count + 6)
-    corner, right = view[..., :width], view[..., width:-1]
+    view = equations.view
+    corner, right = view[..., :6], view[..., 6:-1]
     diagonal = corner.diagonal(dim1=-2, dim2=-1).abs()
     # a view in which too little is seen has no pose to go by
     seen = (diagonal > torch.finfo(view.dtype).eps * diagonal.amax(-1, keepdim=True)).all(-1)
-    eye = torch.eye(width, dtype=view.dtype, device=view.device)
+    eye = torch.eye(6, dtype=view.dtype, device=view.device)
     corner = torch.where(seen[..., None, None], corner, eye)
     inverse = torch.linalg.solve_triangular(corner, eye.expand_as(corner), upper=True)
     share = seen.to(view.dtype) / seen.sum(-1, keepdim=True).clamp(min=1)
     inverse = inverse * share[..., None, None]
-    if width == 6:
-        turn = inverse[..., :3, :]
-        # about the origin, not the board
-        shift = inverse[..., 3:, :] + _cross_matrix(translations) @ turn
-    else:
-        turn, shift = torch.zeros_like(inverse), inverse
-    carried = torch.cat((turn, shift), -2)
+    turn = inverse[..., :3, :]
+    # about the origin, not the board
+    carried = torch.cat((turn, inverse[..., 3:, :] + _cross_matrix(translations) @ turn), -2)
     by_shared = -(carried @ right).sum(1)
-    by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, V L)
-    missing = max(0, 6 - by_noise.shape[-1])
-    rows = torch.nn.functional.pad(by_noise.mT, (0, 0, 0, missing))
-    return torch.cat((by_shared @ shared, torch.linalg.qr(rows, mode="r").R.mT), -1)
+    by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, 6 V)
+    return torch.cat((by_shared @ shared, torch.linalg.qr(by_noise.mT, mode="r").R.mT), -1)
 
 
 def _cross_matrix(vectors: Tensor) -> Tensor:

@@ -63,7 +63,7 @@ class Sightings(NamedTuple):
     @property
     def used(self) -> np.ndarray:
         """(V, N) those that are no outliers."""
-        return self.seen & self.inliers
+        return np.asarray(self.seen & self.inliers)
 
     @property
     def lengths(self) -> np.ndarray:
@@ -86,7 +86,7 @@ class Sightings(NamedTuple):
     def rms(self) -> np.ndarray:
         """(V,) px per point of the inliers of each view, NaN for a view without any."""
         squares, counts = np.where(self.used, self.lengths**2, 0).sum(-1), self.used.sum(-1)
-        return np.sqrt(np.where(counts > 0, squares, np.nan) / np.maximum(counts, 1))
+        return np.asarray(np.sqrt(np.where(counts > 0, squares, np.nan) / np.maximum(counts, 1)))
 
 
 @torch.no_grad()
@@ -368,7 +368,7 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     if some:
         shapes = [outlines[i] for i in some]
         size = float(np.abs(np.concatenate(shapes)).max())
-        options = {"array": shots.rms[some], "cmap": levels("residuals")}
+        options: Any = {"array": shots.rms[some], "cmap": levels("residuals")}
         ax.add_collection(PolyCollection(shapes, **options, alpha=0.35 if few else 0.15, zorder=2))
         rims = PolyCollection(shapes, **options, facecolors="none", linewidths=1.0 if few else 0.5, zorder=3)
         ax.add_collection(rims)

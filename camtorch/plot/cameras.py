@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -218,7 +218,7 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
         ax.fill(wedge[:, across], wedge[:, up], color=colour, alpha=0.16, linewidth=0, zorder=1)
         ax.plot(wedge[:, across], wedge[:, up], color=colour, linewidth=0.9, zorder=2)
         ax.plot(place[across], place[up], "o", color=colour, markersize=6, zorder=3)
-        options = {"textcoords": "offset points", "color": INK, "ha": "center", "va": "top"}
+        options: Any = {"textcoords": "offset points", "color": INK, "ha": "center", "va": "top"}
         ax.annotate(printable(name), place[[across, up]], (0, -7), **options).set_parse_math(False)
     ax.set_aspect("equal")
     ax.margins(0.15)

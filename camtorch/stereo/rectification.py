@@ -467,8 +467,10 @@ def _extent(
     low = torch.where(is_across, torch.maximum(low_left, low_right), torch.minimum(low_left, low_right))
     high = torch.where(is_across, torch.minimum(high_left, high_right), torch.maximum(high_left, high_right))
     if not bool((low < high).all()):
-        lines = "columns" if vertical else "rows"
-        raise ValueError(f"{owner}: no {lines} show what both cameras see; are the extrinsics right from left?")
+        raise ValueError(
+            f"{owner}: no {'columns' if vertical else 'rows'} show what both cameras see; are the extrinsics right "
+            "from left?"
+        )
     middle = (low + high) / 2
     focal = torch.stack([_scale(view, plane, middle) for view in views]).amax(0)
     if not bool((focal > 0).all()):
