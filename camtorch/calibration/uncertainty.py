@@ -42,7 +42,8 @@ class Spread(NamedTuple):
     @property
     def std(self) -> Tensor:
         """(B, P)."""
-        return self.factor[:, : self.parameters.shape[-1]].norm(dim=-1)
+        deviations: Tensor = torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
+        return deviations
 
     def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
         """(B, M, 2, 2) covariances, in px^2, of where points are seen that lie at pixels; NaN where one has no ray.

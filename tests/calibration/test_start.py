@@ -52,13 +52,12 @@ def seen_by(camera, degrees, views, noise, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("key", DISTORTION)
-def test_nothing_has_to_be_known(key, seed):
+@pytest.mark.parametrize(("seed", "key"), enumerate(DISTORTION))
+def test_nothing_has_to_be_known(seed, key):
     widest = {"pinhole": 115, "brown_conrady": 85, "fov": 150, "division": 150, "f_theta": 180}.get(key, 195)
-    degrees, noise = random.Random(f"{key}{seed}").uniform(30, widest), (0.1, 0.8)[seed]
+    degrees, noise = random.Random(f"{key}{seed}").uniform(30, widest), (0.1, 0.8)[seed % 2]
     camera = a_camera(key, degrees, seed)
-    seen, _, _ = seen_by(camera, degrees, 10, noise, seed)
+    seen, _, _ = seen_by(camera, degrees, 8, noise, seed)
     found = ct.calibrate(key, *seen[:2], image_size=SIZE, count=len(camera.distortion_names))
     best = ct.calibrate(key, *seen[:2], start=camera, image_size=SIZE)
     assert found.converged
