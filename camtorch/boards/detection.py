@@ -44,10 +44,7 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
 
     The points of a chessboard are told apart as its colours allow: where black is at the top left of the first one. If
     they allow several orders (`board.symmetries`), the first point is the one nearest to the image's top left corner.
-
-    Args:
-        board: what to look for.
-        image: (H, W) of grey values, uint8 or uint16.
+    image: (H, W) of grey values, uint8 or uint16.
 
     Raises:
         ImportError: there is no OpenCV. ValueError: a dictionary of markers that it does not have.

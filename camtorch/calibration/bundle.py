@@ -130,20 +130,11 @@ def adjust(
     damping: float = FIRST_DAMPING,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Adjusted:
-    """The state of least squares near a given one, for each of B problems.
+    """The state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
     A point that was seen and has no pixel, because the camera's field of view ends before it, counts as far away: no
-    step is taken that loses points.
-
-    Args:
-        sights: what each camera sees; all of the same views.
-        state: where to start.
-        free: what learns.
-        loss: None, "huber" or "cauchy", of the length of each residual; see `robust`.
-        loss_scale: in px.
-        steps: at most.
-        damping: the first one.
-        progress: called after each step with its number and the costs (B,).
+    step is taken that loses points. The loss is one of `LOSSES` or None, of the length of each residual in px, see
+    `robust`. progress: called after each step with its number and the costs (B,).
     """
     problem = Bundle(sights, state, free, loss, loss_scale)
     counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.sights]).sum(0)
@@ -186,12 +177,8 @@ def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Ten
 def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
     """Points of boards that are bent, and the two slopes of their z, (..., N, 2).
 
-    z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points of the board: mrcal's
-    paraboloid.
-
-    Args:
-        points: (..., N, 3), the board about its middle.
-        bend: (B, 2), in the units of the points.
+    z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points (..., N, 3) of the
+    board about its middle: mrcal's paraboloid. bend: (B, 2), in the units of the points.
     """
     plane = points[..., :2]
     reach = plane.abs().amax(tuple(range(plane.ndim - 1)), keepdim=True)

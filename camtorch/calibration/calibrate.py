@@ -406,14 +406,7 @@ class Results(NamedTuple):
 def results(
     searches: Sequence[Search], adjusted: Adjusted, free: Free, object_points: Any, image_points: Sequence[Any]
 ) -> Results:
-    """What an optimum says; a better one in another basin of a model takes its place.
-
-    Args:
-        searches: of the cameras.
-        adjusted: the optimum.
-        free: what learned.
-        object_points: as they were passed.
-        image_points: of each camera, as they were passed.
+    """What an optimum says; a better one in another basin of a model takes its place. Points are as they were passed.
 
     Raises:
         ValueError: the data leave the problem open.

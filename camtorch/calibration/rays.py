@@ -43,15 +43,9 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
 
     Nothing is divided by z, so that rays may have any angle from the optical axis.
 
-    Args:
-        points: (B, N, 3) in any unit, float64.
-        rays: (B, N, 3) of unit length.
-        weights: (B, N), not negative; 0 for what is not seen, whose points and rays do not matter.
-
-    Returns:
-        Two poses a row, S = 2. A pose is valid if four points or more are seen that are not on a line, everything is
-        finite, and most of what is seen lies ahead on its rays; the second one if it is another minimum. Others are
-        finite and mean nothing.
+    Points and unit rays are (B, N, 3), weights (B, N) not negative, 0 for what is not seen. There are two poses
+    a row, S = 2. A pose is valid if four points or more are seen that are not on a line, everything is finite, and most
+    of what is seen lies ahead on its rays; the second one if it is another minimum. Others are finite and mean nothing.
     """
     # what is not finite, which a sum shows, has weight 0; what has no weight is zero
     seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)

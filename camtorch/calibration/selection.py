@@ -94,15 +94,8 @@ def select(
     coefficients if it is worse by no more than 1 %, or by no more than 5 % and the standard error of
     the difference by views.
 
-    Args:
-        object_points: as `calibrate` takes them.
-        image_points: likewise.
-        image_size: (height, width).
-        candidates: models and their numbers of coefficients.
-        loss: as `calibrate` takes it.
-        loss_scale: px.
-        fixed: as `calibrate` takes it; names that a model does not have are left out.
-        progress: called with the part that is done.
+    Arguments are those of `calibrate`; names in `fixed` that a model does not have are left out, and progress is called
+    with the part that is done. candidates: models and their numbers of coefficients.
 
     Raises:
         ValueError: bad points; no model can be fitted.

@@ -145,13 +145,7 @@ def other_cameras(
 ) -> Tensor | None:
     """(S, 4 + n) nearly the same camera all along the valley of its model, see `_ALONG`; None where it has none.
 
-    Args:
-        parameters: (1, 4 + n) at an optimum.
-        learns: (4 + n,) bool.
-        boards: (1, V), in the frame of the camera.
-        observations: what it saw.
-        model: of the camera.
-        image_size: (height, width).
+    parameters: (1, 4 + n) at an optimum. learns: (4 + n,) bool. boards: (1, V), in the frame of the camera.
     """
     count = parameters.shape[-1] - 4
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))

@@ -50,10 +50,7 @@ class Spread(NamedTuple):
 
         What is seen is taken into the frame of every board by its pose, and back by the pose that the noise made of it;
         the mean of all these is projected by the camera that the noise made: mrcal's mean-pcam.
-
-        Args:
-            pixels: (B, M, 2).
-            distance: (B, M) from the camera; infinite for directions.
+        distance: (B, M) from the camera; infinite for directions.
         """
         parts = zip(pixels.split(_PIXELS, 1), distance.split(_PIXELS, 1), strict=True)
         return torch.cat([self._of_pixels(*part) for part in parts], 1)
@@ -106,13 +103,7 @@ def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Te
     in the weighted problem: this is sqrt(mean(w^2 r^2) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator. It
     holds where outliers fall on all corners alike, and they widen the intervals of a Huber loss as they widen its
     estimates; of a view that is nothing but outliers it knows nothing.
-
-    Args:
-        loss: as `adjust` takes it.
-        loss_scale: likewise.
-        residuals: (*B, V, N, 2).
-        seen: (*B, V, N) bool.
-        free: how many parameters were free, poses included.
+    residuals: (*B, V, N, 2). free: how many parameters were free, poses included.
     """
     squares = residuals.square().sum(-1)
     _, weights = robust(loss, loss_scale, squares)

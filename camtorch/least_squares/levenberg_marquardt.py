@@ -47,11 +47,7 @@ class Minimum(NamedTuple):
 def rounding_of(pixels: Tensor, weights: Tensor) -> Tensor:
     """(B,) the weighted sums of squares of the rounding of pixels: eps of the dtype times the largest coordinate.
 
-    The projections of all models are rounded by 0.2 to 0.4 of that, root mean square.
-
-    Args:
-        pixels: (B, ..., 2), those that residuals are to.
-        weights: (B, ...) of the squares, 0 where a pixel does not count.
+    The projections of all models are rounded by 0.2 to 0.4 of that, root mean square. weights: (B, ...) of the squares.
     """
     largest = torch.where(weights > 0, pixels.abs().amax(-1), 0.0).flatten(1).amax(-1)
     return (torch.finfo(pixels.dtype).eps * largest).square() * weights.flatten(1).sum(-1)

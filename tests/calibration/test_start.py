@@ -52,7 +52,7 @@ def seen_by(camera, degrees, views, noise, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "key"), enumerate(DISTORTION))
+@pytest.mark.parametrize(("seed", "key"), list(enumerate(DISTORTION)))
 def test_nothing_has_to_be_known(seed, key):
     widest = {"pinhole": 115, "brown_conrady": 85, "fov": 150, "division": 150, "f_theta": 180}.get(key, 195)
     degrees, noise = random.Random(f"{key}{seed}").uniform(30, widest), (0.1, 0.8)[seed % 2]
