@@ -114,30 +114,25 @@ def test_the_steps_fit_the_repository(page, tmp_path):
             assert done.returncode == 0, file + done.stdout + done.stderr
 
 
-# Page -> files of its steps, and the command that finds each forgotten
-FORGOTTEN = {
-    "model.md": {"camtorch/models/__init__.py": "test_laws", "docs/models.md": "test_gallery"},
-    "format.md": {"camtorch/io/formats.py": "test_files"},
-    "augmentation.md": {"docs/api/augment.md": "test_docs"},
-}
+# Page -> a file of its steps, and the command that finds it forgotten
+FORGOTTEN = {"model.md": ("docs/models.md", "test_gallery"), "format.md": ("camtorch/io/formats.py", "test_files")}
 
 
 @pytest.mark.slow
 @every_walk
-def test_a_walk_ends_with_green_tests_and_none_of_its_steps_may_be_forgotten(page, copy):
+def test_a_walk_ends_with_green_tests_and_its_steps_may_not_be_forgotten(page, copy):
     take(page, copy)
     for command in commands(page):
         status, printed = run(command, copy)
         assert status == 0, f"{command}\n{printed}"
         if command.startswith("pytest"):
             assert re.search(r"\d+ passed", printed), printed
-    for file, word in FORGOTTEN[page].items():
+    if page in FORGOTTEN:
+        file, word = FORGOTTEN[page]
         (command,) = (command for command in commands(page) if command.startswith("pytest") and word in command)
-        after = (copy / file).read_text()
         shutil.copy(ROOT / file, copy / file)
         status, printed = run(f"{command} -x", copy)
         assert status, f"{command} does not miss {file}\n{printed}"
-        (copy / file).write_text(after)
 
 
 # -- the rooms
