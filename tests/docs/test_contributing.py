@@ -1,6 +1,7 @@
 """The pages for contributors: their walks are taken step by step, and what they say of the rooms is so."""
 
 import ast
+import functools
 import itertools
 import os
 import re
@@ -145,8 +146,13 @@ def rooms():
     return [re.findall(r"`camtorch/(\w+)(?:/|\.py)`", row) for row in rows]
 
 
+@functools.cache
 def arrows():
-    """(room, imported room, file): all imports but those of type checkers; a room is a folder or a file."""
+    """(room, imported room, file) of all imports but those of type checkers; a room is a folder or a file."""
+    return set(imported())
+
+
+def imported():
     package = ROOT / "camtorch"
     for path in package.rglob("*.py"):
         parts = path.relative_to(package).with_suffix("").parts
@@ -180,8 +186,27 @@ def test_every_room_has_its_row():
 
 def test_imports_go_down_the_table():
     place = {name: i for i, row in enumerate(rooms()) for name in row}
-    found = set(arrows())
+    found = arrows()
     assert len(found) > 100
     for room, other, file in found:
         if other in place and room != other:
             assert place[room] < place[other], f"{file} imports camtorch.{other}, which stands above"
+
+
+def test_the_picture_shows_the_rooms_and_no_arrow_too_many():
+    names = [name for row in rooms() for name in row]
+    below = {name: {other for room, other, _ in arrows() if room == name != other in names} for name in names}
+    for name in reversed(names):  # which import from below only
+        below[name] |= set().union(*(below[other] for other in below[name]))
+    shown = {name for name in names if not name.startswith("_")}
+    direct = {
+        (name, other)
+        for name in shown
+        for other in below[name] & shown
+        if not any(other in below[between] for between in below[name])
+    }
+    (picture,) = re.findall(
+        r"^```mermaid\nflowchart TD\n(.*?)^```$", (ROOT / "CONTRIBUTING.md").read_text(), re.M | re.S
+    )
+    lines = [line.strip().split(" --> ") for line in picture.splitlines()]
+    assert sorted((name, other) for name, others in lines for other in others.split(" & ")) == sorted(direct)
