@@ -21,8 +21,8 @@ from camtorch.cli.terminal import note
 from camtorch.jobs import pool
 
 if TYPE_CHECKING:
-    from camtorch.cli.labelled_image import LabelledImage
     from camtorch.cli.options import Commands
+    from camtorch.cli.sheet import LabelledImage
 
 _SHEET = "augment.png"
 _COUNT = 8
@@ -91,79 +91,72 @@ def add(commands: Commands) -> None:
 def prepare(arguments: argparse.Namespace) -> None:
     """Before torch is imported: let processes begin to do so as well."""
     if arguments.dataset is not None and arguments.jobs != 1 and not arguments.dry_run:
-        pool.prepare("camtorch.cli.augmenting")
+        pool.prepare("camtorch.cli.dataset")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
-    from camtorch.cli import labelled_image
+    from camtorch.cli import dataset, sheet
 
     if arguments.list:
-        print("\n".join(labelled_image.presets()))
+        print("\n".join(sheet.presets()))
         return 0
     is_sheet = arguments.dataset is None
     for name in ("jobs", "resume", "shard", "dry_run", "copies") if is_sheet else ("n", "labels"):
         if getattr(arguments, name):
             option = "-n" if name == "n" else f"--{name.replace('_', '-')}"
             raise ValueError(f"{option} is for {'--dataset' if is_sheet else 'a sheet, without --dataset'}")
-    if arguments.dataset is not None:
-        from camtorch.cli import dataset
-
+    if not is_sheet:
         return dataset.run(arguments)
     _sheet(arguments)
     return 0
 
 
 def _sheet(arguments: argparse.Namespace) -> None:
-    from camtorch.cli import images, labelled_image, sheet
+    from camtorch.cli import images, sheet
 
     if arguments.image is None:
         raise ValueError("which image? camtorch augment IMAGE --camera FILE")
-    arguments.output = arguments.output or Path(_SHEET)
-    arguments.n = _COUNT if arguments.n is None else arguments.n
-    lens = labelled_image.lens(arguments.preset)
-    ranges = checked_ranges(arguments)
+    output, count = arguments.output or Path(_SHEET), arguments.n or _COUNT
+    lens, ranges = sheet.lens(arguments.preset), checked_ranges(arguments)
     for name in ("from_model", "name"):
         if arguments.camera is None and getattr(arguments, name):
             raise ValueError(f"--{name.replace('_', '-')} needs --camera FILE")
-    inputs = (arguments.image, arguments.camera, arguments.labels)
-    images.check_target(arguments.output, force=arguments.force, inputs=inputs)
+    images.check_target(output, force=arguments.force, inputs=(arguments.image, arguments.camera, arguments.labels))
     before = _photograph(arguments)
-    shown = [before]
-    for new in labelled_image.augmented(
-        before, lens, arguments.n, arguments.seed, arguments.size, arguments.min_filled, **ranges
-    ):
+    shown, ranges = [before], {"min_filled": arguments.min_filled, **ranges}
+    for new in sheet.augmented(before, lens, count, arguments.seed, arguments.size, **ranges):
         print(new.note, flush=True)
         shown.append(new)
-    empty = 1 - sum(new.filled for new in shown[1:]) / arguments.n
+    empty = 1 - sum(new.filled for new in shown[1:]) / count
     if empty > _MUCH and not arguments.min_filled:
         note(
             f"{100 * empty:.0f} % of the new images shows nothing, as the camera of the image does not see so far; "
             "--fov source or --min-filled 0.9 takes less of that"
         )
-    title = f"One image, {arguments.n} other camera{'s' * (arguments.n != 1)}"
-    images.write(arguments.output, sheet.drawing(shown, title, labelled_image.origin(lens, before)))
+    title = f"One image, {count} other camera{'s' * (count != 1)}"
+    images.write(output, sheet.drawing(shown, title, sheet.origin(lens, before)))
     told = "" if before.is_made_up else ", with what became of the labels"
-    print(f"{arguments.output}: the image before, and as each of them sees it{told}")
+    print(f"{output}: the image before, and as each of them sees it{told}")
 
 
 def _photograph(arguments: argparse.Namespace) -> LabelledImage:
     """The image given, with its labels."""
-    from camtorch.cli import cameras, images, labelled_image, labels
+    from camtorch.cli import cameras, images, labels, sheet
 
     image, orientation = images.read(arguments.image)
     height, width = image.shape[-2:]
-    parts = None if arguments.labels is None else labels.entries_of(arguments.labels).get("camera")
-    if parts is None:
+    entries = None if arguments.labels is None else labels.read_json(arguments.labels)
+    if entries is None or "camera" not in entries:
         camera, _ = cameras.read_posed(arguments.image, (height, width), arguments)
     elif arguments.camera is None:
         try:
-            camera = cameras.stated(parts, (height, width))
+            camera = cameras.stated(entries["camera"], (height, width))
         except ValueError as error:
             raise ValueError(f"{arguments.image}: {error}") from None
     else:
         raise ValueError(f"{arguments.labels}: states the camera, and so does --camera; leave that out")
     if orientation not in (None, 1):
         note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
-    known = None if arguments.labels is None else labels.read(arguments.labels, camera)
-    return labelled_image.photograph(image, camera, known, arguments.image.name)
+    known = None if entries is None else labels.labels_of(entries, arguments.labels, camera)
+    return sheet.photograph(image, camera, known, arguments.image.name)

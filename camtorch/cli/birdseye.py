@@ -48,7 +48,6 @@ def run(arguments: argparse.Namespace) -> None:
     import torch
 
     from camtorch.cli import cameras, images
-    from camtorch.cli.warping import warped
     from camtorch.warp.plane import BirdsEye
 
     height, pitch = arguments.height, arguments.pitch
@@ -74,8 +73,8 @@ def run(arguments: argparse.Namespace) -> None:
         if max(rows, columns) > LARGEST_SIDE:
             ranges = "--x, --y and --resolution"
             raise ValueError(f"{ranges} make {columns}x{rows} pixels; each side must be at most {LARGEST_SIDE}")
-        result, filled = warped(warp, image, "seen from above")
-    images.write(arguments.output, images.from_tensor(result))
+        images.write(arguments.output, images.from_tensor(warp(image[None])[0]))
+        filled = images.filled(warp)
     print(
         f"{arguments.output}: the ground from above, x {_range(arguments.x)} and y {_range(arguments.y)} at "
         f"{arguments.resolution:g} a pixel, {columns}x{rows}, by {camera.key}, {float(pose.position[2]):.4g} above; "

@@ -1,4 +1,4 @@
-"""What `camtorch dewarp` does to each of many files, in whatever process."""
+"""What `camtorch dewarp` does to each file, in whatever process."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from camtorch.cli import cameras, images, videos
 from camtorch.jobs.items import Item, Listener
 from camtorch.warp.dewarp import Dewarp, Projection
 
-TOLERANCE = 0.001
-"""Pixels that nobody sees, for a lattice of positions also where a calibration is in float64."""
+_TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
 _MOST_KEPT = 4  # warps of images of different sizes
 
 
@@ -37,23 +36,9 @@ class Dewarping:
 
     def settings(self) -> dict[str, Any]:
         """All that outputs depend on; JSON."""
-        camera = self.camera
-        intrinsics, distortion = (values.detach().tolist() for values in (camera.intrinsics, camera.distortion))
-        return {
-            "camtorch": __version__,
-            "camera": {
-                "model": camera.key,
-                "image_size": camera.image_size,
-                "intrinsics": intrinsics,
-                "distortion": dict(zip(camera.distortion_names, distortion, strict=True)),
-            },
-            "rescale": self.rescale,
-            "projection": self.projection,
-            "fov": self.fov,
-            "image_size": self.image_size,
-            "codec": self.encoder.codec,
-            "crf": self.encoder.crf,
-        }
+        names = ("rescale", "projection", "fov", "image_size")
+        settings = {"camtorch": __version__, "camera": cameras.settings_of(self.camera), **vars(self.encoder)}
+        return settings | {name: getattr(self, name) for name in names}
 
     def __call__(self, item: Item, listener: Listener) -> dict[str, Any]:
         """What the new camera is."""
@@ -62,33 +47,41 @@ class Dewarping:
             return videos.remake(source, target, lambda size: self._warp(source, size), self.encoder, listener)
         image, orientation = images.read(source, tell=listener.note)
         rows, columns = image.shape[-2:]
-        warp, told = self._warp(source, (rows, columns))
+        warp, facts = self._warp(source, (rows, columns))
         with torch.no_grad():
             result = warp(image[None])[0]
+        del image  # of hundreds of megabytes, perhaps
         made = images.from_tensor(result)
         images.write(target, made, orientation=orientation, tell=listener.note, synced=False)
-        return told
+        return facts
 
     def warp_of(self, camera: Camera) -> Dewarp:
         """That of images of a camera."""
-        return Dewarp(camera, projection=self.projection, fov=self.fov, image_size=self.image_size, tolerance=TOLERANCE)
+        return Dewarp(
+            camera, projection=self.projection, fov=self.fov, image_size=self.image_size, tolerance=_TOLERANCE
+        )
 
     def _warp(self, source: Path, size: tuple[int, int]) -> tuple[Dewarp, dict[str, Any]]:
         if size not in self._warps:
-            while len(self._warps) >= _MOST_KEPT:
+            if len(self._warps) >= _MOST_KEPT:
                 del self._warps[next(iter(self._warps))]
             warp = self.warp_of(cameras.fitting(self.camera, self.path, source, size, self.rescale))
             self._warps[size] = warp, _facts(warp)
         return self._warps[size]
 
 
+@torch.no_grad()
 def _facts(warp: Dewarp) -> dict[str, Any]:
-    """What is to be known of new images."""
+    """What is to be known of new images; `shown` is the part that they show of 64 x 64 pixels of the old one."""
+    source, target = warp.source, warp.target
+    part = torch.tensor([source.width / 64, source.height / 64])
+    lattice = (source.resize(64, 64).pixel_grid() + 0.5) * part - 0.5
     return {
-        "model": warp.source.key,
-        "width": warp.target.width,
-        "height": warp.target.height,
-        "intrinsics": warp.target.intrinsics.tolist(),
-        "degrees": float(warp.target.fov[0]),
-        "filled": float(warp.valid_mask().double().mean()),
+        "model": source.key,
+        "width": target.width,
+        "height": target.height,
+        "intrinsics": target.intrinsics.tolist(),
+        "degrees": float(target.fov[0]),
+        "filled": images.filled(warp),
+        "shown": float(warp.transform_points(lattice)[1].double().mean()),
     }

@@ -88,7 +88,6 @@ def run(arguments: argparse.Namespace) -> None:
 
     from camtorch.cli import images
     from camtorch.cli.cameras import read_pair
-    from camtorch.cli.warping import warped
     from camtorch.stereo.matching import opencv
     from camtorch.stereo.rectification import rectify
 
@@ -124,14 +123,13 @@ def run(arguments: argparse.Namespace) -> None:
             align=arguments.align,
         )
         limits = _limits(rectification, arguments) if matches else (0.0, 0.0)
-        left, filled_left = warped(rectification.left, left, "rectifying the left image")
-        right, filled_right = warped(rectification.right, right, "rectifying the right image")
-        both = float(rectification.valid_masks()[2].double().mean())
+        left, right = rectification.left(left[None])[0], rectification.right(right[None])[0]
+        parts = [100 * int(mask.sum()) / mask.numel() for mask in rectification.valid_masks()]
         for name, image in (("left", left), ("right", right)):
             images.write(folder / f"{name}.png", images.from_tensor(image))
         images.write(folder / "pair.png", _side_by_side(left, right, arguments.vertical))
         _write_cameras(folder, rig, rectification)
-        _tell(rectification, rig, folder, (filled_left, filled_right, both))
+        _tell(rectification, rig, folder, parts)
         if matches:
             _match(rectification, (left, right), limits, arguments)
 
@@ -196,11 +194,10 @@ def _write_cameras(folder: Path, rig: Rig, rectification: Rectification) -> None
         rectification.save(folder / "opencv.yml")
 
 
-def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: tuple[float, ...]) -> None:
+def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: list[float]) -> None:
     camera = rectification.camera_left
     fx, fy, cx, cy = camera.intrinsics.tolist()
-    across, down = camera.fov[:2].tolist()
-    left, right, both = (100 * part for part in parts)
+    (across, down), (left, right, both) = camera.fov[:2].tolist(), parts
     print(
         f"{folder}: {' and '.join(rig[name].key for name in rig)} rectified to {rectification.projection}, "
         f"{across:.1f} x {down:.1f} degrees, {camera.width}x{camera.height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} "

@@ -192,7 +192,7 @@ def sized(item: Item) -> Item:
         return item
     try:
         with _opened(item.inputs[0]) as (container, stream):
-            return replace(item, size=float(max(stream.frames or _length(container, stream) * _rate(stream), 1)))
+            return replace(item, size=max(int(stream.frames or _length(container, stream) * _rate(stream)), 1))
     except VideoFileError:
         return item
 

@@ -41,15 +41,10 @@ class Manifest:
         OSError: no such folder can be made, or written to. BlockingIOError: another process does the same right now.
     """
 
-    folder: Path
-    shard: Shard
-    settings: str
-    """A hash of them."""
-
     def __init__(self, folder: Path, job: str, settings: Json, shard: Shard | None = None):
         self.folder, self.shard, self._job, self._stated = folder, shard or Shard(), job, settings
         text = json.dumps(settings, sort_keys=True, allow_nan=False)
-        self.settings = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        self.settings: str = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
         self._begun: set[str] = set()
         self._records: dict[tuple[str, ...], list[dict[str, Json]]] = {}
 

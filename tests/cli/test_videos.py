@@ -45,7 +45,7 @@ def test_all_but_the_image_stays(folder, capsys):
     )  # fmt: skip
     command(*WORDS, "--codec", "ffv1")
     assert capsys.readouterr() == (
-        "out.mkv: dewarped, kannala_brandt to perspective, 120.0 degrees wide, 96x64, fx 27.7128 fy 27.7128 cx 47.5 "
+        "out.mkv: kannala_brandt dewarped to perspective, 120.0 degrees wide, 96x64, fx 27.7128 fy 27.7128 cx 47.5 "
         "cy 31.5; 100.0 % of it is filled, 6 frames\n",
         "",
     )
