@@ -15,9 +15,8 @@ import torch
 
 from camtorch.augment import RandomCamera
 from camtorch.camera import Camera
-from camtorch.cli import cameras, coco, images, many, sheet
+from camtorch.cli import cameras, coco, images, many
 from camtorch.cli.labels import Json, read_json
-from camtorch.cli.options import checked_ranges
 from camtorch.data.samples import MapSamples
 from camtorch.io.writing import replacing
 from camtorch.jobs import inputs, items
@@ -119,9 +118,8 @@ class Augmenting:
         return self._samples[known]
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Carry it out."""
-    like, ranges = sheet.lens(arguments.preset), checked_ranges(arguments)
+def run(arguments: argparse.Namespace, like: str | None, ranges: dict[str, Any]) -> int:
+    """Carry it out, with such lenses and ranges of `RandomCamera`."""
     folder, source, copies = arguments.image, arguments.dataset, arguments.copies or 1
     if folder is None or not folder.is_dir():
         raise ValueError(f"--dataset: which images? camtorch augment FOLDER --dataset LABELS; got {folder}")
@@ -143,7 +141,8 @@ def run(arguments: argparse.Namespace) -> int:
         taken = {os.path.realpath(path) for item in everything for path in (*item.inputs, *item.outputs)}
         if os.path.realpath(merged) in {*taken, *map(os.path.realpath, others)}:
             raise ValueError(f"{merged}: would overwrite what is read; -o names another folder")
-    camera = _camera(arguments, everything)
+    sources = [item.inputs[0] for item in everything]
+    camera = None if arguments.camera is None else cameras.read_for_many(sources, images.size_of, arguments)
     options = {"like": like, "image_size": arguments.size, "min_filled": arguments.min_filled or None, **ranges}
     work = Augmenting(camera, arguments.camera, arguments.rescale, arguments.seed, copies, options)
     work.augmentation(camera)  # what is wrong with it is so for all
@@ -158,16 +157,6 @@ def run(arguments: argparse.Namespace) -> int:
             lock(file, wait=True)
             _merge(data, everything, manifest, merged, copies)
     return status
-
-
-def _camera(arguments: argparse.Namespace, everything: Sequence[Labelled]) -> Camera | None:
-    """Of all images; None where their labels are to state it."""
-    if arguments.camera is not None:
-        return cameras.read_for_many([item.inputs[0] for item in everything], images.size_of, arguments)
-    for name in ("from_model", "name", "rescale"):
-        if getattr(arguments, name):
-            raise ValueError(f"--{name.replace('_', '-')} needs --camera FILE")
-    return None
 
 
 def _copies_of(place: Path, copies: int) -> list[Path]:

@@ -3,79 +3,102 @@
 from __future__ import annotations
 
 import argparse
-import glob
 import os
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from camtorch.cli.options import add_force, add_jobs, add_photograph, add_projection, parse_path, parse_suffix
+import torch
+
+from camtorch import __version__
+from camtorch.camera import Camera
+from camtorch.cli import cameras, images, many, targets, videos
+from camtorch.cli.commands import are_several
 from camtorch.cli.terminal import bar, note
-from camtorch.jobs import pool
+from camtorch.io import CameraFileError, load
+from camtorch.jobs import inputs, items
+from camtorch.jobs.items import Item, Listener, Shard
+from camtorch.jobs.manifest import Manifest
+from camtorch.jobs.run import Report
+from camtorch.warp.dewarp import Dewarp, Projection
 
-if TYPE_CHECKING:
-    from camtorch.cli.dewarping import Dewarping
-    from camtorch.cli.options import Commands
-    from camtorch.jobs.items import Item
-    from camtorch.jobs.run import Report
-
-_DEFAULT = "dewarped.png"
 _SLASHES = ("/", os.sep)
+_TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
+_MOST_KEPT = 4  # warps of images of different sizes
 
 
-def add(commands: Commands) -> None:
-    """Add the command to a command line."""
-    command = commands.add_parser(
-        "dewarp",
-        help="undistort images and videos",
-        description="Undistort an image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png; or all of a "
-        "folder: camtorch dewarp images/ --camera camera.yml -o straight/",
-        allow_abbrev=False,
-    )
-    command.set_defaults(run=run, prepare=prepare)
-    command.add_argument(
-        "image", type=_word, nargs="+", metavar="IMAGE", help="the image; or images, videos, folders, quoted patterns"
-    )
-    add_projection(command)
-    add_photograph(command)
-    command.add_argument(
-        "-o",
-        "--output",
-        type=_word,
-        metavar="OUT",
-        help=f"the new image, {_DEFAULT} by default; OUT/, a folder, where there are several",
-    )
-    add_force(command)
-    many = add_jobs(command)
-    many.add_argument(
-        "--suffix", type=parse_suffix, metavar=".EXT", help="of new images or videos; by default those of the old ones"
-    )
-    video = command.add_argument_group("videos (pip install 'camtorch[video]')")
-    video.add_argument(
-        "--codec", metavar="NAME", help="an encoder of ffmpeg's; libx264 by default, in .webm libvpx-vp9"
-    )
-    video.add_argument("--crf", type=int, metavar="N", help="the encoder's quality, lower is better; 18 in libx264")
+@dataclass
+class Dewarping:
+    """Makes one item; a `camtorch.jobs.items.Work`. The map is computed once for each size of image."""
+
+    camera: Camera
+    """Of a known size."""
+    path: Path
+    """Of the file it is from."""
+    rescale: bool
+    projection: Projection
+    fov: float | None
+    """Degrees."""
+    image_size: tuple[int, int] | None
+    encoder: videos.Encoder
+    _warps: dict[tuple[int, int], tuple[Dewarp, dict[str, Any]]] = field(default_factory=dict)
+
+    def settings(self) -> dict[str, Any]:
+        """All that outputs depend on; JSON."""
+        names = ("rescale", "projection", "fov", "image_size")
+        settings = {"camtorch": __version__, "camera": cameras.settings_of(self.camera), **vars(self.encoder)}
+        return settings | {name: getattr(self, name) for name in names}
+
+    def __call__(self, item: Item, listener: Listener) -> dict[str, Any]:
+        """What the new camera is."""
+        (source,), (target,) = item.inputs, item.outputs
+        if videos.is_video(source):
+            return videos.remake(source, target, lambda size: self._warp(source, size), self.encoder, listener)
+        image, orientation = images.read(source, tell=listener.note)
+        rows, columns = image.shape[-2:]
+        warp, facts = self._warp(source, (rows, columns))
+        with torch.no_grad():
+            result = warp(image[None])[0]
+        del image  # of hundreds of megabytes, perhaps
+        made = images.from_tensor(result)
+        images.write(target, made, orientation=orientation, tell=listener.note, synced=False)
+        return facts
+
+    def warp_of(self, camera: Camera) -> Dewarp:
+        """That of images of a camera."""
+        return Dewarp(
+            camera, projection=self.projection, fov=self.fov, image_size=self.image_size, tolerance=_TOLERANCE
+        )
+
+    def _warp(self, source: Path, size: tuple[int, int]) -> tuple[Dewarp, dict[str, Any]]:
+        if size not in self._warps:
+            if len(self._warps) >= _MOST_KEPT:
+                del self._warps[next(iter(self._warps))]
+            warp = self.warp_of(cameras.fitting(self.camera, self.path, source, size, self.rescale))
+            self._warps[size] = warp, _facts(warp)
+        return self._warps[size]
 
 
-def _word(text: str) -> str:
-    """A path as it was written: a slash at its end says that it is a folder."""
-    parse_path(text)
-    return text
-
-
-def prepare(arguments: argparse.Namespace) -> None:
-    """Before torch is imported: let processes begin to do so as well."""
-    if _are_several(arguments.image) and arguments.jobs != 1 and not arguments.dry_run:
-        pool.prepare("camtorch.cli.dewarping")
-
-
-def _are_several(words: list[str]) -> bool:
-    is_pattern = glob.has_magic(words[0]) and not os.path.lexists(words[0])
-    return len(words) > 1 or os.path.isdir(words[0]) or is_pattern
+@torch.no_grad()
+def _facts(warp: Dewarp) -> dict[str, Any]:
+    """What is to be known of new images; `shown` is the part that they show of 64 x 64 pixels of the old one."""
+    source, target = warp.source, warp.target
+    part = torch.tensor([source.width / 64, source.height / 64])
+    lattice = (source.resize(64, 64).pixel_grid() + 0.5) * part - 0.5
+    return {
+        "model": source.key,
+        "width": target.width,
+        "height": target.height,
+        "intrinsics": target.intrinsics.tolist(),
+        "degrees": float(target.fov[0]),
+        "filled": images.filled(warp),
+        "shown": float(warp.transform_points(lattice)[1].double().mean()),
+    }
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
-    if _are_several(arguments.image) or (arguments.output or "").endswith(_SLASHES):
+    if are_several(arguments.image) or (arguments.output or "").endswith(_SLASHES):
         return _many(arguments)
     for name in ("resume", "shard", "suffix"):
         if getattr(arguments, name):
@@ -85,11 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _single(arguments: argparse.Namespace, source: Path) -> None:
-    from camtorch.cli import images, targets, videos
-    from camtorch.jobs.items import Item, Listener
-
     is_video = videos.is_video(source)
-    output = Path(arguments.output or Path(_DEFAULT).with_suffix(source.suffix if is_video else ".png"))
+    output = Path(arguments.output or f"dewarped{source.suffix if is_video else '.png'}")
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
     (videos if is_video else images).check_kind(output)
     if not (is_video or source.exists()):
@@ -110,15 +130,11 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
 
 
 def _many(arguments: argparse.Namespace) -> int:
-    from camtorch.cli import images, many, videos
-    from camtorch.jobs import inputs, items
-    from camtorch.jobs.manifest import Manifest
-
     known = inputs.IMAGES | set(videos.FORMATS)
     for word in arguments.image:
-        if os.path.isfile(word) and Path(word).suffix.lower() not in known:
-            _check_no_calibration(word)
-    output, shard = many.output_folder(arguments.output), arguments.shard or items.Shard.of_environment()
+        if os.path.isfile(word) and Path(word).suffix.lower() not in known and _is_calibration(word):
+            raise ValueError(f"{word}: a calibration, not an image; --camera {word} names it")
+    output, shard = many.output_folder(arguments.output), arguments.shard or Shard.of_environment()
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
         raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
     found, faults = inputs.find(arguments.image, known, output)
@@ -132,37 +148,20 @@ def _many(arguments: argparse.Namespace) -> int:
         facts = [{**result, "frames": 0} for result in report.results]
         return f", {_told(arguments, facts[0])}" if facts and all(one == facts[0] for one in facts) else ""
 
-    return many.carry_out(
-        everything,
-        faults,
-        work,
-        Manifest(output, "dewarp", work.settings(), shard),
-        arguments,
-        doing="dewarping",
-        units="frames" if any(item.size != 1 for item in everything) else "images",
-        told=told,
-    )
+    manifest = Manifest(output, "dewarp", work.settings(), shard)
+    units = "frames" if any(item.size != 1 for item in everything) else "images"
+    return many.carry_out(everything, faults, work, manifest, arguments, doing="dewarping", units=units, told=told)
 
 
-def _check_no_calibration(word: str) -> None:
-    """Who names a calibration without an option means it for --camera.
-
-    Raises:
-        ValueError: the file is one.
-    """
-    from camtorch.io import CameraFileError, load
-
+def _is_calibration(word: str) -> bool:
     try:
         load(word)
     except (CameraFileError, OSError):
-        return
-    raise ValueError(f"{word}: a calibration, not an image; --camera {word} names it")
+        return False
+    return True
 
 
 def _item(source: Path, target: Path, suffix: str | None) -> Item:
-    from camtorch.cli import videos
-    from camtorch.jobs.items import Item
-
     if suffix is not None and videos.is_video(target) == videos.is_video(Path("any" + suffix)):
         target = target.with_suffix(suffix)
     return videos.sized(Item((source,), (target,)))
@@ -170,9 +169,6 @@ def _item(source: Path, target: Path, suffix: str | None) -> Item:
 
 def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
     """What is done to each; the camera is of the size of the first image where its file states none."""
-    from camtorch.cli import cameras, images, videos
-    from camtorch.cli.dewarping import Dewarping
-
     camera = cameras.read_for_many(
         sources, lambda one: (videos if videos.is_video(one) else images).size_of(one), arguments
     )

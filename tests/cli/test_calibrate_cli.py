@@ -17,7 +17,7 @@ from camtorch.boards.boards import AprilGrid, Chessboard
 from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_corners
 from camtorch.boards.turns import agreeing, reordered, turns_of
 from camtorch.calibration.selection import select
-from camtorch.cli import gathering, searching
+from camtorch.cli import searching
 from camtorch.cli.main import main
 from camtorch.rotations import rotation_matrix
 
@@ -109,7 +109,7 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypat
     Path("other").mkdir()
     for index in range(1, 5):
         Path(f"{index}.png").rename(f"other/{9 - index}.png")
-    images = {"": gathering.gather(["other/[0-9].png"])}
+    images = {"": searching.gather(["other/[0-9].png"])}
     again = searching.found_corners(images, None, Path("corners.json"), None, measured=False, force=False)
     assert [image.path.name for image in again.images] == ["5.png", "6.png", "7.png", "8.png"]
     assert all(image.seen > 40 for image in again.images)
@@ -301,10 +301,10 @@ def test_images_come_in_natural_order():
     for name in ("a10.png", "a9.jpg", "a1.PNG", "notes.txt"):
         Path(name).touch()
     Path("folder").mkdir()
-    assert [str(path) for path in gathering.gather(["."])] == ["a1.PNG", "a9.jpg", "a10.png"]
-    assert [str(path) for path in gathering.gather(["a?.*", "a10.png", "a9.jpg"])] == ["a1.PNG", "a9.jpg", "a10.png"]
+    assert [str(path) for path in searching.gather(["."])] == ["a1.PNG", "a9.jpg", "a10.png"]
+    assert [str(path) for path in searching.gather(["a?.*", "a10.png", "a9.jpg"])] == ["a1.PNG", "a9.jpg", "a10.png"]
     Path("[1].png").touch()
-    assert gathering.gather(["[1].png"]) == [Path("[1].png")]
+    assert searching.gather(["[1].png"]) == [Path("[1].png")]
 
 
 @pytest.mark.parametrize(
@@ -317,7 +317,7 @@ def test_images_come_in_natural_order():
 )
 def test_images_taken_together(left, right, how, views):
     cameras = {"left": list(map(Path, left)), "right": list(map(Path, right))}
-    found, words = gathering.together(cameras, None)
+    found, words = searching.together(cameras, None)
     assert words == how
     assert list(found) == views
     assert sum(map(len, found.values())) == len(left) + len(right)
@@ -326,11 +326,11 @@ def test_images_taken_together(left, right, how, views):
 def test_images_that_cannot_be_matched():
     cameras = {"left": [Path("left7.png")], "right": [Path("right1.png"), Path("right2.png")]}
     with pytest.raises(ValueError, match="1 of left, 2 of right: images are matched by their order, so as"):
-        gathering.together(cameras, None)
+        searching.together(cameras, None)
     with pytest.raises(ValueError, match="have no names in common; --match order"):
-        gathering.together(cameras, "name")
+        searching.together(cameras, "name")
     cameras = {"left": [Path("l/1.png"), Path("l/2.png")], "right": [Path("r/2.png"), Path("r/3.png")]}
-    assert gathering.together(cameras, "order")[0]["0"] == {"left": Path("l/1.png"), "right": Path("r/2.png")}
+    assert searching.together(cameras, "order")[0]["0"] == {"left": Path("l/1.png"), "right": Path("r/2.png")}
 
 
 @pytest.mark.slow

@@ -56,8 +56,8 @@ def test_a_folder_is_dewarped_as_its_images_one_by_one(folder, capsys):
     told = capsys.readouterr()
     assert told.err == ""
     assert told.out == (
-        "out: 5 of 5 files made, kannala_brandt dewarped to perspective, 90.0 degrees wide, 96x64, fx 48 fy 48 cx 47.5 cy 31.5; "
-        "100.0 % of it is filled\n"
+        "out: 5 of 5 files made, kannala_brandt dewarped to perspective, 90.0 degrees wide, 96x64, fx 48 fy 48 cx 47.5 "
+        "cy 31.5; 100.0 % of it is filled\n"
     )
     made = outputs()
     assert made.keys() == {"1.png", "2.jpg", "deep/1.png", "deep/er/3.tif", "deep/4.webp"}
