@@ -117,11 +117,7 @@ def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = (
 
 
 def check_kind(path: Path) -> None:
-    """Refuse a name that says of no file type that images can be written as.
-
-    Raises:
-        ImageFileError: an unknown file type, or one that stores other sizes.
-    """
+    """Refuse, by an ImageFileError, a name of no file type that holds images of any size."""
     kind = Image.registered_extensions().get(path.suffix.lower())
     if kind not in Image.SAVE or kind in _OTHER_SIZES:
         why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"

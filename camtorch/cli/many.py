@@ -15,11 +15,7 @@ from camtorch.jobs.run import Report
 
 
 def output_folder(text: str | None) -> Path:
-    """Where files go, by what -o says.
-
-    Raises:
-        ValueError: nothing, or what is no folder.
-    """
+    """Where files go, by what -o says."""
     if text is None:
         raise ValueError("into which folder? -o OUT/ names it, for several images or a folder of them")
     path = Path(text)
@@ -41,21 +37,12 @@ def carry_out(
 ) -> int:
     """Have items made, and say what became of them: notes and failures on stderr, numbers on stdout.
 
-    Args:
-        items: of all shards.
-        faults: what there is to report beside, by the first shard.
-        work: makes one.
-        manifest: of this shard; not yet open.
-        arguments: with `jobs`, `resume`, `shard`, `dry_run` and `force`.
-        doing: what goes on, as "dewarping".
-        units: of `Item.size`, in the plural.
-        told: what more is to be said of what was made; if anything, it begins with a comma.
+    Items are those of all shards, and so are faults, what there is to report beside; the manifest is that of this shard,
+    and not yet open. `doing` is what goes on, as "dewarping", `units` are those of `Item.size`, in the plural; what
+    `told` adds of what was made begins with a comma, if it is anything.
 
     Returns:
         The exit status: 0, or 1 where anything failed.
-
-    Raises:
-        ValueError: outputs exist, and it is not said what is to become of them.
     """
     shard = manifest.shard
     items, faults = shard.of(items), faults if shard.rank == 0 else []

@@ -70,16 +70,11 @@ def gather(words: Iterable[str]) -> list[Path]:
 def together(cameras: Mapping[str, Sequence[Path]], how: str | None) -> tuple[dict[str, dict[str, Path]], str]:
     """Which images of several cameras were taken together.
 
-    Args:
-        cameras: their images in order, by the cameras' names.
-        how: "name", "order", or None for what fits: names that are the same, else the last number in them, else the
-            order.
+    `how` is "name", "order", or None for what fits: names that are the same, else the last number in them, else the
+    order, for which there must be as many of each.
 
     Returns:
         Views, camera -> image of each, by a name of the view; and how they were found, in words.
-
-    Raises:
-        ValueError: other numbers of images where they are matched by their order, or no name in common.
     """
     for words, key in (("file name", lambda path: path.stem), ("number in the file name", _last_number)):
         keyed = {name: {key(path): path for path in paths} for name, paths in cameras.items()}
@@ -128,12 +123,9 @@ def found_corners(
         cameras: images by the names of cameras, "" for a single one; empty for those of the file.
         board: what to look for, or None for that of the file.
         path: a file of corners, from which those of known images are taken, and which is written; or None.
-        match: how images of several cameras are put together, see `gathering.together`.
+        match: see `together`.
         measured: whether the board's size is known, or that in the file is taken.
         force: whether a file of corners of another board may be overwritten.
-
-    Raises:
-        ValueError: no board, a file of corners of another one, views that do not fit together.
     """
     known = read_corners(path) if path is not None and path.exists() else None
     if known is not None and board is not None and (known.board is None or not known.board.looks_like(board)):

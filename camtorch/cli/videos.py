@@ -74,11 +74,7 @@ class Encoder:
     """Its quality; by default one at which hardly anything is lost."""
 
     def check(self) -> None:
-        """Refuse what no video can be written with.
-
-        Raises:
-            ImportError: PyAV is not installed. ValueError: no such encoder, or it knows no crf.
-        """
+        """Refuse what no video can be written with, and a PyAV that is not installed."""
         av = _av()
         if self.codec is None:
             return
@@ -132,21 +128,13 @@ def size_of(path: Path) -> tuple[int, int] | None:
 
 
 def length_of(path: Path) -> float:
-    """Seconds; 0 where that is not said.
-
-    Raises:
-        VideoFileError: it cannot be read. ImportError: PyAV is not installed.
-    """
+    """Seconds; 0 where that is not said."""
     with _opened(path) as (container, stream):
         return float(_length(container, stream))
 
 
 def frames(path: Path) -> Iterator[tuple[float, float, Any]]:
-    """Frames as they are stored: when each is shown, in seconds, the part of the video until then, and PyAV's frame.
-
-    Raises:
-        VideoFileError: it cannot be read. ImportError: PyAV is not installed.
-    """
+    """Frames as they are stored: when each is shown, in seconds, the part of the video until then, and PyAV's frame."""
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
         length, step = float(_length(container, stream)), float(1 / _rate(stream))
@@ -344,38 +332,37 @@ def remake(
     return facts | {"frames": count}
 
 
+@dataclass
 class _Remake:
     """A video on its way from file to file."""
 
-    def __init__(
-        self,
-        source: Path,
-        target: Path,
-        container: Any,
-        stream: Any,
-        output: Any,
-        encoder: Encoder,
-        first: Any,
-        listener: Listener,
-    ):
-        self.source, self.target, self.container, self.stream = source, target, container, stream
-        self.output, self.encoder, self.listener = output, encoder, listener
-        self.codec = encoder.codec or ("libvpx-vp9" if output.format.name == "webm" else "libx264")
-        self.others = [other for other in container.streams if other.type in ("audio", "subtitle")]
-        self.rate, self.size = _rate(stream), (first.height, first.width)
+    source: Path
+    target: Path
+    container: Any
+    stream: Any
+    output: Any
+    encoder: Encoder
+    first: Any
+    """Frame."""
+    listener: Listener
+    _first_stamp: int | None = None
+    _stamp: int | None = None
+    """Of the last frame."""
+
+    def __post_init__(self) -> None:
+        streams, first, format = self.container.streams, self.first, self.output.format.name
+        self.codec = self.encoder.codec or ("libvpx-vp9" if format == "webm" else "libx264")
+        self.others = [other for other in streams if other.type in ("audio", "subtitle")]
+        self.rate, self.size = _rate(self.stream), (first.height, first.width)
         self.pixels = _pixels(first.format.name, self.codec)
         if first.interlaced_frame:
-            listener.note(f"{source}: is interlaced; two moments get mixed within its frames")
-        lost = sorted({one.type for one in container.streams if one not in (stream, *self.others)})
-        if lost:
-            listener.note(f"{source}: its other streams, {', '.join(lost)}, are left out")
-        self.first = _converted(first, self.pixels)
+            self.listener.note(f"{self.source}: is interlaced; two moments get mixed within its frames")
+        if lost := sorted({one.type for one in streams if one not in (self.stream, *self.others)}):
+            self.listener.note(f"{self.source}: its other streams, {', '.join(lost)}, are left out")
         # formats and encoders that know no time stamps but multiples of one step
-        whole = output.format.name == "avi" or self.codec == "mpeg4"
+        whole = format == "avi" or self.codec == "mpeg4"
         self.tick = 1 / self.rate if whole else first.time_base or 1 / self.rate
-        self._first_stamp: int | None = None
-        self._stamp: int | None = None
-        """Of the last frame."""
+        self.first = _converted(first, self.pixels)
 
     def run(self, frames: _Frames) -> int:
         """How many frames were written."""

@@ -29,7 +29,6 @@ class Item:
 
     @property
     def name(self) -> str:
-        """What it is called."""
         return str(self.inputs[0])
 
 
@@ -52,11 +51,7 @@ shown as it is.
 
 
 def check(items: Sequence[Item], others: Iterable[Path] = ()) -> None:
-    """Refuse items that would write over each other, or over what is read, by them or in `others`.
-
-    Raises:
-        ValueError: two items have the same output; an output is an input.
-    """
+    """Refuse, by a ValueError, items that would write over each other, or over what is read, by them or in `others`."""
     read = {os.path.realpath(path): path for path in (*(path for item in items for path in item.inputs), *others)}
     of_place: dict[str, Item] = {}
     for item in items:

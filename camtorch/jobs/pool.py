@@ -39,13 +39,10 @@ def prepare(module: str) -> None:
 def run(
     work: Work[T], tasks: Iterable[T], processes: int, add: Callable[[int], object]
 ) -> Generator[tuple[T, Any], None, None]:
-    """Tasks with what `work` returned, as they are done.
+    """Tasks with what `work` returned, as they are done; with one process here, by one thread as well.
 
-    Args:
-        work: is pickled once for each process, and must not raise.
-        tasks: are pickled, and taken as processes get free.
-        processes: how many; with one, the work is done here, by one thread as well.
-        add: is called here with what was done since it was called last.
+    `work` is pickled once for each process, and must not raise; tasks are pickled, and taken as processes get free;
+    `add` is called here with what was done since it was called last.
 
     Raises:
         ChildProcessError: a process was killed. What `tasks` raise, or an interrupt: processes are then ended at once.

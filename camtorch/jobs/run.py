@@ -43,15 +43,9 @@ def run(
 ) -> Report:
     """Have items made.
 
-    Args:
-        items: see `items.check`.
-        work: makes one; see there.
-        manifest: open.
-        processes: how many work; with one it is this one.
-        resume: keep what the manifest knows, where inputs, settings and outputs are those it says; make anew what else
-            the job had begun.
-        force: overwrite what the job did not begin.
-        add: is told how much more of the items' sizes is done.
+    With `resume`, what the manifest knows is kept, where inputs, settings and outputs are those it says, and what else
+    the job had begun is made anew; with `force` also what it did not begin is overwritten. `add` is told how much more
+    of the items' sizes is done. With one of `processes` it is this one that works.
 
     Raises:
         FileExistsError: outputs exist, and neither `resume` nor `force`. As `pool.run`.
