@@ -149,11 +149,11 @@ def found_corners(
         places = [("", str(i), image) for i, image in enumerate(cameras[""]) if image not in films]
     else:
         views, how = together(cameras, match)
-        print(f"{len(views)} views of {', '.join(cameras)}, matched {how}")
         places = [(camera, view, image) for view, of_view in views.items() for camera, image in of_view.items()]
         twice = [str(image) for image, count in Counter(image for *_, image in places).items() if count > 1]
         if twice:
             raise ValueError(f"{twice[0]}: is given as an image of two cameras")
+        print(f"{len(views)} views of {', '.join(cameras)}, matched {how}")
     in_videos = [image for path in films for image in _searched_video(path, board, known)]
     found = Corners(board, board.points(), [*_searched(places, board, known), *in_videos])
     if path is not None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import LEVEL, camera, command, refused, write_photograph
+from command_line import LEVEL, camera, command, refused
 from PIL import Image
 from test_folders import TRIALS, outputs
 from videos import read_video, write_video
@@ -20,14 +20,6 @@ import camtorch as ct
 
 av = pytest.importorskip("av")
 WORDS = ["dewarp", "in.mkv", "--camera", "camera.yml", "-o", "out.mkv"]
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """The current folder, with a camera."""
-    monkeypatch.chdir(tmp_path)
-    write_photograph(tmp_path)
-    return tmp_path
 
 
 def planes(frame):
