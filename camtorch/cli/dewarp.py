@@ -21,10 +21,12 @@ from camtorch.jobs.items import Item, Listener, Shard
 from camtorch.jobs.manifest import Manifest
 from camtorch.jobs.run import Report
 from camtorch.warp.dewarp import Dewarp, Projection
+from camtorch.warp.warp import Warp
 
 _SLASHES = ("/", os.sep)
 _TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
 _MOST_KEPT = 4  # warps of images of different sizes
+_LARGE = 32e6  # pixels, from where on their map is not kept, and one in 64 tells how much is filled
 
 
 @dataclass
@@ -85,13 +87,15 @@ def _facts(warp: Dewarp) -> dict[str, Any]:
     source, target = warp.source, warp.target
     part = torch.tensor([source.width / 64, source.height / 64])
     lattice = (source.resize(64, 64).pixel_grid() + 0.5) * part - 0.5
+    large = target.height * target.width > _LARGE
+    seen = Warp(source, target.resize(target.height // 8, target.width // 8), warp.rotation) if large else warp
     return {
         "model": source.key,
         "width": target.width,
         "height": target.height,
         "intrinsics": target.intrinsics.tolist(),
         "degrees": float(target.fov[0]),
-        "filled": images.filled(warp),
+        "filled": images.filled(seen),
         "shown": float(warp.transform_points(lattice)[1].double().mean()),
     }
 

@@ -38,7 +38,7 @@ def carry_out(
     """Have items made, and say what became of them: notes and failures on stderr, numbers on stdout.
 
     Items are those of all shards, and so are faults, what there is to report beside; the manifest is that of this
-    shard, and not yet open. `doing` is what goes on, as "dewarping", `units` are those of `Item.size`, in the plural; what
+    shard, and not yet open. `doing` is what goes on, as "dewarping", `units` are those of `Item.size`; what
     `told` adds of what was made begins with a comma, if it is anything.
 
     Returns:
