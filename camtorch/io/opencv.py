@@ -15,7 +15,7 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
 from camtorch.io.filestorage import Value, text_for
-from camtorch.io.parsing import read_mapping
+from camtorch.io.parsing import parse_mapping, read_bytes
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy
@@ -64,13 +64,13 @@ def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | 
         OSError: no such file, or it cannot be opened. ValueError: an unknown model.
     """
     check_path(path, "io.opencv.read")
-    return _File(Record(path, read_mapping(path))).camera(_known(model), name).requires_grad_(False)
+    return _File(Record(path, parse_mapping(path, read_bytes(path)))).camera(_known(model), name).requires_grad_(False)
 
 
 def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
     """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
     check_path(path, "io.opencv.read_rig")
-    rig = parse(Record(path, read_mapping(path)), _known(model))
+    rig = parse(Record(path, parse_mapping(path, read_bytes(path))), _known(model))
     for layer in (*rig.cameras.values(), *rig.extrinsics.values()):
         layer.requires_grad_(False)
     return rig

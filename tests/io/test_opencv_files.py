@@ -150,7 +150,7 @@ def test_stereo_file_asks_for_a_name():
         ("- 1", "content", "not keys and values"),
         ("a: [1", r"line \d", "expected"),
         ("{'K': 1}", "K", "neither"),
-        ("{'K': [1}", "line 1", "Expecting ',' delimiter"),
+        ("{'K': [1}", "line 1", "does not match"),
         ("{K': 1}", "line 1", "double quotes"),
         ("x: 1", "camera_matrix", "missing"),
         ("K: !!opencv-matrix 3", "line 1", "keys and values"),
