@@ -1,6 +1,7 @@
 """What the checks of the rows of the pages "Coming from" have in common; beside this is one file a library."""
 
 import importlib
+import inspect
 
 import cv2
 import numpy as np
@@ -21,6 +22,19 @@ def row(*keys, slow=False):
         return check
 
     return register
+
+
+def equal(table):
+    """Register rows where the same numbers come out of both: names -> what gives pairs (ours, theirs), and an atol."""
+    for keys, pairs in table.items():
+
+        def check(pairs=pairs):
+            *found, atol = pairs()
+            for ours, theirs in found:
+                close(ours, theirs, atol)
+
+        check.__signature__ = inspect.Signature()
+        row(*keys.split(" "))(check)
 
 
 def trap(check, slow=False):
