@@ -20,7 +20,7 @@ import camtorch.augment.numpy
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "coming-from").glob("*.md"))
 for _library in ("opencv", "kornia", "colmap", "albumentations", "pytorch3d", "nvtorchcam"):
     importlib.import_module(f"coming_from.{_library}")  # which registers its checks
-LIBRARIES = ["albumentations", "cv2", "kornia", "nvtorchcam", "pycolmap", "pytorch3d"]
+LIBRARIES = ["albumentations", "cv2", "kornia", "pycolmap"]
 INSTANCES = {
     "augment": ct.augment.Augmentation,
     "calibration": ct.Calibration,
