@@ -202,39 +202,6 @@ def keypoints():
     np.testing.assert_allclose(found, mine["keypoints"][mine["keypoints_valid"]])
 
 
-def lattice():
-    return np.stack(np.meshgrid(np.arange(10, 150, 10.0), np.arange(10, 110, 10.0)), -1).reshape(-1, 2)
-
-
-@trap
-def keypoints_that_drop_out():
-    needed()
-    kept = theirs(A.OpticalDistortion((0.3, 0.3), mode="camera", p=1), keypoints=lattice())["keypoints"]
-    assert (len(lattice()), len(kept)) == (140, 134)
-
-
-@trap
-def keypoints_that_are_rounded():
-    needed()
-    exact, valid = (value.numpy() for value in optical("fisheye").transform_points(torch.from_numpy(lattice())))
-    for method, median, most in (("mask", 0.9, 1.4), ("direct", 0.5, 1.1)):
-        transform = A.OpticalDistortion((0.3, 0.3), mode="fisheye", keypoint_remapping_method=method, p=1)
-        off = np.linalg.norm(theirs(transform, keypoints=lattice())["keypoints"] - exact, axis=1)[valid]
-        np.testing.assert_allclose([np.median(off), off.max()], [median, most], atol=0.05)
-
-
-@trap
-def resized_keypoints():
-    needed()
-    np.testing.assert_allclose(theirs(A.Resize(60, 80))["keypoints"], [[50, 15]])
-
-
-@trap
-def flipped_boxes():
-    needed()
-    np.testing.assert_allclose(theirs(A.HorizontalFlip(p=1))["bboxes"], [[130, 20, 150, 40]], atol=1e-4)
-
-
 @trap
 def how_likely():
     assert ct.augment.HorizontalFlip().p == 0.5

@@ -351,29 +351,6 @@ def resize():
 
 
 @trap
-def labels_that_stay():
-    zero, one = torch.zeros(2), torch.ones(2)
-    for augmentation in (
-        K.RandomFisheye(zero, zero, one, p=1.0),
-        K.RandomThinPlateSpline(p=1.0, align_corners=False),
-        K.RandomElasticTransform(p=1.0, align_corners=False),
-    ):
-        close(kornias(augmentation)[0], SPOT, 0)
-    masked = K.AugmentationSequential(K.RandomFisheye(zero, zero, one, p=1.0), data_keys=["input", "mask"])
-    with pytest.raises(NotImplementedError, match=r"^$"):
-        masked(torch.zeros(1, 1, *SIZE), torch.zeros(1, 1, *SIZE))
-
-
-@trap
-def remap_without_corners():
-    columns = torch.arange(160.0).expand(1, 1, 120, 160).contiguous()
-    rows, same = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
-    shifted = geometry.remap(columns, same[None], rows[None])[0, 0, 60]
-    close(shifted[1:-1] - columns[0, 0, 60, 1:-1], torch.arange(1.0, 159.0) / 159 - 0.5, 1e-4)
-    close(geometry.remap(columns, same[None], rows[None], align_corners=True), columns, 1e-4)
-
-
-@trap
 def behind_and_past():
     behind = torch.tensor([[0.1, 0.2, -1.0]], dtype=torch.float64)
     close(geometry.project_points(behind, MATRIX), geometry.project_points(-behind, MATRIX))
