@@ -1,6 +1,5 @@
 """What the checks of the rows of the pages "Coming from" have in common; beside this is one file a library."""
 
-import importlib
 import inspect
 
 import cv2
@@ -42,14 +41,6 @@ def trap(check, slow=False):
     name = f"{check.__module__.split('.')[-1]}: {check.__name__}"
     TRAPS.append(pytest.param(check, id=name, marks=[pytest.mark.slow] if slow else []))
     return check
-
-
-def optional(name):
-    """The module, or None where it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        return None
 
 
 def close(ours, theirs, atol=1e-9):
