@@ -136,7 +136,7 @@ def wandering(lens, count, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0])
 def test_a_chain_of_a_thousand_edits(seed):
     lens = camera(size=(240, 320))
     lens = ct.BrownConrady(lens.intrinsics, lens.distortion[:5], image_size=(240, 320)).requires_grad_(False)

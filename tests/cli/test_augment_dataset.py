@@ -375,7 +375,7 @@ def test_wrong_words_and_files_are_told(folder, capsys):
 
 @pytest.mark.slow
 def test_ranks_and_killed_runs_of_several_processes_end_as_one_process_does(tmp_path):
-    make(tmp_path, 24)
+    make(tmp_path, 16)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
 
     def start(*words):
@@ -389,7 +389,7 @@ def test_ranks_and_killed_runs_of_several_processes_end_as_one_process_does(tmp_
     assert files(tmp_path / "ranks") == whole
     rng = np.random.default_rng(0)
     killed = 0
-    for _ in range(3):
+    for _ in range(2):
         process = start("-o", "new", "--jobs", "2", "--resume")
         deadline = time.monotonic() + 60
         there = len(files(tmp_path / "new"))
@@ -401,6 +401,6 @@ def test_ranks_and_killed_runs_of_several_processes_end_as_one_process_does(tmp_
             killed += 1
         process.wait()
         time.sleep(0.3)  # its processes follow
-    assert killed >= 2
+    assert killed >= 1
     assert start("-o", "new", "--jobs", "2", "--resume").wait(120) == 0
     assert files(tmp_path / "new") == whole

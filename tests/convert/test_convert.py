@@ -137,7 +137,7 @@ def test_close_conversions(make_source, target, options, limit):
     assert float(result.valid_fraction) > 0.999 or "max_angle" in options
 
 
-@pytest.mark.parametrize("p", slow_unless({1e-6}.__contains__, [0.0, 1e-6, 1e-4, 1e-3]))
+@pytest.mark.parametrize("p", slow_unless({1e-6}.__contains__, [1e-6, 1e-3]))
 def test_a_table_of_a_lens_that_is_nearly_radial(p):
     """The fewer pixels determine a node, the less may what is not radial pull at it."""
     lens = torch.tensor([-0.1, 0, p, -p, 0], **F64)
@@ -427,7 +427,7 @@ def test_nothing_between_the_nodes_is_worse(key, target, intrinsics, distortion)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", KEYS)
+@each_kind
 @given(data=st.data())
 @settings(max_examples=4)
 def test_nothing_between_the_nodes_of_drawn_cameras_is_worse(key, data):

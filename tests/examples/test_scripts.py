@@ -1,7 +1,6 @@
 """The scripts: what they measure can fail, what they learn from is labelled truly, and each writes its figure."""
 
 import math
-import statistics
 
 import birds_eye
 import dewarp_room
@@ -103,19 +102,14 @@ def test_photographs_are_what_their_cameras_see():
 @pytest.mark.slow
 def test_a_small_network_learns_focal_length_and_distortion_from_single_images(tmp_path):
     # of lenses and places that it has not seen. After 700 steps chance decides much, and another processor is like
-    # another seed: of four 10 to 18 % and 4.3 to 7.7 degrees were measured. So the median of three is asked to be
-    # better than any prior, of which the least were 23 % and 8.9 degrees
-    results = [predict_camera.run(seed=seed) for seed in range(3)]
-    for result in results:
-        assert bool(result.found.rays()[1].all())
+    # another seed: of four 10 to 18 % and 4.3 to 7.7 degrees were measured. So it is asked to be better than any prior,
+    # of which the least were 23 % and 8.9 degrees
+    result = predict_camera.run()
+    assert bool(result.found.rays()[1].all())
     for measure, least in ((predict_camera.Result.focal, 0.23), (predict_camera.Result.corners, 8)):
-        before, after = (
-            [float(measure(result, cameras).median()) for result, cameras in pairs]
-            for pairs in ([(r, r.prior) for r in results], [(r, r.found) for r in results])
-        )
-        assert min(before) > least
-        assert statistics.median(after) < least
-    predict_camera.draw(results[0], str(tmp_path / "camera.png"))
+        before, after = (float(measure(result, cameras).median()) for cameras in (result.prior, result.found))
+        assert after < least < before
+    predict_camera.draw(result, str(tmp_path / "camera.png"))
     assert is_a_figure(tmp_path / "camera.png")
 
 
@@ -187,7 +181,7 @@ def test_faces_before_a_rolling_shutter_are_those_that_a_warp_makes(drivers):
 
 @pytest.mark.slow
 def test_a_small_run_is_reproducible(tmp_path):
-    first, again = (train_faces.run(images=8, count=10, steps=3, seed=2) for _ in range(2))
+    first, again = (train_faces.run(images=4, count=6, steps=2, seed=2) for _ in range(2))
     assert list(first[0]) == list(train_faces.TRAINING_SETS)
     for name, result in first[0].items():
         assert result.curves == again[0][name].curves
