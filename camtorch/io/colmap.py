@@ -18,7 +18,7 @@ from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import decoded
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
-from camtorch.io.writing import Lossy, left_over, number
+from camtorch.io.writing import Lossy, all_left_over, number
 from camtorch.rig import Rig
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
@@ -63,8 +63,9 @@ def read(path: str, content: bytes) -> Rig:
     cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
-        if beside is not None and (lost := left_over(beside)) is not None:
-            Record(beside, None, "file").fail(f"missing; an interrupted save left {lost}: rename it, or delete it")
+        if beside is not None and (lost := all_left_over([beside])):
+            name = os.path.basename(lost[0])
+            Record(beside, None, "file").fail(f"missing; an interrupted save left {name}: rename it, or delete it")
         return Rig(cameras)
     images = colmap_images.read(beside)
     if unknown := set(images.cameras) - cameras.keys():
