@@ -148,18 +148,6 @@ def test_a_table_of_a_lens_that_is_nearly_radial(p):
     assert float(result.valid_fraction) == 1
 
 
-@pytest.mark.slow
-def test_rows_of_a_batch_take_as_many_coefficients_as_alone():
-    omega = torch.linspace(0.6, 1.3, 8, **F64)[:, None]
-    source = ct.FOV(torch.tensor([300.0, 300, 320, 240], **F64).expand(8, 4), omega, image_size=SIZE)
-    together = source.convert("kannala_brandt")
-    for i in (0, 3, 7):
-        alone = ct.FOV(source.intrinsics[i].detach(), omega[i], image_size=SIZE).convert("kannala_brandt")
-        count = alone.camera.distortion.shape[-1]
-        assert not bool(together.camera.distortion[i, count:].any())
-        torch.testing.assert_close(together.max_error[i], alone.max_error, rtol=1e-5, atol=1e-9)
-
-
 # -- related models
 
 
