@@ -195,7 +195,8 @@ class GLTF(TextureMesh):
                 raise ValueError(f"{accessor['count']} {accessor['type']} of {accessor['componentType']}")
             wide, start = {"VEC3": 3, "VEC2": 2, "SCALAR": 1}[kind], document["bufferViews"][accessor["bufferView"]]
             numbers = np.frombuffer(buffer, dtype, accessor["count"] * wide, int(start.get("byteOffset", 0)))
-            arrays.append(numbers.reshape(-1, wide).astype(np.float64 if wide > 1 else np.int64))
+            arrays.append(numbers.reshape(-1, wide))
         sizes = document["asset"].get("extras")
-        triangles = arrays[0][:, :2], arrays[1], arrays[2].reshape(-1, 3)
-        return triangles, sizes if isinstance(sizes, dict) else {}
+        places, parts = arrays[0][:, :2].astype(np.float64), arrays[1].astype(np.float64)
+        triangles = arrays[2].reshape(-1, 3).astype(np.int64)
+        return (places, parts, triangles), sizes if isinstance(sizes, dict) else {}

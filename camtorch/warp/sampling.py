@@ -131,13 +131,13 @@ def _natively(
         return None
     values = fill * images.shape[1] if len(fill) == 1 else fill
     if isinstance(where, Lattice):
-        result = sampler.empty(images, len(images), where.size) if out is None else out
+        result = sampler.empty(images, images.shape[0], where.size) if out is None else out
         at = where.single
         sampler.sample(images, result, mode, padding_mode, values, nodes=at.nodes, cells=at.cells, exact=at.exact)
         return result
     if positions.dtype not in (torch.float32, torch.float64):
         return None
-    result = sampler.empty(images, len(images), (positions.shape[1], positions.shape[2])) if out is None else out
+    result = sampler.empty(images, images.shape[0], (positions.shape[1], positions.shape[2])) if out is None else out
     # in "zeros" positions far outside say that there is none
     mapped = None if padding_mode == "zeros" else where.mapped
     sampler.sample(images, result, mode, padding_mode, values, grid=positions, mapped=mapped)
