@@ -6,15 +6,17 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch._dtypes import SIGNED, narrow, widen
 from camtorch.maps.exact import Exact
-from camtorch.warp.grid import OUTSIDE, Sampling
-from camtorch.warp.sampling import MODES, PADDINGS, one_of, render
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
+OUTSIDE = -9.0
+"""A position of `grid_sample` that no image reaches."""
 _FAR = 100.0  # positions beyond are drawn in, as by `Warp`: float32 does not hold all of them, nor do integers
 
 
@@ -77,7 +79,7 @@ class LookupMap:
             padding_mode: "zeros", "border" or "reflection".
 
         Raises:
-            ValueError: another shape or size, or no such mode.
+            ValueError: another shape or size.
         """
         size = self.source_size
         if not isinstance(images, Tensor) or images.is_complex() or images.is_sparse or images.shape[2:] != size:
@@ -85,10 +87,16 @@ class LookupMap:
             raise ValueError(
                 f"LookupMap: images must be a dense tensor (B, C, {size[0]}, {size[1]}) of real numbers; got {what}"
             )
-        grid = self.grid().to(images.device)
-        where = Sampling(grid, torch.ones_like(grid[..., 0], dtype=torch.bool), None)
-        modes = one_of(mode, MODES, "mode", "LookupMap"), one_of(padding_mode, PADDINGS, "padding_mode", "LookupMap")
-        return render(images, where, *modes, (0.0,))
+        grid = self.grid().to(images.device, torch.float64)
+        if mode != "nearest" or images.is_floating_point():
+            values = widen(images)
+            grid = grid.to(values).expand(len(values), -1, -1, -1)
+            return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
+        # which pixel it is, counted from 1, as no float holds every id
+        place = torch.arange(1, math.prod(size) + 1, device=images.device).to(grid).view(1, 1, *size)
+        index = F.grid_sample(place, grid, mode, padding_mode, align_corners=False)[0, 0].long()
+        pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
+        return F.pad(pixels, (1, 0))[..., index].view(images.dtype)
 
     def error(self, warp: Warp) -> Tensor:
         """(H', W') float64: how far it is from a warp, in pixels of the source; NaN where the warp shows nothing.

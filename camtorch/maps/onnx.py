@@ -15,9 +15,8 @@ import numpy as np
 import torch
 
 from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
+from camtorch.maps.lookup import OUTSIDE, LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, MapFormat, Options, checked
-from camtorch.warp.grid import OUTSIDE
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")
