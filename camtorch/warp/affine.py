@@ -15,8 +15,8 @@ from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
-from camtorch.warp.routes import Sampler, positions, route_of
-from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, joined, render
+from camtorch.warp.routes import positions, route_of
+from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, Sampler, joined, render
 from camtorch.warp.warp import Warp, checked
 
 SHRINKS = 1.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ from camtorch.native.sampler import empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.sampling import PADDINGS, Mode, PaddingMode, Pyramid, render
+from camtorch.warp.sampling import PADDINGS, Mode, PaddingMode, Pyramid, Sampler, render
 from camtorch.warp.shutter import averaged
 
 if TYPE_CHECKING:
@@ -34,14 +34,6 @@ Route = Literal["exposure", "operator", "strips", "graph", "kept"]
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
-
-
-class Sampler(NamedTuple):
-    """How the images of one call are sampled."""
-
-    mode: Mode
-    padding_mode: PaddingMode
-    fill: tuple[float, ...]
 
 
 def route_of(warp: Warp, inputs: Sequence[Tensor], images: Tensor | None = None, mode: Mode = "nearest") -> Route:

@@ -26,6 +26,7 @@ from camtorch.warp.sampling import (
     Mode,
     Options,
     PaddingMode,
+    Sampler,
     as_fill,
     as_options,
     one_of,
@@ -396,7 +397,7 @@ class Warp(GeometryModule):
 
 def checked(
     warp: Warp, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
-) -> routes.Sampler:
+) -> Sampler:
     """How a warp samples images in one call, if they and its options are as `Warp.forward` wants them."""
     expected = warp.source.size_for("Warp")
     if not isinstance(images, Tensor) or images.dtype.is_complex:
@@ -426,7 +427,7 @@ def checked(
     values = warp.fill if fill is None else as_fill(fill, "Warp")
     if len(values) not in (1, shape[1]):
         raise ValueError(f"Warp: fill has {len(values)} values, but the images have {shape[1]} channels")
-    return routes.Sampler(
+    return Sampler(
         warp.mode if mode is None else one_of(mode, MODES, "mode", "Warp"),
         warp.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp"),
         values,
