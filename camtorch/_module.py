@@ -341,7 +341,7 @@ class Memo:
             return compute()
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
-            copies = [t.detach().clone() for t in inputs]
+            copies = [t.clone() for t in inputs]
             result = compute()
         self._kept, self.result = [(options, copies, result), *self._kept[: self.capacity - 1]], result
         return result
