@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_flag, as_mapping
+from camtorch._arguments import as_mapping
 from camtorch.augment.augmentation import Augmentation, Range, draw
 from camtorch.augment.change import Change
 from camtorch.augment.edits import Edit, change_by
@@ -86,10 +86,9 @@ class Compose(Augmentation):
             ranges,
             camera=camera,
             fields=fields,
-            antialias=antialias is not None and as_flag(antialias, "antialias", name),
+            antialias=antialias,
             **options,
         )
-        self.antialias = antialias
         self.augmentations = nn.ModuleList(parts)
         self.needs_camera: bool = any(part.needs_camera for part in parts)
         self._check_options(parts)

@@ -45,8 +45,7 @@ class Edit(Augmentation):
     def __init__(self, ranges: Mapping[str, Range] | None = None, *, antialias: bool | None = None, **options: Any):
         if options.get("min_filled") is not None:
             raise TypeError(f"{type(self).__name__}: there is no min_filled here; RandomCamera has it")
-        super().__init__(ranges, antialias=bool(antialias), **options)
-        self.antialias = antialias
+        super().__init__(ranges, antialias=antialias, **options)
 
     needs_camera = False
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
+import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast
 
 import numpy as np
 import torch
@@ -30,6 +32,7 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
+from camtorch.warp.sampling import Options, as_options
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -307,16 +310,51 @@ def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
     return wrapped
 
 
+class SampleOptions(TypedDict, total=False):
+    """What every transform of samples takes; see `Augmentation`."""
+
+    camera: Camera | None
+    fields: Mapping[str, str] | None
+    mode: str
+    padding_mode: str
+    fill: float | Sequence[float]
+    mask_fill: float
+    valid_mask: bool
+    antialias: bool | None
+    tolerance: float
+
+
 class SampleTransform(nn.Module):
     """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
 
     fields: dict[str, str]
     mask_fill: float
     valid_mask: bool
+    options: Options
+    """Of warps."""
+    antialias: bool | None
+    """As in `options`, but None where each warp says."""
+    other_words: ClassVar[Mapping[str, str]] = {}
+    """Words that people try as keywords -> the keyword, for the hint of an error."""
 
-    def __init__(self, camera: Camera | None, fields: Mapping[str, str] | None, mask_fill: float, valid_mask: bool):
+    def __init__(
+        self,
+        *,
+        camera: Camera | None = None,
+        fields: Mapping[str, str] | None = None,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+        fill: float | Sequence[float] = 0.0,
+        mask_fill: float = 0.0,
+        valid_mask: bool = False,
+        antialias: bool | None = False,
+        tolerance: float = 0.001,
+        **unknown: object,
+    ):
         super().__init__()
         self._name = type(self).__name__
+        for name in unknown:
+            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
         if camera is not None and not isinstance(camera, Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
         self.camera = camera
@@ -324,8 +362,25 @@ class SampleTransform(nn.Module):
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
         if wrong:
             raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
+        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        self.antialias = None if antialias is None else self.options["antialias"]
         self.mask_fill = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask = as_flag(valid_mask, "valid_mask", self._name)
+
+    @classmethod
+    def _meant(cls, word: str) -> str:
+        """The keyword that somebody may have meant."""
+        known = [
+            parameter.name
+            for owner in cls.__mro__
+            if "__init__" in vars(owner) and issubclass(owner, SampleTransform)
+            for parameter in inspect.signature(vars(owner)["__init__"]).parameters.values()
+            if parameter.kind is not parameter.VAR_KEYWORD and parameter.name != "self"
+        ]
+        close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
+        if close:
+            return f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
+        return f"; known are {', '.join(dict.fromkeys(known))}"
 
     mirroring: Mirroring | None = None
     """What changes places where an augmentation mirrors; None: it never does."""

@@ -16,11 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import GUESS_CAMERA, no_camera
-from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
-from camtorch.augment.sample import Unknown
 from camtorch.camera import Camera
 
 try:
@@ -79,10 +77,7 @@ class Transform(v2.Transform):
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, *, valid: bool = False):
         super().__init__()
-        if not isinstance(augmentation, Augmentation):
-            raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
-        if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"{_OWNER}: camera must be a Camera; got {no_camera(camera)}")
+        check_front_end(_OWNER, augmentation, camera)
         self.augmentation = augmentation
         self.camera, self.valid = camera, bool(valid)
         self._flags: list[tuple[Tensor, Tensor]] = []
@@ -109,26 +104,8 @@ class Transform(v2.Transform):
         cameras = [one for one in flat_inputs if isinstance(one, Camera)]
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample has one camera; here are {len(cameras)}")
-        camera = cameras[0] if cameras else self.augmentation.camera if self.camera is None else self.camera
-        if camera is None and not self.augmentation.needs_camera:
-            size = next((size for one in flat_inputs if (size := _size(one)) is not None), None)
-            camera = None if size is None else Unknown.of(size)
-        if camera is None:
-            raise ValueError(
-                f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation. {GUESS_CAMERA}"
-            )
-        if camera.image_size is None or camera.batch_shape:
-            raise ValueError(
-                f"{_OWNER}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} "
-                f"and batch dims {tuple(camera.batch_shape)}"
-            )
-        for one in flat_inputs:
-            size = _size(one)
-            if size not in (None, camera.image_size):
-                raise ValueError(
-                    f"{_OWNER}: {type(one).__name__} is {size} (height, width), but the camera's image_size is "
-                    f"{camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
-                )
+        sizes = [(type(one).__name__, size) for one in flat_inputs if (size := _size(one)) is not None]
+        camera = camera_of_sample(_OWNER, self.augmentation, cameras[0] if cameras else self.camera, sizes)
         with torch.no_grad():
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.change(camera, self.augmentation.draw(1))
