@@ -443,27 +443,24 @@ class SampleTransform(nn.Module):
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
         camera = self._camera_of(named) if camera is None else camera
         batched = is_batch(named, camera)
-        counts: dict[str, int] = {}
+        count = -1
         for name, (found, value) in named.items():
-            if isinstance(value, (list, tuple)):
-                items = [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
-                for i, item in enumerate(items):
-                    check(found, f"{name}[{i}]", item, False, self._name)
-                    if not predicted:
-                        check_values(found, f"{name}[{i}]", item, self._name)
-                value = items
-            else:
-                check(found, name, value, batched, self._name)
+            several = isinstance(value, (list, tuple))
+            items = (
+                [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)] if several else [value]
+            )
+            for i, item in enumerate(items):
+                which = f"{name}[{i}]" if several else name
+                check(found, which, item, batched and not several, self._name)
                 if not predicted:
-                    check_values(found, name, value, self._name)
-                value = value if batched else value.unsqueeze(0)
-            named[name], counts[name] = (found, value), len(value)
-            count = next(iter(counts.values()))
-            if counts[name] != count:
-                raise ValueError(f"{self._name}: {name} is of {counts[name]} samples, other fields are of {count}")
+                    check_values(found, which, item, self._name)
+            value = items if several else value if batched else value.unsqueeze(0)
+            named[name], count = (found, value), len(value) if count < 0 else count
+            if len(value) != count:
+                raise ValueError(f"{self._name}: {name} is of {len(value)} samples, other fields are of {count}")
         self._check_cameras(camera, count, named, batched)
-        values = [v for _, value in named.values() for v in (value if isinstance(value, list) else [value])]
-        device = values[0].device if values else torch.device("cpu")
+        tensors = (v for _, value in named.values() for v in (value if isinstance(value, list) else [value]))
+        device = next((tensor.device for tensor in tensors), torch.device("cpu"))
         camera = alone(as_one(camera))
         camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
         return named, batched, count, camera
@@ -485,24 +482,24 @@ class SampleTransform(nn.Module):
             if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
                 raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
             for field, (found, value) in named.items():
-                # one for each sample where there are as many cameras
-                images = value if isinstance(value, list) else [value]
-                images = images[i : i + 1] if isinstance(value, list) and len(cameras) > 1 else images
-                for shape in {tuple(image.shape) for image in images if found in IMAGES}:
-                    size = shape[-2:]
-                    if size != one.image_size:
-                        if shape[-3:-1] == one.image_size:
-                            shape = shape if batched or isinstance(value, list) else shape[1:]
-                            to = "0, 3, 1, 2" if len(shape) == 4 else "2, 0, 1"
-                            raise ValueError(
-                                f"{self._name}: {field} is {shape}, with the channels last. A tensor goes in as "
-                                f"{field}.permute({to}), an array as {field}.transpose({to}); "
-                                "camtorch.augment.numpy takes arrays as they are"
-                            )
-                        raise ValueError(
-                            f"{self._name}: {field} is {size} (height, width), but the image_size of {name} is "
-                            f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
-                        )
+                if found in IMAGES:
+                    images = value if isinstance(value, list) else [value if batched else value[0]]
+                    for image in images[i : i + 1] if several and isinstance(value, list) else images:
+                        self._check_size(field, tuple(image.shape), name, one.image_size)
+
+    def _check_size(self, field: str, shape: tuple[int, ...], name: str, size: tuple[int, int]) -> None:
+        if shape[-2:] == size:
+            return
+        if shape[-3:-1] == size:
+            to = "0, 3, 1, 2" if len(shape) == 4 else "2, 0, 1"
+            raise ValueError(
+                f"{self._name}: {field} is {shape}, with the channels last. A tensor goes in as {field}.permute({to}), "
+                f"an array as {field}.transpose({to}); camtorch.augment.numpy takes arrays as they are"
+            )
+        raise ValueError(
+            f"{self._name}: {field} is {shape[-2:]} (height, width), but the image_size of {name} is {size}. "
+            "camera.resize, .crop and .pad give the camera of an edited image"
+        )
 
     def _moved(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
         """The sample after a change; `named` holds its fields as a batch."""
@@ -515,17 +512,16 @@ class SampleTransform(nn.Module):
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
 
         for name, (found, value) in named.items():
+            valid: Any
             if isinstance(value, list):
                 pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
                 put(name, [result.squeeze(0) for result, _ in pairs])
-                flags = [valid.squeeze(0) for _, valid in pairs if valid is not None]
-                if flags:
-                    self._put_valid(put, sample, f"{name}_valid", flags, batched)
+                valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
             else:
                 result, valid = self._one(change, found, value, options)
                 put(name, result)
-                if valid is not None:
-                    self._put_valid(put, sample, f"{name}_valid", valid, batched)
+            if valid is not None:
+                put(f"{name}_valid", self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"), batched))
         before = sample.get("image_valid")
         if before is not None:
             before = torch.as_tensor(before) != 0
@@ -553,43 +549,36 @@ class SampleTransform(nn.Module):
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
         mirroring = cast("Mirroring", self.mirroring)
-        mirroring.sides(named)  # that none lacks the other, whatever was drawn
-        kept: dict[str, tuple[str | None, Any]] = {}
-        for name in mirroring.by_name:
-            if name in moved and name not in named:
-                moved[name] = self._of_landmarks(moved[name], name)
-                kept[name] = None, moved[name]
-        for name, (found, value) in {**named, **kept}.items():
+        sides = mirroring.sides(named)  # that none lacks the other, whatever was drawn
+        kept = {name: (None, moved[name]) for name in mirroring.by_name if name in moved and name not in named}
+        for name, (_, value) in kept.items():  # what says something of each landmark, and does not move itself
+            several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
+            if not several and not isinstance(value, (Tensor, np.ndarray)):
+                raise TypeError(
+                    f"{self._name}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
+                    f"{type(value).__name__}"
+                )
+            moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
+        for name, (found, _) in {**named, **kept}.items():
             for key, flags in ((name, found is None), (f"{name}_valid", True)):
-                if isinstance(value, list):
-                    rows = torch.zeros(len(value), dtype=torch.bool) if mirrored is None else mirrored
-                    pairs = zip(moved.get(key, ()), rows, strict=False)
-                    new = [mirroring.swapped(name, found, v[None], row[None], flags)[0] for v, row in pairs]
-                    moved.update({key: new} if key in moved else {})
-                elif key in moved:
-                    now = moved[key] if batched else moved[key][None]
-                    rows = torch.zeros(len(now), dtype=torch.bool) if mirrored is None else mirrored
-                    swapped = mirroring.swapped(name, found, now, rows, flags)
-                    moved[key] = swapped if batched else swapped[0]
-        for left, right in mirroring.sides(named) if mirrored is not None else ():
-            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
-                if one not in moved or other not in moved:
+                if key not in moved:
                     continue
-                single = not (batched or isinstance(moved[one], list))
-                rows = cast("Tensor", mirrored)
-                pair = [moved[key].unsqueeze(0) if single else moved[key] for key in (one, other)]
-                for key, new in zip((one, other), exchanged(pair[0], pair[1], rows), strict=True):
-                    moved[key] = new.squeeze(0) if single else new
-
-    def _of_landmarks(self, value: Any, name: str) -> Tensor | list[Tensor]:
-        """What a field that does not move says of each landmark, which changes places with it."""
-        several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
-        if not several and not isinstance(value, (Tensor, np.ndarray)):
-            raise TypeError(
-                f"{self._name}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
-                f"{type(value).__name__}"
-            )
-        return [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
+                now, single = moved[key], not (batched or isinstance(moved[key], list))
+                now = now[None] if single else now
+                rows = torch.zeros(len(now), dtype=torch.bool) if mirrored is None else mirrored
+                if isinstance(now, list):
+                    pairs = zip(now, rows, strict=False)
+                    moved[key] = [mirroring.swapped(name, found, v[None], row[None], flags)[0] for v, row in pairs]
+                else:
+                    swapped = mirroring.swapped(name, found, now, rows, flags)
+                    moved[key] = swapped[0] if single else swapped
+        for left, right in sides if mirrored is not None else ():
+            for pair in ((left, right), (f"{left}_valid", f"{right}_valid")):
+                if all(key in moved for key in pair):
+                    single = not (batched or isinstance(moved[pair[0]], list))
+                    values = [moved[key].unsqueeze(0) if single else moved[key] for key in pair]
+                    for key, new in zip(pair, exchanged(*values, cast("Tensor", mirrored)), strict=True):
+                        moved[key] = new.squeeze(0) if single else new
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
@@ -598,21 +587,18 @@ class SampleTransform(nn.Module):
         # geometry is computed in float32 at least; what came in half precision goes out in it
         return result.to(value.dtype) if value.dtype.is_floating_point else result, valid
 
-    def _put_valid(
-        self, put: Callable[[str, Any], None], sample: Sample, name: str, valid: Tensor | list[Tensor], batched: bool
-    ) -> None:
-        """Put the validity of a field, which stays invalid where it was; any number but zero is valid, as in COCO."""
-        given = sample.get(name)
-        if given is not None:
-            many = isinstance(valid, list)
-            before = [torch.as_tensor(b) != 0 for b in (given if many else [given])]
-            now = valid if isinstance(valid, list) else [valid if batched else valid.squeeze(0)]
-            if [b.shape for b in before] != [v.shape for v in now]:
-                shapes = ", ".join(str(tuple(v.shape)) for v in now)
-                raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
-            now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
-            valid = now if many else now[0] if batched else now[0].unsqueeze(0)
-        put(name, valid)
+    def _still(self, name: str, valid: Any, given: Any, batched: bool) -> Any:
+        """Flags of a batch, invalid where those given were; any number but zero is valid, as in COCO."""
+        if given is None:
+            return valid
+        many, single = isinstance(valid, list), not batched
+        now = valid if many else [valid.squeeze(0) if single else valid]
+        before = [torch.as_tensor(b) != 0 for b in (given if many else [given])]
+        if [b.shape for b in before] != [v.shape for v in now]:
+            shapes = ", ".join(str(tuple(v.shape)) for v in now)
+            raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
+        now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
+        return now if many else now[0].unsqueeze(0) if single else now[0]
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:
