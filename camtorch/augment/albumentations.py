@@ -18,7 +18,7 @@ import torch
 from albumentations.core.type_definitions import Targets
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
+from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
 from camtorch.augment.sample import KINDS, Unknown, moves
@@ -114,13 +114,8 @@ class Transform(A.DualTransform):
 
     def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
-        moved = change.points(torch.as_tensor(keypoints[:, :2])[None])[0][0].numpy()
-        lost = (keypoints[:, :2] == -1).all(1, keepdims=True)
-        moved, mirroring = np.where(lost, -1, moved), self.augmentation.mirroring
-        if mirroring is not None and change.mirrored is not None:
-            order = mirroring.order("keypoints", "keypoints", len(moved))
-            moved = moved if order is None else moved[list(order)]
-        return np.concatenate((moved, keypoints[:, 2:]), 1)
+        moved = move_points(self.augmentation, change, torch.as_tensor(keypoints[:, :2])[None])[0][0]
+        return np.concatenate((moved.numpy(), keypoints[:, 2:]), 1)
 
     def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""

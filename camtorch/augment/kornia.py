@@ -24,7 +24,7 @@ from camtorch._arguments import as_part, shown
 from camtorch._dtypes import narrow, widen
 from camtorch._module import Memo, remade
 from camtorch.augment import compose, edits, random_camera
-from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
+from camtorch.augment.augmentation import Augmentation, check_front_end, check_single, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
@@ -210,21 +210,11 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         self, input: Keypoints, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
     ) -> Keypoints:
         rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
-        moved, valid = self._move(params, rows, lambda change, pixels: change.points(pixels), back)
-        lost = (rows == -1).all(-1)
-        moved, valid, lost = self._mirrored(params, moved, valid, lost)
+        own = self.augmentation
+        moved, valid = self._move(params, rows, lambda change, pixels: move_points(own, change, pixels), back)
         result = input.clone()
-        result._data = torch.where(lost.unsqueeze(-1), -1.0, moved).reshape(input.shape)
-        self.keypoints_valid = (valid & ~lost).reshape(input.shape[:-1])
+        result._data, self.keypoints_valid = moved.reshape(input.shape), valid.reshape(input.shape[:-1])
         return result
-
-    def _mirrored(self, params: Params, *values: Tensor) -> list[Tensor]:
-        """Landmarks (B, N, ...) in their order in a mirror, where the augmentation has a table of them."""
-        mirroring = self.augmentation.mirroring
-        mirrored = None if mirroring is None else self.change(params, values[0].device).mirrored
-        if mirroring is None or mirrored is None:
-            return list(values)
-        return [mirroring.swapped("keypoints", "keypoints", value, mirrored, True) for value in values]
 
     def apply_transform_box(
         self, input: Boxes, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False

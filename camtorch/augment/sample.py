@@ -576,8 +576,8 @@ class SampleTransform(nn.Module):
             for pair in ((left, right), (f"{left}_valid", f"{right}_valid")):
                 if all(key in moved for key in pair):
                     single = not (batched or isinstance(moved[pair[0]], list))
-                    values = [moved[key].unsqueeze(0) if single else moved[key] for key in pair]
-                    for key, new in zip(pair, exchanged(*values, cast("Tensor", mirrored)), strict=True):
+                    one, other = (moved[key].unsqueeze(0) if single else moved[key] for key in pair)
+                    for key, new in zip(pair, exchanged(one, other, cast("Tensor", mirrored)), strict=True):
                         moved[key] = new.squeeze(0) if single else new
 
     @staticmethod

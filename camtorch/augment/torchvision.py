@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
+from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
 from camtorch.camera import Camera
@@ -124,12 +124,7 @@ class Transform(v2.Transform):
         plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
         if isinstance(inpt, _PLACES):
             of_boxes = isinstance(inpt, tv_tensors.BoundingBoxes)
-            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else _points(change, plain)
-            mirroring = self.augmentation.mirroring
-            if mirroring is not None and change.mirrored is not None and not of_boxes and plain.ndim > 1:
-                order = mirroring.order("keypoints", "keypoints", plain.shape[-2])
-                if order is not None:
-                    moved, valid = moved[..., order, :], valid[..., order]
+            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else self._points(change, plain)
             if change.parts[0].warp is None:
                 moved = plain
             result = tv_tensors.wrap(moved, like=inpt, canvas_size=camera.image_size)
@@ -144,6 +139,14 @@ class Transform(v2.Transform):
         if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
             return tv_tensors.wrap(_images(change, plain), like=inpt)
         return inpt if isinstance(inpt, tv_tensors.TVTensor) else _images(change, plain)
+
+    def _points(self, change: Change, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (..., 2), and valid (...)."""
+        number = points.shape[-2] if points.ndim > 1 else 1
+        rows = _wide(points).reshape(1, math.prod(points.shape[:-2]), number, 2)
+        moved, valid = move_points(self.augmentation, change, rows)
+        moved = moved if points.is_floating_point() else moved.round()
+        return moved.reshape(points.shape).to(points.dtype), valid.reshape(points.shape[:-1])
 
 
 def _put(outputs: Any, flags: list[tuple[Tensor, Tensor]]) -> None:
@@ -196,27 +199,15 @@ def _labels(change: Change, masks: Tensor, fill: float) -> Tensor:
     return moved.reshape(*masks.shape[:-2], *moved.shape[-2:])
 
 
-def _points(change: Change, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (..., 2), and valid (...)."""
-    lost = (points == -1).all(-1)
-    moved, valid = (t[0] for t in change.points(_wide(points).reshape(1, math.prod(points.shape[:-1]), 2)))
-    moved = torch.where(lost.unsqueeze(-1), -1.0, moved.reshape(points.shape))
-    return (moved if points.is_floating_point() else moved.round()).to(points.dtype), valid.reshape(lost.shape) & ~lost
-
-
 def _boxes(change: Change, boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
     """Boxes (M, 4) between pixel edges, of one of torchvision's formats, and valid (M,)."""
-    one, two = _wide(boxes).chunk(2, -1)
-    if form == "XYXY":
-        low, high = one, two
-    elif form == "XYWH":
-        low, high = one, one + two
-    elif form == "CXCYWH":
-        low, high = one - two / 2, one + two / 2
-    else:
+    if form not in ("XYXY", "XYWH", "CXCYWH"):
         raise ValueError(
             f"{_OWNER}: boxes of the format {form} turn with no lens; v2.ConvertBoundingBoxFormat('XYXY') encloses them"
         )
+    one, two = _wide(boxes).chunk(2, -1)
+    low = one - two / 2 if form == "CXCYWH" else one
+    high = {"XYXY": two, "XYWH": one + two, "CXCYWH": one + two / 2}[form]
     whole = not boxes.is_floating_point()
     if whole:  # as torchvision reads them
         low, high = low.trunc(), high.trunc()
