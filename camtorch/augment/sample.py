@@ -70,40 +70,14 @@ class Field:
     """Whether its number of dims tells a batch from a single sample."""
 
 
-def _image(change: Change, images: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.images(images)
+def _planes(move: Move) -> Move:
+    """Of masks and the like, which also come without channels, (B, H, W)."""
 
+    def of(change: Change, value: Tensor, options: Mapping[str, float]) -> Tensor:
+        moved: Tensor = move(change, value.unsqueeze(1) if value.ndim == 3 else value, options)
+        return moved.squeeze(1) if value.ndim == 3 else moved
 
-def _mask(change: Change, masks: Tensor, options: Mapping[str, float]) -> Tensor:
-    flat = masks.ndim == 3
-    moved = change.labels(masks.unsqueeze(1) if flat else masks, options["mask_fill"])
-    return moved.squeeze(1) if flat else moved
-
-
-def _depth(change: Change, depth: Tensor, options: Mapping[str, float]) -> Tensor:
-    flat = depth.ndim == 3
-    moved = change.depth(depth.unsqueeze(1) if flat else depth)
-    return moved.squeeze(1) if flat else moved
-
-
-def _distance(change: Change, distance: Tensor, options: Mapping[str, float]) -> Tensor:
-    return _mask(change, distance, {"mask_fill": 0.0})
-
-
-def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    return change.points(pixels)
-
-
-def _boxes(change: Change, boxes: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    return change.boxes(boxes)
-
-
-def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(rays)
-
-
-def _pitch_yaw(change: Change, angles: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(angles, from_pitch_yaw, to_pitch_yaw)
+    return of
 
 
 def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
@@ -133,32 +107,41 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
     return torch.where(still.unsqueeze(-1), rvec.to(turned), rotation_vector(turned))
 
 
-def _rotation(change: Change, rotation: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(rotation, _columns, _columns)
-
-
 _MANY = 16
 _ROUNDING = 0.01
-_RAYS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays)
+
+
+def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
+    return change.rays(rays)
+
+
+def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+    return change.points(pixels)
+
+
+_DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays)
 _POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose)
+_MASKS = "(B, C, H, W) or (B, H, W)"
+_DEPTHS = "(B, 1, H, W) or (B, H, W), along"
+_PITCH_YAW = "(B, *N, 2) pitch and yaw of a gaze in radians"
 KINDS = {
-    "image": Field(3, 3, (), "(B, C, H, W)", _image, True),
-    "mask": Field(2, 3, (), "(B, C, H, W) or (B, H, W)", _mask),
-    "depth": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along z", _depth),
-    "distance": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along the ray", _distance),
+    "image": Field(3, 3, (), "(B, C, H, W)", lambda change, images, _: change.images(images), True),
+    "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
+    "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
+    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.labels(distance))),
     "keypoints": Field(2, 3, (2,), "(B, N, 2) pixels x, y", _pixels, True),
     "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
-    "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", _boxes, True),
+    "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
     "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
     "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _rays),
-    "gaze": _RAYS,
-    "directions": _RAYS,
-    "pitch_yaw": Field(1, _MANY, (2,), "(B, *N, 2) pitch and yaw of a gaze in radians", _pitch_yaw),
+    "gaze": _DIRECTIONS,
+    "directions": _DIRECTIONS,
+    "pitch_yaw": Field(1, _MANY, (2,), _PITCH_YAW, lambda c, angles, _: c.rays(angles, from_pitch_yaw, to_pitch_yaw)),
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector),
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _rays),
-    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation),
+    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
 _SINGLE_FILE = ("keypoints", "landmarks")  # which OpenCV has as (N, 1, 2)
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
