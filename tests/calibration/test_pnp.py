@@ -101,8 +101,7 @@ def test_noisy_pixels_are_explained_better_than_by_the_truth(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["planar", "space"])
-@pytest.mark.parametrize("fov", [10, 90, 190])
+@pytest.mark.parametrize(("fov", "kind"), [(10, "space"), (190, "planar")])
 def test_poses_end_in_the_optimum(fov, kind):
     cases = product((4, 5, 8, 50), (0.0, 0.1, 1.0))
     good = [attempts(lens(fov), fov, 100, points, kind, noise, points) for points, noise in cases]
