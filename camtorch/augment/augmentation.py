@@ -345,8 +345,8 @@ class Augmentation(SampleTransform):
     def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What `new_camera` is given."""
         values = {name: value for name, value in draw.items() if name != "apply"}
-        batched = bool(source.batch_shape) or not _one_for_all(values)
-        if not batched:  # one map serves the whole batch
+        # one map serves the whole batch where all samples draw the same
+        if not source.batch_shape and all(holds(value == value[:1]) for value in values.values()):
             values = {name: value[0] for name, value in values.items()}
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
@@ -482,11 +482,6 @@ class Augmentation(SampleTransform):
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
-
-
-def _one_for_all(values: Mapping[str, Tensor]) -> bool:
-    """Whether all samples draw the same. Of none, nothing can be said."""
-    return all(holds(value == value[:1]) for value in values.values())
 
 
 # -- for front ends, which hold an augmentation and the camera of their images

@@ -105,7 +105,7 @@ class CanonicalCamera(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
-        scale = self._scale_of_each(camera, count)
+        scale = self.scale(camera).expand(count)
         if self.scales == "depth":
             moved = self._scaled(sample, named, batched, scale)
         else:
@@ -129,7 +129,7 @@ class CanonicalCamera(SampleTransform):
         sample.pop("scale", None)
         if self.scales == "depth":
             named, batched, count, camera = self._batch(sample, predicted=True)
-            return self._scaled(sample, named, batched, 1 / self._scale_of_each(camera, count))
+            return self._scaled(sample, named, batched, 1 / self.scale(camera).expand(count))
         source = sample.pop("source_camera", None)
         if source is None:
             raise ValueError(f"{self._name}: to go back, the sample needs source_camera as it came out")
@@ -144,10 +144,6 @@ class CanonicalCamera(SampleTransform):
 
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
-
-    def _scale_of_each(self, camera: Camera, count: int) -> Tensor:
-        """(count,)."""
-        return self.scale(camera).expand(count)
 
     def _scaled(self, sample: Sample, named: Named, batched: bool, scale: Tensor) -> Sample:
         """The sample with every length of the camera's frame times a factor (B,)."""
