@@ -24,11 +24,10 @@ from camtorch._arguments import (
     shown,
 )
 from camtorch._module import typed_as
-from camtorch._threads import on_one_thread
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, as_one
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
 from camtorch.warp.shutter import RollingShutter
@@ -401,8 +400,7 @@ class Augmentation(SampleTransform):
 
     # -- applying
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def forward(
         self,
         sample: Mapping[str, Any] | None = None,
@@ -437,8 +435,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def inverse(
         self,
         sample: Mapping[str, Any] | None = None,
