@@ -25,7 +25,7 @@ from camtorch._arguments import (
 )
 from camtorch._module import typed_as
 from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.change import Change, Part, alone, as_one
+from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.camera import Camera
@@ -284,11 +284,13 @@ class Augmentation(SampleTransform):
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
             )
-        batch_type = type(camera) if isinstance(camera, Mixed) else None
+
+        def part(rows: list[int] | None, source: Camera) -> Part:
+            return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
+
         looks = may_look(applied) or count == 0
         if not looks or bool(applied.all()):  # traced, all rows move, and a gate chooses
-            parts = [self._part_of(rows, group, draw, True) for rows, group in groups]
-            return Change(count, parts, batch_type=batch_type, gate=None if looks or self.p == 1 else applied)
+            return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
         parts, chosen = [], applied.tolist()
         for rows, group in groups:
             rows = list(range(count)) if rows is None else rows
@@ -296,19 +298,15 @@ class Augmentation(SampleTransform):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
                 if here:
                     source = group[here] if group.batch_shape and len(here) < len(rows) else group
-                    parts.append(self._part_of([rows[n] for n in here], source, draw, moves))
+                    own = [rows[n] for n in here]
+                    parts.append(part(own, source) if moves else Part(own, None, source))
         sizes = {part.target.image_size for part in parts}
         if len(sizes) > 1 and len(before) == 1:
             found = sorted(map(str, sizes))
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {found}; with p < 1 the size must stay"
             )
-        return Change(count, parts, batch_type=batch_type)
-
-    def _part_of(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor], moves: bool) -> Part:
-        if not moves:
-            return Part(rows, None, source)
-        return self._part(rows, source, draw if rows is None else {name: value[rows] for name, value in draw.items()})
+        return Change(count, parts, batch_type=type(camera) if isinstance(camera, Mixed) else None)
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         as_mapping(draw, "draw", self._name, "what draw() returns")
