@@ -16,9 +16,10 @@ from camtorch._module import remade
 from camtorch.camera import Camera
 from camtorch.mixed import Listed, Mixed
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
+from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shutter import Shutters
-from camtorch.warp.warp import Warp, corners_of, in_order
+from camtorch.warp.warp import Warp
 
 _ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
 Moved = TypeVar("Moved", Tensor, tuple[Tensor, Tensor])

@@ -26,9 +26,10 @@ from camtorch.projection.domain import domain_of
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
 from camtorch.projection.unproject import has_ray
 from camtorch.rotations import mount_rotation
-from camtorch.warp.light import vignetting
+from camtorch.warp.boxes import along_edges
 from camtorch.warp.shutter import RollingShutter
-from camtorch.warp.warp import Warp, along_edges
+from camtorch.warp.vignetting import vignetting
+from camtorch.warp.warp import Warp
 
 RangeLike = float | Sequence[float]
 

@@ -5,7 +5,7 @@ import torch
 
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens
-from camtorch.warp.warp import along_edges
+from camtorch.warp.boxes import along_edges
 
 WHOLE = [name for name in PRESETS if name != "aria"]
 """Of Aria's, the calibrated polynomial folds before the corners: they lie beyond what the lens lights."""
