@@ -21,8 +21,8 @@ from camtorch.augment.sample import IMAGES, Sample, kind_of
 from camtorch.camera import Camera
 from camtorch.data.columns import camera_of
 from camtorch.data.seeded import Key, Seeded
+from camtorch.warp.proxy import ProxyWarp
 from camtorch.warp.shutter import Shutters
-from camtorch.warp.surface import SurfaceWarp
 from camtorch.warp.warp import Warp
 
 Moves = Augmentation | FaceNormalizer | Warp | Callable[[Camera], Warp]
@@ -36,7 +36,7 @@ class Always(Augmentation):
     warp: Warp
 
     def __init__(self, warp: Warp, owner: str, fields: Mapping[str, str] | None = None):
-        if isinstance(warp, SurfaceWarp):
+        if isinstance(warp, ProxyWarp):
             raise TypeError(f"{owner}: {type(warp).__name__} moves images alone; call it on them, without their labels")
         if warp.batch_shape:
             raise ValueError(f"{owner}: the warp must be a single one; got batch dims {tuple(warp.batch_shape)}")
