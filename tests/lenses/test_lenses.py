@@ -14,7 +14,7 @@ import camtorch as ct
 from camtorch.cli.main import main
 from camtorch.lenses.collection import columns
 from camtorch.lenses.drawing import lenses_for
-from camtorch.warp.warp import along_edges
+from camtorch.warp.boxes import along_edges
 
 SAMPLE = Path(__file__).parents[1] / "files" / "lenses.csv"
 """Some rows of the collection, as they were published, with their numbers."""
