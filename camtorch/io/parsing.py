@@ -157,7 +157,7 @@ def _value_of(path: str | os.PathLike[str], node: ast.expr) -> Any:
     if isinstance(node, (ast.List, ast.Tuple)):
         return [_value_of(path, item) for item in node.elts]
     if isinstance(node, ast.Dict):
-        keys = [key and _value_of(path, key) for key in node.keys]
+        keys: list[Any] = [key and _value_of(path, key) for key in node.keys]
         if not all(isinstance(key, str) for key in keys):
             raise CameraFileError(path, f"line {node.lineno}", "a key that is no text")
         if (twice := repeated(keys)) is not None:
