@@ -125,7 +125,7 @@ WRONG = [
     (lambda: ct.data.from_columns(7), TypeError, r"from_columns: columns must be a dict of columns; got int"),
     (lambda: ct.data.from_columns({}), ValueError, r"from_columns: camera_model, .* is missing"),
     (lambda: ct.data.MapBatches(WARP, key=7), TypeError, r"MapBatches: key must be the name of a column.*got 7"),
-    (lambda: ct.data.MapBatches(WARP)({"image": 3}), TypeError, r"a batch must be a dict of arrays.*got .*3"),
+    (lambda: ct.data.MapBatches(WARP)({"image": 3}), TypeError, r"a batch must be a dict of arrays, .*; got .*image"),
     (lambda: ct.data.MapBatches(ct.Warp(BATCH, BATCH)), ValueError, r"the warp must be a single one; got batch dims"),
     (lambda: ct.data.MapSamples(WARP, key=[]), TypeError, r"MapSamples: key must name an entry of a sample; got \[\]"),
     (lambda: ct.triangulate(7, [POSE] * 2, torch.ones(2, 5, 2)), TypeError, r"cameras must be Camera in a list; got a"),
