@@ -437,7 +437,7 @@ def test_plain_rotations_are_copied():
 @pytest.mark.slow
 def test_export_takes_any_number_of_cameras_that_are_inputs(monkeypatch):
     # as if images were so large that little is kept: a comparison with that would bound the batch
-    for module in ("warp.warp", "camera"):
+    for module in ("warp.routes", "camera"):
         monkeypatch.setattr(f"camtorch.{module}._MOST_KEPT", 10 * math.prod(SIZE))
 
     class Seen(torch.nn.Module):
