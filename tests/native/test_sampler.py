@@ -358,7 +358,7 @@ def runs_here():
 @pytest.mark.slow
 def test_no_read_outside_and_nothing_undefined_in_any_variant(tmp_path):
     sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-    fuzz(tmp_path, runs_here(), sanitizers, 10_000, 2_000)
+    fuzz(tmp_path, runs_here(), sanitizers, 4_000, 1_000)
 
 
 # -- positions from a lattice
@@ -483,7 +483,7 @@ def test_positions_of_lattices_keep_their_tolerance(pair):
 
 @pytest.mark.slow
 @given(pairs())
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_positions_of_more_lattices_keep_their_tolerance(pair):
     check_lattice(*pair)
 
