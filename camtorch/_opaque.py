@@ -105,3 +105,13 @@ def _(name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], fl
         return CameraNumbers(*values)
 
     return list(_FUNCTIONS[name][1](*_arguments(kinds, tensors, sizes, floats, numbers)))
+
+
+@_computed.register_vmap
+def _(info: Any, in_dims: Any, name: str, kinds: str, tensors: Sequence[Tensor], *others: Any) -> tuple[Any, Any]:
+    def row(i: int) -> list[Tensor]:
+        return [t if dim is None else t.select(dim, i) for t, dim in zip(tensors, in_dims[2], strict=True)]
+
+    rows = [_computed(name, kinds, row(i), *others) for i in range(info.batch_size)]
+    results = [torch.stack(same) for same in zip(*rows, strict=True)]
+    return results, [0] * len(results)

@@ -234,7 +234,7 @@ def classify(probed: Probed) -> tuple[Tensor, int] | None:
         return None
     rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(nodes.shape[0], rows, columns, dtype=torch.int32, device="cpu")
-    scratch = torch.empty(25 * (columns + 8), dtype=torch.float32, device="cpu")
+    scratch = (c_float * (25 * (columns + 8)))()
     given = _Classification(
         nodes.data_ptr(),
         nodes.stride()[:2],
@@ -250,6 +250,6 @@ def classify(probed: Probed) -> tuple[Tensor, int] | None:
         probed.tolerance,
         _PADDINGS[probed.padding],
         cells.data_ptr(),
-        scratch.data_ptr(),
+        addressof(scratch),
     )
     return cells, native.camtorch_classify(byref(given))

@@ -75,21 +75,15 @@ class MirrorWarp(Warp):
                     return self._smoothed(images, where, self._halvings, sampler)
         return super().forward(images, mode=mode, padding_mode=padding_mode, fill=fill)
 
-    def _smoothed(
-        self,
-        images: Tensor,
-        where: Sampling | Lattice,
-        halvings: list[int],
-        sampler: Sampler,
-    ) -> Tensor:
+    def _smoothed(self, images: Tensor, where: Sampling | Lattice, halvings: list[int], sampler: Sampler) -> Tensor:
         """Sampled from images that torch's antialiased interpolation halved so many times, for each camera."""
         result = self._empty(images)
         if where.seam is not None:
             images, where = joined(images, where, 4 << max(halvings))
         images = images.expand(len(result), -1, -1, -1)
         halvings = halvings * (len(result) // len(halvings))
+        every = len(set(halvings)) == 1
         for k in sorted(set(halvings)):
-            every = len(set(halvings)) == 1
             rows = torch.tensor([i for i, n in enumerate(halvings) if n == k], device=images.device)
             here = images if every else images[rows]
             if k:
@@ -97,8 +91,7 @@ class MirrorWarp(Warp):
                 plain = images.dtype in _PLAIN
                 small = F.interpolate(here if plain else widen(here), size, mode="bilinear", antialias=True)
                 here = small if plain else narrow(small, images.dtype)
-            part = where if every else where.cameras(rows)
-            made = render(here, part, *sampler)
+            made = render(here, where if every else where.cameras(rows), *sampler)
             if every:
                 return made
             result[rows] = made
@@ -194,14 +187,10 @@ class AffineWarp(MirrorWarp):
         if not bool((linear.abs().sum(-1) == 1).all() & ((matrices - matrices.round()).abs() < _WHOLE).all()):
             return None
         height, width = self.target.size_for("Warp")
-        moves = [[tuple(map(round, row)) for row in matrix] for matrix in matrices.tolist()]
-        if all(move == moves[0] for move in moves):
-            result, rows = self._empty(images), [(slice(None), moves[0])]
-        else:
-            result = self._empty(images)
-            rows = [(slice(i, i + 1), move) for i, move in enumerate(moves)]
+        moves = [tuple(tuple(map(round, row)) for row in matrix) for matrix in matrices.tolist()]
+        result = self._empty(images)
         images = images.expand(len(result), -1, -1, -1)
-        for row, ((a, b, left), (c, d, top)) in rows:
+        for row, ((a, b, left), (c, d, top)) in _alike(moves):
             view = images[row]
             if b:
                 view = view.mT
@@ -236,21 +225,18 @@ class AffineWarp(MirrorWarp):
             return None
         boxes = torch.cat((edges.amin(1), edges.amax(1)), 1).round().long().tolist()
         flips = [[dim for dim, sign in ((-1, a), (-2, d)) if sign < 0] for ((a, *_), (_, d, _)) in back.tolist()]
-        together = boxes[1:] == boxes[:-1] and flips[1:] == flips[:-1]
-        parts = [slice(None)] if together else [slice(i, i + 1) for i in range(len(boxes))]
         images = images.expand(len(boxes), -1, -1, -1) if len(boxes) > len(images) else images
         plain = images.dtype in _PLAIN
-
-        def made(part: slice, box: list[int], flip: list[int]) -> Tensor:
-            left, top, right, bottom = box
+        results = []
+        for part, ((left, top, right, bottom), flip) in _alike(
+            [*zip(map(tuple, boxes), map(tuple, flips), strict=True)]
+        ):
             view = images[part, :, top:bottom, left:right]
             view = view if plain else widen(view)
             view = F.interpolate(view, (height, width), mode=mode, align_corners=False, antialias=True)
             view = view if plain else narrow(view, images.dtype)
-            return view.flip(flip) if flip else view
-
-        results = [made(part, box, flip) for part, box, flip in zip(parts, boxes, flips, strict=False)]
-        return results[0] if together else torch.cat(results)
+            results.append(view.flip(flip) if flip else view)
+        return results[0] if len(results) == 1 else torch.cat(results)
 
     @property
     def _maps(self) -> Tensor:
@@ -294,6 +280,13 @@ class AffineWarp(MirrorWarp):
         moved = (matrix[..., :2] * wide.unsqueeze(-2)).sum(-1) + matrix[..., 2]
         dtype = torch.promote_types(pixels.dtype, torch.float32)
         return torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype), valid
+
+
+def _alike(kinds: list[Any]) -> list[tuple[slice, Any]]:
+    """The rows of a batch that are treated alike: all of them, or each alone."""
+    if all(kind == kinds[0] for kind in kinds):
+        return [(slice(None), kinds[0])]
+    return [(slice(i, i + 1), kind) for i, kind in enumerate(kinds)]
 
 
 def _halvings(where: Sampling | Lattice, size: tuple[int, int]) -> list[int]:

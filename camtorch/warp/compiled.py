@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -12,11 +13,10 @@ from torch import Tensor
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import Memo
 from camtorch._opaque import CameraNumbers, opaque
-from camtorch._registry import CLASSES
-from camtorch.camera import Camera, fixed_camera
+from camtorch.camera import Camera
 from camtorch.native.sampler import layout
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
-from camtorch.warp.sampling import MODES, PADDINGS, Mode, PaddingMode, one_of, render
+from camtorch.warp.sampling import MODES, PADDINGS, Sampler, one_of, render
 
 
 def positions(
@@ -72,84 +72,57 @@ def warped(
     tolerance: float,
     antialias: bool,
     padding: str,
-    mode: Mode,
-    padding_mode: PaddingMode,
-    fill: tuple[float, ...],
+    how: Sampler,
 ) -> Tensor:
     """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`."""
-    cameras = [n for c in (source, target) for n in (c._model, c.intrinsics.detach(), c.distortion.detach())]
-    sizes = [side for camera in (source, target) for side in camera.size_for("Warp")]
-    last = layout(images) == torch.channels_last
-    options = tolerance, antialias, padding, mode, padding_mode, list(fill), last
     turned = None if rotation is None else rotation.detach()
-    result: Tensor = _warp(images.detach(), *cameras, turned, sizes, *options)
+    # numbers as words: integers of fills may be ids, which no float holds
+    options = str(antialias), padding, how.mode, how.padding_mode, ",".join(map(repr, how.fill))
+    (result,) = _warp(images.detach(), source, target, turned, float(tolerance), *options, str(_is_last(images)))
     return result
 
 
-def _layout(channels_last: bool) -> torch.memory_format:
-    return torch.channels_last if channels_last else torch.contiguous_format
+def _is_last(images: Tensor) -> bool:
+    return layout(images) == torch.channels_last
+
+
+def _laid(images: Tensor, is_last: str) -> Tensor:
+    return images.contiguous(memory_format=torch.channels_last if is_last == "True" else torch.contiguous_format)
+
+
+def _warp_shapes(
+    images: Tensor, source: CameraNumbers, target: CameraNumbers, rotation: Tensor | None, *options: Any
+) -> tuple[Tensor]:
+    count = _count(rotation, *source[:2], *target[:2])
+    result = images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *target.image_size)
+    return (_laid(result, options[-1]),)
 
 
 _located = Memo(2)  # masks are warped after their images, and cameras may be still
 
 
-@torch.library.custom_op("camtorch::warp", mutates_args=())
+@opaque(_warp_shapes)
 def _warp(
     images: Tensor,
-    source_model: str,
-    source_intrinsics: Tensor,
-    source_distortion: Tensor,
-    target_model: str,
-    target_intrinsics: Tensor,
-    target_distortion: Tensor,
+    source: Camera,
+    target: Camera,
     rotation: Tensor | None,
-    sizes: Sequence[int],
     tolerance: float,
-    antialias: bool,
+    antialias: str,
     padding: str,
     mode: str,
     padding_mode: str,
-    fill: Sequence[int | float | bool],
-    channels_last: bool,
-) -> Tensor:
+    fill: str,
+    is_last: str,
+) -> tuple[Tensor]:
     """The images (B, C, h, w), plane by plane or with their channels last in memory."""
-    numbers = source_intrinsics, source_distortion, target_intrinsics, target_distortion
 
     def positions() -> Sampling | Lattice:
-        source = fixed_camera(CLASSES[source_model], *numbers[:2], sizes[:2])
-        target = fixed_camera(CLASSES[target_model], *numbers[2:], sizes[2:])
-        return locate(source, target, rotation, tolerance, antialias, range(sizes[2]), padding)
+        every = range(target.size_for("Warp")[0])
+        return locate(source, target, rotation, tolerance, antialias == "True", every, padding)
 
-    inputs = [*numbers] if rotation is None else [*numbers, rotation]
-    what = source_model, target_model, tuple(sizes), tolerance, antialias, padding, rotation is None
-    where = _located(inputs, what, positions)
-    options = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp"), tuple(fill)
-    return render(images, where, *options).contiguous(memory_format=_layout(channels_last))
-
-
-@_warp.register_fake
-def _(
-    images: Tensor,
-    _: str,
-    source: Tensor,
-    source_distortion: Tensor,
-    __: str,
-    target: Tensor,
-    target_distortion: Tensor,
-    rotation: Tensor | None,
-    sizes: Sequence[int],
-    *options: Any,
-) -> Tensor:
-    count = _count(rotation, source, source_distortion, target, target_distortion)
-    result = images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *sizes[2:])
-    return result.contiguous(memory_format=_layout(options[-1]))
-
-
-@_warp.register_vmap
-def _(info: Any, in_dims: tuple[Any, ...], *arguments: Any) -> tuple[Tensor, int]:
-    dims = (*in_dims, *[None] * (len(arguments) - len(in_dims)))
-    rows = (
-        [a if not isinstance(dim, int) else a.select(dim, i) for a, dim in zip(arguments, dims, strict=True)]
-        for i in range(info.batch_size)
-    )
-    return torch.stack([_warp(*row) for row in rows]), 0
+    inputs = [*source.tensors, *target.tensors, *([] if rotation is None else [rotation])]
+    where = _located(inputs, (source.form, target.form, tolerance, antialias, padding, rotation is None), positions)
+    how = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
+    values = tuple(ast.literal_eval(f"({fill},)"))
+    return (_laid(render(images, where, *how, values), is_last),)

@@ -77,7 +77,7 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
         ]
         return averaged(images, parts, warp.target_shutter.gamma, *sampler)
     if route == "operator":
-        options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), *sampler
+        options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), sampler
         return compiled.warped(images, warp.source, warp.target, warp.rotation, *options)
     if route == "strips":
         cameras = math.prod(warp.batch_shape)

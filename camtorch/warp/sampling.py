@@ -536,8 +536,10 @@ class _Sample(torch.autograd.Function):
         tangent = F.grid_sample(images_tangent, grid, ctx.mode, ctx.padding_mode, align_corners=False)
         # a channel alone, so that its gradient by the positions is not added to that of others
         alone, at = images.flatten(0, 1).unsqueeze(1), grid.repeat_interleave(channels, 0)
-        _, slopes = _backward(torch.ones_like(tangent).flatten(0, 1).unsqueeze(1), alone, at, ctx, (True, True))
-        return tangent + (slopes.unflatten(0, (count, channels)) * grid_tangent.unsqueeze(1)).sum(-1)
+        ones = torch.ones_like(tangent).flatten(0, 1).unsqueeze(1)
+        slopes = _backward(ones, alone, at, ctx, (True, True))[1].unflatten(0, (count, channels))
+        moved: Tensor = tangent + (slopes * grid_tangent.unsqueeze(1)).sum(-1)
+        return moved
 
 
 def _backward(gradient: Tensor, images: Tensor, grid: Tensor, ctx: Any, wanted: tuple[bool, ...]) -> tuple[Tensor, ...]:

@@ -1,4 +1,4 @@
-"""The light that a lens lets through: less of it, the farther a ray is from the axis."""
+"""Natural vignetting: how much less a lens lets through, the farther a ray is from the axis."""
 
 from __future__ import annotations
 

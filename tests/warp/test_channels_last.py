@@ -119,6 +119,7 @@ LARGE = (360, 480)
 
 
 @needs_native
+@pytest.mark.slow  # for the profiler
 @pytest.mark.parametrize("read_only", [False, True])
 def test_nothing_as_large_as_an_image_is_made_but_the_result(read_only):
     array = colours(size=(400, 500))[4:364, 7:487]
@@ -130,6 +131,7 @@ def test_nothing_as_large_as_an_image_is_made_but_the_result(read_only):
 
 
 @needs_native
+@pytest.mark.slow
 def test_batches_of_kornia_stay_as_they_lie():
     images = torch.rand(4, 3, *LARGE).to(memory_format=torch.channels_last)
     module = RandomCamera(camera(LARGE), min_filled=0)

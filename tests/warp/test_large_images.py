@@ -118,7 +118,7 @@ print(peak() - before)
     [
         ("for _ in warp.strips(images, rows=64): pass", "fill=3", 1, 60),
         # the result, the grid (96 MB, in float32), and what is made of one image
-        ("warp(images)", "antialias=True, tolerance=0.01", 4, 4 * 36 + 96 + 48 + 400),
+        ("warp(images)", "antialias=True, tolerance=0.01", 1, 36 + 96 + 48 + 400),
     ],
 )
 def test_memory_beyond_the_images(act, options, count, bound):
