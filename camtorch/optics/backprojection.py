@@ -27,8 +27,6 @@ class Inverted(Chart):
     Rays are covered before theta ceases to ascend, and up to `FURTHEST`.
     """
 
-    factor: type[RadialFactor]
-
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor]):
         """factor: the class of R, whose instances are made of the parameters."""
         self.factor = factor

@@ -78,24 +78,6 @@ def test_a_copy_is_its_own_and_what_is_shared_is_not():
     assert not clone.clone().intrinsics.requires_grad
 
 
-@pytest.mark.parametrize(
-    ("index", "rows"),
-    [
-        (slice(1, None), [1, 2]),
-        (-1, 2),
-        ([True, False, True], [0, 2]),
-        (torch.tensor([2, 0]), [2, 0]),
-        (torch.tensor([False, True, True]), [1, 2]),
-    ],
-)
-@pytest.mark.parametrize("mixed", [False, True])
-def test_a_batch_is_indexed_as_a_tensor(mixed, index, rows):
-    keys = ("kannala_brandt", "pinhole", "kannala_brandt") if mixed else ("kannala_brandt",) * 3
-    batch = ct.cat([camera_of(key).replace([30.0 + i, 30.0, 40.0, 30.0]) for i, key in enumerate(keys)])
-    assert isinstance(batch, ct.Mixed) == mixed
-    assert torch.equal(batch[index].intrinsics, batch.intrinsics[rows])
-
-
 def test_a_mixed_batch_is_a_value():
     members = [camera_of("pinhole"), camera_of("mei", learns=False)]
     mixed = ct.cat(members)
