@@ -13,7 +13,7 @@ from camtorch._arguments import broadcast_shapes
 from camtorch._tracing import is_exporting
 
 
-def for_elsewhere() -> bool:
+def is_portable_export() -> bool:
     """Whether a program is exported that runs without operators of our own.
 
     Not where dynamo reads the code itself (`strict=True`), which does not follow all of it.
@@ -91,7 +91,7 @@ def count_not_above(table: Tensor, values: Tensor) -> Tensor:
 
 def of_points(k: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
     """The columns (M,) of coefficients (C, n), of points seen by the cameras of these indices, for `repeat` as well."""
-    if for_elsewhere():  # a recorded loop takes no views of one tensor, and no tensor of size one
+    if is_portable_export():  # a recorded loop takes no views of one tensor, and no tensor of size one
         return tuple(c[camera] for c in k.unbind(-1))
     # a single camera serves all points
     return (k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT).unbind(0)
@@ -118,7 +118,7 @@ def repeat(
     Returns:
         moves and the state at last.
     """
-    if not for_elsewhere():
+    if not is_portable_export():
         for count in range(most):
             if not bool(moves.any()):
                 break

@@ -358,7 +358,7 @@ class Camera(BatchedModule):
         """
         return mapped(self, Unproject, pixels, "pixels", 2)
 
-    def evaluate(
+    def _evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -366,7 +366,6 @@ class Camera(BatchedModule):
         tensors: Sequence[Tensor],
         cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Planes (size, C, N), and valid (C, N), of rows (C, N, size); see `camtorch._evaluation`."""
         return evaluated(self, direction, rows, lead, tensors, cameras_of)
 
     @property

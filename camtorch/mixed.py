@@ -190,7 +190,7 @@ class Mixed(Camera):
 
     # -- both directions
 
-    def evaluate(
+    def _evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -207,7 +207,7 @@ class Mixed(Camera):
                 index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
                 here, count = rows[index], torch.Size((len(group.rows),))
             of_model = self._member(group.members[0])
-            results.append(of_model.evaluate(direction, here, count, pair, self._watch(n)))
+            results.append(of_model._evaluate(direction, here, count, pair, self._watch(n)))
         if len(results) == 1:
             return results[0]
         planes, valid = zip(*results, strict=True)
