@@ -16,7 +16,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch._arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch._evaluation import new_cameras, per_row
 from camtorch._evaluation import rows_of as camera_rows
-from camtorch._module import Memo, remade
+from camtorch._module import FORWARDS, Memo, remade
 from camtorch._numbers import as_numbers_of
 from camtorch.camera import Camera
 from camtorch.projection.project import Project
@@ -300,8 +300,8 @@ class Mixed(Camera):
             raise IndexError(f"Mixed: {index!r} of a batch ({len(self._places)},): {error}") from None
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(
-                "Mixed: it is indexed by whole numbers, masks, slices that go forwards, and lists, as [2, 1, 0], that "
-                f"may not; got {shown(index)}"
+                f"Mixed: it is indexed by whole numbers, slices and masks; got {shown(index)}"
+                + (FORWARDS if isinstance(index, slice) else "")
             ) from None
         if taken.ndim == 0:
             i, row = self._places[int(taken)]

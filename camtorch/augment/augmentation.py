@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-import difflib
-import inspect
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from camtorch._arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, fails, holds, shown
+from camtorch._arguments import (
+    GUESS_CAMERA,
+    as_flag,
+    as_mapping,
+    as_number,
+    as_part,
+    as_whole,
+    fails,
+    holds,
+    no_camera,
+    shown,
+)
 from camtorch._module import typed_as
 from camtorch._threads import on_one_thread
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, as_one
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, without_graph_in_workers
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
-from camtorch.warp.sampling import Options, as_options
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
 _TRIES = 8
@@ -120,20 +131,11 @@ def draw(
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
 
 
-class EditOptions(TypedDict, total=False):
+class EditOptions(SampleOptions, total=False):
     """What every edit takes; see `Edit`."""
 
-    camera: Camera | None
     p: float
     same_on_batch: bool
-    fields: Mapping[str, str] | None
-    mode: str
-    padding_mode: str
-    fill: float | Sequence[float]
-    mask_fill: float
-    valid_mask: bool
-    antialias: bool | None
-    tolerance: float
 
 
 class Augmentation(SampleTransform):
@@ -199,61 +201,27 @@ class Augmentation(SampleTransform):
     ranges: dict[str, Range]
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
-    other_words: ClassVar[Mapping[str, str]] = {}
-    """Words that people try as keywords -> the keyword, for the hint of an error."""
     p: float
     same_on_batch: bool
-    options: Options
     min_filled: float | None
 
     def __init__(
         self,
         ranges: Mapping[str, Range] | None = None,
         *,
-        camera: Camera | None = None,
         p: float = 1.0,
         same_on_batch: bool = False,
-        fields: Mapping[str, str] | None = None,
-        mode: str = "bilinear",
-        padding_mode: str = "zeros",
-        fill: float | Sequence[float] = 0.0,
-        mask_fill: float = 0.0,
-        valid_mask: bool = False,
-        antialias: bool | None = False,
-        tolerance: float = 0.001,
         min_filled: float | None = None,
-        **unknown: object,
+        **options: Unpack[SampleOptions],
     ):
-        super().__init__(camera, fields, mask_fill, valid_mask)
-        for name in unknown:
-            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
-        self.p, self.same_on_batch = (
-            as_part(p, "p", self._name, "probability"),
-            as_flag(same_on_batch, "same_on_batch", self._name),
-        )
-        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        super().__init__(**options)
+        self.p = as_part(p, "p", self._name, "probability")
+        self.same_on_batch = as_flag(same_on_batch, "same_on_batch", self._name)
         self.ranges = dict(ranges or {})
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
         self._warned = False
         self.last: Change | None = None
         """The change of the last call: its `source`, `target` and `rotation`."""
-
-    @classmethod
-    def _meant(cls, word: str) -> str:
-        """The keyword that somebody may have meant."""
-        known = [
-            parameter.name
-            for owner in cls.__mro__
-            if "__init__" in vars(owner) and issubclass(owner, Augmentation)
-            for parameter in inspect.signature(vars(owner)["__init__"]).parameters.values()
-            if parameter.kind is not parameter.VAR_KEYWORD and parameter.name != "self"
-        ]
-        close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
-        return (
-            f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
-            if close
-            else f"; known are {', '.join(dict.fromkeys(known))}"
-        )
 
     # -- what a subclass writes
 
@@ -519,3 +487,72 @@ class Augmentation(SampleTransform):
 def _one_for_all(values: Mapping[str, Tensor]) -> bool:
     """Whether all samples draw the same. Of none, nothing can be said."""
     return all(holds(value == value[:1]) for value in values.values())
+
+
+# -- for front ends, which hold an augmentation and the camera of their images
+
+
+def check_front_end(owner: str, augmentation: object, camera: object) -> None:
+    """Raise a TypeError unless this is an augmentation, and that a camera or None."""
+    if not isinstance(augmentation, Augmentation):
+        raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
+    if camera is not None and not isinstance(camera, Camera):
+        raise TypeError(f"{owner}: camera must be a Camera; got {no_camera(camera)}")
+
+
+def check_single(
+    owner: str, camera: Camera, sizes: Sequence[tuple[str, tuple[int, ...]]], hint: str = ""
+) -> tuple[int, int]:
+    """The image_size of a single camera.
+
+    Raises:
+        ValueError: a batch, no image_size, or images, by name, of other sizes.
+    """
+    if camera.image_size is None or camera.batch_shape:
+        raise ValueError(
+            f"{owner}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} and "
+            f"batch dims {tuple(camera.batch_shape)}{hint}"
+        )
+    for name, size in sizes:
+        if size != camera.image_size:
+            raise ValueError(
+                f"{owner}: {name} is {size} (height, width), but the camera's image_size is {camera.image_size}. "
+                "camera.resize, .crop and .pad give the camera of an edited image"
+            )
+    return camera.image_size
+
+
+def camera_of_sample(
+    owner: str, augmentation: Augmentation, camera: object, sizes: Sequence[tuple[str, tuple[int, ...]]]
+) -> Camera:
+    """The single camera of a sample whose images are of these sizes: the one given, the augmentation's, or none known.
+
+    Raises:
+        ValueError: none is known, and the augmentation needs one; a batch; images of another size.
+    """
+    camera = augmentation.camera if camera is None else camera
+    if camera is None and sizes and not augmentation.needs_camera:
+        height, width = sizes[0][1]
+        camera = Unknown.of((height, width))
+    if not isinstance(camera, Camera):
+        how = "give one here, in the sample, or to the augmentation"
+        raise ValueError(f"{owner}: no camera; {how}; got {shown(camera)}. {GUESS_CAMERA}")
+    check_single(owner, camera, sizes)
+    return camera
+
+
+def move_points(augmentation: Augmentation, change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Keypoints (B, *N, 2) moved, and valid (B, *N); landmarks in their order in a mirror.
+
+    (-1, -1), by which front ends say that a point has no place, stays that, and is not valid.
+    """
+    lost = (pixels == -1).all(-1)
+    moved, valid = change.points(pixels)
+    moved, valid = torch.where(lost.unsqueeze(-1), -1.0, moved), valid & ~lost
+    mirrored, mirroring = change.mirrored, augmentation.mirroring
+    order = None if mirroring is None else mirroring.order("keypoints", "keypoints", pixels.shape[-2])
+    if mirrored is None or order is None:
+        return moved, valid
+    rows, index = mirrored.reshape(-1, *[1] * (valid.ndim - 1)), torch.tensor(order, device=pixels.device)
+    moved = torch.where(rows.unsqueeze(-1), moved.index_select(-2, index), moved)
+    return moved, torch.where(rows, valid.index_select(-1, index), valid)

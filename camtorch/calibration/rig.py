@@ -5,34 +5,17 @@ from __future__ import annotations
 import math
 import warnings as python_warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from camtorch._threads import on_one_thread
-from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State, adjust
-from camtorch.calibration.calibrate import (
-    STEPS,
-    Calibration,
-    Model,
-    adjusted_alone,
-    as_model,
-    as_options,
-    counted_once,
-    first_state,
-    free_count,
-    middle_of,
-    noise_of,
-    other_optima,
-    result_of,
-    sight_of,
-    twins_of,
-)
-from camtorch.calibration.observations import Observations, Points, as_rig_observations
+from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State
+from camtorch.calibration.calibrate import STEPS, Calibration, Search, as_model, as_options, middle_of, results
+from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
-from camtorch.calibration.verdict import check_determined
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
@@ -149,81 +132,44 @@ def calibrate_rig(
         ValueError: what `calibrate` refuses; names that differ; cameras that no board links.
     """
     owner = "calibrate_rig"
-    seen, layouts = as_rig_observations(object_points, image_points, image_sizes, models, owner)
-    as_options(loss, loss_scale, bend, progress, owner)
-    names = list(seen)
+    observed = as_rig_observations(object_points, image_points, image_sizes, models, owner)
+    told = as_options(loss, loss_scale, bend, progress, owner)
     for given in (count, start, fixed):
-        stray = [name for name in given if name not in seen] if isinstance(given, Mapping) else []
+        stray = [name for name in given if name not in observed] if isinstance(given, Mapping) else []
         if stray:
             raise ValueError(
-                f"{owner}: no camera is called {', '.join(map(repr, stray))}; there are {', '.join(names)}"
+                f"{owner}: no camera is called {', '.join(map(repr, stray))}; there are {', '.join(observed)}"
             )
-    asked = [
-        as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), f"{owner}: {name}")
-        for name in names
-    ]
-    middle = middle_of(seen.values())
-    centred = [s.about(middle) for s in seen.values()]
-    sights = [sight_of(s, m) for m, s in zip(asked, centred, strict=True)]
-    alone = [
-        _alone(m, s, loss, loss_scale, layout.image_size)
-        for m, s, layout in zip(asked, centred, layouts.values(), strict=True)
-    ]
-    device = sights[0].pixels.device
-    free = Free(tuple(a.free.to(device) for a in asked), tuple(c > 0 for c in range(len(asked))), bend=bend)
-    first = _joined(sights, alone, free)
-    told = None if progress is None else lambda number, cost: progress(number, float(cost))
-    adjusted = adjust(sights, first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
-    optima = []
-    for c, (m, s, layout) in enumerate(zip(asked, centred, layouts.values(), strict=True)):
-        adjusted, found = other_optima(c, s, m, sights, adjusted, free, layout.image_size, loss, loss_scale)
-        optima.append(found)
-    parameters = free_count(adjusted, [s.seen for s in seen.values()])
-    residuals, valid, used = (
-        torch.cat(parts)
-        for parts in zip(
-            *((r[0], v[0], s.seen) for r, v, s in zip(adjusted.residuals, adjusted.valid, seen.values(), strict=True)),
-            strict=True,
-        )
-    )
-    owners = [f"{owner}: {name}" for name in names]
-    check_determined(adjusted, [a.kind for a in asked], [a.names for a in asked], sights, owners)
-    noise = noise_of(residuals, used, valid, loss, loss_scale, parameters)
-    named, noise = counted_once(list(seen.values()), adjusted, list(layouts.values()), noise)
-    layouts = dict(zip(names, named, strict=True))
-    each = noise.inliers.split([len(s.seen) for s in seen.values()])
-    cameras = {
-        name: result_of(
-            adjusted,
-            c,
-            asked[c],
-            seen[name],
-            middle,
-            layouts[name],
-            noise._replace(inliers=each[c]),
-            (object_points, image_points[name]),
-        )
-        for c, name in enumerate(names)
-    }
-    for camera, ends in zip(cameras.values(), optima, strict=True):
-        camera.twins = twins_of(camera, ends)
-    lengths = torch.where(used, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
-    rotations, translations = (t[0] for t in adjusted.state.boards)
+    middle = middle_of([seen for seen, _ in observed.values()])
+    searches = []
+    for name, (seen, layout) in observed.items():
+        of = f"{owner}: {name}"
+        asked = as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), of)
+        searches.append(Search(of, asked, seen, middle, layout, loss, loss_scale))
+    sights = [search.sight for search in searches]
+    learns = tuple(parameters for search in searches for parameters in search.free().parameters)
+    free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
+    first = _joined(sights, [_alone(search) for search in searches], free)
+    adjusted = searches[0].adjusted(sights, first, free, steps=STEPS, progress=told)
+    found = results(searches, adjusted, free, object_points, [image_points[name] for name in observed])
+    cameras = dict(zip(observed, found.cameras, strict=True))
+    state = found.adjusted.state
+    rotations, translations = (t[0] for t in state.boards)
     mounts = {
         name: Extrinsics(rotation_vector(r).unsqueeze(-1), t)
-        for name, r, t in zip(names, *(t[0] for t in adjusted.state.mounts), strict=True)
+        for name, r, t in zip(observed, *(t[0] for t in state.mounts), strict=True)
     }
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
-        rms=float((lengths.square().sum() / used.sum()).sqrt()),
-        sigma=float(noise.sigma),
+        rms=found.rms,
+        sigma=found.sigma,
         cameras=cameras,
-        mount_std=_mount_std(adjusted, asked, names, noise.spread),
-        converged=all(c.converged for c in cameras.values()),
-        bend=next(iter(cameras.values())).bend,
-        views=next(iter(cameras.values())).views,
-        adjusted=adjusted,
+        mount_std=_mount_std(found.adjusted, list(observed), found.noise),
+        converged=all(c.converged for c in found.cameras),
+        bend=found.cameras[0].bend,
+        views=found.cameras[0].views,
+        adjusted=found.adjusted,
     )
     if not result.converged:
         python_warnings.warn(
@@ -247,16 +193,11 @@ class _Alone(NamedTuple):
     has_pose: Tensor
 
 
-def _alone(
-    asked: Model, seen: Observations, loss: str | None, loss_scale: float, image_size: tuple[int, int]
-) -> _Alone:
+def _alone(search: Search) -> _Alone:
     """What one camera says."""
-    has_pose = seen.seen.any(-1)
-    some = seen.of(has_pose)
-    first = first_state(some, asked, image_size, loss, loss_scale)
-    free = Free((asked.free.to(some.pixels.device),), (False,))
-    state = adjusted_alone(some, asked, first, free, image_size, loss, loss_scale).state
-    boards = Poses(*(t[0] for t in Poses.none(1, len(has_pose), some.pixels)))
+    has_pose = search.given.seen.any(-1)
+    state = replace(search, given=search.given.of(has_pose)).alone().state
+    boards = Poses(*(t[0] for t in Poses.none(1, len(has_pose), search.given.pixels)))
     for whole, part in zip(boards, state.boards, strict=True):
         whole[has_pose] = part[0]
     return _Alone(state.parameters[0][0], boards, has_pose)
@@ -311,14 +252,12 @@ def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     return rotations[middle], translations[middle]
 
 
-def _mount_std(adjusted: Adjusted, asked: list[Model], names: list[str], noise: Tensor) -> dict[str, Tensor]:
+def _mount_std(adjusted: Adjusted, names: list[str], noise: Tensor) -> dict[str, Tensor]:
     """(6,) by the name of a camera; zeros for the first one."""
     std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0], dim=-1) * noise
-    result = {}
-    for c, (name, model) in enumerate(zip(names, asked, strict=True)):
-        own = std.new_zeros(6)
-        for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
-            if camera == c and i >= 4 + model.count:
-                own[i - 4 - model.count] = value
-        result[name] = own
+    result = {name: std.new_zeros(6) for name in names}
+    for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
+        count = adjusted.state.parameters[camera].shape[-1]
+        if camera >= 0 and i >= count:
+            result[names[camera]][i - count] = value
     return result

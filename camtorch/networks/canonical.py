@@ -19,7 +19,6 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed, Mixed
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.warp.affine import AffineWarp
-from camtorch.warp.sampling import Options, as_options
 
 _LENGTHS = ("depth", "distance", "points", "tvec")
 
@@ -63,7 +62,6 @@ class CanonicalCamera(SampleTransform):
 
     focal: float
     image_size: tuple[int, int] | None
-    options: Options
 
     def __init__(
         self,
@@ -71,17 +69,10 @@ class CanonicalCamera(SampleTransform):
         *,
         scales: Literal["depth", "image"] = "depth",
         image_size: Sequence[int] | None = None,
-        camera: Camera | None = None,
-        mode: str = "bilinear",
-        padding_mode: str = "zeros",
-        fill: float | Sequence[float] = 0.0,
         antialias: bool | None = None,
-        tolerance: float = 0.001,
-        fields: Mapping[str, str] | None = None,
-        mask_fill: float = 0.0,
-        valid_mask: bool = False,
+        **options: Any,
     ):
-        super().__init__(camera, fields, mask_fill, valid_mask)
+        super().__init__(antialias=antialias, **options)
         focal = as_number(focal, "focal", self._name)
         if not 0 < focal < math.inf:
             raise ValueError(f"{self._name}: focal must be positive pixels; got {focal!r}")
@@ -91,8 +82,6 @@ class CanonicalCamera(SampleTransform):
             raise ValueError(f"{self._name}: images keep their size where depth is scaled; got image_size={image_size}")
         self.focal, self.scales = focal, scales
         self.image_size = as_image_size(image_size, self._name)
-        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
-        self.antialias = antialias
 
     def scale(self, camera: Camera) -> Tensor:
         """(*B,): s of cameras (*B), `focal` by their focal length. Its gradients go to fx and fy."""

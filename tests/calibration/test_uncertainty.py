@@ -1,10 +1,10 @@
-"""Covariances and projection uncertainty: mrcal's numbers, brute force, and what repeated calibrations scatter by."""
+"""Covariances and projection uncertainty: by brute force, and by what repeated calibrations scatter by."""
 
 import math
 
 import pytest
 import torch
-from boards import opencv_left, seen_by
+from boards import seen_by
 
 import camtorch as ct
 from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
@@ -30,30 +30,24 @@ PIXELS = torch.tensor([(320.0, 240), (20, 20), (620, 460)], **F64)
 class Problem:
     """A board, seen without noise by cameras at the mounts (C, 3, 3), (C, 3); the first one's are nothing."""
 
-    def __init__(self, *cameras, mounts=None, views=16, seed=0, columns=7, rows=6, **where):
-        corners, rotations, translations = seen_by(
-            cameras[0], views, columns=columns, rows=rows, square=0.04, seed=seed, **where
-        )
+    def __init__(self, *cameras, mounts=None, views=16):
+        corners, rotations, translations = seen_by(cameras[0], views, columns=7, rows=6, square=0.04)
         middle = corners.object_points.mean(0)
         self.cameras, self.points = cameras, corners.object_points - middle
         self.boards = Poses(rotations[None], (translations + rotations @ middle)[None])
         self.mounts = mounts or Poses.none(1, len(cameras), self.points)
         self.parameters = [torch.cat((c.intrinsics, c.distortion)).detach() for c in cameras]
         self.pixels, self.seen = [], []
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(0)
         for camera, rotation, translation in zip(cameras, *(t[0] for t in self.mounts), strict=True):
             points = self.boards.moved(self.points[None, None])[0] @ rotation.mT + translation
             pixels, valid = (t.detach() for t in camera.project(points))
-            found = torch.rand(valid.shape, generator=generator) > 0.1
             self.pixels.append(pixels)
-            self.seen.append(valid & camera.contains(pixels) & found)
+            self.seen.append(valid & camera.contains(pixels) & (torch.rand(valid.shape, generator=generator) > 0.1))
 
     def state(self, batch=1):
-        def many(tensor):
-            return tensor.expand(batch, *tensor.shape[1:])
-
-        mounts, boards = (Poses(*map(many, poses)) for poses in (self.mounts, self.boards))
-        return State(tuple(many(p[None]) for p in self.parameters), mounts, boards, torch.zeros(batch, 2, **F64))
+        parameters = tuple(p.expand(batch, -1) for p in self.parameters)
+        return State(parameters, self.mounts.expand(batch), self.boards.expand(batch), torch.zeros(batch, 2, **F64))
 
     def free(self, *fixed, **more):
         names = [("fx", "fy", "cx", "cy", *camera.distortion_names) for camera in self.cameras]
@@ -84,45 +78,6 @@ class Problem:
 def lens(key):
     intrinsics, distortion = LENSES[key]
     return ct.MODELS[key](torch.tensor(intrinsics, **F64), torch.tensor(distortion, **F64), image_size=(480, 640))
-
-
-def real_views(bend):
-    """OpenCV's thirteen views, adjusted, with the noise that mrcal assumes: the root of the mean square."""
-    corners, optima = opencv_left()
-    optimum = optima[5]
-    parameters = torch.cat((optimum["intrinsics"], optimum["distortion"]))[None]
-    middle = (corners.object_points.amax(0) + corners.object_points.amin(0)) / 2
-    rotations = rotation_matrix(optimum["rotations"].view(-1, 3))
-    translations = optimum["translations"].view(-1, 3) + rotations @ middle
-    points = (corners.object_points - middle).expand(1, *corners.image_points.shape[:-1], 3)
-    sight = Sight(ct.BrownConrady, points, corners.image_points[None], torch.ones(points.shape[:-1], **F64))
-    boards = Poses(rotations[None], translations[None])
-    state = State((parameters,), Poses.none(1, 1, parameters), boards, torch.zeros(1, 2, **F64))
-    adjusted = adjust([sight], state, Free((torch.ones(9, dtype=torch.bool),), (False,), bend=bend))
-    assert bool(adjusted.converged)
-    noise = (adjusted.cost / corners.image_points.numel()).sqrt()
-    return adjusted, spread(adjusted, ct.BrownConrady, 0, noise), optimum["std"], noise
-
-
-@pytest.mark.parametrize(
-    ("bend", "infinity", "near"),
-    [
-        # drcal 0.0.0 (mrcal) on the same corners: LENSMODEL_OPENCV5, without regularisation, mean-pcam
-        (None, (0.13531484, 5.85650548, 2.64013932), (0.04614336, 5.88096998, 2.65341868)),
-        ((2.92625783e-05, -1.75310142e-04), (0.13034116, 5.24030511, 2.44796354), (0.04433168, 5.25551759, 2.4513902)),
-    ],
-    ids=["flat", "bent"],
-)
-def test_is_that_of_mrcal(bend, infinity, near):
-    adjusted, values, std, noise = real_views(bend is not None)
-    if bend:
-        assert torch.allclose(adjusted.state.bend[0], torch.tensor(bend, **F64), rtol=1e-5)
-    # their optima agree to a part of their standard deviations
-    for distance, expected in ((math.inf, infinity), (0.5, near)):
-        assert torch.allclose(uncertainty(values, PIXELS, distance), torch.tensor(expected, **F64), rtol=1e-5)
-    if not bend:  # and OpenCV's standard deviations are those of the sigma that counts the parameters
-        unbiased = noise * math.sqrt(1404 / (1404 - 87))
-        assert torch.allclose(values.std[0] * unbiased / noise, std, rtol=1e-4)
 
 
 def test_of_a_rig_is_that_of_mrcal_by_brute_force():
@@ -229,12 +184,9 @@ def check_pixels(problem, adjusted, values):
         check(along.flatten(1), sizes.sqrt().flatten().expand(len(errors), -1), slack=1.5)
 
 
-@pytest.mark.parametrize(
-    ("key", "fixed"),
-    [*((key, ()) for key in LENSES), ("fisheye624", ("cx", "cy", "s0")), ("double_sphere", ("fx", "xi"))],
-)
-def test_refits_of_every_lens_scatter_as_predicted(key, fixed):
-    found = scatter(key, 400, *fixed, views=12)
+@pytest.mark.parametrize(("key", "fixed"), [("fisheye624", ("cx", "cy", "s0")), ("double_sphere", ("fx", "xi"))])
+def test_refits_of_lenses_scatter_as_predicted(key, fixed):
+    found = scatter(key, 300, *fixed, views=10)
     check(*found[3:], slack=1.5)
     check_pixels(*found[:3])
 
@@ -249,7 +201,7 @@ def robustly(loss, scale, share, batch):
     push = 40 * (torch.rand(sight.pixels.shape, generator=generator, **F64) - 0.5)
     sight = sight._replace(pixels=sight.pixels + bad[..., None] * push)
     adjusted = adjust([sight], problem.state(batch), free, loss=loss, loss_scale=scale, steps=200)
-    noise = noise_under(loss, scale, adjusted.residuals, [problem.seen[0][None]], problem.unknowns(free))
+    noise = noise_under(loss, scale, adjusted.residuals[0], problem.seen[0][None], problem.unknowns(free))
     values = spread(adjusted, ct.KannalaBrandt, 0, noise)
     return adjusted.state.parameters[0] - problem.parameters[0], values.std, noise
 
@@ -261,59 +213,6 @@ def test_robust_refits_scatter_as_predicted(loss, scale, share):
     check(errors, std, slack=3.0)
     if not share and scale >= 5 * NOISE:  # what the loss leaves alone
         assert torch.allclose(noise, noise.new_full((), NOISE), rtol=0.1)
-
-
-def test_without_a_loss_noise_is_sigma():
-    problem = Problem(lens("kannala_brandt"))
-    free = problem.free()
-    adjusted = adjust(problem.sights(3), problem.state(3), free)
-    noise = noise_under(None, 1.0, adjusted.residuals, [problem.seen[0][None]], problem.unknowns(free))
-    assert torch.allclose(noise, problem.sigma(adjusted, free), rtol=1e-12)
-
-
-@pytest.mark.parametrize("boards", ["positions", ""])
-def test_poses_that_are_known_move_nothing(boards):
-    problem = Problem(lens("kannala_brandt"))
-    adjusted = adjust(problem.sights(noise=0.0), problem.state(), problem.free(boards=boards), steps=0)
-    noise = torch.tensor([NOISE], **F64)
-    free = adjust(problem.sights(noise=0.0), problem.state(), problem.free(), steps=0)
-    known, found = (spread(a, ct.KannalaBrandt, 0, noise) for a in (adjusted, free))
-    assert bool((known.std < found.std).all())
-    # and at infinity the frame does not turn: what is left is the lens
-    camera = problem.cameras[0]
-    slopes = torch.autograd.functional.jacobian(
-        lambda p: ct.KannalaBrandt(p[:4], p[4:]).project(camera.unproject(PIXELS[0])[0].detach())[0],
-        problem.parameters[0],
-    )
-    covariance = slopes @ known.covariance[0] @ slopes.mT
-    assert torch.allclose(uncertainty(known, PIXELS[0]), torch.linalg.eigvalsh(covariance)[-1].sqrt(), rtol=1e-9)
-
-
-def test_views_of_nothing_do_not_count():
-    problem = Problem(lens("kannala_brandt"))
-    whole = adjust(problem.sights(noise=0.0), problem.state(), problem.free(), steps=0)
-    (sight,), state = problem.sights(noise=0.0), problem.state()
-    more = Sight(sight.model, *(torch.cat((t, 0 * t[:, :2]), 1) for t in sight[1:]))
-    boards = Poses(*(torch.cat((t, t[:, :2]), 1) for t in state.boards))
-    padded = adjust([more], state._replace(boards=boards), problem.free(), steps=0)
-    noise = torch.tensor([NOISE], **F64)
-    results = [uncertainty(spread(a, ct.KannalaBrandt, 0, noise), PIXELS, 0.5) for a in (whole, padded)]
-    assert torch.allclose(*results, rtol=1e-9)
-
-
-def test_what_is_undetermined_is_huge_and_finite():
-    """A single view of a plane leaves focal lengths and principal point open."""
-    problem = Problem(lens("kannala_brandt"), views=1, tilt=5.0)
-    free = problem.free("k1", "k2", "k3", "k4")
-    problem.points[:, :2] *= 1e-3  # so small that nothing is seen of its perspective
-    with torch.no_grad():
-        points = problem.boards.moved(problem.points[None, None])[0]
-        problem.pixels[0] = problem.cameras[0].project(points)[0]
-    adjusted = adjust(problem.sights(noise=0.0), problem.state(), free, steps=0)
-    std = spread(adjusted, ct.KannalaBrandt, 0, torch.tensor([NOISE], **F64)).std[0]
-    assert bool(torch.isfinite(std).all())
-    assert bool((std[:4] > 1e3).all())
-    assert not std[4:].any()
 
 
 def test_projections_are_known_where_parameters_are_not():
@@ -328,41 +227,3 @@ def test_projections_are_known_where_parameters_are_not():
     assert loose.std[0, 2] > 1e6 * loose.std[0, 0]
     for distance in (0.4, math.inf):
         assert torch.allclose(uncertainty(loose, PIXELS, distance), uncertainty(held, PIXELS, distance), rtol=1e-5)
-
-
-def test_any_shape_of_pixels():
-    problem = Problem(lens("double_sphere"))
-    adjusted = adjust(problem.sights(), problem.state(), problem.free())
-    values = spread(adjusted, ct.DoubleSphere, 0, torch.tensor([NOISE], **F64))
-    grid = torch.stack(torch.meshgrid(torch.arange(0, 640, 40), torch.arange(0, 480, 40), indexing="xy"), -1)
-    whole = uncertainty(values, grid)
-    assert whole.shape == (12, 16)
-    assert whole.dtype == torch.float64
-    assert torch.equal(whole[3, 5], uncertainty(values, (200, 120)))
-    assert uncertainty(values, torch.zeros(0, 2)).shape == (0,)
-    distances = torch.full((12, 16), math.inf)
-    distances[3, 5] = 0.3
-    mixed = uncertainty(values, grid.float(), distances)
-    assert mixed[3, 5] == uncertainty(values, (200, 120), 0.3) != whole[3, 5]
-    distances[3, 5] = math.inf
-    assert torch.equal(uncertainty(values, grid, distances).nan_to_num(), whole.nan_to_num())
-    # where the lens ends there is no ray
-    assert torch.equal(whole.isnan(), ~problem.cameras[0].unproject(grid.double())[1])
-    assert uncertainty(values, (1e5, 0.0)).isnan()
-
-
-@pytest.mark.parametrize(
-    ("pixels", "distance", "words"),
-    [
-        ((1.0, 2.0, 3.0), 1.0, r"pixels must be \(\.\.\., 2\); got shape \(3,\)"),
-        ((1.0, 2.0), 0.0, "distance must be positive"),
-        ((1.0, 2.0), math.nan, "distance must be positive"),
-        ([(1.0, 2.0)], (1.0, 2.0), r"one for each pixel \(1,\); got shape \(2,\)"),
-    ],
-)
-def test_bad_arguments(pixels, distance, words):
-    problem = Problem(lens("double_sphere"), views=4)
-    adjusted = adjust(problem.sights(), problem.state(), problem.free(), steps=0)
-    values = spread(adjusted, ct.DoubleSphere, 0, torch.ones(1, **F64))
-    with pytest.raises(ValueError, match=words):
-        uncertainty(values, pixels, distance)

@@ -10,19 +10,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from command_line import FILES, LEVEL, MATRIX, camera, command, opened, pixels, refused, write_photograph
+from command_line import FILES, LEVEL, MATRIX, camera, command, opened, pixels, refused
 from PIL import Image
 
 import camtorch as ct
 from camtorch.cli import images
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """The current folder, with an image and its camera."""
-    monkeypatch.chdir(tmp_path)
-    write_photograph(tmp_path)
-    return tmp_path
 
 
 def test_dewarp_writes_what_dewarp_makes(folder, capsys):

@@ -3,15 +3,14 @@
 import functools
 
 import numpy as np
-import pytest
+import pycolmap
 import torch
 from torch.nn.utils import parametrize
 
 import camtorch as ct
 
-from . import SIZE, close, optional, photograph, pixels, points, row, same_images, trap
+from . import SIZE, close, photograph, pixels, points, row, same_images, trap
 
-pycolmap = optional("pycolmap")
 HEIGHT, WIDTH = SIZE
 FISHEYE = [75.0, 77.5, 80.0, 60.0, 0.02, -0.01, 0.003, -0.001]
 OPENCV = [75.0, 77.5, 80.0, 60.0, -0.28, 0.1, 1e-3, -5e-4]
@@ -46,11 +45,6 @@ CLASSES = {
 }
 
 
-def needed():
-    if pycolmap is None:
-        pytest.skip("pycolmap is not installed")
-
-
 def theirs(name="OPENCV", params=OPENCV):
     return pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
 
@@ -81,7 +75,6 @@ def plane(rays):
 
 @row("pycolmap.Reconstruction", "pycolmap.Reconstruction.cameras", "pycolmap.Reconstruction.images")
 def read(tmp_path):
-    needed()
     reconstruction(theirs()).write(tmp_path)
     rig = ct.load(tmp_path)
     assert list(rig.cameras) == ["1"]
@@ -93,7 +86,6 @@ def read(tmp_path):
 
 @row("pycolmap.Reconstruction.write")
 def write(tmp_path):
-    needed()
     rig = ct.Rig({"1": lens()}, {"a.jpg": pose()}, images={"a.jpg": "1"})
     (tmp_path / "binary").mkdir()
     for path in (tmp_path / "text", tmp_path / "binary" / "cameras.bin"):
@@ -106,13 +98,11 @@ def write(tmp_path):
 
 @row("pycolmap.Camera.img_from_cam")
 def project():
-    needed()
     close(lens().project(torch.from_numpy(points()))[0] + 0.5, theirs().img_from_cam(points()))
 
 
 @row("pycolmap.Camera.cam_ray_from_img", "pycolmap.Camera.cam_from_img")
 def unproject():
-    needed()
     rays, valid = lens().unproject(torch.from_numpy(pixels() - 0.5))
     assert valid.all()
     close(rays, theirs().cam_ray_from_img(pixels()), 1e-7)
@@ -121,13 +111,11 @@ def unproject():
 
 @row("pycolmap.Camera.calibration_matrix")
 def matrix():
-    needed()
     close(lens().K + torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), theirs().calibration_matrix())
 
 
 @row("pycolmap.Camera.rescale")
 def rescale():
-    needed()
     camera = theirs()
     camera.rescale(80, 60)
     close(lens().resize(60, 80).intrinsics + torch.tensor([0, 0, 0.5, 0.5]), camera.params[:4])
@@ -141,7 +129,6 @@ def rescale():
     "pycolmap.Rigid3d.inverse",
 )
 def poses():
-    needed()
     image = reconstruction(theirs()).images[7]
     close(pose().matrix()[:3], image.cam_from_world().matrix())
     close(pose().position, image.projection_center())
@@ -154,7 +141,6 @@ def poses():
 
 @row("pycolmap.undistort_camera")
 def undistort():
-    needed()
     bitmap = pycolmap.Bitmap.from_array(photograph())
     flat, camera = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, theirs())
     fx, fy, cx, cy = camera.params
@@ -166,7 +152,6 @@ def undistort():
 
 @row("pycolmap.estimate_and_refine_absolute_pose")
 def absolute_pose():
-    needed()
     seen = lens()(pose()(torch.from_numpy(points())))[0]
     found = pycolmap.estimate_and_refine_absolute_pose(seen.numpy() + 0.5, points(), theirs())
     ours, _, valid = ct.solve_pnp(lens(), points(), seen)
@@ -176,7 +161,6 @@ def absolute_pose():
 
 @row("pycolmap.triangulate_point", "pycolmap.estimate_triangulation", slow=True)
 def triangulate():
-    needed()
     here = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False)
     world = torch.from_numpy(points(20))
     seen = torch.stack([lens()(pose)[0] for pose in (here(world), pose()(world))])
@@ -191,7 +175,6 @@ def triangulate():
 
 def model(first):
     def check(tmp_path):
-        needed()
         kind, names = CLASSES[first]
         for name in names:
             focal = [75.0] if name.startswith(("SIMPLE", "RADIAL")) else [75.0, 77.5]
@@ -212,7 +195,6 @@ for _first in CLASSES:
 
 @trap
 def quaternions(tmp_path):
-    needed()
     reconstruction(theirs()).write_text(tmp_path)
     line = next(line for line in (tmp_path / "images.txt").read_text().splitlines() if line.endswith("a.jpg"))
     w, x, y, z = map(float, line.split()[1:5])
@@ -235,7 +217,6 @@ def one_focal_length(tmp_path):
 
 @trap
 def past_ninety_degrees():
-    needed()
     angle = 1.7
     beside = np.array([[np.sin(angle), 0.0, np.cos(angle)]])
     camera, ours = theirs("OPENCV_FISHEYE", FISHEYE), lens(ct.KannalaBrandt, FISHEYE)

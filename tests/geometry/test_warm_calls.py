@@ -79,7 +79,7 @@ needs_the_native_sampler = pytest.mark.skipif(not ct.native_available(), reason=
 @needs_the_native_sampler
 def test_a_new_camera_and_its_warp_take_few_calls_of_torch():
     image = torch.rand(1, 3, 480, 640)
-    assert median_of_calls(lambda: warped(image)) <= 275
+    assert median_of_calls(lambda: warped(image)) <= 240
 
 
 @needs_the_native_sampler

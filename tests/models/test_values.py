@@ -120,8 +120,8 @@ CAMERA = camera_of("kannala_brandt")
         (lambda: CAMERA.expand(2).expand(3), ValueError, r"batch dims \(2,\) do not expand to \(3,\)"),
         (lambda: ct.cat([]), ValueError, "cat: an empty list"),
         (lambda: ct.cat(CAMERA, CAMERA), TypeError, r"cat: the cameras go in as one list, cat\(\[a, b\]\)"),
-        (lambda: CAMERA.expand(2)[::-1], TypeError, "slices that go forwards.*got slice"),
-        (lambda: ct.Mixed([CAMERA] * 2)[::-1], TypeError, "slices that go forwards.*got slice"),
+        (lambda: CAMERA.expand(2)[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
+        (lambda: ct.Mixed([CAMERA] * 2)[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
         (lambda: ct.Mixed([CAMERA]).replace(image_size="a"), TypeError, "Mixed: image_size must be two integers"),
         (lambda: ct.cat([CAMERA, 3]), TypeError, r"cat: cameras\[1\] must be a Camera; got int"),
         (
