@@ -30,7 +30,7 @@ def mapped(
     camera: Camera, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
 ) -> tuple[Tensor, Tensor]:
     """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
-    batch, tensors = camera.batch_shape, camera.tensors
+    batch, tensors = camera.batch_shape, camera._tensors
     lead, dims = batch, len(batch)
     if (
         not isinstance(values, Tensor)
@@ -68,7 +68,7 @@ def evaluated(
     """
     if is_exporting() and cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
         with with_values(camera):
-            intrinsics, distortion = (per_row(t, lead, rows) for t in camera.tensors)
+            intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
             cameras = rows_of(camera, intrinsics, distortion)
             cameras = cameras._replace(domain=cameras.domain.with_all_tables())
         order = 1 if keeps_graph(rows) else 0

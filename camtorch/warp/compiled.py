@@ -78,7 +78,7 @@ def warped(
 ) -> Tensor:
     """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`."""
     cameras = [n for c in (source, target) for n in (c._model, c.intrinsics.detach(), c.distortion.detach())]
-    sizes = [side for camera in (source, target) for side in camera.size_for("Warp")]
+    sizes = [side for camera in (source, target) for side in camera._size_for("Warp")]
     last = layout(images) == torch.channels_last
     options = tolerance, antialias, padding, mode, padding_mode, list(fill), last
     turned = None if rotation is None else rotation.detach()
