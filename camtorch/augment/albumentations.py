@@ -65,7 +65,6 @@ class Transform(A.DualTransform):
 
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
-        """What moves, by name, and the method that moves it."""
         moved = {name: getattr(self, f"apply_to_{name}") for name in ("images", "mask", "masks", "bboxes", "keypoints")}
         others = {name: self._mover(name) for name in _KINDS}
         return {"image": self.apply, **moved, **others, "camera": self.apply_to_camera}
@@ -83,13 +82,11 @@ class Transform(A.DualTransform):
         return result
 
     def get_params(self) -> dict[str, Any]:
-        """A draw, of plain numbers."""
         generator = torch.Generator().manual_seed(self.py_random.getrandbits(63))
         drawn = self.augmentation.drawn(1, 1.0, False, generator)
         return {"draw": {name: value.tolist() for name, value in drawn.items()}}
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
-        """Move what a sample holds by the draw in `params`."""
         camera = self._source(data)
         drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
         with torch.no_grad():
@@ -105,11 +102,9 @@ class Transform(A.DualTransform):
     # -- what moves
 
     def apply(self, img: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        """An image (H, W, C) or (H, W)."""
         return as_array(change.images(as_tensor("image", img))[0], img)
 
     def apply_to_mask(self, mask: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        """A mask likewise, by the nearest value."""
         return as_array(change.labels(as_tensor("mask", mask), self.augmentation.mask_fill)[0], mask)
 
     def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
@@ -129,7 +124,6 @@ class Transform(A.DualTransform):
         return np.concatenate((moved.numpy().astype(bboxes.dtype), bboxes[:, 4:]), 1)
 
     def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
-        """The camera of the new image."""
         return change.target[0].clone()
 
     def _mover(self, kind: str) -> Callable[..., np.ndarray]:

@@ -24,11 +24,10 @@ from camtorch._arguments import (
     shown,
 )
 from camtorch._module import typed_as
-from camtorch._threads import on_one_thread
 from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.change import Change, Part, alone, as_one
+from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
 from camtorch.warp.shutter import RollingShutter
@@ -285,11 +284,13 @@ class Augmentation(SampleTransform):
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
             )
-        batch_type = type(camera) if isinstance(camera, Mixed) else None
+
+        def part(rows: list[int] | None, source: Camera) -> Part:
+            return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
+
         looks = may_look(applied) or count == 0
         if not looks or bool(applied.all()):  # traced, all rows move, and a gate chooses
-            parts = [self._part_of(rows, group, draw, True) for rows, group in groups]
-            return Change(count, parts, batch_type=batch_type, gate=None if looks or self.p == 1 else applied)
+            return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
         parts, chosen = [], applied.tolist()
         for rows, group in groups:
             rows = list(range(count)) if rows is None else rows
@@ -297,19 +298,15 @@ class Augmentation(SampleTransform):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
                 if here:
                     source = group[here] if group.batch_shape and len(here) < len(rows) else group
-                    parts.append(self._part_of([rows[n] for n in here], source, draw, moves))
+                    own = [rows[n] for n in here]
+                    parts.append(part(own, source) if moves else Part(own, None, source))
         sizes = {part.target.image_size for part in parts}
         if len(sizes) > 1 and len(before) == 1:
             found = sorted(map(str, sizes))
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {found}; with p < 1 the size must stay"
             )
-        return Change(count, parts, batch_type=batch_type)
-
-    def _part_of(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor], moves: bool) -> Part:
-        if not moves:
-            return Part(rows, None, source)
-        return self._part(rows, source, draw if rows is None else {name: value[rows] for name, value in draw.items()})
+        return Change(count, parts, batch_type=type(camera) if isinstance(camera, Mixed) else None)
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         as_mapping(draw, "draw", self._name, "what draw() returns")
@@ -345,8 +342,8 @@ class Augmentation(SampleTransform):
     def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What `new_camera` is given."""
         values = {name: value for name, value in draw.items() if name != "apply"}
-        batched = bool(source.batch_shape) or not _one_for_all(values)
-        if not batched:  # one map serves the whole batch
+        # one map serves the whole batch where all samples draw the same
+        if not source.batch_shape and all(holds(value == value[:1]) for value in values.values()):
             values = {name: value[0] for name, value in values.items()}
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
@@ -401,8 +398,7 @@ class Augmentation(SampleTransform):
 
     # -- applying
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def forward(
         self,
         sample: Mapping[str, Any] | None = None,
@@ -437,8 +433,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def inverse(
         self,
         sample: Mapping[str, Any] | None = None,
@@ -482,11 +477,6 @@ class Augmentation(SampleTransform):
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
-
-
-def _one_for_all(values: Mapping[str, Tensor]) -> bool:
-    """Whether all samples draw the same. Of none, nothing can be said."""
-    return all(holds(value == value[:1]) for value in values.values())
 
 
 # -- for front ends, which hold an augmentation and the camera of their images

@@ -411,15 +411,17 @@ class Change:
         return self.each(depth, move, lambda camera, rows: rows)
 
 
-def by_kinds(count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part]) -> Change:
+def by_kinds(
+    count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part], gate: Tensor | None = None
+) -> Change:
     """The change of samples by one camera or a batch of them: `part` makes the part of each kind of camera.
 
     Its arguments are those rows, None for all, and their cameras.
     """
     camera = alone(camera)
     if not isinstance(camera, Mixed):
-        return Change(count, [part(None, camera)])
-    return Change(count, [part(rows, source) for rows, source in camera.groups], batch_type=type(camera))
+        return Change(count, [part(None, camera)], gate=gate)
+    return Change(count, [part(rows, source) for rows, source in camera.groups], batch_type=type(camera), gate=gate)
 
 
 def as_one(camera: Camera | Sequence[Camera]) -> Camera:

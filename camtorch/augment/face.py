@@ -11,9 +11,8 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, fails, no_camera, shown
 from camtorch._module import remade, typed_as
-from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, Part, alone
-from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
@@ -128,8 +127,7 @@ class FaceNormalizer(SampleTransform):
         target = remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Normalise a sample, a dict or keyword arguments.
 
@@ -160,8 +158,7 @@ class FaceNormalizer(SampleTransform):
             moved["source_rotation"] = sample["rotation"].clone()
         return moved
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Move what was predicted on a normalised sample back to the frame and the image of its source camera.
 

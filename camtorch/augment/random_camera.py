@@ -49,7 +49,6 @@ _told: set[tuple[object, ...]] = set()
 _EDGE_SAMPLES = 32
 _AZIMUTHS = 128
 _ANGLES = 64
-_RIM = 4 * _EDGE_SAMPLES + _AZIMUTHS
 
 
 class RandomCamera(Augmentation):
@@ -454,10 +453,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     measured = _kept(_sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
     steps = amounts.reshape(-1, DRAWN)[:, [i % DRAWN for i in range(count)]] * measured
     given = camera.distortion.reshape(-1, count)
-    p, q = (w.reshape(len(given), -1) for w in _rim(camera))
-    # nothing is asked for where the old lens shows nothing
-    seen = has_ray(domain_of(camera._model, given, camera.optics), p, q)
-    p, q = (torch.where(seen, w, 0.0).view(-1, _RIM).expand(len(steps), -1) for w in (p, q))
+    p, q = (w.expand(len(steps), -1) for w in _rim(camera))
     given = given.expand_as(steps)
     result, left = given.clone(), torch.arange(len(steps), device=steps.device)
     for part in _PARTS:
@@ -517,19 +513,28 @@ def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Ten
 
 
 def _rim(camera: Camera) -> tuple[Tensor, ...]:
-    """Planes (C, _RIM) of points of the sensor in focal lengths: the outline of what the lens shows of the image.
+    """Planes (C, N) of points of the sensor in focal lengths: the outline of what the lens shows of the image.
 
-    Of both: the image's edges, and where the lens ends. What is mapped has no holes: a lens that is invertible on the
-    outline is so inside.
+    Of both: the image's edges, and where the lens ends on it; (0, 0) for what it does not show. What is mapped has no
+    holes: a lens that is invertible on the outline is so inside.
     """
     intrinsics, k = camera.intrinsics.reshape(-1, 1, 4), camera.distortion.detach()
     focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
     edges = (_border(camera._size_for("its rim")).to(focal) - centre) / focal
-    # edited images have different intrinsics, and few kinds of coefficients
-    lenses, which = k.reshape(-1, k.shape[-1]).unique(dim=0, return_inverse=True) if k.ndim > 1 else (k[None], [0])
-    ends = _kept(_ends, camera, lenses).to(focal)[which]
-    ends = torch.where(camera.contains(ends * focal + centre).unsqueeze(-1), ends, edges[:, :1])
-    return torch.cat((edges.expand(len(ends), -1, -1), ends), 1).unbind(-1)
+    own = domain_of(camera._model, k.reshape(-1, k.shape[-1]), camera.optics)
+    rim = edges.expand(len(own.k), -1, -1) if len(edges) == 1 else edges
+
+    def seen(points: Tensor) -> Tensor:
+        return has_ray(own, *(w.reshape(len(own.k), -1) for w in points.unbind(-1))).view(points.shape[:-1])
+
+    if not bool(seen(rim).all()):
+        # edited images have different intrinsics, and few kinds of coefficients
+        lenses, which = own.k.unique(dim=0, return_inverse=True)
+        ends = _kept(_ends, camera, lenses).to(focal)[which]
+        ends = torch.where(camera.contains(ends * focal + centre).unsqueeze(-1), ends, rim[:, :1])
+        rim = torch.cat((rim, ends), 1)
+        rim = torch.where(seen(rim).unsqueeze(-1), rim, 0.0)
+    return rim.unbind(-1)
 
 
 @lru_cache(maxsize=16)

@@ -26,6 +26,7 @@ from camtorch._arguments import (
     fails,
     no_camera,
 )
+from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
@@ -280,9 +281,12 @@ class Unknown(Pinhole):
         return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
-def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
-    """A method that records no graph in a worker of a DataLoader, which tensors of a graph cannot leave."""
+def on_samples(method: Callable[P, R]) -> Callable[P, R]:
+    """A method that moves samples: on one thread of torch, and in a worker of a DataLoader, which no graph can leave,
+    without one.
+    """
 
+    @on_one_thread
     @functools.wraps(method)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling() or get_worker_info() is None:

@@ -83,7 +83,6 @@ class Transform(v2.Transform):
         self._flags: list[tuple[Tensor, Tensor]] = []
 
     def forward(self, *inputs: Any) -> Any:
-        """Move a sample, of one input or several."""
         outputs = super().forward(*inputs)
         if self.valid:
             _put(outputs, self._flags)

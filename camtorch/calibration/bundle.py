@@ -63,6 +63,11 @@ class Poses(NamedTuple):
         return Poses(*(t.index_copy(1, index, new) for t, new in zip(self, other, strict=True)))
 
     @classmethod
+    def where(cls, which: Tensor, a: Poses, b: Poses) -> Poses:
+        """Those of a where which, bool (P,), and those of b elsewhere."""
+        return cls(*(torch.where(which.view(-1, *[1] * (x.ndim - 2)), x, y) for x, y in zip(a, b, strict=True)))
+
+    @classmethod
     def none(cls, batch: int, count: int, like: Tensor) -> Poses:
         """That leave points where they are."""
         eye = torch.eye(3, dtype=like.dtype, device=like.device)

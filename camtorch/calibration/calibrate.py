@@ -284,8 +284,9 @@ def middle_of(seen: Sequence[Observations]) -> Tensor:
 
 @dataclass
 class Search:
-    """The search for one camera: its model, what it saw, and the loss. About `middle` a pose's turn and shift keep
-    apart.
+    """The search for one camera: its model, what it saw, and the loss.
+
+    The boards are taken about their middle, where a pose's turn and its shift hardly depend on each other.
     """
 
     owner: str

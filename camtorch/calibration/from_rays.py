@@ -100,7 +100,7 @@ def fit(
 def _observations(pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: int, owner: str) -> fitting.Observations:
     """Rows of unit rays; what is not finite, or of no length, has no weight."""
     shape = rays.shape[:-1]
-    flat_rays = rays.reshape(-1, math.prod(shape[-dims:]), 3)
+    flat_rays = rays.reshape(math.prod(shape[:-dims]), math.prod(shape[-dims:]), 3)
     flat_pixels = pixels.to(rays.device).expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
     lengths = torch.linalg.vector_norm(flat_rays, dim=-1, keepdim=True)
     good = torch.isfinite(flat_rays).all(-1) & torch.isfinite(flat_pixels).all(-1) & (lengths[..., 0] > 0)

@@ -186,7 +186,7 @@ def _of(given: Any, name: str, otherwise: Any) -> Any:
 
 
 class _Alone(NamedTuple):
-    """A camera by itself: parameters (4 + n,), and the poses of boards (V,), where it has them, bool (V,)."""
+    """A camera by itself: parameters (1, 4 + n), and the poses of boards (1, V), where it has them, bool (V,)."""
 
     parameters: Tensor
     boards: Poses
@@ -197,15 +197,15 @@ def _alone(search: Search) -> _Alone:
     """What one camera says."""
     has_pose = search.given.seen.any(-1)
     state = replace(search, given=search.given.of(has_pose)).alone().state
-    boards = Poses(*(t[0] for t in Poses.none(1, len(has_pose), search.given.pixels)))
-    for whole, part in zip(boards, state.boards, strict=True):
-        whole[has_pose] = part[0]
-    return _Alone(state.parameters[0][0], boards, has_pose)
+    (rows,) = has_pose.nonzero(as_tuple=True)
+    boards = Poses.none(1, len(has_pose), search.given.pixels).with_views(rows, state.boards)
+    return _Alone(state.parameters[0], boards, has_pose)
 
 
 def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
     """Where to start: mounts by what two cameras say of the same boards, boards by the camera that says it best."""
-    mounts = Poses(*(t[0] for t in Poses.none(1, len(alone), alone[0].parameters)))
+    mounts = Poses.none(1, len(alone), alone[0].parameters)
+    turns, shifts = mounts.rotations[0], mounts.translations[0]
     together = torch.stack([one.has_pose for one in alone]).double()
     together = together @ together.mT
     known = [0]
@@ -215,34 +215,26 @@ def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
         i, j = divmod(int(links.argmax()), len(rest))
         a, b = known[i], rest[j]
         rotation, translation = _between(alone[a], alone[b])
-        mounts.rotations[b] = rotation @ mounts.rotations[a]
-        mounts.translations[b] = rotation @ mounts.translations[a] + translation
+        turns[b], shifts[b] = rotation @ turns[a], rotation @ shifts[a] + translation
         known.append(b)
-    parameters = tuple(one.parameters[None] for one in alone)
-    boards, least = alone[0].boards, torch.full_like(alone[0].boards.translations[:, 0], torch.inf)
+    parameters = tuple(one.parameters for one in alone)
+    boards, least = alone[0].boards, torch.full_like(alone[0].boards.translations[0, :, 0], torch.inf)
     for c, one in enumerate(alone):
-        back = mounts.rotations[c].mT
-        own = Poses(back @ one.boards.rotations, (one.boards.translations - mounts.translations[c]) @ back.mT)
-        state = State(parameters, _batched(mounts), _batched(own), own.translations.new_zeros(1, 2))
+        own = Poses(turns[c].mT @ one.boards.rotations, (one.boards.translations - shifts[c]) @ turns[c])
+        state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
         bundle = Bundle(sights, state, free, "cauchy", 1.0)
         flat = bundle.flat(state)
         cost = torch.stack([bundle.look(k, flat).cost[0].sum(-1) for k in range(len(sights))]).sum(0)
         better = one.has_pose & (cost < least)
         least = torch.where(better, cost, least)
-        boards = Poses(
-            *(torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(own, boards, strict=True))
-        )
-    return State(parameters, _batched(mounts), _batched(boards), least.new_zeros(1, 2))
-
-
-def _batched(poses: Poses) -> Poses:
-    return Poses(*(t[None] for t in poses))
+        boards = Poses.where(better, own, boards)
+    return State(parameters, mounts, boards, least.new_zeros(1, 2))
 
 
 def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     """The pose from camera a to b that lies in the middle of those that each of the boards gives."""
     both = a.has_pose & b.has_pose
-    (from_a, at_a), (from_b, at_b) = ((t[both] for t in one.boards) for one in (a, b))
+    (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in one.boards) for one in (a, b))
     rotations = from_b @ from_a.mT
     translations = at_b - (rotations @ at_a[..., None])[..., 0]
     turned = (rotations[:, None] - rotations).flatten(2).norm(dim=-1)

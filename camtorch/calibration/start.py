@@ -132,7 +132,7 @@ def other_poses(state: State, observations: Observations, model: type[Camera], i
     is_other = (cosine < math.cos(_OTHER)) | (shift > _OTHER * torch.linalg.vector_norm(boards.translations, dim=-1))
     if not bool(is_other.any()):
         return state
-    return state._replace(boards=state.boards.with_views(rows, _chosen(is_other[0], others, boards)))
+    return state._replace(boards=state.boards.with_views(rows, Poses.where(is_other[0], others, boards)))
 
 
 def other_cameras(
@@ -335,7 +335,7 @@ def _turned(lens: _Lens, some: Observations) -> _Lens:
     found = poses_from_rays(some.points, rays, weights)
     first, second = (Poses(*(t[None, :, i] for t in found[:2])) for i in range(2))
     usual, other, others = (lens.errors(some, poses)[0].nanmedian(-1).values for poses in (old, first, second))
-    first = _chosen(usual <= other, old, first)
+    first = Poses.where(usual <= other, old, first)
     (rows,) = (others <= _IN_DOUBT * torch.minimum(usual, other)).nonzero(as_tuple=True)
     if len(rows) == 0:
         return lens._replace(boards=first)
@@ -348,16 +348,8 @@ def _turned(lens: _Lens, some: Observations) -> _Lens:
     ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_STEPS)
     halves = slice(len(rows)), slice(len(rows), None)
     a, b = (Poses(*(t[half].transpose(0, 1) for t in ended.state.boards)) for half in halves)
-    better = _chosen(ended.cost[halves[0]] <= ended.cost[halves[1]], a, b)
+    better = Poses.where(ended.cost[halves[0]] <= ended.cost[halves[1]], a, b)
     return lens._replace(boards=first.with_views(rows, better))
-
-
-def _chosen(which: Tensor, a: Poses, b: Poses) -> Poses:
-    """Of poses (1, V) those of a where which, bool (V,)."""
-    return Poses(
-        torch.where(which[:, None, None], a.rotations, b.rotations),
-        torch.where(which[:, None], a.translations, b.translations),
-    )
 
 
 def _refined(

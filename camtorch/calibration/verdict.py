@@ -51,8 +51,6 @@ class Zone(NamedTuple):
     """A ninth of the image."""
 
     name: str
-    corners: int
-    """How many were seen there."""
     share: float
     """The part of its cells that corners lie in or next to."""
     rays: float
@@ -170,8 +168,6 @@ class Survey:
     @cached_property
     def zones(self) -> list[Zone]:
         """Nine, by rows."""
-        low, high = image_edges(self.calibration.image_size, self.corners)
-        places = ((self.corners - low) / (high - low) * 3).long().clamp(0, 2)
         result = []
         for i, band in enumerate(torch.arange(self.shape[0], device="cpu").tensor_split(3)):
             for j, part in enumerate(torch.arange(self.shape[1], device="cpu").tensor_split(3)):
@@ -180,7 +176,6 @@ class Survey:
                 result.append(
                     Zone(
                         " ".join(filter(None, (_ROWS[i], _COLUMNS[j]))) or "middle",
-                        int(((places[:, 0] == j) & (places[:, 1] == i)).sum()),
                         float(self.covered[band][:, part].double().mean()),
                         len(known) / here.numel(),
                         float(known.amax()) if len(known) else math.nan,

@@ -112,10 +112,6 @@ def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """Where the image has corners: dots, on cells that are the darker the more corners they have; crosses are outliers.
 
     The title says in how many of the cells that have rays a corner was seen.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
     """
     from matplotlib.colors import PowerNorm
 
@@ -142,10 +138,6 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
 
     They are drawn longer, by a factor that the title says. Crosses are outliers. Of more than 15,000 an even choice of
     all lengths is drawn, with the longest.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm
@@ -177,12 +169,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
 
 
 def residual_histogram(calibration: Calibration, ax: Axes | None = None) -> Axes:
-    """How often residuals have a size, across (u) and down (v), beside the normal distribution of sigma.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
-    """
+    """How often residuals have a size, across (u) and down (v), beside the normal distribution of sigma."""
     ax, shots = axes_or_new(ax), sightings(calibration)
     errors = shots.errors[shots.used]
     sigma = float(calibration.sigma)
@@ -306,10 +293,6 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     Shaded are the angles that the corners have but for one in 200, with the histogram of all at the bottom. The band is
     the uncertainty of a projection at infinity, drawn wider by the factor that the legend says. The curve ends with the
     image, or with the rays.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
     """
     ax, shots, camera = axes_or_new(ax), sightings(calibration), calibration.camera
     size_of(camera)
@@ -353,10 +336,6 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """The boards as they stood before the camera, seen from its upper right, each in the colour of its rms.
 
     Of more than 300 an even choice is drawn.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
     """
     from matplotlib.collections import PolyCollection
 

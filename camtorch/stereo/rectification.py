@@ -381,7 +381,7 @@ def rectify(
     with torch.no_grad():
         frame = frame_of(extrinsics, vertical, align)
         model = _KINDS[projection].columns if vertical else _KINDS[projection].rows
-        views = [_View(left, frame.left), _View(right, frame.right)]
+        views = [(left, frame.left), (right, frame.right)]
         low, high, focal = _extent(views, model, _KINDS[projection], vertical, owner)
         if fov is not None:
             high = _half(fov, projection, vertical, (high - low) / 2, owner)
@@ -439,26 +439,19 @@ def _unit(axis: int, like: Tensor) -> Tensor:
     return like.new_tensor([float(i == axis) for i in range(3)])
 
 
-class _View(NamedTuple):
-    """A camera and how it is turned."""
-
-    camera: Camera
-    rotation: Tensor
-
-
 def _extent(
-    views: list[_View], model: type[Camera], kind: _Kind, vertical: bool, owner: str
+    views: list[tuple[Camera, Tensor]], model: type[Camera], kind: _Kind, vertical: bool, owner: str
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Lows and highs (*B, 2) on the plane of a projection, and (*B,) the focal length that loses nothing in the middle.
 
     Raises:
         ValueError: nothing that both see.
     """
-    plane = model(torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64, device=views[0].rotation.device))
-    limit = torch.tensor([kind.across, kind.along] if vertical else [kind.along, kind.across]).to(views[0].rotation)
+    plane = model(torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64, device=views[0][1].device))
+    limit = torch.tensor([kind.across, kind.along] if vertical else [kind.along, kind.across]).to(views[0][1])
     ends = []
-    for view in views:  # what the middle row and column of the image show
-        lines = middle_lines(view.camera, view.rotation, plane, limit, _LINE)
+    for camera, rotation in views:  # what the middle row and column of the image show
+        lines = middle_lines(camera, rotation, plane, limit, _LINE)
         for end in (torch.inf, -torch.inf):
             one, other = (torch.where(valid, p[..., i], end) for i, (p, valid) in enumerate(lines))
             ends.append(torch.stack([w.amin(-1) if end > 0 else w.amax(-1) for w in (one, other)], -1))
@@ -472,17 +465,17 @@ def _extent(
             "from left?"
         )
     middle = (low + high) / 2
-    focal = torch.stack([_scale(view, plane, middle) for view in views]).amax(0)
+    focal = torch.stack([_scale(*view, plane, middle) for view in views]).amax(0)
     if not bool((focal > 0).all()):
         raise ValueError(f"{owner}: neither camera sees the middle of the rectified images; give fov and image_size")
     return low, high, focal
 
 
-def _scale(view: _View, plane: Camera, middle: Tensor) -> Tensor:
+def _scale(camera: Camera, rotation: Tensor, plane: Camera, middle: Tensor) -> Tensor:
     """(*B,) pixels of a camera per unit of the plane of a projection, at a point of it; 0 where it does not see it."""
     offsets = _STEP * middle.new_tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
     rays, _ = plane.unproject(middle[..., None, :] + offsets)
-    pixels, valid = view.camera.project((rays @ view.rotation).to(view.camera.intrinsics.dtype))
+    pixels, valid = camera.project((rays @ rotation).to(camera.intrinsics.dtype))
     (a, b), (c, d) = (side.unbind(-1) for side in pixels.double()[..., 1::2, :].sub(pixels[..., ::2, :]).unbind(-2))
     return torch.where(valid.all(-1), (a * d - b * c).abs().sqrt() / (2 * _STEP), 0.0)
 

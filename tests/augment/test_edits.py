@@ -607,24 +607,15 @@ def test_kornia():
     moved, keypoints = pipeline(image, points)
     torch.testing.assert_close(moved, expected["image"])
     torch.testing.assert_close(keypoints, expected["keypoints"])
-    flip = fronts.HorizontalFlip(lens, landmarks=[(0, 1)], p=1.0)
+    assert torch.equal(fronts.HorizontalFlip(lens, p=1.0)(image), image.flip(-1))
+    assert torch.equal(fronts.Rotate90(lens, 1)(image), torch.rot90(image, 1, (-2, -1)))
     both = fronts.Compose(lens, [A.RandomResizedCrop(SIZE), A.HorizontalFlip(), A.RandomLens()])
-    half = fronts.HorizontalFlip(lens)
-    assert (flip.p, both.p, half.p) == (1.0, 1.0, 0.5)
-    back = flip.inverse_keypoints
-    mirrored = flip(image)
-    assert torch.equal(mirrored, image.flip(-1))
-    assert callable(back)
+    assert (both.p, fronts.HorizontalFlip(lens).p) == (1.0, 0.5)
     torch.manual_seed(0)
-    seen = both(image)
-    assert seen.shape == image.shape
-    last = both.last.target
-    assert last.batch_shape == (2,)
+    assert both(image).shape == image.shape
     torch.manual_seed(0)
     direct = both.augmentation(image=image, camera=lens)
-    torch.testing.assert_close(direct["camera"].intrinsics, last.intrinsics)
-    turned = K.AugmentationSequential(fronts.Rotate90(lens, 1), data_keys=["input"])(image)
-    assert torch.equal(turned, torch.rot90(image, 1, (-2, -1)))
+    torch.testing.assert_close(direct["camera"].intrinsics, both.last.target.intrinsics)
 
 
 def test_albumentations():

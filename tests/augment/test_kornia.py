@@ -490,14 +490,6 @@ def test_dtypes(dtype):
     assert (copy.deepcopy(aug).to(dtype)(images(), params=params) - wide).abs().max() < 0.01
 
 
-def test_autocast_changes_nothing():
-    seq = K.AugmentationSequential(adapter.RandomCamera(camera()), data_keys=KEYS)
-    plain, params = seq(*batch()), seq._params
-    for fresh in (seq, copy.deepcopy(seq)):
-        with torch.autocast("cpu", torch.bfloat16):
-            assert equal(fresh(*batch(), params=params), plain)
-
-
 def test_gradients_reach_image_and_keypoints():
     image, keypoints, corners = (v.double().requires_grad_() for v in (images(2), points(2), vertices(2)))
     seq = K.AugmentationSequential(adapter.RandomCamera(camera(), p=0.7), data_keys=["input", "keypoints", "bbox"])

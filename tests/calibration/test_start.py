@@ -52,12 +52,12 @@ def seen_by(camera, degrees, views, noise, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "key"), list(enumerate(DISTORTION)))
+@pytest.mark.parametrize(("seed", "key"), [(i % 2, key) for i, key in enumerate(DISTORTION)])
 def test_nothing_has_to_be_known(seed, key):
     widest = {"pinhole": 115, "brown_conrady": 85, "fov": 150, "division": 150, "f_theta": 180}.get(key, 195)
-    degrees, noise = random.Random(f"{key}{seed}").uniform(30, widest), (0.1, 0.8)[seed % 2]
+    degrees, noise = random.Random(f"{key}{seed}").uniform(30, widest), (0.1, 0.8)[seed]
     camera = a_camera(key, degrees, seed)
-    seen, _, _ = seen_by(camera, degrees, 8, noise, seed)
+    seen, _, _ = seen_by(camera, degrees, 14, noise, seed)
     found = ct.calibrate(key, *seen[:2], image_size=SIZE, count=len(camera.distortion_names))
     best = ct.calibrate(key, *seen[:2], start=camera, image_size=SIZE)
     assert found.converged
