@@ -46,8 +46,8 @@ def _sheet(arguments: argparse.Namespace, like: str | None, ranges: dict[str, An
     output, count = arguments.output or Path(SHEET), arguments.n or SHEET_COUNT
     images.check_target(output, force=arguments.force, inputs=(arguments.image, arguments.camera, arguments.labels))
     before = _photograph(arguments)
-    shown, options = [before], {"min_filled": arguments.min_filled, **ranges}
-    for new in sheet.augmented(before, like, count, arguments.seed, arguments.size, **options):
+    shown = [before]
+    for new in sheet.augmented(before, like, count, arguments.seed, arguments.size, arguments.min_filled, **ranges):
         print(new.note, flush=True)
         shown.append(new)
     empty = 1 - sum(new.filled for new in shown[1:]) / count

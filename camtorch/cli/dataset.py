@@ -96,13 +96,13 @@ class Augmenting:
         return result
 
     def _camera(self, path: Path, size: tuple[int, int], stated: Any) -> Camera:
-        if stated is None:
-            if self.camera is None or self.path is None:
+        if self.camera is None or self.path is None:
+            if stated is None:
                 raise ValueError("which camera took it? Neither its labels nor --camera FILE say so")
-            return cameras.fitting(self.camera, self.path, path, size, self.rescale)
-        if self.camera is not None:
+            return cameras.stated(stated, size)
+        if stated is not None:
             raise ValueError(f"its labels state its camera, and so does --camera {self.path}; leave that out")
-        return cameras.stated(stated, size)
+        return cameras.fitting(self.camera, self.path, path, size, self.rescale)
 
     def augmentation(self, camera: Camera | None) -> RandomCamera:
         """For images of a camera."""
@@ -151,7 +151,8 @@ def run(arguments: argparse.Namespace, like: str | None, ranges: dict[str, Any])
         manifest.read()
         if shard.count == 1 or not any(map(manifest.has_begun, everything)):
             raise ValueError(f"{merged}: exists already; --resume goes on where it was broken off, --force overwrites")
-    status = many.carry_out(everything, faults, work, manifest, arguments, doing="augmenting", units="images")
+    mine = shard.of(everything)
+    status = many.carry_out(mine, faults, work, manifest, arguments, doing="augmenting", units="images")
     if data is not None and merged is not None and not arguments.dry_run:
         with (output / ".camtorch-augment.lock").open("wb") as file:  # the last shard has what all have made
             lock(file, wait=True)

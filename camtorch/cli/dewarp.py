@@ -152,9 +152,10 @@ def _many(arguments: argparse.Namespace) -> int:
         facts = [{**result, "frames": 0} for result in report.results]
         return f", {_told(arguments, facts[0])}" if facts and all(one == facts[0] for one in facts) else ""
 
+    mine = list(map(videos.sized, shard.of(everything)))
     manifest = Manifest(output, "dewarp", work.settings(), shard)
-    units = "frames" if any(item.size != 1 for item in everything) else "images"
-    return many.carry_out(everything, faults, work, manifest, arguments, doing="dewarping", units=units, told=told)
+    units = "frames" if any(item.size != 1 for item in mine) else "images"
+    return many.carry_out(mine, faults, work, manifest, arguments, doing="dewarping", units=units, told=told)
 
 
 def _is_calibration(word: str) -> bool:
@@ -168,7 +169,7 @@ def _is_calibration(word: str) -> bool:
 def _item(source: Path, target: Path, suffix: str | None) -> Item:
     if suffix is not None and videos.is_video(target) == videos.is_video(Path("any" + suffix)):
         target = target.with_suffix(suffix)
-    return videos.sized(Item((source,), (target,)))
+    return Item((source,), (target,))
 
 
 def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:

@@ -37,15 +37,15 @@ def carry_out(
 ) -> int:
     """Have items made, and say what became of them: notes and failures on stderr, numbers on stdout.
 
-    Items are those of all shards, and so are faults, what there is to report beside; the manifest is that of this
-    shard, and not yet open. `doing` is what goes on, as "dewarping", `units` are those of `Item.size`; what
-    `told` adds of what was made begins with a comma, if it is anything.
+    Items and the manifest, which is not yet open, are those of this shard; faults are what the first shard reports
+    beside. `doing` is what goes on, as "dewarping", `units` are those of `Item.size`; what `told` adds of what was made
+    begins with a comma, if it is anything.
 
     Returns:
         The exit status: 0, or 1 where anything failed.
     """
     shard = manifest.shard
-    items, faults = shard.of(items), faults if shard.rank == 0 else []
+    faults = faults if shard.rank == 0 else []
     if arguments.dry_run:
         return _dry_run(items, faults, manifest, arguments.resume)
     part = "" if shard.count == 1 else f", shard {shard.rank + 1} of {shard.count}"

@@ -157,16 +157,9 @@ def found_corners(
     in_videos = [image for path in films for image in _searched_video(path, board, known)]
     found = Corners(board, board.points(), [*_searched(places, board, known), *in_videos])
     if path is not None:
-        kept = Corners(board, found.points, [*found.images, *_others(known, found.images)])
-        if known is None or known.board != board or _told(known) != _told(kept):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_corners(kept, path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_corners(Corners(board, found.points, [*found.images, *_others(known, found.images)]), path)
     return found
-
-
-def _told(corners: Corners) -> list[tuple[object, ...]]:
-    """What a file says of images, but for the corners."""
-    return [(i.path.resolve(), i.camera, i.view, i.hash, i.reason, i.image_size) for i in corners.images]
 
 
 def _others(known: Corners | None, images: Sequence[ImageCorners]) -> list[ImageCorners]:

@@ -106,7 +106,8 @@ def augmented(
     count: int,
     seed: int,
     size: tuple[int, int] | None = None,
-    **options: Any,
+    min_filled: float = 0.0,
+    **ranges: Any,
 ) -> Iterator[LabelledImage]:
     """What `count` random cameras make of an image.
 
@@ -117,7 +118,8 @@ def augmented(
         seed: of the draws; the first ones are the same for every count.
         size: (height, width) of the new images; by default that of the old one. They are scaled to fit `NEW_SIZE`
             and show the same.
-        options: of `RandomCamera`: ranges, `min_filled`.
+        min_filled: of `RandomCamera`.
+        ranges: its other ones.
     """
     height, width = size or (before.camera.height, before.camera.width)
     scale = min(NEW_SIZE[1] / width, NEW_SIZE[0] / height)
@@ -128,7 +130,8 @@ def augmented(
         antialias=True,
         fill=_NOTHING,
         valid_mask=True,
-        **options,
+        min_filled=min_filled,
+        **ranges,
     )
     labels, generator = before.labels, torch.Generator().manual_seed(seed)
     for i in range(count):

@@ -112,8 +112,9 @@ def convert(
     most = max(part.parameters.shape[-1] for part in parts)
     result = _Result(*map(torch.cat, zip(*(part.padded(most) for part in parts), strict=True)))
     camera = build(result.parameters.reshape(*batch, most)).freeze_like(source)
-    numbers = (number.reshape(batch) for number in result[1:])
-    return Conversion(camera, *numbers, type_before_parametrizations(source).__name__)
+    names = ("rms", "max_error", "max_angle", "valid_fraction", "exact")
+    numbers: dict[str, Any] = {name: getattr(result, name).reshape(batch) for name in names}
+    return Conversion(camera, **numbers, source_name=type_before_parametrizations(source).__name__)
 
 
 class _Task(NamedTuple):

@@ -87,7 +87,9 @@ def parse(record: Record, model: str | None = None) -> Rig:
     file = _File(record)
     names = sorted(file.matrices, key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     record.few(len(names))
-    cameras = {name or "camera": file.camera(model, name) for name in names or [None]}
+    if not names:
+        file.camera(model, None)
+    cameras = {name or "camera": file.camera(model, name) for name in names}
     extrinsics = {}
     keys = next((keys for keys in _POSES if all(key in record for key in keys)), None)
     if names in _PAIRS and keys is not None:

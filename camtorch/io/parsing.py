@@ -152,19 +152,19 @@ def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
         raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
 
 
-def _value_of(path: str | os.PathLike[str], node: ast.expr | None) -> Any:
+def _value_of(path: str | os.PathLike[str], node: ast.expr) -> Any:
     """A node as JSON has it. `ast.literal_eval` alone passes over keys that stand there twice."""
     if isinstance(node, (ast.List, ast.Tuple)):
         return [_value_of(path, item) for item in node.elts]
     if isinstance(node, ast.Dict):
-        keys = [_value_of(path, key) for key in node.keys]
+        keys: list[Any] = [key and _value_of(path, key) for key in node.keys]
         if not all(isinstance(key, str) for key in keys):
             raise CameraFileError(path, f"line {node.lineno}", "a key that is no text")
         if (twice := repeated(keys)) is not None:
             raise CameraFileError(path, f"line {node.lineno}", f"the key {twice!r:.60} stands there twice")
         return dict(zip(keys, [_value_of(path, value) for value in node.values], strict=True))
     try:
-        value = None if node is None else ast.literal_eval(node)
+        value = ast.literal_eval(node)
     except ValueError:
         raise CameraFileError(path, f"line {node.lineno}", "no text, number, list or mapping") from None
     if isinstance(value, bytes):
@@ -225,7 +225,8 @@ class _YamlTree:
                 self.fail("a third document in the file")
         elif self.documents > 1:
             # rostopic ends a message with ---, which begins an empty document
-            if kind in ("SequenceStartEvent", "MappingStartEvent", "AliasEvent") or getattr(event, "value", ""):
+            text = getattr(event, "value", "")
+            if text or kind in ("SequenceStartEvent", "MappingStartEvent", "AliasEvent"):
                 self.fail("a second document in the file")
         elif kind == "ScalarEvent":
             self.check_tag(event.tag, "str")
@@ -263,7 +264,7 @@ class _YamlTree:
     def put(self, value: Any, count: int, anchor: str | None = None) -> None:
         """A value of so many values, which in a mapping is a key or what belongs to it."""
         self.count += 1
-        top = self.open[-1] if self.open else [None, None, None, 0]
+        top: list[Any] = self.open[-1] if self.open else [None, None, None, 0]
         top[3] += count
         if max(self.count, top[3]) > _MOST_VALUES:  # an alias costs nothing here, but whoever walks through it pays
             self.fail(f"too many values: more than {_MOST_VALUES} are not read")

@@ -11,6 +11,7 @@ from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
+from torch.utils.data import DataLoader, Dataset
 
 import camtorch as ct
 from camtorch import augment
@@ -527,6 +528,37 @@ def test_gradients_reach_a_learnable_camera(key):
     aug(images(), params=adapter.with_cameras(aug.forward_parameters(images().shape), leaves)).sum().backward()
     assert (leaves.intrinsics.grad != 0).any(1).all()
     assert torch.equal(pickle.loads(pickle.dumps(aug)).last.rotation, aug.last.rotation)
+
+
+def test_autocast_changes_nothing():
+    seq = K.AugmentationSequential(adapter.RandomCamera(camera()), data_keys=KEYS)
+    plain, params = seq(*batch()), seq._params
+    with torch.autocast("cpu", torch.bfloat16):
+        assert equal(seq(*batch(), params=params), plain)
+
+
+class Faces(Dataset):
+    def __init__(self):
+        self.seq = K.AugmentationSequential(adapter.RandomCamera(camera(), p=0.9), data_keys=["input", "keypoints"])
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, index):
+        torch.manual_seed(index)
+        image, keypoints = self.seq(images(1), points(1))
+        return image[0], keypoints[0], self.seq[0].last.rotation[0]
+
+
+@pytest.mark.slow
+# of Python 3.12 on, about fork beside threads
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_workers(context):
+    expected = [torch.stack(parts) for parts in zip(*map(Faces().__getitem__, range(4)), strict=True)]
+    loaded = DataLoader(Faces(), batch_size=2, num_workers=2, multiprocessing_context=context)
+    for first, second in zip((torch.cat(parts) for parts in zip(*loaded, strict=True)), expected, strict=True):
+        assert torch.allclose(first, second, atol=1e-5)
 
 
 def test_copies_and_pickles():

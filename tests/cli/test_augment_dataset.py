@@ -2,10 +2,8 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -391,33 +389,10 @@ def test_what_is_wrong_with_all_images_is_said_once_and_nothing_is_written(folde
 
 
 @pytest.mark.slow
-def test_ranks_and_killed_runs_of_several_processes_end_as_one_process_does(tmp_path):
-    make(tmp_path, 16)
+def test_ranks_and_processes_make_what_one_process_makes(folder):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-
-    def start(*words):
-        command = [sys.executable, "-m", "camtorch", *WORDS, *words]
-        return subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
-
-    assert start("-o", "whole", "--jobs", "1").wait(120) == 0
-    whole = files(tmp_path / "whole")
+    augment("-o", "whole")
+    augment("-o", "two", jobs=2)
     ranks = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "camtorch"]
-    subprocess.run([*ranks, *WORDS, "-o", "ranks"], cwd=tmp_path, env=environment, check=True, capture_output=True)
-    assert files(tmp_path / "ranks") == whole
-    rng = np.random.default_rng(0)
-    killed = 0
-    for _ in range(2):
-        process = start("-o", "new", "--jobs", "2", "--resume")
-        deadline = time.monotonic() + 60
-        there = len(files(tmp_path / "new"))
-        while process.poll() is None and len(files(tmp_path / "new")) <= there and time.monotonic() < deadline:
-            time.sleep(0.002)
-        time.sleep(rng.uniform(0, 0.05))
-        if process.poll() is None:
-            process.send_signal(signal.SIGKILL)
-            killed += 1
-        process.wait()
-        time.sleep(0.3)  # its processes follow
-    assert killed >= 1
-    assert start("-o", "new", "--jobs", "2", "--resume").wait(120) == 0
-    assert files(tmp_path / "new") == whole
+    subprocess.run([*ranks, *WORDS, "-o", "ranks"], env=environment, check=True, capture_output=True)
+    assert files("ranks") == files("two") == files("whole")

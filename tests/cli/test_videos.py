@@ -1,10 +1,5 @@
 """`camtorch dewarp` on videos."""
 
-import os
-import random
-import subprocess
-import sys
-import time
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +8,7 @@ import pytest
 import torch
 from command_line import LEVEL, camera, command, refused
 from PIL import Image
-from test_folders import TRIALS, outputs
+from test_folders import outputs
 from videos import read_video, write_video
 
 import camtorch as ct
@@ -199,23 +194,3 @@ def test_quality(folder):
         sizes.append(Path("out.mp4").stat().st_size)
         assert len(read_video("out.mp4")["frames"]) == 10
     assert sizes[1] < 0.6 * sizes[0]
-
-
-@pytest.mark.slow
-def test_killed_at_any_moment_and_gone_on(folder):
-    Path("in").mkdir()
-    for number in range(3):
-        write_video(f"in/{number}.mp4", range(120 + number), sound="aac")
-    words = [sys.executable, "-m", "camtorch", "dewarp", "in", "--camera", "camera.yml", "--jobs", "2", "-o"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    begin = time.monotonic()
-    subprocess.run([*words, "whole"], check=True, capture_output=True, env=environment)
-    took, whole = time.monotonic() - begin, outputs("whole")
-    generator = random.Random(11)
-    for trial in range(TRIALS):
-        process = subprocess.Popen([*words, f"{trial}"], stdout=subprocess.DEVNULL, env=environment)
-        time.sleep(generator.uniform(0.4, 1) * took)
-        process.kill()
-        process.wait()
-        subprocess.run([*words, f"{trial}", "--resume"], check=True, capture_output=True, env=environment)
-        assert outputs(f"{trial}") == whole

@@ -9,7 +9,7 @@ from torch.nn.utils import parametrize
 
 import camtorch as ct
 
-from . import SIZE, close, photograph, pixels, points, row, same_images, trap
+from . import SIZE, close, equal, photograph, pixels, points, row, same_images, trap
 
 HEIGHT, WIDTH = SIZE
 FISHEYE = [75.0, 77.5, 80.0, 60.0, 0.02, -0.01, 0.003, -0.001]
@@ -96,47 +96,53 @@ def write(tmp_path):
         close(image.cam_from_world().matrix(), moved().matrix())
 
 
-@row("pycolmap.Camera.img_from_cam")
-def project():
-    close(lens().project(torch.from_numpy(points()))[0] + 0.5, theirs().img_from_cam(points()))
+HALF = torch.tensor([0, 0, 0.5, 0.5])
+IN_K = torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+POINT = torch.from_numpy(points()[0])
 
 
-@row("pycolmap.Camera.cam_ray_from_img", "pycolmap.Camera.cam_from_img")
-def unproject():
-    rays, valid = lens().unproject(torch.from_numpy(pixels() - 0.5))
-    assert valid.all()
-    close(rays, theirs().cam_ray_from_img(pixels()), 1e-7)
-    close(plane(rays), theirs().cam_from_img(pixels()), 1e-7)
+def turned():
+    """Another pose, theirs and ours."""
+    turn, shift = np.array([0.0, 0.3, 0.0]), np.array([1.0, 0.0, 0.0])
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(turn), shift), ct.Extrinsics(turn, shift).requires_grad_(False)
 
 
-@row("pycolmap.Camera.calibration_matrix")
-def matrix():
-    close(lens().K + torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), theirs().calibration_matrix())
-
-
-@row("pycolmap.Camera.rescale")
-def rescale():
+def rescaled():
     camera = theirs()
     camera.rescale(80, 60)
-    close(lens().resize(60, 80).intrinsics + torch.tensor([0, 0, 0.5, 0.5]), camera.params[:4])
+    return camera.params[:4]
 
 
-@row(
-    "pycolmap.Image.cam_from_world",
-    "pycolmap.Image.projection_center",
-    "pycolmap.Image.project_point",
-    "pycolmap.Rigid3d.matrix",
-    "pycolmap.Rigid3d.inverse",
-)
-def poses():
-    image = reconstruction(theirs()).images[7]
-    close(pose().matrix()[:3], image.cam_from_world().matrix())
-    close(pose().position, image.projection_center())
-    close(lens()(pose()(torch.from_numpy(points()[0])))[0] + 0.5, image.project_point(points()[0]))
-    close(pose().inverse().matrix()[:3], moved().inverse().matrix())
-    other = ct.Extrinsics(np.array([0.0, 0.3, 0.0]), np.array([1.0, 0.0, 0.0])).requires_grad_(False)
-    turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.3, 0.0])), np.array([1.0, 0.0, 0.0]))
-    close(pose().compose(other).matrix()[:3], (moved() * turned).matrix())
+def image():
+    return reconstruction(theirs()).images[7]
+
+
+def rays():
+    return lens().unproject(torch.from_numpy(pixels() - 0.5))[0]
+
+
+_of = "pycolmap.Image"
+equal({
+    "pycolmap.Camera.img_from_cam": lambda: (
+        (lens().project(torch.from_numpy(points()))[0] + 0.5, theirs().img_from_cam(points())), 1e-9
+    ),
+    "pycolmap.Camera.cam_ray_from_img pycolmap.Camera.cam_from_img": lambda: (
+        (rays(), theirs().cam_ray_from_img(pixels())), (plane(rays()), theirs().cam_from_img(pixels())), 1e-7
+    ),
+    "pycolmap.Camera.calibration_matrix": lambda: ((lens().K + IN_K, theirs().calibration_matrix()), 1e-9),
+    "pycolmap.Camera.rescale": lambda: ((lens().resize(60, 80).intrinsics + HALF, rescaled()), 1e-9),
+    f"{_of}.cam_from_world {_of}.projection_center {_of}.project_point": lambda: (
+        (pose().matrix()[:3], image().cam_from_world().matrix()),
+        (pose().position, image().projection_center()),
+        (lens()(pose()(POINT))[0] + 0.5, image().project_point(points()[0])),
+        1e-9,
+    ),
+    "pycolmap.Rigid3d.matrix pycolmap.Rigid3d.inverse": lambda: (
+        (pose().inverse().matrix()[:3], moved().inverse().matrix()),
+        (pose().compose(turned()[1]).matrix()[:3], (moved() * turned()[0]).matrix()),
+        1e-9,
+    ),
+})  # fmt: skip
 
 
 @row("pycolmap.undistort_camera")

@@ -116,18 +116,21 @@ def undistort():
     np.testing.assert_array_equal(cv2.undistort(photograph(), K, D5), cv2.undistort(photograph(), K, D5, None, K))
 
 
-@row("cv2.initUndistortRectifyMap", "cv2.remap")
+@row("cv2.initUndistortRectifyMap", "cv2.remap", "cv2.fisheye.initUndistortRectifyMap")
 def rectify_map():
-    maps = cv2.initUndistortRectifyMap(K, D5, TURN, P, WH, cv2.CV_32FC1)
-    warp = ct.Warp(brown(), target(), tensor(TURN))
-    same_images(warped(warp), cv2.remap(photograph(), *maps, cv2.INTER_LINEAR))
-    seen = warp.valid_mask()[0, 0].numpy()
-    grid = warp.grid()[0].numpy()
-    for i, (found, size) in enumerate(zip(maps, WH, strict=True)):
-        np.testing.assert_allclose(((grid[..., i] + 1) * size - 1)[seen] / 2, found[seen], atol=2e-3)
-    grid = (2 * tensor(np.stack(maps, -1)) + 1) / torch.tensor(WH) - 1  # as on the page
-    ours = torch.nn.functional.grid_sample(as_images(photograph()).float(), grid[None], align_corners=False)
-    same_images(ours[0].permute(1, 2, 0).numpy(), cv2.remap(photograph(), *maps, cv2.INTER_LINEAR))
+    for camera, lens, of in ((brown(), D5, cv2), (fisheye(), D4, cv2.fisheye)):
+        maps = of.initUndistortRectifyMap(K, lens, TURN, P, WH, cv2.CV_32FC1)
+        theirs = cv2.remap(photograph(), *maps, cv2.INTER_LINEAR)
+        warp = ct.Warp(camera, target(), tensor(TURN))
+        same_images(warped(warp), theirs)
+        seen = warp.valid_mask()[0, 0].numpy()
+        grid = warp.grid()[0].numpy()
+        for i, (found, size) in enumerate(zip(maps, WH, strict=True)):
+            np.testing.assert_allclose(((grid[..., i] + 1) * size - 1)[seen] / 2, found[seen], atol=2e-3)
+        grid = (2 * tensor(np.stack(maps, -1)) + 1) / torch.tensor(WH) - 1  # as on the page
+        ours = torch.nn.functional.grid_sample(as_images(photograph()).float(), grid[None], align_corners=False)
+        same_images(ours[0].permute(1, 2, 0).numpy(), theirs)
+    same_images(warped(ct.Warp(fisheye(), target())), cv2.fisheye.undistortImage(photograph(), K, D4, Knew=P))
 
 
 @row("cv2.initInverseRectificationMap")
@@ -281,16 +284,19 @@ def stereo_calibrate():
     close(ours.rig.extrinsics["right"].translation, shift[:, 0], 1e-4)
 
 
-@row("cv2.stereoRectify")
+@row("cv2.stereoRectify", "cv2.fisheye.stereoRectify")
 def stereo_rectify():
     turn, shift = cv2.Rodrigues(np.array([0.01, 0.05, -0.02]))[0], np.array([[-0.12], [0.01], [0.005]])
     r1, r2, p1, p2, q, *_ = cv2.stereoRectify(K, D5, K, D5, WH, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY)
-    pair = ct.rectify(brown(), brown(), ct.Extrinsics(turn, shift).requires_grad_(False), align="opencv")
-    ours = pair.opencv()
+    extrinsics = ct.Extrinsics(turn, shift).requires_grad_(False)
+    ours = ct.rectify(brown(), brown(), extrinsics, align="opencv").opencv()
     close(ours["R1"], r1, 1e-9)
     close(ours["R2"], r2, 1e-9)
     close(ours["P2"][0, 3] / ours["P2"][0, 0], p2[0, 3] / p2[0, 0], 1e-9)
     assert (ours["P1"].shape, ours["Q"].shape) == (p1.shape, q.shape)
+    r1, *_ = cv2.fisheye.stereoRectify(K, D4, K, D4, WH, turn, shift[:, 0], cv2.CALIB_ZERO_DISPARITY)
+    close(ct.rectify(fisheye(), fisheye(), extrinsics, align="opencv").rotation_left, r1, 1e-6)
+    assert ct.rectify(fisheye(), fisheye(), extrinsics, projection="latlon").camera_left.key == "latlon"
 
 
 @row("cv2.reprojectImageTo3D")
@@ -342,22 +348,16 @@ def moved_pixel(operation, pixel):
     return [column, row]
 
 
-@row("cv2.flip")
-def flip():
-    ray = brown().unproject(torch.tensor([100.0, 50.0], dtype=torch.float64))[0]
-    for code, camera, mirror in ((1, brown().hflip(), [-1, 1, 1]), (0, brown().vflip(), [1, -1, 1])):
-        seen = camera.project(ray * torch.tensor(mirror))[0]
-        np.testing.assert_allclose(
-            seen, moved_pixel(lambda image, code=code: cv2.flip(image, code), (100, 50)), atol=1e-6
-        )
-
-
-@row("cv2.rotate")
-def rotate():
-    ray = brown().unproject(torch.tensor([100.0, 50.0], dtype=torch.float64))[0]
-    quarter = moved_pixel(lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE), (100, 50))
-    # the scene turns with the image: what was to the right is up, which is -y
-    np.testing.assert_allclose(brown().rot90().project(torch.stack([ray[1], -ray[0], ray[2]]))[0], quarter, atol=1e-6)
+@row("cv2.flip", "cv2.rotate")
+def flip_and_rotate():
+    x, y, z = brown().unproject(torch.tensor([100.0, 50.0], dtype=torch.float64))[0]
+    for camera, ray, operation in (
+        (brown().hflip(), (-x, y, z), lambda image: cv2.flip(image, 1)),
+        (brown().vflip(), (x, -y, z), lambda image: cv2.flip(image, 0)),
+        # the scene turns with the image: what was to the right is up, which is -y
+        (brown().rot90(), (y, -x, z), lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE)),
+    ):
+        close(camera.project(torch.stack(ray))[0], moved_pixel(operation, (100, 50)), 1e-6)
 
 
 @row("cv2.calibrationMatrixValues")
@@ -398,15 +398,6 @@ def fisheye_undistort():
     assert back[0, 2] < 0
 
 
-@row("cv2.fisheye.initUndistortRectifyMap")
-def fisheye_map():
-    maps = cv2.fisheye.initUndistortRectifyMap(K, D4, TURN, P, WH, cv2.CV_32FC1)
-    warp = ct.Warp(fisheye(), target(), tensor(TURN))
-    same_images(warped(warp), cv2.remap(photograph(), *maps, cv2.INTER_LINEAR))
-    theirs = cv2.fisheye.undistortImage(photograph(), K, D4, Knew=P)
-    same_images(warped(ct.Warp(fisheye(), target())), theirs)
-
-
 @row("cv2.fisheye.calibrate", slow=True)
 def fisheye_calibrate():
     board, (seen,) = boards([(fisheye(), HERE)])
@@ -416,15 +407,6 @@ def fisheye_calibrate():
     ours = ct.calibrate("kannala_brandt", board, seen, image_size=SIZE)
     close(ours.camera.K, matrix, 1e-3)
     close(ours.camera.distortion, distortion.ravel(), 1e-4)
-
-
-@row("cv2.fisheye.stereoRectify")
-def fisheye_rectify():
-    turn, shift = cv2.Rodrigues(np.array([0.01, 0.05, -0.02]))[0], np.array([-0.12, 0.01, 0.005])
-    r1, *_ = cv2.fisheye.stereoRectify(K, D4, K, D4, WH, turn, shift, cv2.CALIB_ZERO_DISPARITY)
-    extrinsics = ct.Extrinsics(turn, shift).requires_grad_(False)
-    close(ct.rectify(fisheye(), fisheye(), extrinsics, align="opencv").rotation_left, r1, 1e-6)
-    assert ct.rectify(fisheye(), fisheye(), extrinsics, projection="latlon").camera_left.key == "latlon"
 
 
 def spherical(xyz):

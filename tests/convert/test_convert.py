@@ -449,8 +449,11 @@ def test_wild_cameras_become_something_finite(key, data):
     check(source, result)
 
 
-def test_conversion_in_inference_mode():
+@pytest.mark.parametrize("key", slow_unless({"brown_conrady"}.__contains__, ["brown_conrady", "division"]))
+def test_conversion_in_inference_mode(key):
+    """Derivatives of the one go backward, of the other forward."""
     camera = ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640))
-    known = camera.convert("double_sphere")
+    options = {"count": 4, "max_angle": 0.8}
+    known = camera.convert(key, **options)
     with torch.inference_mode():
-        assert torch.equal(camera.convert("double_sphere").camera.distortion, known.camera.distortion)
+        torch.testing.assert_close(camera.convert(key, **options).camera.distortion, known.camera.distortion)
