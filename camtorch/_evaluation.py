@@ -15,7 +15,7 @@ from torch.nn.utils import parametrize
 
 from camtorch._arguments import Numbers, as_points
 from camtorch._module import Memo, is_constant, with_values
-from camtorch._portable import for_elsewhere
+from camtorch._portable import is_portable_export
 from camtorch._tracing import FAKE_MODE, has_tangent, in_jit_trace, is_concrete, is_exporting, keeps_graph
 from camtorch.projection.explanation import unusable
 from camtorch.projection.project import Project
@@ -30,7 +30,7 @@ def mapped(
     camera: Camera, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
 ) -> tuple[Tensor, Tensor]:
     """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
-    batch, tensors = camera.batch_shape, camera.tensors
+    batch, tensors = camera.batch_shape, camera._tensors
     lead, dims = batch, len(batch)
     if (
         not isinstance(values, Tensor)
@@ -44,7 +44,7 @@ def mapped(
         values, lead = as_points(values, name, size, batch, tensors, type(camera).__name__)
     shape = values.shape[:-1]
     rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
-    planes, valid = camera.evaluate(direction, rows, lead, tensors)
+    planes, valid = camera._evaluate(direction, rows, lead, tensors)
     return planes.reshape((planes.shape[0], *shape)).movedim(0, -1), valid.reshape(shape)
 
 
@@ -68,9 +68,9 @@ def evaluated(
     """
     if is_exporting() and cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
         with with_values(camera):
-            intrinsics, distortion = (per_row(t, lead, rows) for t in camera.tensors)
+            intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
             cameras = rows_of(camera, intrinsics, distortion)
-            cameras = cameras._replace(domain=cameras.domain.at_hand())
+            cameras = cameras._replace(domain=cameras.domain.with_all_tables())
         order = 1 if keeps_graph(rows) else 0
         return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
     intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
@@ -90,7 +90,7 @@ def evaluated(
     # what is compiled has no derivatives of derivatives
     order = 1 if torch.compiler.is_compiling() else 2
     known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
-    if for_elsewhere() and not keeps_graph(*inputs):
+    if is_portable_export() and not keeps_graph(*inputs):
         inputs = rows, intrinsics.detach(), distortion.detach()
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
 

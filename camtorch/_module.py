@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 R = TypeVar("R")
 
+FORWARDS = ". Slices go forwards; a list of rows, as [2, 1, 0], need not"
+
 
 def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
     """For type checkers, of a `__call__`: it is called as `forward` is, which nn.Module's does not say."""
@@ -197,8 +199,8 @@ class BatchedModule(GeometryModule):
                 raise IndexError(f"{type(self).__name__}: {index!r} of a batch {shape}: {error}") from None
             except (TypeError, ValueError, RuntimeError):
                 raise TypeError(
-                    f"{type(self).__name__}: a batch is indexed by whole numbers, masks, slices that go "
-                    f"forwards, and lists, as [2, 1, 0], that may not; got {shown(index)}"
+                    f"{type(self).__name__}: a batch is indexed by whole numbers, slices and masks; got {shown(index)}"
+                    + (FORWARDS if isinstance(index, slice) else "")
                 ) from None
             tensors[name] = rows
         return remade(self, **tensors)

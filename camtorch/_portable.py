@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
-from camtorch._tracing import is_exporting
 
 
-def for_elsewhere() -> bool:
+def is_portable_export() -> bool:
     """Whether a program is exported that runs without operators of our own.
 
     Not where dynamo reads the code itself (`strict=True`), which does not follow all of it.
     """
-    return is_exporting() and not torch.compiler.is_dynamo_compiling()
+    return torch.compiler.is_exporting() and not torch.compiler.is_dynamo_compiling()
 
 
 _MOST_BITS = 100
@@ -29,7 +28,7 @@ _MOST_BITS = 100
 
 def plus(a: Tensor, least: float) -> Tensor:
     """The sum of a tensor and of a number that is nearly nothing, and yet is to be there."""
-    if not is_exporting():
+    if not torch.compiler.is_exporting():
         return a + least
     bits = -math.floor(math.log2(abs(least)))
     steps = [_MOST_BITS] * (bits // _MOST_BITS) + [bits % _MOST_BITS]
@@ -43,29 +42,29 @@ def plus(a: Tensor, least: float) -> Tensor:
 
 def times(a: Tensor, nearly_one: float) -> Tensor:
     """The product of a tensor and of a number beside 1."""
-    return a * nearly_one if not is_exporting() else a * 0.5 * (2 * nearly_one)
+    return a * nearly_one if not torch.compiler.is_exporting() else a * 0.5 * (2 * nearly_one)
 
 
 def hypot(a: Tensor, b: Tensor) -> Tensor:
     """The length of (a, b), elsewhere of what has a square that is a number."""
-    return (a * a + b * b).sqrt() if is_exporting() else torch.hypot(a, b)
+    return (a * a + b * b).sqrt() if torch.compiler.is_exporting() else torch.hypot(a, b)
 
 
 def as_index(position: Tensor) -> Tensor:
     """The integer below a position, in as few bits as serve; NaN becomes some integer."""
-    return position.to(torch.int64 if is_exporting() else torch.int32)
+    return position.to(torch.int64 if torch.compiler.is_exporting() else torch.int32)
 
 
 def leading(flags: Tensor) -> Tensor:
     """(..., S) -> (..., 1): how many of the flags are set before the first that is not."""
-    if is_exporting():
+    if torch.compiler.is_exporting():
         return (flags.logical_not().long().cumsum(-1) == 0).long().sum(-1, keepdim=True)
     return flags.long().cumprod(-1).sum(-1, keepdim=True)
 
 
 def running_max(values: Tensor) -> Tensor:
     """(..., S): the largest up to each."""
-    if not is_exporting():
+    if not torch.compiler.is_exporting():
         return torch.cummax(values, -1).values
     step = 1
     while step < values.shape[-1]:
@@ -76,7 +75,7 @@ def running_max(values: Tensor) -> Tensor:
 
 def count_not_above(table: Tensor, values: Tensor) -> Tensor:
     """(..., M): how many entries of the ascending table (..., S) are not above each of the values (..., M)."""
-    if not is_exporting():
+    if not torch.compiler.is_exporting():
         return torch.searchsorted(table.contiguous(), values.contiguous(), right=True)
     size = table.shape[-1]
     low, high = (torch.full_like(values, end, dtype=torch.int64) for end in (0, size))
@@ -91,7 +90,7 @@ def count_not_above(table: Tensor, values: Tensor) -> Tensor:
 
 def of_points(k: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
     """The columns (M,) of coefficients (C, n), of points seen by the cameras of these indices, for `repeat` as well."""
-    if for_elsewhere():  # a recorded loop takes no views of one tensor, and no tensor of size one
+    if is_portable_export():  # a recorded loop takes no views of one tensor, and no tensor of size one
         return tuple(c[camera] for c in k.unbind(-1))
     # a single camera serves all points
     return (k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT).unbind(0)
@@ -118,7 +117,7 @@ def repeat(
     Returns:
         moves and the state at last.
     """
-    if not for_elsewhere():
+    if not is_portable_export():
         for count in range(most):
             if not bool(moves.any()):
                 break
@@ -140,7 +139,7 @@ def repeat(
 
 def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
     """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
-    if is_exporting():  # one by one: few, or the memory of all comparisons
+    if torch.compiler.is_exporting():  # one by one: few, or the memory of all comparisons
         passed = [(node <= place).long() for node in nodes]
         return reduce(torch.add, passed)
     table = torch.stack(nodes, -1).contiguous()
@@ -152,7 +151,7 @@ def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
 
 def pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
     """From each plane's own columns the one of that index."""
-    if is_exporting():  # no sizes are compared, which may be unknown
+    if torch.compiler.is_exporting():  # no sizes are compared, which may be unknown
         found = columns[0] + torch.zeros_like(index, dtype=columns[0].dtype)
         for i, column in enumerate(columns[1:], 1):
             found = torch.where(index == i, column, found)
@@ -164,7 +163,7 @@ def pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
 
 def solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor) -> Tensor:
     """The solution (*B, N) of equations with diagonals (*B, N - 1), (*B, N), (*B, N - 1)."""
-    if not is_exporting():
+    if not torch.compiler.is_exporting():
         matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
         found: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
         return found
@@ -183,7 +182,8 @@ def solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor)
 def unbound(table: Tensor) -> tuple[Tensor, ...]:
     """The columns (...) of a table (..., N)."""
     columns = table.unbind(-1)
-    return tuple(c.clone() for c in columns) if is_exporting() else columns  # a recorded loop takes no views of one
+    # a recorded loop takes no views of one tensor
+    return tuple(c.clone() for c in columns) if torch.compiler.is_exporting() else columns
 
 
 def exported_atan2(y: Tensor, x: Tensor) -> Tensor:

@@ -266,12 +266,12 @@ class Camera(BatchedModule):
         Raises:
             ValueError: the camera has no image size.
         """
-        return self.size_for("height")[0]
+        return self._size_for("height")[0]
 
     @property
     def width(self) -> int:
         """Of the image, in pixels; see `height`."""
-        return self.size_for("width")[1]
+        return self._size_for("width")[1]
 
     # -- what a model states
 
@@ -358,7 +358,7 @@ class Camera(BatchedModule):
         """
         return mapped(self, Unproject, pixels, "pixels", 2)
 
-    def evaluate(
+    def _evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -366,16 +366,15 @@ class Camera(BatchedModule):
         tensors: Sequence[Tensor],
         cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Planes (size, C, N), and valid (C, N), of rows (C, N, size); see `camtorch._evaluation`."""
         return evaluated(self, direction, rows, lead, tensors, cameras_of)
 
     @property
-    def tensors(self) -> tuple[Tensor, ...]:
+    def _tensors(self) -> tuple[Tensor, ...]:
         """All that the camera learns, or could."""
         return self.intrinsics, self.distortion
 
     @property
-    def form(self) -> tuple[object, ...]:
+    def _form(self) -> tuple[object, ...]:
         """What else it is: cameras of one form and equal tensors are the same."""
         return type(self), self.image_size
 
@@ -383,7 +382,7 @@ class Camera(BatchedModule):
 
     def contains(self, pixels: Numbers) -> Tensor:
         """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
-        height, width = self.size_for("contains")
+        height, width = self._size_for("contains")
         pixels = as_values(pixels, "pixels", type(self).__name__)
         if pixels.ndim == 0 or pixels.shape[-1] != 2:
             raise ValueError(f"{type(self).__name__}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
@@ -402,9 +401,9 @@ class Camera(BatchedModule):
                 the image is.
         """
         like = self.intrinsics.new_empty(0, dtype=torch.promote_types(self.intrinsics.dtype, torch.float32))
-        return patch_centres(self.size_for("pixel_grid"), stride, like, type(self).__name__)
+        return patch_centres(self._size_for("pixel_grid"), stride, like, type(self).__name__)
 
-    def size_for(self, what: str) -> tuple[int, int]:
+    def _size_for(self, what: str) -> tuple[int, int]:
         if self.image_size is None:
             raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
         return self.image_size
@@ -415,7 +414,7 @@ class Camera(BatchedModule):
         Those of up to half a million pixels or patches are kept while nothing that they depend on can learn or has
         changed.
         """
-        rays, valid = over_image(self, self._rays, self.tensors, stride, self.unproject)
+        rays, valid = over_image(self, self._rays, self._tensors, stride, self.unproject)
         return rays, valid
 
     def plucker(self, extrinsics: Extrinsics | None = None, stride: int = 1) -> tuple[Tensor, Tensor]:
@@ -530,26 +529,26 @@ class Camera(BatchedModule):
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """The camera of the image with that many more pixels on each side."""
-        height, width = self.size_for("pad")
+        height, width = self._size_for("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
         return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
 
     def resize(self, height: int, width: int) -> Self:
         """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False."""
-        old_height, old_width = self.size_for("resize")
+        old_height, old_width = self._size_for("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
         across, down = width / old_width, height / old_height
         return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
 
     def hflip(self) -> Self:
         """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
-        height, width = self.size_for("hflip")
+        height, width = self._size_for("hflip")
         return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
 
     def vflip(self) -> Self:
         """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
-        height, width = self.size_for("vflip")
+        height, width = self._size_for("vflip")
         return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
 
     def rot90(self, k: int = 1) -> Self:
@@ -560,7 +559,7 @@ class Camera(BatchedModule):
         Raises:
             ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
         """
-        size, turns = self.size_for("rot90"), as_whole(k, "k", "rot90") % 4
+        size, turns = self._size_for("rot90"), as_whole(k, "k", "rot90") % 4
         return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
 
     # -- another model
@@ -616,7 +615,7 @@ class Camera(BatchedModule):
     def extra_repr(self) -> str:
         """Batch, size and, for a single camera, its numbers."""
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
-        numbers = None if self.batch_shape else values_of(torch.cat(self.tensors, -1))
+        numbers = None if self.batch_shape else values_of(torch.cat(self._tensors, -1))
         if numbers is not None:
             names = "fx", "fy", "cx", "cy", *self.distortion_names
             parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]

@@ -16,7 +16,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch._arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch._evaluation import new_cameras, per_row
 from camtorch._evaluation import rows_of as camera_rows
-from camtorch._module import Memo, remade
+from camtorch._module import FORWARDS, Memo, remade
 from camtorch._numbers import as_numbers_of
 from camtorch.camera import Camera
 from camtorch.projection.project import Project
@@ -126,7 +126,7 @@ class Mixed(Camera):
     def groups(self) -> list[tuple[list[int], Camera]]:
         """The rows of each model and number of coefficients, and their cameras as a batch; gradients go to all."""
         made = []
-        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self.tensors), strict=True):
+        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self._tensors), strict=True):
             first = self._member(group.members[0])
             if group.counts[1:] or group.counts[0] is None or group.taken is not None:
                 first = remade(first, intrinsics=intrinsics, distortion=distortion)
@@ -142,12 +142,12 @@ class Mixed(Camera):
         return torch.Size((len(self._places),))
 
     @property
-    def tensors(self) -> tuple[Tensor, ...]:
+    def _tensors(self) -> tuple[Tensor, ...]:
         """Intrinsics and distortion of each group."""
         tensors: list[Tensor] = []
         members = cast("list[Camera]", list(self.cameras._modules.values()))
         for group in self._groups:
-            pairs = [members[i].tensors for i in group.members]
+            pairs = [members[i]._tensors for i in group.members]
             tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
         if not self.one_dtype or all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
@@ -159,13 +159,13 @@ class Mixed(Camera):
         return zip(tensors[::2], tensors[1::2], strict=True)
 
     @property
-    def form(self) -> tuple[object, ...]:
+    def _form(self) -> tuple[object, ...]:
         return type(self), self.image_size, tuple((group.model, group.rows) for group in self._groups)
 
     @property
     def intrinsics(self) -> Tensor:  # type: ignore[override]
         """(B, 4) fx, fy, cx, cy of all."""
-        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self.tensors[::2], strict=True)]
+        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self._tensors[::2], strict=True)]
         return parts[0] if len(parts) == 1 else self._in_order(torch.cat(parts))
 
     @property
@@ -190,7 +190,7 @@ class Mixed(Camera):
 
     # -- both directions
 
-    def evaluate(
+    def _evaluate(
         self,
         direction: type[Project] | type[Unproject],
         rows: Tensor,
@@ -207,7 +207,7 @@ class Mixed(Camera):
                 index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
                 here, count = rows[index], torch.Size((len(group.rows),))
             of_model = self._member(group.members[0])
-            results.append(of_model.evaluate(direction, here, count, pair, self._watch(n)))
+            results.append(of_model._evaluate(direction, here, count, pair, self._watch(n)))
         if len(results) == 1:
             return results[0]
         planes, valid = zip(*results, strict=True)
@@ -225,7 +225,7 @@ class Mixed(Camera):
                 for member in map(self._member, group.members):
                     if not member._warned:
                         lead = member.batch_shape
-                        camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member.tensors))
+                        camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member._tensors))
             return found
 
         return cameras
@@ -300,8 +300,8 @@ class Mixed(Camera):
             raise IndexError(f"Mixed: {index!r} of a batch ({len(self._places)},): {error}") from None
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(
-                "Mixed: it is indexed by whole numbers, masks, slices that go forwards, and lists, as [2, 1, 0], that "
-                f"may not; got {shown(index)}"
+                f"Mixed: it is indexed by whole numbers, slices and masks; got {shown(index)}"
+                + (FORWARDS if isinstance(index, slice) else "")
             ) from None
         if taken.ndim == 0:
             i, row = self._places[int(taken)]
@@ -350,7 +350,7 @@ class Listed(Mixed):
 
     @staticmethod
     def _kind(camera: Camera) -> tuple[object, ...]:
-        return *kind(camera), *((t.dtype, t.requires_grad) for t in camera.tensors)
+        return *kind(camera), *((t.dtype, t.requires_grad) for t in camera._tensors)
 
 
 def cat(cameras: Iterable[Camera], *_more: object) -> Camera:

@@ -251,7 +251,7 @@ class RandomCamera(Augmentation):
             intrinsics, k, reach = drawn(values["lens"], size, self._among)
             base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
-        if any(t.dtype != dtype or t.device != device for t in base.tensors):
+        if any(t.dtype != dtype or t.device != device for t in base._tensors):
             base = base.each(lambda t: t.to(device, dtype))
         if self.fov == "source":
             intrinsics = usual = self._from_source(source, base, size)
@@ -285,7 +285,7 @@ class RandomCamera(Augmentation):
         def made() -> Tensor:
             return _sized(base, size, base.intrinsics.new_tensor(self.ranges["fov"].middle)).detach()
 
-        kept: Tensor = self._memo(base.tensors, (type(base), base.image_size, size), made)
+        kept: Tensor = self._memo(base._tensors, (type(base), base.image_size, size), made)
         return kept
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
@@ -296,7 +296,7 @@ class RandomCamera(Augmentation):
             whole = remade(base, intrinsics=_sized(base, size, fov), image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
-        kept: Tensor = self._memo(source.tensors + base.tensors, (type(source), source.image_size, size), narrowed)
+        kept: Tensor = self._memo(source._tensors + base._tensors, (type(source), source.image_size, size), narrowed)
         return kept
 
 
@@ -520,7 +520,7 @@ def _rim(camera: Camera) -> tuple[Tensor, ...]:
     """
     intrinsics, k = camera.intrinsics.reshape(-1, 1, 4), camera.distortion.detach()
     focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
-    edges = (_border(camera.size_for("its rim")).to(focal) - centre) / focal
+    edges = (_border(camera._size_for("its rim")).to(focal) - centre) / focal
     own = domain_of(camera._model, k.reshape(-1, k.shape[-1]), camera.optics)
     rim = edges.expand(len(own.k), -1, -1) if len(edges) == 1 else edges
 

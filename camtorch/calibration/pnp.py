@@ -148,7 +148,7 @@ class _Task(NamedTuple):
                 f"{owner}: the batch dims of {shapes}, weights {tuple(given.shape)} and the camera's "
                 f"{tuple(camera.batch_shape)} do not fit"
             ) from None
-        dtype = working_dtype(points, seen_at, *camera.tensors)
+        dtype = working_dtype(points, seen_at, *camera._tensors)
         points, seen_at, given = (
             t.double().expand(*batch, count, *size).reshape(-1, count, *size)
             for t, size in ((points, (3,)), (seen_at, (2,)), (given, ()))
@@ -218,7 +218,7 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor,
     if len(rows) == 0:
         return _Found(translations[:, 0], rotations, translations)
     points, pixels, weights = (t.detach()[rows, None] for t in task[1:4])
-    parameters = torch.cat(task.camera.tensors, -1).detach()
+    parameters = torch.cat(task.camera._tensors, -1).detach()
     parameters = parameters[None] if parameters.ndim == 1 else parameters[rows]
     boards = Poses(rotations[:, None], translations[:, None])
     start = State((parameters,), Poses.none(len(rows), 1, points), boards, points.new_zeros(len(rows), 2))

@@ -111,7 +111,7 @@ class _Task(NamedTuple):
             )
         if count < 2:
             raise ValueError(f"{owner}: it takes two cameras at least; got {count}")
-        dtype = working_dtype(seen_at, *(t for camera in given for t in camera.tensors), *(p.rotation for p in poses))
+        dtype = working_dtype(seen_at, *(t for camera in given for t in camera._tensors), *(p.rotation for p in poses))
         shape = seen_at.shape[1:-1]
         seen_at = seen_at.double().reshape(count, shape.numel(), 2)
         matrices = torch.stack([pose.matrix().double() for pose in poses])
@@ -172,7 +172,7 @@ def _solved(task: _Task) -> tuple[Tensor, Tensor]:
     first, shift = rotations[0], translations[0]
     turns = rotations @ first.mT
     moves = translations - (turns @ shift[:, None])[..., 0]
-    parameters = [torch.cat(camera.tensors, -1).detach() for camera in task.cameras]
+    parameters = [torch.cat(camera._tensors, -1).detach() for camera in task.cameras]
     state = State(
         tuple(p[None] for p in parameters),
         Poses(turns.expand(count, -1, 3, 3), moves.expand(count, -1, 3)),

@@ -45,8 +45,8 @@ class Exact:
                 "one; a target_shutter with exposure=0 has one"
             )
         self.warp = warp
-        self.source_size: tuple[int, int] = warp.source.size_for(owner)
-        self.target_size: tuple[int, int] = warp.target.size_for(owner)
+        self.source_size: tuple[int, int] = warp.source._size_for(owner)
+        self.target_size: tuple[int, int] = warp.target._size_for(owner)
         self._batch, self._device = warp.batch_shape, warp.target.intrinsics.device
         with torch.no_grad():
             self._back = warp.inverse()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import holds
-from camtorch._portable import for_elsewhere, times
+from camtorch._portable import is_portable_export, times
 from camtorch._tracing import has_tangent, is_fake, may_look, set_aside
 from camtorch.optics.charts import Chart, Equidistant, Planes2, Planes3, even_steps_and_ratios
 from camtorch.optics.lens import Planar
@@ -27,8 +27,6 @@ class Inverted(Chart):
     Rays are covered before theta ceases to ascend, and up to `FURTHEST`.
     """
 
-    factor: type[RadialFactor]
-
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor]):
         """factor: the class of R, whose instances are made of the parameters."""
         self.factor = factor
@@ -42,10 +40,10 @@ class Inverted(Chart):
     @property
     def _inverse(self) -> RadialInverse:
         """Graph-free, with its tables, made when first asked for; compiled code may keep nothing."""
-        if torch.compiler.is_compiling() and not for_elsewhere():
+        if torch.compiler.is_compiling() and not is_portable_export():
             return RadialInverse(self.factor, self.parameters, FURTHEST)
         if self._known is None:
-            known = for_elsewhere() and not any(map(is_fake, self.parameters))  # a constant of an exported program
+            known = is_portable_export() and not any(map(is_fake, self.parameters))  # a constant of an exported program
             with set_aside() if known else nullcontext():
                 self._known = RadialInverse(self.factor, self.parameters, FURTHEST)
         return self._known

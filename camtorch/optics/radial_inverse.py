@@ -15,7 +15,7 @@ from camtorch._portable import (
     as_index,
     choose,
     count_not_above,
-    for_elsewhere,
+    is_portable_export,
     leading,
     of_points,
     repeat,
@@ -86,7 +86,7 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
         return radial.fold.clamp(max=end)
     # of numbers that are not known, or that another runtime is to compute with, it is looked for
     k = radial.parameters[0]
-    known = k.dtype == torch.float64 and not k.is_meta and not for_elsewhere()
+    known = k.dtype == torch.float64 and not k.is_meta and not is_portable_export()
     if known and (fold := radial.closed_fold()) is not None:
         fold = fold.clamp(max=end)
         for _ in range(_LIMITING):
@@ -182,11 +182,6 @@ class InverseTable:
     at the fold out of the inverse, and is as analytic in r2 as that.
     """
 
-    reach2: Tensor
-    most2: Tensor
-    values: Tensor
-    steps: Tensor
-
     def __init__(self, table: Tensor, *, is_constant: bool = False):
         """table: (C, 2 + 2 nodes): its last squared radius, the largest one that has a point, factors and steps.
 
@@ -210,10 +205,6 @@ class InverseTable:
 class SmallTable:
     """The same up to a radius, read off the factor at few radii: for few points of a camera that is about to change."""
 
-    images: Tensor
-    values: Tensor
-    slopes: Tensor
-
     def __init__(self, radial: RadialFactor, radii: Tensor):
         """radii: (C, K) ascending from 0, on which the factor is followed without a fold."""
         factor = radial(radii * radii)
@@ -231,11 +222,11 @@ class SmallTable:
 # -- the solution
 
 
-def solve(radial: RadialFactor, table: InverseTable | SmallTable, r2: Tensor, looks: bool) -> tuple[Tensor, Tensor]:
+def solve(radial: RadialFactor, table: InverseTable | SmallTable, r2: Tensor, adaptive: bool) -> tuple[Tensor, Tensor]:
     """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
 
     Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
-    positive where the last step was so short that the next one would be nothing. looks: whether the steps may stop
+    positive where the last step was so short that the next one would be nothing. adaptive: whether the steps may stop
     where that is so everywhere.
     """
     scale, converged = table(r2), None
@@ -248,7 +239,7 @@ def solve(radial: RadialFactor, table: InverseTable | SmallTable, r2: Tensor, lo
         scale = scale + step
         if count >= _STEPS[r2.dtype]:
             converged = short(scale.dtype) * scale - step.abs()
-            if not looks or bool(converged.amin() > 0):
+            if not adaptive or bool(converged.amin() > 0):
                 break
     assert converged is not None  # there are more steps than those before the first look
     return scale, converged
@@ -292,14 +283,6 @@ class RadialInverse:
     none; both in the shape of the parameters.
     """
 
-    factor: type[RadialFactor]
-    radial: RadialFactor
-    end: float
-    of_points: bool
-    k: Tensor
-    inner2: Tensor
-    most2: Tensor
-
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor], end: float):
         """Factors of cameras, or of single points.
 
@@ -313,7 +296,7 @@ class RadialInverse:
         self.of_points = parameters[0].ndim < 2
         self.k = torch.stack(parameters, -1).reshape(-1, len(parameters))
         k, rows = self.k, None
-        if for_elsewhere():
+        if is_portable_export():
             inner2, table = _made_tables(factor.name, k, end)
             self._table = InverseTable(table)
             most2 = self._table.most2
@@ -329,7 +312,7 @@ class RadialInverse:
         if self.of_points:
             return bracketed(self.radial, r2, self.inner2)
         rows = r2.reshape(self.k.shape[0], -1)
-        if for_elsewhere():
+        if is_portable_export():
             inner2 = self.inner2.reshape(-1, 1)
             return _scale(self.factor.name, self.k, inner2, self._table, rows).view_as(r2)
         found: Tensor = _radial_inverse(self.factor.name, self.k, self.end, rows)[0]
@@ -340,7 +323,7 @@ _tables = Memo(8)
 
 
 def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
-    wide = k if for_elsewhere() else precise(k)  # ONNX Runtime has no arc tangent in float64
+    wide = k if is_portable_export() else precise(k)  # ONNX Runtime has no arc tangent in float64
     radial = CLASSES[name](columns(wide))
     fold = fold_of(
         radial,
@@ -353,9 +336,9 @@ def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
 
 def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
-    scale, converged = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not for_elsewhere())
+    scale, converged = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not is_portable_export())
     camera, point = (~(converged > 0)).nonzero(as_tuple=True)
-    if for_elsewhere() or len(camera):
+    if is_portable_export() or len(camera):
         radial = CLASSES[name](of_points(k, camera))
         found = bracketed(radial, r2[camera, point], inner2[camera, 0])
         scale = scale.index_put((camera, point), found)

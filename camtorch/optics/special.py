@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._portable import exported_atan2, for_elsewhere, plus
+from camtorch._portable import exported_atan2, is_portable_export, plus
 from camtorch._threads import ALONE, EVEN
 
 _PAIR = 32  # numbers of two vectors of 64 bytes, or a multiple
@@ -79,7 +79,7 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
 
     torch takes the last elements of each thread's part, fewer than two vectors, one by one, and rounds them otherwise.
     """
-    if for_elsewhere():
+    if is_portable_export():
         return exported_atan2(y, x)
     count = y.numel()
     if torch.compiler.is_compiling() or not y.is_cpu or count % (EVEN if count > ALONE else _PAIR) == 0:

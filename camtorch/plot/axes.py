@@ -58,7 +58,7 @@ def check_single(camera: Camera) -> None:
 def size_of(camera: Camera) -> tuple[int, int]:
     """(height, width) of a single camera that must have them."""
     check_single(camera)
-    return camera.size_for("a plot")
+    return camera._size_for("a plot")
 
 
 def draw_frame(ax: Axes, height: int, width: int) -> None:

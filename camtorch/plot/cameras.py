@@ -168,7 +168,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
         ValueError: a batch, no image size, or two different ones.
     """
     compared = differences.difference(a, b, remove_rotation=remove_rotation)
-    height, width = a.size_for("a difference")
+    height, width = a._size_for("a difference")
     ax = axes_or_new(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
     draw_frame(ax, height, width)

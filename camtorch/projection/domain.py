@@ -11,9 +11,9 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._module import Memo
-from camtorch._portable import for_elsewhere, of_points, plus
+from camtorch._portable import is_portable_export, of_points, plus
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
-from camtorch.projection.fold import AZIMUTHS, Azimuths, Outline, azimuth, limits_and_outline
+from camtorch.projection.fold import AZIMUTHS, Azimuths, Extent, azimuth, limits_and_extent
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
@@ -35,7 +35,7 @@ def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
         if self.whole is not None:
             of_all: Tensor = getattr(self.whole, make.__name__)
             return of_all[self.cameras]
-        if for_elsewhere():
+        if is_portable_export():
             return make(self)
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
@@ -53,14 +53,6 @@ class Domain:
     others it is known from bounds of their terms how far out they certainly are; the azimuths are followed only when a
     point lies further out.
     """
-
-    optics: Optics
-    k: Tensor
-    whole: Domain | None
-    cameras: slice
-    chart: Chart
-    lens: Lens
-    untabulated: int
 
     def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice | None = None):
         """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points.
@@ -95,14 +87,14 @@ class Domain:
         self._set(stagewise=None, all_stagewise=False)  # which takes a look
         return self
 
-    def at_hand(self) -> Domain:
+    def with_all_tables(self) -> Domain:
         """The same, with all tables that a graph may ask for: those of values that are known, or recorded with it."""
-        if for_elsewhere():
+        if is_portable_export():
             if self.lens.stages and not self.lens.is_radial:
                 stagewise = torch.isfinite(self.circle2) if self.lens.rest is not None else None
-                limits2, outline = limits_and_outline(self.optics, self.k)
+                limits2, extent = limits_and_extent(self.optics, self.k)
                 limits2 = limits2 if stagewise is None else torch.where(stagewise, 0.0, limits2)
-                self._set(stagewise=stagewise, all_stagewise=False, limits2=limits2, outline=outline)
+                self._set(stagewise=stagewise, all_stagewise=False, limits2=limits2, extent=extent)
             return self
         # constants: none is a view of another
         made = Domain(self.optics, self.k.clone())
@@ -112,15 +104,15 @@ class Domain:
         tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]
         tables += [] if self.lens.is_radial else ["limits2"]
         made._set(**{name: getattr(self, name).clone() for name in tables})
-        made._set(stagewise=self.stagewise, all_stagewise=self.all_stagewise, inverse=None, outline=None)
+        made._set(stagewise=self.stagewise, all_stagewise=self.all_stagewise, inverse=None, extent=None)
         if self.inverse is not None:
             made.__dict__["inverse"] = InverseTable(self.table, is_constant=True)
         if not (self.lens.is_radial or self.all_stagewise):
             with torch.inference_mode(False):
-                made.outline = self.azimuths.outline(torch.arange(len(self.k), device=self.k.device))
+                made.extent = self.azimuths.extent(torch.arange(len(self.k), device=self.k.device))
         return made
 
-    outline: Outline | None
+    extent: Extent | None
     """Of all cameras, where tables are at hand and the inverse of some does not go stage by stage."""
 
     @cached_property
@@ -250,12 +242,15 @@ class Domain:
         certain = torch.minimum(certain.unsqueeze(-1), end - 1.01 * radii[..., -1:])
         return radii if bool(certain.amin() > 0) else None
 
-    def margin(self, a: Tensor, b: Tensor, t: Tensor, looks: bool) -> Tensor:
-        """Positive for the plane points (C, N) in the domain; t = a^2 + b^2. looks: whether it may look at values."""
+    def margin(self, a: Tensor, b: Tensor, t: Tensor, adaptive: bool) -> Tensor:
+        """Positive for the plane points (C, N) in the domain.
+
+        t: a^2 + b^2. adaptive: whether it may look at values.
+        """
         inside = self.inner2 - t
         if self.lens.is_radial or self.all_stagewise:
             return inside
-        if looks:  # at the azimuths on which something lies so far out, only
+        if adaptive:  # at the azimuths on which something lies so far out, only
             outside = ~(inside > 0) if self.stagewise is None else ~((inside > 0) | self.stagewise)
             camera, point = outside.nonzero(as_tuple=True)
             a, b, t = a[camera, point], b[camera, point], t[camera, point]

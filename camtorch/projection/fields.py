@@ -83,9 +83,9 @@ def over_image(
     if torch.compiler.is_compiling():  # nothing is kept then, and a comparison would bound sizes that are left open
         return compute()
     step = max(as_whole(stride, "stride", "pixel_grid"), 1)
-    if math.prod((*camera.batch_shape, *camera.size_for("pixel_grid"))) // step**2 > _MOST_KEPT:
+    if math.prod((*camera.batch_shape, *camera._size_for("pixel_grid"))) // step**2 > _MOST_KEPT:
         return compute()
-    return memo.copies(inputs, (camera.form, stride), compute)
+    return memo.copies(inputs, (camera._form, stride), compute)
 
 
 def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: str) -> tuple[Tensor, Tensor]:
@@ -138,7 +138,7 @@ def tangents(camera: Camera, pixels: Tensor) -> Tangents:
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
         by_v: Any = torch.func.jvp(camera.unproject, (pixels,), (below,), has_aux=True)
         return Tangents(by_u[0], by_u[1], by_v[1], by_u[2])
-    learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera.tensors))
+    learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera._tensors))
     with torch.inference_mode(False), torch.enable_grad():
         given = pixels if learns and pixels.requires_grad else pixels.detach().clone().requires_grad_()
         rays, valid = camera.unproject(given)
@@ -175,7 +175,7 @@ def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
 def local_pinhole(camera: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
     """Rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
     owner = f"{type(camera).__name__}.local_pinhole"
-    pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera.tensors, owner)
+    pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera._tensors, owner)
     rotation, per_unit, valid = local_frames(tangents(camera, pixels))
     centre = torch.where(valid[..., None], pixels.to(per_unit.dtype), 0.0)
     top = torch.cat((per_unit, centre[..., None]), -1)
@@ -191,7 +191,7 @@ def perspective_field(camera: Camera, gravity: Numbers, stride: int) -> tuple[Te
         raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
     down = down.to(camera.intrinsics.device)
     _broadcast(camera.batch_shape, down.shape[:-1], "gravity", owner)
-    inputs = *camera.tensors, down
+    inputs = *camera._tensors, down
     latitude, up, valid = over_image(
         camera, camera._fields, inputs, stride, lambda pixels: _field(camera, down, pixels)
     )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._module import Memo
-from camtorch._portable import as_index, for_elsewhere, hypot, repeat, running_max
+from camtorch._portable import as_index, hypot, is_portable_export, repeat, running_max
 from camtorch.optics.radial_inverse import first_loss
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ _RECORDED_LOOKS = 2  # at such dips, one after the other, in an exported program
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 _FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
 _ROWS = 2048  # azimuths that are followed at a time
-_KEPT = 8  # outlines of some of the cameras
-_BEYOND, _ASIDE = 1.01, 4  # what an outline allows for outside of its rim and, in azimuths, beside it
+_KEPT = 8  # extents of some of the cameras
+_BEYOND, _ASIDE = 1.01, 4  # what an extent allows for outside of its rim and, in azimuths, beside it
 _SPAN = 12  # how many azimuths the rim may go on from one to the next, and beside it, or else it becomes a circle
 
 
@@ -42,9 +42,6 @@ class Azimuths:
     Such a lens mostly folds where its radial factor does: there the radii are dense.
     """
 
-    optics: Optics
-    k: Tensor
-
     def __init__(self, optics: Optics, k: Tensor):
         """optics: a model's. k: (C, n) coefficients of cameras, in the dtype and on the device of the points."""
         self.optics, self.k = optics, k
@@ -52,7 +49,7 @@ class Azimuths:
         self._radii = k.new_full((len(k), _COARSE + _CLOSE), torch.nan)
         self._lost = k.new_full((len(k), AZIMUTHS), torch.nan)
         self._limits2 = self._lost.clone()
-        self._outlines = Memo(_KEPT)
+        self._extents = Memo(_KEPT)
 
     def limits2(self, camera: Tensor, index: Tensor) -> Tensor:
         """(M,): the squared radius, up to the next azimuth, before which the orientation decides.
@@ -77,16 +74,16 @@ class Azimuths:
         chart, _ = self.optics(columns(self.k if len(self.k) == 1 else self.k[camera]))
         return _limit(chart, self._radii[camera], lost)
 
-    def outline(self, camera: Tensor) -> Outline:
+    def extent(self, camera: Tensor) -> Extent:
         """Of several cameras (G,), each given once."""
-        found: Outline = self._outlines((camera,), (), lambda: self._made_outline(camera))
+        found: Extent = self._extents((camera,), (), lambda: self._made_extent(camera))
         return found
 
-    def _made_outline(self, camera: Tensor) -> Outline:
+    def _made_extent(self, camera: Tensor) -> Extent:
         index = torch.arange(AZIMUTHS, device=camera.device).repeat(len(camera))
         rows = camera.repeat_interleave(AZIMUTHS)
         parts = [self._follow(*some) for some in zip(rows.split(_ROWS), index.split(_ROWS), strict=True)]
-        return _outline(self._radii[camera], *(torch.cat(w) for w in zip(*parts, strict=True)))
+        return _extent(self._radii[camera], *(torch.cat(w) for w in zip(*parts, strict=True)))
 
     def _radii_of(self, camera: Tensor) -> Tensor:
         """(M, radii), those of cameras that are asked for the first time made now."""
@@ -110,8 +107,8 @@ class Azimuths:
         return tuple(rest)
 
 
-def limits_and_outline(optics: Optics, k: Tensor) -> tuple[Tensor, Outline]:
-    """`Azimuths.limits2` of all azimuths, (C, azimuths), and the outlines, of all cameras: without a look at values."""
+def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
+    """`Azimuths.limits2` of all azimuths, (C, azimuths), and the extents, of all cameras: without a look at values."""
     chart, lens = optics(columns(k))
     radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(k.shape[0], -1)
     # each camera's azimuths are rows
@@ -122,7 +119,7 @@ def limits_and_outline(optics: Optics, k: Tensor) -> tuple[Tensor, Outline]:
     of_each = lost.unflatten(0, (-1, AZIMUTHS))
     pairs = torch.stack((of_each, of_each.roll(-1, -1)), -1).flatten(0, 1)
     limits = _limit(chart, rows, pairs).unflatten(0, (-1, AZIMUTHS))
-    return limits * limits, _outline(radii, *rest)
+    return limits * limits, _extent(radii, *rest)
 
 
 def _limit(chart: Chart, radii: Tensor, lost: Tensor) -> Tensor:
@@ -155,14 +152,14 @@ def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> 
     return lost, reach, torch.where(open_ended, torch.inf, furthest).squeeze(-1), x.squeeze(-1), y.squeeze(-1)
 
 
-def _outline(radii: Tensor, reach: Tensor, furthest: Tensor, x: Tensor, y: Tensor) -> Outline:
+def _extent(radii: Tensor, reach: Tensor, furthest: Tensor, x: Tensor, y: Tensor) -> Extent:
     """Of cameras (G,), whose azimuths are rows (G azimuths, ...)."""
     reach, furthest, x, y = (w.unflatten(0, (-1, AZIMUTHS)) for w in (reach, furthest, x, y))
     envelope = _envelope(furthest, x, y)
-    return Outline(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
+    return Extent(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
 
 
-class Outline(NamedTuple):
+class Extent(NamedTuple):
     """Where the lenses of cameras (G,) send azimuths.
 
     radii: (G, radii). reach: (G, azimuths, radii), how far from the centre they go, ascending; infinite past the fold.
@@ -230,7 +227,7 @@ def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) 
     spared = torch.zeros_like(orientation, dtype=torch.bool)
     lost = first_loss(orientation, spared)
     dips = assumed(lost)
-    if for_elsewhere():  # few are spared at all
+    if is_portable_export():  # few are spared at all
         for count in range(_RECORDED_LOOKS):
             dips, spared, lost = look(count, dips, spared, lost)
         return lost

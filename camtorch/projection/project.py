@@ -63,10 +63,10 @@ class PlanePoints(NamedTuple):
     is_plain: bool
 
 
-def normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, looks: bool) -> Ray:
+def normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, adaptive: bool) -> Ray:
     """Points as rays that the chart covers; invalid: not finite, the origin, or not covered."""
     shrink = valid = None
-    if looks:
+    if adaptive:
         bounds = [float(bound) for plane in (x, y, z) for bound in plane.aminmax()]
         near, extent = bounds[4], max(map(abs, bounds))
         # NaN fails every comparison, and max() may pass over it
@@ -75,16 +75,16 @@ def normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, looks: bool) -> Ray
             return Ray(x, y, z, None, None)
     x_0, y_0, z_0 = x.detach(), y.detach(), z.detach()
     size = torch.maximum(torch.maximum(x_0.abs(), y_0.abs()), z_0.abs())
-    if not (looks and float(size.amin()) > _SMALL and float(size.amax()) < _LARGE):
+    if not (adaptive and float(size.amin()) > _SMALL and float(size.amax()) < _LARGE):
         # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
         valid = ((size > floor_of(size.dtype)) & (size < torch.inf)).to(size.dtype)
         # a constant: the projection does not depend on the distance, so this has no part in its derivative
         shrink = as_kept(power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
         x_0, y_0, z_0 = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x_0, 0.0), (y_0, 0.0), (z_0, 1.0)))
         x, y, z = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
-    mask = both(valid, to_mask(chart.margin(x_0, y_0, z_0), looks))
+    mask = both(valid, to_mask(chart.margin(x_0, y_0, z_0), adaptive))
     mask = None if mask is None else as_kept(mask)
-    x, y, z = (replace(mask, w, axis, looks) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+    x, y, z = (replace(mask, w, axis, adaptive) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
     return Ray(x, y, z, shrink, mask)
 
 
@@ -95,8 +95,8 @@ def see(
     domain: Domain,
     usable: Tensor | None,
     order: int,
-    looks: bool = False,
-    few: bool = False,
+    adaptive: bool = False,
+    without_tables: bool = False,
 ) -> PlanePoints:
     """Where points, planes (C, N), are seen: the formula of every camera, and all that makes a point invalid.
 
@@ -107,27 +107,27 @@ def see(
         domain: that of the same lens, without a graph.
         usable: the mask of the cameras whose parameters make a camera.
         order: of the derivatives that shall be exact.
-        looks: whether a look at the values may find a shorter way, and no graph is recorded.
-        few: whether the points are few, and the camera about to change: too few for tables.
+        adaptive: whether a look at the values may find a shorter way, and no graph is recorded.
+        without_tables: whether the points are few, and the camera is about to change, which tables are too dear for.
     """
-    x, y, z, shrink, mask = normalise(chart, *points, looks)
+    x, y, z, shrink, mask = normalise(chart, *points, adaptive)
     is_plain = shrink is None and mask is None
     scale = chart.scale(x, y, z, order) if chart.has_scale else None
     a, b = chart.to_plane(x, y, z, order, scale)
     if lens.stages:
         t = torch.addcmul(a * a, b, b)
         inside = None
-        if not (few and domain.radii_without_fold(t.amax(-1, keepdim=True)) is not None):
+        if not (without_tables and domain.radii_without_fold(t.amax(-1, keepdim=True)) is not None):
             inside = domain.inner2 - t.detach()
-            if looks and bool(inside.amin() > 0):
+            if adaptive and bool(inside.amin() > 0):
                 inside = None
             else:
                 if not lens.is_radial:
-                    inside = domain.margin(a.detach(), b.detach(), t.detach(), looks)
-                inside = to_mask(inside, looks)
+                    inside = domain.margin(a.detach(), b.detach(), t.detach(), adaptive)
+                inside = to_mask(inside, adaptive)
         if inside is not None:
             inside = as_kept(inside)
-            a, b, t = (replace(inside, w, 0.0, looks) for w in (a, b, t))
+            a, b, t = (replace(inside, w, 0.0, adaptive) for w in (a, b, t))
             mask = inside if mask is None else mask * inside
         a, b = lens.at(a, b, 0, t).value
     return PlanePoints(a, b, mask if usable is None else both(mask, usable), scale, is_plain)
@@ -178,18 +178,20 @@ class Project(Function):
         pixels = points.new_empty(2, *shape)
         valid = torch.ones(shape, dtype=torch.bool, device=points.device)
         scales = points.new_empty(shape if keeps and cameras.domain.chart.has_scale else (0, 0))
-        looks = cameras.looks
-        few = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
+        adaptive = cameras.adaptive
+        without_tables = adaptive and ctx.needs_input_grad[2] and shape[1] <= FEW
 
         def evaluate(block: Block) -> tuple[tuple[int, int], bool]:
             """Where it begins, and whether the formula took all of it as it came."""
             here, domain = block.here, block.domain
             x, y, z = planes_of(points[here])
-            a, b, mask, scale, is_plain = see((x, y, z), domain.chart, domain.lens, domain, block.usable, 1, looks, few)
+            a, b, mask, scale, is_plain = see(
+                (x, y, z), domain.chart, domain.lens, domain, block.usable, 1, adaptive, without_tables
+            )
             for plane, m, focal, centre in zip(pixels, (a, b), block.intrinsics[:2], block.intrinsics[2:], strict=True):
                 torch.add(focal * m, centre, out=plane[here])
                 if mask is not None:
-                    plane[here] = replace(mask, plane[here], INVALID_PIXEL, looks)
+                    plane[here] = replace(mask, plane[here], INVALID_PIXEL, adaptive)
             if mask is not None:
                 valid[here] = mask > 0
             if scale is not None and scales.numel():
@@ -218,7 +220,7 @@ class Project(Function):
         if torch.is_grad_enabled():
             again = by_formulas(lambda p, i, d: Project.traced(ctx.model, p, i, d, cameras), inputs, wanted, by_pixels)
             return *again, None, None, None
-        points, looks = inputs[0], cameras.looks
+        points, adaptive = inputs[0], cameras.adaptive
         sums = Sums(cameras, wanted, points)
         by_points = torch.empty_like(points) if wanted[0] else None
 
@@ -229,12 +231,12 @@ class Project(Function):
             # a sum is rounded by how what it adds lies in memory
             gu, gv = planes_of(by_pixels.movedim(0, -1)[here])
             if not ctx.plain[block.first]:
-                x, y, z, shrink, _ = normalise(chart, x, y, z, looks)
+                x, y, z, shrink, _ = normalise(chart, x, y, z, adaptive)
                 mask = valid[here].to(x.dtype)
-                x, y, z = (replace(mask, w, axis, looks) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+                x, y, z = (replace(mask, w, axis, adaptive) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
                 # what comes back of an invalid point need not be finite
                 gu, gv = (torch.where(valid[here], g, 0.0) for g in (gu, gv))
-            scale = replace(mask, scales[here], 1.0, looks) if scales.numel() else None
+            scale = replace(mask, scales[here], 1.0, adaptive) if scales.numel() else None
             at = block.domain.lens.at(*chart.to_plane(x, y, z, 1, scale))
             of_intrinsics = sums.of_intrinsics(gu, gv, *at.value)
             wants = sums.wants_distortion

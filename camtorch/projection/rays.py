@@ -33,7 +33,7 @@ def image_edges(image_size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tens
 
 def image_lattice(camera: Camera, rows: int, columns: int) -> Tensor:
     """(rows, columns, 2): pixels in even steps from outer edge to outer edge of the image."""
-    return pixel_lattice(*image_edges(camera.size_for("a lattice of pixels"), camera.intrinsics), rows, columns)
+    return pixel_lattice(*image_edges(camera._size_for("a lattice of pixels"), camera.intrinsics), rows, columns)
 
 
 def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
@@ -140,7 +140,7 @@ def field_of_view(camera: Camera) -> Tensor:
 
     From outer edge to outer edge, or as far as there are rays; 0 where there are none. Graph-free.
     """
-    low, high = image_edges(camera.size_for("field_of_view"), camera.intrinsics)
+    low, high = image_edges(camera._size_for("field_of_view"), camera.intrinsics)
     (left, top), (right, bottom) = low, high
     cx, cy = camera.intrinsics.expand(*camera.batch_shape, 4)[..., 2:].clamp(low, high).unbind(-1)
     lines = (left, cy, right, cy), (cx, top, cx, bottom), (left, top, right, bottom), (left, bottom, right, top)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns, holds
-from camtorch._portable import for_elsewhere
+from camtorch._portable import is_portable_export
 from camtorch._threads import ALONE, EVEN, on_one_thread, spread, thread_count
 from camtorch._tracing import is_recorded
 from camtorch.optics.radial import total
@@ -47,7 +47,7 @@ class Cameras(NamedTuple):
     columns: tuple[Tensor, ...]  # those of the intrinsics
     domain: Domain
     usable: Tensor | None  # (C, 1) mask, None where all are
-    looks: bool
+    adaptive: bool
     """Whether a look at values costs next to nothing, to take a shorter way with a whole block."""
 
     @classmethod
@@ -105,8 +105,8 @@ class Traced(NamedTuple):
             usable = able.to(intrinsics.dtype)
             k = torch.where(able, distortion.detach(), _ideal(model, intrinsics, distortion)[1])
             domain = Domain(model.optics, k)
-            if for_elsewhere():
-                domain.at_hand()
+            if is_portable_export():
+                domain.with_all_tables()
             elif domain.lens.stages:
                 domain.with_tables(*tables(model._model, k))
         if usable is not None:
@@ -141,7 +141,7 @@ def blocks(given: Cameras, rows: Tensor) -> Iterator[Block]:
     count, length = rows.shape[:2]
     if not rows.numel():
         return
-    if not given.looks or count * length <= _BLOCK:  # elsewhere than on a CPU a kernel more costs more than memory
+    if not given.adaptive or count * length <= _BLOCK:  # elsewhere than on a CPU a kernel more costs more than memory
         everything = slice(0, count), slice(0, length)
         yield Block(*everything, (), given.columns, given.domain, given.usable)
         return
@@ -168,7 +168,7 @@ def over_blocks(given: Cameras, rows: Tensor, work: Callable[[Block], R]) -> lis
     So results depend neither on the number of threads nor on who else wants the cores.
     """
     parts = list(blocks(given, rows))
-    if not given.looks or rows.shape[:2].numel() <= ALONE:
+    if not given.adaptive or rows.shape[:2].numel() <= ALONE:
         return list(map(work, parts))
     results: dict[int, R] = {}
     left, inference = iter(enumerate(parts)), torch.is_inference_mode_enabled()
@@ -194,22 +194,22 @@ def planes_of(rows: Tensor) -> tuple[Tensor, ...]:
 # On a CPU selecting by numbers is several times as fast as by bools, and compiled code writes bools one by one.
 
 
-def to_mask(margin: Tensor, looks: bool) -> Tensor | None:
-    """Where a margin is positive. looks: whether a look at it may find that it is so everywhere."""
+def to_mask(margin: Tensor, adaptive: bool) -> Tensor | None:
+    """Where a margin is positive. adaptive: whether a look at it may find that it is so everywhere."""
     margin = margin.detach()
-    if looks:
+    if adaptive:
         return None if bool(margin.amin() > 0) else margin.nan_to_num(-1.0).relu().sign()
     return (margin > 0).to(margin.dtype)
 
 
-def replace(mask: Tensor | None, plane: Tensor, value: float, looks: bool = False) -> Tensor:
+def replace(mask: Tensor | None, plane: Tensor, value: float, adaptive: bool = False) -> Tensor:
     """The plane where the mask is 1, and the value where it is 0.
 
-    looks: the faster way; it needs finite numbers in both places, and records no graph.
+    adaptive: the faster way; it needs finite numbers in both places, and records no graph.
     """
     if mask is None:
         return plane
-    if not looks:  # a cotangent need not be finite
+    if not adaptive:  # a cotangent need not be finite
         return torch.where(mask > 0, plane, value)
     return plane * mask if value == 0 else torch.lerp(plane.new_full((1, 1), value), plane, mask)
 
@@ -228,11 +228,6 @@ def both(*masks: Tensor | None) -> Tensor | None:
 
 class Sums:
     """The cotangents of the parameters, gathered from the blocks."""
-
-    wants_intrinsics: bool
-    wants_distortion: bool
-    intrinsics: Tensor
-    optics: list[Tensor]
 
     def __init__(self, cameras: Cameras, needs_input_grad: tuple[bool, ...], like: Tensor):
         self.cameras = cameras

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._portable import for_elsewhere, hypot, repeat, times
+from camtorch._portable import hypot, is_portable_export, repeat, times
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
@@ -15,7 +15,7 @@ from camtorch.projection.fold import azimuth
 
 if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
-    from camtorch.projection.fold import Outline
+    from camtorch.projection.fold import Extent
 
 Planes2 = tuple[Tensor, Tensor]
 
@@ -35,11 +35,11 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     """
     if domain.lens.is_radial:
         return _Search(domain, camera)(u, v)
-    if for_elsewhere():
+    if is_portable_export():
         return _search_recorded(domain, camera, u, v)
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
     stagewise = torch.zeros_like(found) if domain.stagewise is None else domain.stagewise[camera, 0]
-    for ways, way in ((stagewise, _by_stages), (~stagewise, _within_outlines)):
+    for ways, way in ((stagewise, _by_stages), (~stagewise, _within_extents)):
         (some,) = ways.nonzero(as_tuple=True)
         if len(some):
             a[some], b[some], found[some] = way(domain, camera[some], u[some], v[some])
@@ -55,10 +55,10 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tu
         by_stages = a, b, there & within
         if domain.all_stagewise:
             return by_stages
-    outline = domain.outline
-    assert outline is not None  # of a domain whose tables are at hand
-    within = hypot(u, v) <= outline.furthest[camera, azimuth(u, v)]
-    a, b, there = _Search(domain, camera, outline, camera, within=within)(u, v)
+    extent = domain.extent
+    assert extent is not None  # of a domain whose tables are at hand
+    within = hypot(u, v) <= extent.furthest[camera, azimuth(u, v)]
+    a, b, there = _Search(domain, camera, extent, camera, within=within)(u, v)
     found = a, b, there & within
     if by_stages is None:
         return found
@@ -94,17 +94,17 @@ def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[
     return (p, q), (u * u + v * v <= domain.circle2[camera, 0]) & (p * p + q * q <= most2)
 
 
-def _within_outlines(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`search` of any other lens, for the points within the outline of what it shows."""
+def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`search` of any other lens, for the points within the extent of what it shows."""
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
     cameras, row = camera.unique(return_inverse=True)
     for first in range(0, len(cameras), _CAMERAS):
-        outline = domain.azimuths.outline(cameras[first : first + _CAMERAS])
+        extent = domain.azimuths.extent(cameras[first : first + _CAMERAS])
         (some,) = ((row >= first) & (row < first + _CAMERAS)).nonzero(as_tuple=True)
-        within = hypot(u[some], v[some]) <= outline.furthest[row[some] - first, azimuth(u[some], v[some])]
+        within = hypot(u[some], v[some]) <= extent.furthest[row[some] - first, azimuth(u[some], v[some])]
         some = some[within]
         if len(some):
-            alone = _Search(domain, camera[some], outline, row[some] - first)
+            alone = _Search(domain, camera[some], extent, row[some] - first)
             a[some], b[some], found[some] = alone(u[some], v[some])
     return a, b, found
 
@@ -116,21 +116,21 @@ class _Search:
         self,
         domain: Domain,
         camera: Tensor,
-        outline: Outline | None = None,
+        extent: Extent | None = None,
         row: Tensor | None = None,
         *,
         is_circle: bool = False,
         within: Tensor | None = None,
     ):
-        """outline: of some of the cameras, unless the fold is a circle. row: (M,) which of them.
+        """extent: of some of the cameras, unless the fold is a circle. row: (M,) which of them.
 
         is_circle: whether the fold is one, as it is for every radial lens.
         within: (M,) bool: of a recorded search, the points that it is for.
         """
-        self.domain, self.camera, self.outline, self.row = domain, camera, outline, row
+        self.domain, self.camera, self.extent, self.row = domain, camera, extent, row
         self.within = within
         self.chart, self.lens = domain.optics_of(camera)
-        self.limits2 = domain.limits2 if for_elsewhere() and not (is_circle or self.lens.is_radial) else None
+        self.limits2 = domain.limits2 if is_portable_export() and not (is_circle or self.lens.is_radial) else None
         self.is_circle = is_circle or self.lens.is_radial
 
     def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -180,7 +180,7 @@ class _Search:
 
     def planar(self, u: Tensor, v: Tensor) -> Planes2:
         """Newton's method; the few that need many steps go on by themselves."""
-        if for_elsewhere():
+        if is_portable_export():
             return self._newton(u, v, *self._start(u, v), _FIRST_STEPS + _LATE_STEPS)[:2]
         a, b, active = self._newton(u, v, *self._start(u, v), _FIRST_STEPS)
         (late,) = active.nonzero(as_tuple=True)
@@ -227,15 +227,15 @@ class _Search:
 
         The azimuth is followed by the secant method: it is nearly that of (u, v), unless a prism dominates.
         """
-        assert self.outline is not None  # a lens that is not radial has one
+        assert self.extent is not None  # a lens that is not radial has one
         assert self.row is not None
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
-        outline, row = self.outline, self.row
+        extent, row = self.extent, self.row
 
         def look(count: int | Tensor, far: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             a, b, best, angle, step, last_off = state
             c, s = torch.cos(angle), torch.sin(angle)
-            rho = outline.start(row, target, c, s)
+            rho = extent.start(row, target, c, s)
             x, y = self.lens(rho * c, rho * s)
             error = (u - x) ** 2 + (v - y) ** 2
             better = (error < best) & far  # what is close stays, whatever else is in its batch

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch._arguments import columns
-from camtorch._portable import for_elsewhere, times
+from camtorch._portable import is_portable_export, times
 from camtorch._threads import on_one_thread
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, SmallTable, short, solve
@@ -51,75 +51,75 @@ class Found(NamedTuple):
     possible: Tensor
 
 
-def invert(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+def invert(domain: Domain, u: Tensor, v: Tensor, adaptive: bool) -> Found:
     """The point that the lens sends to (u, v), from a table and a few steps of Newton's method.
 
     What is solved is the solution in the domain, to rounding: the last step was so short that the next one would be
     nothing. What is not, and yet possible, is left to `search`.
     """
     if domain.lens.is_radial:
-        return _invert_radial(domain, u, v, looks)
+        return _invert_radial(domain, u, v, adaptive)
     if domain.all_stagewise:
-        return _invert_stagewise(domain, u, v, looks)
-    found = _invert_planar(domain, u, v, looks)
+        return _invert_stagewise(domain, u, v, adaptive)
+    found = _invert_planar(domain, u, v, adaptive)
     if domain.stagewise is None:
         return found
     # each camera alike, whatever else is in its batch
-    pairs = zip(_invert_stagewise(domain, u, v, looks), found, strict=True)
+    pairs = zip(_invert_stagewise(domain, u, v, adaptive), found, strict=True)
     return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
 
 
-def _invert_planar(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+def _invert_planar(domain: Domain, u: Tensor, v: Tensor, adaptive: bool) -> Found:
     # in the plane, from the inverse of the radial factor
     a, b = domain.lens.start(u, v)
     if domain.inverse is not None:
         # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
-    found = _newton(domain.lens, u, v, a, b, looks)
+    found = _newton(domain.lens, u, v, a, b, adaptive)
     # further out than images reach a determinant may overflow, and a step seem short
     inside = domain.usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
     return found._replace(solved=torch.minimum(found.solved, inside))
 
 
-def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor, adaptive: bool) -> Found:
     """The stages after the radial one first: only that one has a limit, and what it would have to reach tells at once.
 
     Pixels beyond the image of every ray are never solved for.
     """
-    first, within = _first_image(domain, u, v, looks)
-    found = _invert_radial(domain, first.a, first.b, looks)
+    first, within = _first_image(domain, u, v, adaptive)
+    found = _invert_radial(domain, first.a, first.b, adaptive)
     known = first.solved > 0
     possible = torch.minimum(torch.where(known, found.possible, 1.0), within)
     solved = torch.where(known, torch.minimum(found.solved, within), -1.0)
     return found._replace(solved=solved, possible=possible)
 
 
-def _first_image(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> tuple[Found, Tensor]:
+def _first_image(domain: Domain, u: Tensor, v: Tensor, adaptive: bool) -> tuple[Found, Tensor]:
     """Where the first stage has to send what later ones send to (u, v); and positive within the circle of the image."""
     rest = domain.lens.rest
     assert rest is not None
     within = domain.circle2 - torch.addcmul(u * u, v, v)
-    mask = to_mask(within, looks)
-    u, v = replace(mask, u, 0.0, looks), replace(mask, v, 0.0, looks)
-    return _newton(rest, u, v, *rest.start(u, v), looks, near=True), within
+    mask = to_mask(within, adaptive)
+    u, v = replace(mask, u, 0.0, adaptive), replace(mask, v, 0.0, adaptive)
+    return _newton(rest, u, v, *rest.start(u, v), adaptive, near=True), within
 
 
-def _invert_radial(domain: Domain, u: Tensor, v: Tensor, looks: bool) -> Found:
+def _invert_radial(domain: Domain, u: Tensor, v: Tensor, adaptive: bool) -> Found:
     r2 = torch.addcmul(u * u, v, v)
     eps, radial, table = torch.finfo(u.dtype).eps, domain.lens.radial, domain.inverse
     assert radial is not None  # a radial lens has both
     assert table is not None
     possible = times(table.most2, 1 + 8 * eps) - r2
     # what is beyond the fold would never settle
-    r2 = torch.minimum(replace(to_mask(possible, looks), r2, 0.0, looks), table.most2)
-    scale, converged = solve(radial, table, r2, looks)
+    r2 = torch.minimum(replace(to_mask(possible, adaptive), r2, 0.0, adaptive), table.most2)
+    scale, converged = solve(radial, table, r2, adaptive)
     # a ray's rounding must not carry it across the fold
     inside = times(domain.inner2, 1 - 32 * eps) - r2 * scale * scale
     return Found(u * scale, v * scale, torch.minimum(torch.minimum(converged, inside), possible), possible)
 
 
-def invert_few(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
+def invert_without_tables(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
     """The same without the tables of the domain, for few points; None where it takes those to tell."""
     a, b = domain.lens.start(u, v)
     r2 = torch.addcmul(a * a, b, b)
@@ -131,16 +131,16 @@ def invert_few(domain: Domain, u: Tensor, v: Tensor) -> Found | None:
     if not bool((table.images[..., -1:] ** 2 - r2).amin() > 0):
         return None
     if domain.lens.is_radial:
-        scale, converged = solve(domain.lens.radial, table, r2, looks=True)
+        scale, converged = solve(domain.lens.radial, table, r2, adaptive=True)
         found = Found(u * scale, v * scale, converged, converged)
     else:
         scale = table(r2)
-        found = _newton(domain.lens, u, v, a * scale, b * scale, looks=True)
+        found = _newton(domain.lens, u, v, a * scale, b * scale, adaptive=True)
         converged = torch.minimum(found.solved, radii[..., -1:] ** 2 - torch.addcmul(found.a**2, found.b, found.b))
     return found if bool(converged.amin() > 0) else None
 
 
-def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool, near: bool = False) -> Found:
+def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor, adaptive: bool, near: bool = False) -> Found:
     """From (a, b) on, wherever that leads. near: whether most points begin a step nearer than from a table."""
     short2, fewest, converged = short(u.dtype) ** 2, _STEPS[u.dtype] - near, None
     for count in range(1, MOST_STEPS + 1):
@@ -153,7 +153,7 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor, looks: bool,
         t = torch.addcmul(a * a, b, b)
         if count >= fewest:
             converged = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
-            if not looks or bool(converged.amin() > 0):
+            if not adaptive or bool(converged.amin() > 0):
                 break
     assert converged is not None  # there are more steps than those before the first look
     return Found(a, b, torch.minimum(converged, reciprocal.abs()), torch.ones_like(a))
@@ -208,13 +208,13 @@ class Target(NamedTuple):
     mask: Tensor | None
 
 
-def to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...], looks: bool = False) -> Target:
+def to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...], adaptive: bool = False) -> Target:
     """Invalid: pixels that are no numbers, or so large that a square overflows."""
     focal_x, focal_y, centre_x, centre_y = intrinsics
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())
     limit = torch.finfo(far.dtype).max ** 0.25
-    if looks and float(far.amax()) < limit:
+    if adaptive and float(far.amax()) < limit:
         return Target(p, q, None)
     mask = (far < limit).to(far.dtype)
     p, q = ((torch.where(mask > 0, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
@@ -238,8 +238,8 @@ def solutions(
     domain: Domain,
     usable: Tensor | None,
     finish: Callable[[Planes2, Found], Found] | None = None,
-    looks: bool = False,
-    few: bool = False,
+    adaptive: bool = False,
+    without_tables: bool = False,
 ) -> Solution:
     """Where pixels, planes (C, N), come from: graph-free, with all that makes a pixel invalid.
 
@@ -250,29 +250,29 @@ def solutions(
         domain: of the lens.
         usable: the mask of the cameras whose parameters make a camera.
         finish: adds to what was found at p, q what a search finds; by default that is left open.
-        looks: whether a look at the values may find a shorter way.
-        few: whether the points are few, and the camera about to change: too few for tables.
+        adaptive: whether a look at the values may find a shorter way.
+        without_tables: whether the points are few, and the camera is about to change, which tables are too dear for.
     """
-    p, q, known = to_target(u, v, intrinsics, looks)
+    p, q, known = to_target(u, v, intrinsics, adaptive)
     known = known if usable is None else both(known, usable)
     if known is not None:
-        p, q = replace(known, p, 0.0, looks), replace(known, q, 0.0, looks)
+        p, q = replace(known, p, 0.0, adaptive), replace(known, q, 0.0, adaptive)
     target, left = Target(p, q, known), None
     if domain.lens.stages:
-        found = (invert_few(domain, p, q) if few else None) or invert(domain, p, q, looks)
+        found = (invert_without_tables(domain, p, q) if without_tables else None) or invert(domain, p, q, adaptive)
         if finish is not None:
             found = finish((p, q), found)
-        solved = to_mask(found.solved, looks)
+        solved = to_mask(found.solved, adaptive)
         a, b = found.a, found.b
         if solved is not None:
             left = (found.possible > 0) & ~(solved > 0)
-            if looks:  # a product has no use for what ran away
+            if adaptive:  # a product has no use for what ran away
                 a, b = a.nan_to_num(0.0, 0.0, 0.0), b.nan_to_num(0.0, 0.0, 0.0)
     else:
-        solved, a, b = to_mask(domain.chart.on_plane(p, q), looks), p, q
+        solved, a, b = to_mask(domain.chart.on_plane(p, q), adaptive), p, q
     if solved is None:
         return Solution(a, b, known, target, left)
-    a, b = replace(solved, a, 0.0, looks), replace(solved, b, 0.0, looks)
+    a, b = replace(solved, a, 0.0, adaptive), replace(solved, b, 0.0, adaptive)
     return Solution(a, b, both(known, solved), target, left)
 
 
@@ -296,7 +296,7 @@ class Unproject(Function):
         u, v = to_planes(pixels)
 
         def finish(target: Planes2, found: Found) -> Found:
-            if for_elsewhere():
+            if is_portable_export():
                 return _search_recorded(usual.domain, target, found)
             if torch.compiler.is_compiling():
                 search_in_place(model._model, usual.domain.k, *target, *found)
@@ -331,10 +331,10 @@ class Unproject(Function):
         keeps: bool,
     ) -> tuple[Tensor, Tensor]:
         """keeps: whether there will be a backward."""
-        shape, looks = pixels.shape[:2], cameras.looks
+        shape, adaptive = pixels.shape[:2], cameras.adaptive
         rays, solution = pixels.new_empty(3, *shape), pixels.new_empty(2, *shape) if keeps else None
         valid = torch.ones(shape, dtype=torch.bool, device=pixels.device)
-        few = looks and ctx.needs_input_grad[2] and shape[1] <= FEW
+        without_tables = adaptive and ctx.needs_input_grad[2] and shape[1] <= FEW
 
         all_valid = True
         left_open: list[tuple[Tensor, ...]] = []
@@ -343,10 +343,12 @@ class Unproject(Function):
             """Whether all is valid, and what is left open."""
             here, domain = block.here, block.domain
             u, v = planes_of(pixels[here])
-            a, b, mask, target, left = solutions(u, v, block.intrinsics, domain, block.usable, None, looks, few)
+            a, b, mask, target, left = solutions(
+                u, v, block.intrinsics, domain, block.usable, None, adaptive, without_tables
+            )
             made = domain.chart.to_ray(a, b, 1)
             for plane, w, axis in zip(rays, made, (0.0, 0.0, 1.0), strict=True):
-                plane[here] = replace(mask, w, axis, looks)
+                plane[here] = replace(mask, w, axis, adaptive)
             if solution is not None:
                 solution[0][here], solution[1][here] = a, b
             if mask is not None:

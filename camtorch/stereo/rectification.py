@@ -182,7 +182,7 @@ class Rectification(GeometryModule):
             ValueError: another shape.
         """
         owner, camera = "disparity_to_points", self.camera_left
-        size = camera.size_for(owner)
+        size = camera._size_for(owner)
         d = as_values(disparity, "disparity", owner, camera.intrinsics.device)
         shape, count = tuple(d.shape), self.extrinsics.batch_shape.numel()
         if d.ndim not in (2, 3, 4) or shape[-2:] != size or (d.ndim > 2 and shape[-3] != 1):
@@ -263,7 +263,7 @@ class Rectification(GeometryModule):
             raise ValueError(f"depth_range: disparities must be least < most; got least={least}, most={most}")
         with torch.no_grad():
             ends = self.camera_left.intrinsics.new_tensor([least, most])[:, None, None]
-            size = self.camera_left.size_for("depth_range")
+            size = self.camera_left._size_for("depth_range")
             parts = [self._points(self._pixels(), end.expand(1, *size)) for end in ends]
             found = torch.cat([points[good] for points, good in parts])
             found = found[..., 2] if self.projection == "perspective" else self.distance(found)
@@ -316,7 +316,7 @@ class Rectification(GeometryModule):
         """
         check_path(path, "Rectification.save")
         matrices, pose = self.opencv(), self.extrinsics.matrix()
-        height, width = self.camera_left.size_for("Rectification.save")
+        height, width = self.camera_left._size_for("Rectification.save")
         values: dict[str, Value] = {"image_width": width, "image_height": height}
         for name, matrix in {"R": pose[:3, :3], "T": pose[:3, 3:], **matrices}.items():
             values[name] = matrix.detach().double().tolist()

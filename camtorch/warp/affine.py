@@ -70,7 +70,7 @@ class MirrorWarp(Warp):
             if smooth and route_of(self, inputs, images, sampler.mode) == "kept":
                 where = positions(self, inputs, "kept", sampler.padding_mode)
                 if self._halvings is None:
-                    self._halvings = _halvings(where, self.source.size_for("Warp"))
+                    self._halvings = _halvings(where, self.source._size_for("Warp"))
                 if any(self._halvings):
                     return self._smoothed(images, where, self._halvings, sampler)
         return super().forward(images, mode=mode, padding_mode=padding_mode, fill=fill)
@@ -98,7 +98,7 @@ class MirrorWarp(Warp):
         return result
 
     def _empty(self, images: Tensor) -> Tensor:
-        cameras, size = self.batch_shape.numel(), self.target.size_for("Warp")
+        cameras, size = self.batch_shape.numel(), self.target._size_for("Warp")
         count = len(images) if cameras == 1 else cameras
         if images.requires_grad or not images.is_cpu:
             return images.new_empty(count, images.shape[1], *size)
@@ -169,13 +169,13 @@ class AffineWarp(MirrorWarp):
     def _is_inside(self) -> bool:
         """Whether the edited images show nothing but the image."""
         low, high = self._edges.amin(1), self._edges.amax(1)
-        size = self._edges.new_tensor(self.source.size_for("Warp")[::-1])
+        size = self._edges.new_tensor(self.source._size_for("Warp")[::-1])
         return bool((low > -_NEARLY).all() & (high < size + _NEARLY).all())
 
     @cached_property
     def _edges(self) -> Tensor:
         """(B or 1, 2, 2): where two opposite corners of the edited image lie, from the corner of the image's pixels."""
-        height, width = self.target.size_for("Warp")
+        height, width = self.target._size_for("Warp")
         back = inverted(self._maps.detach())
         ends = back.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
         return (back[:, None, :, :2] * ends[None, :, None]).sum(-1) + back[:, None, :, 2] + 0.5
@@ -186,7 +186,7 @@ class AffineWarp(MirrorWarp):
         linear = matrices[:, :, :2]
         if not bool((linear.abs().sum(-1) == 1).all() & ((matrices - matrices.round()).abs() < _WHOLE).all()):
             return None
-        height, width = self.target.size_for("Warp")
+        height, width = self.target._size_for("Warp")
         moves = [tuple(tuple(map(round, row)) for row in matrix) for matrix in matrices.tolist()]
         result = self._empty(images)
         images = images.expand(len(result), -1, -1, -1)
@@ -215,7 +215,7 @@ class AffineWarp(MirrorWarp):
         """
         if not (self.antialias or self._decides) or mode == "nearest" or images.dtype == torch.bool:
             return None
-        height, width = self.target.size_for("Warp")
+        height, width = self.target._size_for("Warp")
         back = inverted(self._maps)
         scale = back[:, :, :2].abs().sum(-1)
         if not bool((back[:, 0, 1] == 0).all() & (scale > (1 if self.antialias else SHRINKS)).any()):
@@ -249,9 +249,9 @@ class AffineWarp(MirrorWarp):
         return [self.matrix]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
-        width = self.target.size_for("Warp")[1]
+        width = self.target._size_for("Warp")[1]
         back = inverted(self._maps)
-        side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
+        side = back.new_tensor(self.source._size_for("Warp")[::-1])[:, None]
         # pixels to positions: (2 u + 1) / W - 1
         back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)
         dtype = torch.promote_types(self.source.intrinsics.dtype, torch.float32)

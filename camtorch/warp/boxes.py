@@ -60,7 +60,7 @@ def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
 
     They find what encloses the whole image, or such parts of it as show the source, and has no edge there.
     """
-    height, width = warp.target.size_for("Warp")
+    height, width = warp.target._size_for("Warp")
     share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
     lattice = torch.cartesian_prod(share * width, share * height) - 0.5
     with torch.no_grad():

@@ -118,11 +118,11 @@ def _warp(
     """The images (B, C, h, w), plane by plane or with their channels last in memory."""
 
     def positions() -> Sampling | Lattice:
-        every = range(target.size_for("Warp")[0])
+        every = range(target._size_for("Warp")[0])
         return locate(source, target, rotation, tolerance, antialias == "True", every, padding)
 
-    inputs = [*source.tensors, *target.tensors, *([] if rotation is None else [rotation])]
-    where = _located(inputs, (source.form, target.form, tolerance, antialias, padding, rotation is None), positions)
+    inputs = [*source._tensors, *target._tensors, *([] if rotation is None else [rotation])]
+    where = _located(inputs, (source._form, target._form, tolerance, antialias, padding, rotation is None), positions)
     how = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
     values = tuple(ast.literal_eval(f"({fill},)"))
     return (_laid(render(images, where, *how, values), is_last),)

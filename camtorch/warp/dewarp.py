@@ -71,7 +71,7 @@ class Dewarp(Warp):
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
-        own = as_sized(camera, "camera", "Dewarp").size_for("Dewarp")
+        own = as_sized(camera, "camera", "Dewarp")._size_for("Dewarp")
         size = as_image_size(image_size, "Dewarp") or own
         rotation = as_rotation(rotation, "Dewarp")
         model = _PROJECTIONS[projection][0]

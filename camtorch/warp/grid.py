@@ -162,7 +162,7 @@ def locate(
             tolerance = 0.0
         return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None, seam_of(source))
     # the scale is that between neighbours
-    around = range(max(rows.start - 1, 0), min(rows.stop + 1, target.size_for("Warp")[0]))
+    around = range(max(rows.start - 1, 0), min(rows.stop + 1, target._size_for("Warp")[0]))
     where = scaled(source, *tabulate(source, target, rotation, tolerance, around, padding))
     return where if around == rows else where.part(slice(rows.start - around.start, rows.stop - around.start))
 
@@ -170,7 +170,7 @@ def locate(
 def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
     """Positions with the scale by which antialiasing goes."""
     seam = seam_of(source)
-    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source.size_for("Warp"), seam), seam)
+    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size_for("Warp"), seam), seam)
 
 
 @on_one_thread
@@ -192,7 +192,7 @@ def tabulate(
         rows: of the target; all by default.
         padding: see `on_lattice`.
     """
-    height, width = target.size_for("Warp")
+    height, width = target._size_for("Warp")
     rows = range(height) if rows is None else rows
     like = _like(target)
     exact = partial(_positions, source, target, rotation)
@@ -232,7 +232,7 @@ def _pixels(rows: range, width: int, like: Tensor) -> Tensor:
 
 def pixels_of_rows(target: Camera, rows: range) -> Tensor:
     """(len(rows), W', 2): the centres of a target's pixels, in the dtype to compute positions in."""
-    return _pixels(rows, target.size_for("Warp")[1], _like(target))
+    return _pixels(rows, target._size_for("Warp")[1], _like(target))
 
 
 def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: Tensor) -> tuple[Tensor, Tensor]:
@@ -245,7 +245,7 @@ def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: 
     seen, mapped = seen_by(source, turn(None if rotation is None else rotation.mT, rays, "rays"))
     del rays
     mapped = mapped & has_ray
-    return to_positions(seen, mapped, source.size_for("Warp")), mapped
+    return to_positions(seen, mapped, source._size_for("Warp")), mapped
 
 
 def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
@@ -309,7 +309,7 @@ def on_lattice(
         padding: that the positions are for. Those that "zeros" shows nothing of, and coordinates beyond the rim, which
             "border" draws in, keep no tolerance. For "reflection" all do, and so serve every padding.
     """
-    like, (height, width) = _like(target), (len(rows), target.size_for("Warp")[1])
+    like, (height, width) = _like(target), (len(rows), target._size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
     if min(n, m) < _FEWEST:
         return None
@@ -320,7 +320,7 @@ def on_lattice(
     count, shape = (n + 5) * (m + 5), (n + 5, m + 5)
     lattice = positions[:, 0, :count].movedim(-1, 1).unflatten(2, shape)
     mapped_nodes, rim = mapped[:, 0, :count].unflatten(1, shape), mapped[:, 0, count:]
-    size = source.size_for("Warp")
+    size = source._size_for("Warp")
     probed, classes = Probed(lattice, mapped_nodes, rim, (height, width), size, tolerance, padding), None
     if in_memory(lattice) and not is_recorded():
         classes = classify(probed._replace(nodes=lattice if lattice.dtype == torch.float32 else lattice.float()))

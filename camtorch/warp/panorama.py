@@ -94,7 +94,7 @@ def seam_of(camera: Camera) -> Seam | None:
 
 def _found(camera: Camera, numbers: Tensor) -> Seam | None:
     axis = int(isinstance(camera, _DOWN))
-    sides = camera.size_for("Warp")[::-1]
+    sides = camera._size_for("Warp")[::-1]
     turn, focal, centre = numbers[:, axis], numbers[:, 1 - axis], numbers[:, 3 - axis]
     if not len(numbers) or not bool(((2 * math.pi * turn - sides[axis]).abs() < _NEAR).all()):
         return None
@@ -122,7 +122,7 @@ def seen_by(source: Camera, rays: Tensor) -> tuple[Tensor, Tensor]:
         planes[2] = torch.where(at_pole, least, planes[2])
         rays = torch.stack(planes, -1)
     pixels, mapped = source.project(rays)
-    period = source.size_for("Warp")[1 - seam.axis]
+    period = source._size_for("Warp")[1 - seam.axis]
     planes = list(pixels.unbind(-1))
     turns = ((planes[seam.axis].detach() + 0.5) / period).floor()
     planes[seam.axis] = planes[seam.axis] - turns * period
@@ -138,7 +138,7 @@ def rays_of(target: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
     if seam is None:
         return target.unproject(pixels)
     pixels = as_coordinates(pixels, "pixels", 2, "Warp", target.intrinsics.device, "B, *N")
-    period = target.size_for("Warp")[1 - seam.axis]
+    period = target._size_for("Warp")[1 - seam.axis]
     planes = list(pixels.unbind(-1))
     numbers = target.intrinsics.detach()
     numbers = numbers.reshape(*numbers.shape[:-1], *[1] * (pixels.ndim - numbers.ndim), 4)

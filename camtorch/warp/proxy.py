@@ -33,7 +33,7 @@ class ProxyWarp(Warp):
         if not self.antialias:
             return Sampling(*self._of_rows(rows), None, seam_of(self.source))
         # the scale is that between neighbours
-        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target.size_for("Warp")[0]))
+        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size_for("Warp")[0]))
         where = scaled(self.source, *self._of_rows(around))
         return where.part(slice(rows.start - around.start, rows.stop - around.start))
 
@@ -48,7 +48,7 @@ class ProxyWarp(Warp):
             directions = directions.expand(count, *directions.shape[1:])
         seen, mapped = seen_by(self.source, directions)
         mapped = mapped & has_ray & met
-        return to_positions(seen, mapped, self.source.size_for("Warp")), mapped
+        return to_positions(seen, mapped, self.source._size_for("Warp")), mapped
 
     def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
         source, target, carried = self.source, self.target, self._to_target

@@ -111,7 +111,7 @@ class Reproject(GeometryModule):
             ValueError: shapes that do not fit, an unknown kind. TypeError: no tensors.
         """
         owner = "Reproject"
-        size = self.source.size_for(owner)
+        size = self.source._size_for(owner)
         if (
             not isinstance(images, Tensor)
             or images.is_complex()
@@ -124,7 +124,7 @@ class Reproject(GeometryModule):
                 f"got {what}"
             )
         check_devices(owner, images=images, source=self.source.intrinsics)
-        given = as_depth(depth, kind, self.target.size_for(owner), owner, self.target.intrinsics.device)
+        given = as_depth(depth, kind, self.target._size_for(owner), owner, self.target.intrinsics.device)
         given = given if given.ndim == 4 else given[None, None]
         counts = {"images": len(images), "depth": len(given), "cameras": self.batch_shape.numel()}
         count = max(counts.values())
@@ -179,17 +179,17 @@ class Reproject(GeometryModule):
 
     def _rays(self) -> tuple[Tensor, Tensor]:
         """The target's, kept while nothing can learn."""
-        inputs = self.target.tensors
+        inputs = self.target._tensors
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self.target.rays()
-        kept: tuple[Tensor, Tensor] = self._memo(inputs, self.target.form, self.target.rays)
+        kept: tuple[Tensor, Tensor] = self._memo(inputs, self.target._form, self.target.rays)
         return kept
 
     def _shows(
         self, seen: Tensor, far: Tensor, source_depth: Numbers, kind: str, tolerance: float, owner: str
     ) -> Tensor:
         """Whether the source's own depth lets it see points at its pixels."""
-        size = self.source.size_for(owner)
+        size = self.source._size_for(owner)
         given = as_depth(source_depth, kind, size, f"{owner}: source_depth", seen.device).detach()
         given = (given if given.ndim == 4 else given[None, None])[:, :1]
         known = torch.isfinite(given) & (given > 0)

@@ -81,7 +81,7 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
         return compiled.warped(images, warp.source, warp.target, warp.rotation, *options)
     if route == "strips":
         cameras = math.prod(warp.batch_shape)
-        result = empty(images, len(images) if cameras == 1 else cameras, warp.target.size_for("Warp"))
+        result = empty(images, len(images) if cameras == 1 else cameras, warp.target._size_for("Warp"))
         kept: dict[int, Pyramid] = {}
         for rows, where in strips(warp, sampler.padding_mode):
             with torch.no_grad():
@@ -92,7 +92,7 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
 
 def positions(warp: Warp, inputs: list[Tensor], route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
     """Where all pixels of the target sample the source's image, by the route "graph" or "kept"."""
-    every = range(warp.target.size_for("Warp")[0])
+    every = range(warp.target._size_for("Warp")[0])
     if route == "graph":
         if in_jit_trace():
             raise RuntimeError(
@@ -116,7 +116,7 @@ def positions(warp: Warp, inputs: list[Tensor], route: Route, padding: PaddingMo
         return Sampling(grid, mapped, None, seam_of(warp.source))
 
     forms = [None if shutter is None else shutter.form for shutter in (warp.shutter, warp.target_shutter)]
-    options = warp.source.form, warp.target.form, *forms, warp.rotation is None, warp.antialias, warp.tolerance
+    options = warp.source._form, warp.target._form, *forms, warp.rotation is None, warp.antialias, warp.tolerance
     kept: Sampling | Lattice
     kept = warp._memos[reach if warp.tolerance else "zeros"](inputs, options, computed)  # what is exact serves all
     return kept
@@ -126,7 +126,7 @@ def strips(
     warp: Warp, padding: PaddingMode = "zeros", count: int | None = None
 ) -> Iterator[tuple[slice, Sampling | Lattice]]:
     """Rows of the target, `count` at a time, and where they sample the source's image."""
-    height, width = warp.target.size_for("Warp")
+    height, width = warp.target._size_for("Warp")
     step = count or max(_STRIP // (max(math.prod(warp.batch_shape), 1) * width), 1)
     for top in range(0, height, step):
         rows = range(top, min(top + step, height))
@@ -160,7 +160,7 @@ def _on_image(warp: Warp, where: Sampling | Lattice) -> Tensor:
     where = where.pixels if isinstance(where, Lattice) else where
     grid = where.grid.detach()
     grid = grid if where.seam is None else where.seam.drawn_in(grid)
-    pixels = (grid + 1) * grid.new_tensor(warp.source.size_for("Warp")[::-1]) / 2 - 0.5
+    pixels = (grid + 1) * grid.new_tensor(warp.source._size_for("Warp")[::-1]) / 2 - 0.5
     return (where.mapped & warp.source.contains(pixels)).unsqueeze(1)
 
 
@@ -194,7 +194,7 @@ def _is_long(warp: Warp, inputs: Sequence[Tensor]) -> bool:
     # compared first, sizes that a program leaves open would be bounded in it
     if warp._pinned is not None or torch.compiler.is_compiling():
         return False
-    if math.prod((*warp.batch_shape, *warp.target.size_for("Warp"))) <= _MOST_KEPT:
+    if math.prod((*warp.batch_shape, *warp.target._size_for("Warp"))) <= _MOST_KEPT:
         return False
     return not in_transform() and all(t.is_cpu and is_concrete(t) for t in inputs)
 

@@ -231,14 +231,14 @@ class InMotion:
     def __init__(self, camera: Camera, shutter: RollingShutter):
         self.camera, self.shutter = camera, shutter
         self.batch_shape = broadcast_shapes(camera.batch_shape, shutter.batch_shape)
-        self.size = camera.size_for("Warp")
+        self.size = camera._size_for("Warp")
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.camera, name)
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """As of a camera; in closed form, for a pixel says when it is seen."""
-        pixels, _ = as_points(pixels, "pixels", 2, self.batch_shape, self.camera.tensors[:1], "Warp")
+        pixels, _ = as_points(pixels, "pixels", 2, self.batch_shape, self.camera._tensors[:1], "Warp")
         rays, valid = self.camera.unproject(pixels)
         pixels = torch.where(valid.unsqueeze(-1), pixels, 0.0)
         return self.shutter.turned(rays, self.shutter._share(pixels, self.size), 1.0), valid
@@ -249,7 +249,7 @@ class InMotion:
 
         Not valid where the scene passes as fast as rows are read, or faster.
         """
-        rays, _ = as_points(rays, "points", 3, self.batch_shape, self.camera.tensors[:1], "Warp")
+        rays, _ = as_points(rays, "points", 3, self.batch_shape, self.camera._tensors[:1], "Warp")
         side = self.size[1 if self.shutter.direction in ("right", "left") else 0]
 
         def seen(share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -271,7 +271,7 @@ class InMotion:
                 share = (share + step.clamp(-0.5, 0.5)).clamp(-_BEYOND, _BEYOND)
             pixels, valid, found = seen(share)
             settled = ((found - share).abs() * side < _SETTLED) | (found.abs() >= _BEYOND)
-        tensors = (rays, *self.camera.tensors, *self.shutter.tensors)
+        tensors = (rays, *self.camera._tensors, *self.shutter.tensors)
         if keeps_graph(*tensors) or in_transform():
             with torch.no_grad():
                 h = 1e-4 if share.dtype == torch.float64 else 1e-2

@@ -97,7 +97,7 @@ class Surround(GeometryModule):
 
     def _made(self) -> tuple[Tensor, ...]:
         masks = [warp.valid_mask().to(torch.float32) for warp in self._warps]
-        height, width = self.target.size_for("Surround")
+        height, width = self.target._size_for("Surround")
         reach = _BLEND * min(height, width) if self.blend is None else self.blend
         faded = [_faded(mask, max(1, round(reach))) for mask in masks]
         total = torch.stack(faded).sum(0)

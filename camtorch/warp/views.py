@@ -91,7 +91,7 @@ class Views(GeometryModule):
         It falls linearly to the border of a view.
         """
         rays, has_ray = rays_of(self.camera, self.camera.pixel_grid())
-        height, width = self.view.size_for("Views")
+        height, width = self.view._size_for("Views")
         parts = []
         for rotation in self.rotations:
             pixels, valid = self.view.project((rays @ rotation.mT.to(rays.dtype)).to(self.view.intrinsics.dtype))
@@ -120,7 +120,7 @@ class Views(GeometryModule):
         Raises:
             ValueError: another shape.
         """
-        size = self.view.size_for("Views")
+        size = self.view._size_for("Views")
         if not isinstance(views, Tensor) or views.ndim != 5 or views.shape[1] != len(self) or views.shape[-2:] != size:
             raise ValueError(
                 f"Views: views must be a tensor (B, {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"

@@ -34,7 +34,7 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
     Raises:
         ValueError: a camera without image_size, powers of another number than cameras. TypeError: powers that are none.
     """
-    height, width = as_sized(camera, "camera", "vignetting").size_for("vignetting")
+    height, width = as_sized(camera, "camera", "vignetting")._size_for("vignetting")
     with torch.no_grad():
         single = camera.intrinsics.dtype == torch.float32
         cosine = _between_nodes(camera, height, width) if single and holds(camera.intrinsics[..., 0] > 0) else None

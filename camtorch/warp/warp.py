@@ -245,7 +245,7 @@ class Warp(GeometryModule):
         """All tensors that they depend on."""
         shutters = [t for each in (self.shutter, self.target_shutter) if each is not None for t in each.tensors]
         turned = [] if self.rotation is None else [self.rotation]
-        return [*self.source.tensors, *self.target.tensors, *turned, *shutters]
+        return [*self.source._tensors, *self.target._tensors, *turned, *shutters]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         """Those of some rows of the target, which serve a padding, within a tolerance."""
@@ -399,7 +399,7 @@ def checked(
     warp: Warp, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
 ) -> Sampler:
     """How a warp samples images in one call, if they and its options are as `Warp.forward` wants them."""
-    expected = warp.source.size_for("Warp")
+    expected = warp.source._size_for("Warp")
     if not isinstance(images, Tensor) or images.dtype.is_complex:
         what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
         hint = _way_in(images, expected) if hasattr(images, "__array_interface__") else ""

@@ -6,7 +6,7 @@ from collections import UserList
 import numpy as np
 import pytest
 import torch
-from cameras import KEYS, every_model, make, spread
+from cameras import KEYS, each_kind, every_model, make, spread
 
 import camtorch as ct
 
@@ -18,7 +18,7 @@ def refuses(error, *words):
     return pytest.raises(error, match=re.compile(".*".join(re.escape(word) for word in words), re.DOTALL))
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize(
     ("intrinsics", "error", "words"),
     [
@@ -86,7 +86,7 @@ def test_values_of_coefficients(key):
         model(torch.tensor([INTRINSICS] * 2), torch.tensor([good] * 3))
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize(
     ("image_size", "error"),
     [
@@ -111,7 +111,7 @@ def test_image_size(key, image_size, error):
     assert str(image_size) in message
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize("size", [(np.int64(480), np.int32(640)), [480, 640], torch.Size([480, 640])])
 def test_image_sizes_that_are_integers_are_taken(key, size):
     assert ct.MODELS[key](INTRINSICS, image_size=size).image_size == (480, 640)
@@ -142,7 +142,7 @@ def test_values(key, method, argument, columns):
         refused(ValueError, wrong, "(2, 3)", str(tuple(wrong.shape)), of=deep)
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize(
     ("what", "call"),
     [
@@ -161,7 +161,7 @@ def test_a_camera_without_image_size_where_one_is_needed(key, what, call):
         call(camera)
 
 
-@every_model
+@each_kind
 @pytest.mark.parametrize(
     ("call", "error", "shown"),
     [

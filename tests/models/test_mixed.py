@@ -6,8 +6,6 @@ import pickle
 import pytest
 import torch
 from cameras import DISTINCT, KEYS, make, real
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.data import DataLoader
 
 import camtorch as ct
 
@@ -184,12 +182,6 @@ def test_batches_mixed_batches_and_orders_among_the_cameras():
         ct.Mixed([batch], order=[0, 2])
 
 
-def test_one_camera_serves_any_number_of_rows_as_a_batch_of_one_does():
-    (camera,) = models()[:1]
-    points = torch.randn(5, 4, 3)
-    assert torch.equal(ct.Mixed([camera]).project(points)[0], camera.project(points)[0])
-
-
 def test_the_widest_dtype_is_that_of_all():
     cameras = [models()[0], models()[4].double()]
     pixels, _ = ct.Mixed(cameras).project(torch.randn(2, 3, 3))
@@ -242,34 +234,6 @@ def test_predicted_cameras_inside():
     expected = batch.project(points[1:3])[0].sum() + mixed[3].project(points[3])[0].sum()
     (wanted,) = torch.autograd.grad(expected, network.weight)
     assert torch.allclose(by_weight, wanted, rtol=1e-4)
-
-
-class Counting(TorchDispatchMode):
-    """Counts torch's operations."""
-
-    def __init__(self):
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += 1
-        return func(*args, **(kwargs or {}))
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
-@pytest.mark.parametrize("learns", [True, False])
-def test_one_model_costs_what_its_batch_does(direction, learns):
-    cameras = models(learns)[4:] * 8
-    numbers = [torch.stack([t.detach() for t in ts]) for ts in zip(*map(tensors, cameras), strict=True)]
-    batch = ct.KannalaBrandt(*numbers, image_size=SIZE).requires_grad_(learns)
-    given, counts = torch.rand(16, 50, DIRECTIONS[direction]) + 0.5, []
-    for camera in (batch, ct.Mixed([batch]), ct.Mixed(cameras)):
-        getattr(camera, direction)(given)  # what is made once
-        with Counting() as counting:
-            getattr(camera, direction)(given)
-        counts.append(counting.count)
-    assert counts[1] == counts[0]
-    assert counts[2] <= counts[0] + 2  # and one for each number, that joins them
 
 
 @pytest.mark.slow
@@ -368,35 +332,3 @@ def test_what_it_cannot_be_is_told():
             call()
     with pytest.raises(ValueError, match=r"points must be \(\*B, \*N, 3\) with batch dims \*B = \(2,\)"):
         mixed.project(torch.rand(3, 5, 3))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 2])
-def test_training_on_samples_from_eight_models(workers):
-    """Samples, batches, augmentation, rays, network and loss: where a spot lies, as a direction, is learned."""
-    cameras = [camera.float().requires_grad_(False) for camera in one_of_each() if camera.key in EIGHT]
-    assert len(cameras) == 8
-    torch.manual_seed(0)
-    samples = []
-    for i in range(16):
-        gaze = torch.nn.functional.normalize(torch.tensor([*torch.rand(2) - 0.5, 0.8]), dim=0)
-        pixel, _ = cameras[i % 8].project(gaze)
-        spot = (-(cameras[i % 8].pixel_grid() - pixel).square().sum(-1) / 18).exp()
-        samples.append({"image": spot[None], "gaze": gaze, "camera": cameras[i % 8]})
-    loader = DataLoader(samples, 8, shuffle=True, collate_fn=ct.augment.collate, num_workers=workers)
-    augment = ct.augment.RandomMount(yaw=3, pitch=3, roll=3, min_filled=0)
-    network = torch.nn.Conv2d(1, 1, 8, 8)  # how much each patch counts
-    optimizer, losses = torch.optim.Adam(network.parameters(), 0.1), []
-    for _ in range(6):
-        for batch in loader:
-            assert isinstance(batch["camera"], ct.Mixed)
-            batch = augment(batch)
-            rays, _ = batch["camera"].rays(stride=8)  # at the centres of the patches that the network sees
-            share = network(batch["image"]).flatten(1).softmax(-1)
-            found = torch.nn.functional.normalize((share[..., None] * rays.flatten(1, 2)).sum(1), dim=-1)
-            loss = (found - batch["gaze"]).norm(dim=-1).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            losses.append(loss.item())
-    assert sum(losses[-2:]) < 0.6 * sum(losses[:2]), losses

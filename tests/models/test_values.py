@@ -78,24 +78,6 @@ def test_a_copy_is_its_own_and_what_is_shared_is_not():
     assert not clone.clone().intrinsics.requires_grad
 
 
-@pytest.mark.parametrize(
-    ("index", "rows"),
-    [
-        (slice(1, None), [1, 2]),
-        (-1, 2),
-        ([True, False, True], [0, 2]),
-        (torch.tensor([2, 0]), [2, 0]),
-        (torch.tensor([False, True, True]), [1, 2]),
-    ],
-)
-@pytest.mark.parametrize("mixed", [False, True])
-def test_a_batch_is_indexed_as_a_tensor(mixed, index, rows):
-    keys = ("kannala_brandt", "pinhole", "kannala_brandt") if mixed else ("kannala_brandt",) * 3
-    batch = ct.cat([camera_of(key).replace([30.0 + i, 30.0, 40.0, 30.0]) for i, key in enumerate(keys)])
-    assert isinstance(batch, ct.Mixed) == mixed
-    assert torch.equal(batch[index].intrinsics, batch.intrinsics[rows])
-
-
 def test_a_mixed_batch_is_a_value():
     members = [camera_of("pinhole"), camera_of("mei", learns=False)]
     mixed = ct.cat(members)
@@ -138,8 +120,8 @@ CAMERA = camera_of("kannala_brandt")
         (lambda: CAMERA.expand(2).expand(3), ValueError, r"batch dims \(2,\) do not expand to \(3,\)"),
         (lambda: ct.cat([]), ValueError, "cat: an empty list"),
         (lambda: ct.cat(CAMERA, CAMERA), TypeError, r"cat: the cameras go in as one list, cat\(\[a, b\]\)"),
-        (lambda: CAMERA.expand(2)[::-1], TypeError, "slices that go forwards.*got slice"),
-        (lambda: ct.Mixed([CAMERA] * 2)[::-1], TypeError, "slices that go forwards.*got slice"),
+        (lambda: CAMERA.expand(2)[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
+        (lambda: ct.Mixed([CAMERA] * 2)[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
         (lambda: ct.Mixed([CAMERA]).replace(image_size="a"), TypeError, "Mixed: image_size must be two integers"),
         (lambda: ct.cat([CAMERA, 3]), TypeError, r"cat: cameras\[1\] must be a Camera; got int"),
         (
