@@ -234,12 +234,10 @@ class BatchedModule(GeometryModule):
         As of a tensor, gradients of the copy go to this one where it learns; the copy of a fixed one is fixed.
         `copy.deepcopy` makes Parameters that learn by themselves.
         """
-        if not torch.is_inference_mode_enabled():
+        if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():
             return self.each(torch.clone)
-        with (
-            torch.inference_mode(False),
-            torch.no_grad(),
-        ):  # what inference mode makes could not be used in a graph later
+        # what inference mode makes could not be used in a graph later
+        with torch.inference_mode(False), torch.no_grad():
             return self.each(torch.clone)
 
     def expand(self, *batch: int | Sequence[int]) -> Self:

@@ -16,7 +16,7 @@ from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
 from camtorch.warp.routes import positions, route_of
-from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, Sampler, joined, render
+from camtorch.warp.sampling import Fill, Mode, PaddingMode, Sampler, joined, render
 from camtorch.warp.warp import Warp, checked
 
 SHRINKS = 1.5
@@ -103,12 +103,6 @@ class MirrorWarp(Warp):
         if images.requires_grad or not images.is_cpu:
             return images.new_empty(count, images.shape[1], *size)
         return sampler.empty(images, count, size)
-
-    @property
-    def options(self) -> Options:
-        """See `Warp.options`; an antialias of None stays one."""
-        options = super().options
-        return {**options, "antialias": None} if self._decides else options  # type: ignore[typeddict-item]
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """See `Warp.between`."""

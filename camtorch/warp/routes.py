@@ -169,9 +169,9 @@ def pinned(warp: Warp) -> Sampling | Lattice | None:
     # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the operator
     # of compiled code keeps its own
     inputs = warp._inputs()
-    if in_transform() or torch.is_inference_mode_enabled():
-        return warp._pinned
     if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), inputs):
+        return warp._pinned
+    if in_transform() or torch.is_inference_mode_enabled():
         return warp._pinned
     return positions(warp, inputs, "graph" if warp._pinned is None and keeps_graph(*inputs) else "kept")
 

@@ -339,7 +339,7 @@ class Warp(GeometryModule):
             "mode": self.mode,
             "padding_mode": self.padding_mode,
             "fill": self.fill,
-            "antialias": self.antialias,
+            "antialias": None if self._decides else self.antialias,
             "tolerance": self._tolerance,
         }
 

@@ -18,7 +18,7 @@ camera("a point")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentTyp
 camera(images, images)  # type: ignore[call-arg]  # pyright: ignore[reportCallIssue]
 pixels: torch.Tensor = camera.project(images)  # type: ignore[assignment]  # pyright: ignore[reportAssignmentType]
 other: ct.Mei = camera.convert(ct.Fisheye624).camera  # type: ignore[assignment]  # pyright: ignore[reportAssignmentType]
-camera.convert(ct.Fisheye624, count="many")  # type: ignore[call-overload]  # pyright: ignore
+camera.convert(ct.Fisheye624, count="many")  # type: ignore[arg-type]  # pyright: ignore
 ct.Warp(camera)  # type: ignore[call-arg]  # pyright: ignore[reportCallIssue]
 ct.Warp(camera, camera)(np.zeros((1, 3, 480, 640)))  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 ct.Dewarp(camera, projection="flat")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
