@@ -272,6 +272,21 @@ class _Random(CameraAugmentation):
 
     _wraps: Callable[..., Augmentation]
 
+    def __init_subclass__(cls, wraps: type[Augmentation], **options: Any):
+        super().__init_subclass__(**options)
+        cls._wraps, name = wraps, wraps.__name__
+        cls.__doc__ = f"""`camtorch.augment.{name}` for kornia. {cls.__doc__}
+
+        Args:
+            camera: of the images.
+            given, options: those of `camtorch.augment.{name}`; what comes first there follows the camera, or goes by
+                name.
+            p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
+
+        Convention:
+            as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
+        """
+
     def __init__(
         self,
         *given: Camera | PresetName | str,
@@ -293,34 +308,52 @@ class _Random(CameraAugmentation):
         super().__init__(made, first, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
 
 
-def _wrapped(wraps: type[Augmentation], what: str) -> type[_Random]:
-    """The class for kornia of an augmentation, with its name."""
-    name = wraps.__name__
-    doc = f"""`camtorch.augment.{name}` for kornia: {what}.
-
-    Args:
-        camera: of the images.
-        given, options: those of `camtorch.augment.{name}`; what comes first there follows the camera, or goes by name.
-        p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
-
-    Convention:
-        as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
-    """
-    return type(name, (_Random,), {"_wraps": wraps, "__doc__": doc, "__module__": __name__})
+class RandomMount(_Random, wraps=random_camera.RandomMount):
+    """The camera turned and rolled where it stands, and zoomed."""
 
 
-RandomMount = _wrapped(random_camera.RandomMount, "the camera turned and rolled where it stands, and zoomed")
-RandomLens = _wrapped(random_camera.RandomLens, "another lens before the camera, which stays where it looks")
-RandomCamera = _wrapped(random_camera.RandomCamera, "another camera in the same place, turned and with another lens")
-RandomResizedCrop = _wrapped(edits.RandomResizedCrop, "a box at random, of another size")
-RandomCrop = _wrapped(edits.RandomCrop, "a box of a size at random")
-CenterCrop = _wrapped(edits.CenterCrop, "the middle of the image")
-Resize = _wrapped(edits.Resize, "the image in another size")
-Pad = _wrapped(edits.Pad, "a rim around the image")
-HorizontalFlip = _wrapped(edits.HorizontalFlip, "mirrored left to right, landmarks in their order in a mirror")
-VerticalFlip = _wrapped(edits.VerticalFlip, "mirrored top to bottom")
-Rotate90 = _wrapped(edits.Rotate90, "turned by quarters")
-Compose = _wrapped(compose.Compose, "several augmentations of camtorch, not of kornia, as one")
+class RandomLens(_Random, wraps=random_camera.RandomLens):
+    """Another lens before the camera, which stays where it looks."""
+
+
+class RandomCamera(_Random, wraps=random_camera.RandomCamera):
+    """Another camera in the same place, turned and with another lens."""
+
+
+class RandomResizedCrop(_Random, wraps=edits.RandomResizedCrop):
+    """A box at random, of another size."""
+
+
+class RandomCrop(_Random, wraps=edits.RandomCrop):
+    """A box of a size at random."""
+
+
+class CenterCrop(_Random, wraps=edits.CenterCrop):
+    """The middle of the image."""
+
+
+class Resize(_Random, wraps=edits.Resize):
+    """The image in another size."""
+
+
+class Pad(_Random, wraps=edits.Pad):
+    """A rim around the image."""
+
+
+class HorizontalFlip(_Random, wraps=edits.HorizontalFlip):
+    """Mirrored left to right, landmarks in their order in a mirror."""
+
+
+class VerticalFlip(_Random, wraps=edits.VerticalFlip):
+    """Mirrored top to bottom."""
+
+
+class Rotate90(_Random, wraps=edits.Rotate90):
+    """Turned by quarters."""
+
+
+class Compose(_Random, wraps=compose.Compose):
+    """Several augmentations of camtorch, not of kornia, as one."""
 
 
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:

@@ -122,6 +122,8 @@ class Mirroring:
     """The fields that tables are given for by name."""
     key: object
     """Equal for those that do the same."""
+    owner: str
+    swap_sides: bool
 
     def __init__(
         self,

@@ -209,6 +209,21 @@ class _Look(NamedTuple):
 class Bundle:
     """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
 
+    free: Free
+    loss: str | None
+    loss_scale: float
+    sights: list[Sight]
+    cameras: list[Camera]
+    rounding: Tensor
+    are_shared: list[bool]
+    fixed: list[Camera | None]
+    learns_bend: bool
+    columns: tuple[tuple[int, int], ...]
+    unknowns: int
+    low: Tensor
+    high: Tensor
+    is_bounded: bool
+
     def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
         batch = state.boards.translations.shape[0]

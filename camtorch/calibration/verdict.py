@@ -62,6 +62,9 @@ class Zone(NamedTuple):
 class Survey:
     """Numbers of a calibration that sentences are made of, over a map of the image."""
 
+    shape: tuple[int, ...]
+    pixels: Tensor
+
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
         cell = max(calibration.image_size) / _CELLS

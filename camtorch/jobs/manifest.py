@@ -35,6 +35,9 @@ class Manifest:
     refused by a BlockingIOError.
     """
 
+    folder: Path
+    shard: Shard
+
     def __init__(self, folder: Path, job: str, settings: Json, shard: Shard | None = None):
         self.folder, self.shard, self._job, self._stated = folder, shard or Shard(), job, settings
         text = json.dumps(settings, sort_keys=True, allow_nan=False)

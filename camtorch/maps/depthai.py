@@ -22,7 +22,7 @@ class DepthAI(Table):
     """The format: see the module."""
 
     name = "depthai"
-    options = ("step", "order")
+    options: tuple[str, ...] = ("step", "order")
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """See `Table`."""

@@ -10,6 +10,7 @@ https://docs.kernel.org/userspace-api/media/drivers/dw100.html
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,8 @@ class DW100(Table):
     """The format: see the module."""
 
     name = "dw100"
-    options = ("clip",)
-    steps = (16,)
+    options: tuple[str, ...] = ("clip",)
+    steps: Sequence[int] = (16,)
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """Raises CameraFileError: sizes that the hardware does not take, positions off 0 to 4095.9375."""

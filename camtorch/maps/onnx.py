@@ -26,8 +26,8 @@ class ONNX(MapFormat):
     """The format: see the module. What runtimes do in their own ways is refused."""
 
     name = "onnx"
-    suffixes = (".onnx",)
-    options = ("dtype",)
+    suffixes: tuple[str, ...] = (".onnx",)
+    options: tuple[str, ...] = ("dtype",)
 
     def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """See `MapFormat`."""

@@ -29,7 +29,7 @@ _PAIRS = (("map1", "map2"), ("map_x", "map_y"), ("mapx", "mapy"), ("mapX", "mapY
 class OpenCV(MapFormat):
     """The formats: see the module. "opencv_fixed" is in fixed point."""
 
-    suffixes = (".yml", ".yaml", ".xml", ".npz")
+    suffixes: tuple[str, ...] = (".yml", ".yaml", ".xml", ".npz")
 
     def __init__(self, name: str):
         self.name = name

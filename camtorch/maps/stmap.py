@@ -36,8 +36,8 @@ class STMap(MapFormat):
     """The format: see the module."""
 
     name = "stmap"
-    suffixes = (".exr", ".tif", ".tiff")
-    options = ("v",)
+    suffixes: tuple[str, ...] = (".exr", ".tif", ".tiff")
+    options: tuple[str, ...] = ("v",)
 
     def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """See `MapFormat`."""

@@ -37,7 +37,7 @@ _KINDS = (("VEC3", 5126, 34962, "<f4"), ("VEC2", 5126, 34962, "<f4"), ("SCALAR",
 class TextureMesh(MapFormat):
     """A format of textured meshes: see the module."""
 
-    options = ("step",)
+    options: tuple[str, ...] = ("step",)
 
     @abstractmethod
     def write(self, path: str, mesh: Triangles, sizes: dict[str, int]) -> bytes:
@@ -102,7 +102,7 @@ class OBJ(TextureMesh):
     """OBJ: see the module."""
 
     name = "obj"
-    suffixes = (".obj",)
+    suffixes: tuple[str, ...] = (".obj",)
 
     def write(self, path: str, mesh: Triangles, sizes: dict[str, int]) -> bytes:
         """See `TextureMesh`."""
@@ -135,7 +135,7 @@ class GLTF(TextureMesh):
     """glTF: see the module."""
 
     name = "gltf"
-    suffixes = (".glb", ".gltf")
+    suffixes: tuple[str, ...] = (".glb", ".gltf")
 
     def write(self, path: str, mesh: Triangles, sizes: dict[str, int]) -> bytes:
         """See `TextureMesh`."""

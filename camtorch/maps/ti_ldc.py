@@ -14,6 +14,7 @@ Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -39,9 +40,9 @@ class TILDC(Table):
     """The format: see the module."""
 
     name = "ti_ldc"
-    options = ("step", "block", "clip")
+    options: tuple[str, ...] = ("step", "block", "clip")
     step = 8
-    steps = tuple(1 << m for m in range(8))
+    steps: Sequence[int] = tuple(1 << m for m in range(8))
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """Raises CameraFileError: sizes, offsets or padding that the LDC does not take. ValueError: a bad block."""

@@ -43,6 +43,7 @@ class Shear(Stage):
         return a + e * b, b + d * a
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> ShearAt:
+        """The stage at points."""
         return ShearAt(self, a, b)
 
     def lower_bound(self, radius: Tensor) -> tuple[Tensor, Tensor]:

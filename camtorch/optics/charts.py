@@ -238,6 +238,8 @@ class Equidistant(Chart):
 class EquidistantUpTo(Equidistant):
     """The equidistant chart of a lens that is known up to some angle."""
 
+    last: Tensor
+
     def __init__(self, last: Tensor):
         self.last = last.detach()
 

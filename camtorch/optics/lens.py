@@ -96,6 +96,10 @@ class Stage:
 class StageAt:
     """A stage at points (a, b)."""
 
+    stage: Stage
+    a: Tensor
+    b: Tensor
+
     def __init__(self, stage: Stage, a: Tensor, b: Tensor):
         self.stage, self.a, self.b = stage, a, b
 
@@ -191,6 +195,12 @@ class PlanarAt(StageAt):
     """A `Planar` stage at points m = (a, b)."""
 
     stage: Planar
+    a: Tensor
+    b: Tensor
+    t: Tensor
+    factor: Tensor
+    slope: Tensor
+    twice_dot: Tensor
 
     def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
         """order: 1 if any derivative will be asked for. t: |m|^2, if it is known."""
@@ -326,6 +336,12 @@ class TiltAt(StageAt):
     """A `Tilt` stage at points."""
 
     stage: Tilt
+    a: Tensor
+    b: Tensor
+    depth: Tensor
+    reciprocal: Tensor
+    u: Tensor
+    v: Tensor
 
     def __init__(self, stage: Tilt, a: Tensor, b: Tensor):
         self.stage, self.a, self.b = stage, a, b
@@ -370,6 +386,10 @@ class TiltAt(StageAt):
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
+    is_radial: bool
+    radial: RadialFactor | None
+    rest: Lens | None
+
     def __init__(self, *stages: Stage):
         self.stages = stages
         self.is_radial = len(stages) == 1 and stages[0].is_radial
@@ -412,6 +432,8 @@ class Lens:
 
 class LensAt:
     """A chain of stages at points."""
+
+    value: tuple[Tensor, Tensor]
 
     def __init__(self, stages: Sequence[Stage], a: Tensor, b: Tensor, order: int, t: Tensor | None):
         self.stages: list[StageAt] = []

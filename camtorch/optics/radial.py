@@ -119,6 +119,9 @@ class Polynomial(RadialFactor):
 class Rational(RadialFactor):
     """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
 
+    numerator: Polynomial
+    denominator: Polynomial
+
     def __init__(self, numerator: Sequence[Tensor], denominator: Sequence[Tensor]):
         self.numerator, self.denominator = Polynomial(numerator), Polynomial(denominator)
         self.parameters: tuple[Tensor, ...] = *self.numerator.parameters, *self.denominator.parameters
@@ -163,6 +166,8 @@ class RadiusPolynomial(RadialFactor):
     With odd powers of s the point m R(|m|^2) has one continuous derivative at the centre, and no second one: it depends
     on the direction from which the centre is approached. The one given there is zero, their mean.
     """
+
+    of_radius: Polynomial
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.of_radius = Polynomial(coefficients)
@@ -232,6 +237,10 @@ class RadiusTable(RadialFactor):
     monotonicity preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983). Behind its last node r turns back,
     so that the lens folds there.
     """
+
+    nodes: tuple[Tensor, ...]
+    end: Tensor
+    cubics: tuple[tuple[Tensor, ...], ...]
 
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
         """nodes: ascending radii. values: r at the nodes, as many, two at least."""

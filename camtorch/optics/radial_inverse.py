@@ -182,6 +182,11 @@ class InverseTable:
     at the fold out of the inverse, and is as analytic in r2 as that.
     """
 
+    reach2: Tensor
+    most2: Tensor
+    values: Tensor
+    steps: Tensor
+
     def __init__(self, table: Tensor, *, is_constant: bool = False):
         """table: (C, 2 + 2 nodes): its last squared radius, the largest one that has a point, factors and steps.
 
@@ -204,6 +209,10 @@ class InverseTable:
 
 class SmallTable:
     """The same up to a radius, read off the factor at few radii: for few points of a camera that is about to change."""
+
+    images: Tensor
+    values: Tensor
+    slopes: Tensor
 
     def __init__(self, radial: RadialFactor, radii: Tensor):
         """radii: (C, K) ascending from 0, on which the factor is followed without a fold."""
@@ -282,6 +291,14 @@ class RadialInverse:
     radial: the factor. inner2: the squared radius of its fold. most2: that of the fold's image, infinite where there is
     none; both in the shape of the parameters.
     """
+
+    factor: type[RadialFactor]
+    radial: RadialFactor
+    end: float
+    of_points: bool
+    k: Tensor
+    inner2: Tensor
+    most2: Tensor
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor], end: float):
         """Factors of cameras, or of single points.

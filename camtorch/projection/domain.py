@@ -54,6 +54,14 @@ class Domain:
     point lies further out.
     """
 
+    optics: Optics
+    k: Tensor
+    whole: Domain | None
+    cameras: slice
+    chart: Chart
+    lens: Lens
+    untabulated: int
+
     def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice | None = None):
         """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points.
 

@@ -42,6 +42,9 @@ class Azimuths:
     Such a lens mostly folds where its radial factor does: there the radii are dense.
     """
 
+    optics: Optics
+    k: Tensor
+
     def __init__(self, optics: Optics, k: Tensor):
         """optics: a model's. k: (C, n) coefficients of cameras, in the dtype and on the device of the points."""
         self.optics, self.k = optics, k

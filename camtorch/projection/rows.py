@@ -229,6 +229,11 @@ def both(*masks: Tensor | None) -> Tensor | None:
 class Sums:
     """The cotangents of the parameters, gathered from the blocks."""
 
+    wants_intrinsics: bool
+    wants_distortion: bool
+    intrinsics: Tensor
+    optics: list[Tensor]
+
     def __init__(self, cameras: Cameras, needs_input_grad: tuple[bool, ...], like: Tensor):
         self.cameras = cameras
         self.wants_intrinsics, self.wants_distortion = needs_input_grad[1:3]

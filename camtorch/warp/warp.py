@@ -87,11 +87,18 @@ class Warp(GeometryModule):
         TypeError: source or target is not a Camera.
     """
 
+    _decides = False  # for itself where to antialias
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
     rotation: Tensor | None
     batch_shape: torch.Size
     _pinned: Sampling | Lattice | None
+    source: Camera
+    target: Camera
+    fill: tuple[float, ...]
+    antialias: bool
+    shutter: RollingShutter | None
+    target_shutter: RollingShutter | None
 
     def __init__(
         self,
@@ -339,7 +346,7 @@ class Warp(GeometryModule):
             "mode": self.mode,
             "padding_mode": self.padding_mode,
             "fill": self.fill,
-            "antialias": None if self._decides else self.antialias,
+            "antialias": None if self._decides else self.antialias,  # type: ignore[typeddict-item]
             "tolerance": self._tolerance,
         }
 
