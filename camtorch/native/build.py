@@ -27,6 +27,9 @@ _SUFFIX = {"win32": "dll", "darwin": "dylib"}.get(sys.platform, "so")
 # two dots in its name: what walks a package's modules would take _sampler.so for one, and import it
 LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
 
+# what is compiled for each kind of CPU
+_KERNELS = ("kernel.c", "geometry.c")
+
 # where installation says in one line why it built no library
 REASON = "_sampler.reason.txt"
 
@@ -96,7 +99,12 @@ def build(
         has = [f"HAS_{name.upper()}" for name in known if name != "baseline"]
         has.append(f"SOURCES={checksum(here)}u")
         units: list[tuple[str, str, tuple[str, ...], list[str]]] = [("dispatch.c", "dispatch", (), has)]
-        units += [("kernel.c", name, flags, [f"VARIANT={name}"]) for name, flags in known.items()]
+        kernels = [name for name in _KERNELS if (here / name).exists()]
+        units += [
+            (kernel, f"{Path(kernel).stem}_{name}", flags, [f"VARIANT={name}"])
+            for kernel in kernels
+            for name, flags in known.items()
+        ]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(lambda unit: tools.compile(here / unit[0], *unit[1:]), units))
         os.replace(tools.link(objects), target)
