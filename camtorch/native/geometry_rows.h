@@ -31,8 +31,6 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
 
 static void T(load)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
     if (stride == 1) for (int i = 0; i < count; i++) to[i] = from[i];
-    else if (stride == 2) for (int i = 0; i < count; i++) to[i] = from[2 * i];
-    else if (stride == 3) for (int i = 0; i < count; i++) to[i] = from[3 * i];
     else for (int i = 0; i < count; i++) to[i] = from[stride * i];
     for (int i = count; i < n; i++) to[i] = filling;
 }
@@ -42,6 +40,30 @@ static void T(store)(R *to, int64_t stride, int count, const R *restrict from) {
     else if (stride == 2) for (int i = 0; i < count; i++) to[2 * i] = from[i];
     else if (stride == 3) for (int i = 0; i < count; i++) to[3 * i] = from[i];
     else for (int i = 0; i < count; i++) to[stride * i] = from[i];
+}
+
+/* The points of a row; those that fill up a block lie on the axis */
+static void T(load_points)(const R *from, const int64_t *strides, int count, int n, R *restrict x, R *restrict y,
+                           R *restrict z) {
+    if (strides[1] == 3 && strides[2] == 1) { /* at once, from the same vectors */
+        for (int i = 0; i < count; i++) x[i] = from[3 * i], y[i] = from[3 * i + 1], z[i] = from[3 * i + 2];
+        for (int i = count; i < n; i++) x[i] = y[i] = 0, z[i] = 1;
+        return;
+    }
+    T(load)(from, strides[1], count, n, x, 0);
+    T(load)(from + strides[2], strides[1], count, n, y, 0);
+    T(load)(from + 2 * strides[2], strides[1], count, n, z, 1);
+}
+
+static void T(load_pixels)(const R *from, const int64_t *strides, int count, int n, R *restrict u, R *restrict v, R cx,
+                           R cy) {
+    if (strides[1] == 2 && strides[2] == 1) {
+        for (int i = 0; i < count; i++) u[i] = from[2 * i], v[i] = from[2 * i + 1];
+        for (int i = count; i < n; i++) u[i] = cx, v[i] = cy;
+        return;
+    }
+    T(load)(from, strides[1], count, n, u, cx);
+    T(load)(from + strides[2], strides[1], count, n, v, cy);
 }
 
 /* -- rays to pixels */
@@ -128,9 +150,7 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     uint8_t *valid = rows->valid + camera * rows->count + first;
     T(Seen) s;
     ALIGNED R u[BLOCK], v[BLOCK];
-    T(load)(points, from[1], count, n, s.x, 0);
-    T(load)(points + from[2], from[1], count, n, s.y, 0);
-    T(load)(points + 2 * from[2], from[1], count, n, s.z, 1);
+    T(load_points)(points, from, count, n, s.x, s.y, s.z);
     const int waiting = T(see)(c, count, n, &s);
     if (c->stages) T(lens)(c, 1, n, s.a, s.b, u, v, NULL, NULL);
     else EACH(i) u[i] = s.a[i], v[i] = s.b[i];
@@ -153,9 +173,7 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     const R *cotangents = (const R *)rows->cotangents + camera * by[0] + first * by[1];
     T(Seen) s;
     ALIGNED R gu[BLOCK], gv[BLOCK], u[BLOCK], v[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK];
-    T(load)(points, from[1], count, n, s.x, 0);
-    T(load)(points + from[2], from[1], count, n, s.y, 0);
-    T(load)(points + 2 * from[2], from[1], count, n, s.z, 1);
+    T(load_points)(points, from, count, n, s.x, s.y, s.z);
     T(see)(c, count, n, &s);
     T(load)(cotangents, by[1], count, n, gu, 0);
     T(load)(cotangents + by[2], by[1], count, n, gv, 0);
@@ -364,8 +382,7 @@ static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, in
     ALIGNED R u[BLOCK], v[BLOCK], a[BLOCK], b[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
     ALIGNED I ok[BLOCK], known[BLOCK], possible[BLOCK];
     int left = 0;
-    T(load)(pixels, from[1], count, n, u, c->cx);
-    T(load)(pixels + from[2], from[1], count, n, v, c->cy);
+    T(load_pixels)(pixels, from, count, n, u, v, c->cx, c->cy);
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
     const I usable = c->usable;
     EACH(i) {
