@@ -71,8 +71,9 @@ static void T(load_pixels)(const R *from, const int64_t *strides, int count, int
 /* The azimuth at or below that of a point, in even steps along the rim of the diamond |a| + |b| = 1 */
 static int T(azimuth)(R a, R b) {
     const R size = T(absolute)(a) + T(absolute)(b), across = b / (size > 0 ? size : 1);
-    const int index = (int)floor((a < 0 ? 2 - across : across) * (AZIMUTHS / 4));
-    return ((index % AZIMUTHS) + AZIMUTHS) % AZIMUTHS;
+    const double turn = floor((a < 0 ? 2 - across : across) * (AZIMUTHS / 4));
+    const int index = turn == turn ? (int)turn : 0; /* infinite points have none */
+    return (index + AZIMUTHS) % AZIMUTHS;
 }
 
 /* Of covered points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that

@@ -1,6 +1,9 @@
 """Laws of the compiled geometry: what Python's formulas say of a ray or a pixel, it says too, and their derivatives."""
 
 import math
+import os
+import subprocess
+from pathlib import Path
 from unittest.mock import patch
 
 import pytest
@@ -9,7 +12,9 @@ from cameras import KEYS, every_model, fan, make, one, pixel_lattice, real, spre
 
 import camtorch as ct
 from camtorch._arguments import columns
+from camtorch.native import build as building
 from camtorch.native import geometry
+from camtorch.native.library import library
 from camtorch.optics import Equidistant, Lens, Stage
 from camtorch.projection.rows import Cameras
 
@@ -255,3 +260,24 @@ def test_no_points():
     out, valid = geometry.project(made, torch.empty(1, 0, 3, dtype=torch.float64))
     assert out.shape == (2, 1, 0)
     assert valid.shape == (1, 0)
+
+
+FUZZ = Path(__file__).parent / "geometry_fuzz.c"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", list(building.VARIANTS))
+def test_no_read_outside_and_nothing_undefined(variant, tmp_path):
+    here = list(building.VARIANTS).index(library().camtorch_variant().decode())
+    if list(building.VARIANTS).index(variant) > here:
+        pytest.skip(f"this CPU does not run {variant}")
+    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+    command = [*building._compiler(None), *building._FLAGS, "-O1", "-g", f"-I{building._HERE}", *sanitizers]
+    (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
+    if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=tmp_path, capture_output=True).returncode:
+        pytest.skip(f"{command[0]} has no sanitizers")
+    sources = ["-DVARIANT=fuzzed", *building.VARIANTS[variant], str(building._HERE / "geometry.c"), str(FUZZ)]
+    subprocess.run([*command, *sources, "-lm", "-o", "fuzz"], cwd=tmp_path, check=True)
+    environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
+    done = subprocess.run([tmp_path / "fuzz", "1", "3000"], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
