@@ -32,7 +32,7 @@ enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left t
 /* Over the points of a block; `n` is a multiple of LANES */
 #define EACH(i) for (int i = 0; i < (n & -LANES); i++)
 
-/* How far parts of a planar lens are from being inverted, and how many numbers a part has */
+/* How many numbers a part has: the `parameters` of its chart or stage */
 static int numbers_of(const Part *part) {
     int count = 0;
     if (part->kind == UNIFIED)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from camtorch import optics
 from camtorch._threads import spread, thread_count
+from camtorch.native import memory
 from camtorch.native.library import library
 from camtorch.optics.backprojection import FURTHEST
 from camtorch.optics.radial_inverse import _made_tables
@@ -228,7 +229,7 @@ class Unprojected(NamedTuple):
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
     count = points.shape[1]
-    pixels = torch.empty(2, native.cameras, count, dtype=native.dtype)
+    pixels = _empty(2, native.cameras, count, native.dtype)
     valid = torch.empty(native.cameras, count, dtype=torch.bool)
     if _call(native, PROJECT, points, pixels, valid) and native.struct.limits2 is None:
         native.add_limits()
@@ -239,7 +240,7 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
 def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
     """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
     count = pixels.shape[1]
-    rays = torch.empty(3, native.cameras, count, dtype=native.dtype)
+    rays = _empty(3, native.cameras, count, native.dtype)
     valid = torch.empty(native.cameras, count, dtype=torch.uint8)
     solution = torch.empty(2, native.cameras, count, dtype=native.dtype) if keeps else None
     left = _call(native, UNPROJECT, pixels, rays, valid, solution)
@@ -273,6 +274,13 @@ def unproject_vjp(
     sums = _sums(native, found.valid) if want_parameters else None
     _call(native, UNPROJECT_VJP, None, by_row, found.valid, found.solution, cotangents=cotangents, sums=sums)
     return results, None if sums is None else sums.sum(1).to(native.dtype)
+
+
+def _empty(size: int, cameras: int, count: int, dtype: torch.dtype) -> Tensor:
+    # of large results the first write to each page would take longer than the geometry
+    if size * cameras * count * dtype.itemsize >= memory.LEAST:
+        return memory.empty((size, cameras, count), dtype, torch.contiguous_format)
+    return torch.empty(size, cameras, count, dtype=dtype)
 
 
 def _sums(native: Native, rows: Tensor) -> Tensor:
@@ -314,7 +322,7 @@ def _call(
     run = _entry()
     tiles = -(-count // _TILE) * native.cameras
     if count * native.cameras <= _TILE or tiles == 1:
-        return run(call)
+        return int(run(call))
     left: list[int] = []
     spread(lambda: left.append(run(call)), min(thread_count(), tiles))
     return sum(left)
