@@ -61,9 +61,14 @@ def values_of(tensor: Tensor) -> Tensor | None:
     return tensor.detach().to("cpu", torch.float64) if is_concrete(tensor) else None
 
 
+def is_kept(value: Tensor) -> bool:
+    """Whether a module keeps the tensor itself: a Parameter, or a tensor of a graph. Of other values it has a copy."""
+    return isinstance(value, nn.Parameter) or in_graph(value)
+
+
 def as_own(value: Tensor) -> Tensor:
-    """A Parameter or a tensor of a graph as it is, of other values a copy."""
-    return value if isinstance(value, nn.Parameter) or in_graph(value) else value.detach().clone()
+    """A tensor that `is_kept` as it is, of other values a copy."""
+    return value if is_kept(value) else value.detach().clone()
 
 
 def _all_finite(value: Tensor) -> bool:
@@ -290,7 +295,7 @@ def check_radians(vectors: Tensor, name: str, owner: str) -> None:
 
     A turn is the longest that there is a use for; one that an optimiser moved may be somewhat longer.
     """
-    if not may_look(vectors) or isinstance(vectors, nn.Parameter) or in_graph(vectors) or is_predicted(vectors):
+    if not may_look(vectors) or is_kept(vectors) or is_predicted(vectors):
         return
     if bool((vectors.square().sum(-1) > (4 * math.pi) ** 2 * (1 + 1e-6)).any()):
         longest = torch.linalg.vector_norm(vectors.double(), dim=-1).nan_to_num(0.0).amax().item()

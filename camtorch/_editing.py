@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size
+from camtorch._arguments import as_image_size, fails, values_of
 from camtorch._module import learning_as, remade
-from camtorch._tracing import is_concrete
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -70,7 +69,8 @@ def edited(camera: CameraT, matrix: Tensor, image_size: tuple[int, int] | None, 
     )
     intrinsics = torch.stack(torch.broadcast_tensors(*numbers), -1).to(own.dtype)
     if turns is None:
-        turns = not is_concrete(b) or bool((b != 0).any())
+        known = values_of(b)
+        turns = known is None or bool((known != 0).any())
     distortion = _edited_distortion(camera, a - b, c + d, b != 0 if turns else None)
     return remade(camera, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
 
@@ -95,9 +95,9 @@ def _on_side(camera: Camera) -> Tensor:
             f"{owner}: a quarter turn of the image has no camera of this model. "
             "RandomMount(roll=...) turns the camera, and convert() gives one of another model"
         )
-    if {"tau_x", "tau_y"} <= {*names} and is_concrete(camera.distortion):
+    if {"tau_x", "tau_y"} <= {*names}:
         tilts = camera.distortion[..., [names.index("tau_x"), names.index("tau_y")]]
-        if bool((tilts != 0).all(-1).any()):
+        if fails((tilts == 0).any(-1)):
             raise ValueError(
                 f"{owner}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
                 "quarter turn: the model tilts about one after the other"

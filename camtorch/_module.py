@@ -197,7 +197,8 @@ class BatchedModule(GeometryModule):
                 raise IndexError(f"{type(self).__name__}: {index!r} of a batch {shape}: {error}") from None
             except (TypeError, ValueError, RuntimeError):
                 raise TypeError(
-                    f"{type(self).__name__}: a batch is indexed by whole numbers, slices and masks; got {shown(index)}"
+                    f"{type(self).__name__}: a batch is indexed by whole numbers, masks, slices that go "
+                    f"forwards, and lists, as [2, 1, 0], that may not; got {shown(index)}"
                 ) from None
             tensors[name] = rows
         return remade(self, **tensors)
@@ -231,7 +232,13 @@ class BatchedModule(GeometryModule):
         As of a tensor, gradients of the copy go to this one where it learns; the copy of a fixed one is fixed.
         `copy.deepcopy` makes Parameters that learn by themselves.
         """
-        return self.each(torch.clone)
+        if not torch.is_inference_mode_enabled():
+            return self.each(torch.clone)
+        with (
+            torch.inference_mode(False),
+            torch.no_grad(),
+        ):  # what inference mode makes could not be used in a graph later
+            return self.each(torch.clone)
 
     def expand(self, *batch: int | Sequence[int]) -> Self:
         """The batch of shape `batch` that `torch.Tensor.expand` would give: nothing is copied, and -1 keeps a dim.
@@ -341,10 +348,18 @@ class Memo:
             return compute()
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
-            copies = [t.detach().clone() for t in inputs]
+            copies = [t.clone() for t in inputs]
             result = compute()
         self._kept, self.result = [(options, copies, result), *self._kept[: self.capacity - 1]], result
         return result
+
+    def copies(
+        self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], tuple[Tensor, ...]]
+    ) -> tuple[Tensor, ...]:
+        """Tensors that belong to the caller: copies of those kept, or new ones where an input learns."""
+        if torch.is_grad_enabled() and any(map(in_graph, inputs)):
+            return compute()
+        return tuple(t.clone() for t in self(inputs, options, compute))
 
     def __getstate__(self) -> dict[str, Any]:
         return {"capacity": self.capacity, "_kept": []}

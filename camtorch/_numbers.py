@@ -18,11 +18,13 @@ from camtorch._arguments import (
     as_image_size,
     as_real,
     check_degrees,
+    fails,
+    is_kept,
     is_predicted,
     shown,
+    values_of,
 )
 from camtorch._module import remade
-from camtorch._tracing import in_graph, is_concrete
 from camtorch.projection.rays import AXES, focal_for
 
 if TYPE_CHECKING:
@@ -50,7 +52,7 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
         raise ValueError(
             f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
         )
-    if _is_given(intrinsics) and not bool((intrinsics[..., :2] > 0).all()):
+    if not is_predicted(intrinsics) and fails(intrinsics[..., :2] > 0):
         raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
     return intrinsics
 
@@ -72,10 +74,9 @@ def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Ten
         raise ValueError(
             f"{owner}: distortion must be (*B, n) with {model.counts_text()}; got shape {tuple(distortion.shape)}{hint}"
         )
-    if _is_given(distortion):
-        defined = model.defined(distortion.unbind(-1))
-        if defined is not None and not bool((defined > 0).all()):
-            raise ValueError(f"{owner}: the formula needs {model.defined_text}; got {distortion.tolist()}")
+    defined = None if is_predicted(distortion) else model.defined(distortion.unbind(-1))
+    if defined is not None and fails(defined > 0):
+        raise ValueError(f"{owner}: the formula needs {model.defined_text}; got {distortion.tolist()}")
     return distortion
 
 
@@ -94,9 +95,12 @@ def replaced(
         k = changes["distortion"] = checked_distortion(model, as_numbers_of(camera, distortion, "distortion"), now)
         changes["distortion_names"] = model.names_of(k.shape[-1])
     batch = as_batch(model.__name__, intrinsics=now.shape, distortion=k.shape)
+    size = changes.get("image_size", camera.image_size)
+    if intrinsics is not None and size is not None:
+        warn_of_order(now, size, model.__name__, stacklevel=4)
     for name in changes.keys() & {"intrinsics", "distortion"}:
         value = changes[name]
-        if not isinstance(value, nn.Parameter) and not in_graph(value):
+        if not is_kept(value):
             own = value.detach().expand(*batch, value.shape[-1]).clone()
             own = own.float() if own.dtype.itemsize < 4 else own
             changes[name] = nn.Parameter(own, requires_grad=getattr(camera, name).requires_grad)
@@ -109,11 +113,6 @@ def as_numbers_of(camera: Camera, value: Numbers, name: str) -> Tensor:
         return value
     as_real(value, name, type_before_parametrizations(camera).__name__)
     return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
-
-
-def _is_given(values: Tensor) -> bool:
-    """Whether the values may be looked at, and bad ones are refused."""
-    return is_concrete(values) and not is_predicted(values)
 
 
 def _is_column(model: type[Camera], distortion: Tensor) -> bool:
@@ -141,16 +140,14 @@ def numbers_of_matrix(
     K = as_real(K, "K", owner)  # noqa: N806
     if K.shape[-2:] != (3, 3):
         raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
-    if is_concrete(K):
-        bottom = K[..., 2, :].detach()
-        if bool((bottom != bottom.new_tensor([0, 0, 1])).any()) or bool((K[..., 1, 0] != 0).any()):
-            raise ValueError(f"{owner}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
-        skew = K[..., 0, 1].detach()
-        if not as_flag(ignore_skew, "ignore_skew", owner) and bool((skew != 0).any()):
-            raise ValueError(
-                f"{owner}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
-                "ignore_skew=True drops it"
-            )
+    bottom, skew = K[..., 2, :].detach(), K[..., 0, 1].detach()
+    if fails(bottom == bottom.new_tensor([0, 0, 1])) or fails(K[..., 1, 0] == 0):
+        raise ValueError(f"{owner}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
+    if not as_flag(ignore_skew, "ignore_skew", owner) and fails(skew == 0):
+        raise ValueError(
+            f"{owner}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
+            "ignore_skew=True drops it"
+        )
     intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
     if distortion is None:
         return (intrinsics,)
@@ -191,10 +188,10 @@ def camera_of_fov(
         raise ValueError(f"{owner}: axis must be one of {AXES}; got {shown(axis)}")
     fov = torch.tensor(fov, dtype=torch.float64) if isinstance(fov, (int, float)) else fov
     degrees = as_real(fov, "fov", owner).detach().double()
-    if is_concrete(degrees) and not bool(((degrees > 0) & (degrees <= 360)).all()):
+    if fails((degrees > 0) & (degrees <= 360)):
         raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
-    if is_concrete(degrees) and degrees.numel():
-        check_degrees(float(degrees.min()), degrees.tolist(), owner)
+    if (known := values_of(degrees)) is not None and known.numel():
+        check_degrees(float(known.min()), known.tolist(), owner)
     given = () if distortion is None else (as_real(distortion, "distortion", owner),)
     plane = model(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
     degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
@@ -203,7 +200,7 @@ def camera_of_fov(
     intrinsics = torch.cat((focal[..., None], focal[..., None], centre), -1)
     intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
     made = model(intrinsics, *given, image_size=size)
-    if is_concrete(reached) and not bool(reached.all()):
+    if fails(reached):
         widest = made.fov[..., AXES.index(axis)].flatten().tolist()
         raise ValueError(
             f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "
@@ -212,11 +209,11 @@ def camera_of_fov(
     return made
 
 
-def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
+def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, stacklevel: int = 3) -> None:
     """Warn of plain numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
-    if isinstance(intrinsics, nn.Parameter) or in_graph(intrinsics) or not _is_given(intrinsics):
+    if is_kept(intrinsics) or is_predicted(intrinsics) or (known := values_of(intrinsics)) is None:
         return
-    rows = intrinsics.reshape(-1, 4)[:_LOOKED_AT].tolist()
+    rows = known.reshape(-1, 4)[:_LOOKED_AT].tolist()
     if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
         return
     given = f"fx, fy, cx, cy = {rows[0]}"
@@ -225,7 +222,7 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
         warnings.warn(
             f"{owner}: image_size={size} is (height, width), as image.shape, and the principal point of {given} is the "
             f"middle of {size[::-1]}. OpenCV's (width, height) goes in turned round. {cut_out}",
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
     elif all(
         _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
@@ -234,7 +231,7 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
         warnings.warn(
             f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
             f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
 
 

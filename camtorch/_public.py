@@ -25,11 +25,11 @@ from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
 from camtorch.warp import views
 from camtorch.warp.dewarp import Dewarp
-from camtorch.warp.light import vignetting
 from camtorch.warp.plane import BirdsEye, PlaneWarp
 from camtorch.warp.reproject import Reproject
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.surround import Surround, surround
+from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
 __all__ = [

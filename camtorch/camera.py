@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import difflib
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
 from torch import Tensor
@@ -16,13 +15,12 @@ from camtorch._arguments import (
     Numbers,
     as_batch,
     as_image_size,
-    as_points,
     as_values,
-    as_vectors,
     as_whole,
     broadcast_shapes,
     is_predicted,
     shown,
+    values_of,
 )
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
@@ -36,27 +34,26 @@ from camtorch._numbers import (
     warn_of_order,
 )
 from camtorch._registry import register
-from camtorch._tracing import in_graph, is_concrete
-from camtorch.convert.conversion import CameraT, Conversion, convert
+from camtorch.convert.conversion import Conversion, convert
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
-from camtorch.projection.depth import as_depth, depth_scale
+from camtorch.projection.depth import backproject
 from camtorch.projection.explanation import explain
-from camtorch.projection.fields import local_pinhole, patch_centres, perspective_field, plucker
+from camtorch.projection.fields import local_pinhole, over_image, patch_centres, perspective_field, plucker
 from camtorch.projection.project import Project
 from camtorch.projection.rays import field_of_view
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    from typing_extensions import Self, TypeVar
 
     from camtorch.extrinsics import Extrinsics
 
+    Model = TypeVar("Model", bound="Camera", default="Camera")
+
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""
-
-_MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 
 _ELSEWHERE = {
     "opencv": "brown_conrady",
@@ -68,6 +65,13 @@ _ELSEWHERE = {
     "omnidir": "mei",
 }
 """What OpenCV, ROS, Kalibr and COLMAP call some of them."""
+
+
+def _intrinsic(index: int, doc: str) -> Any:
+    def one(camera: Camera) -> Tensor:
+        return camera.intrinsics[..., index].expand(camera.batch_shape)
+
+    return property(one, doc=doc)
 
 
 class Camera(BatchedModule):
@@ -138,24 +142,8 @@ class Camera(BatchedModule):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if cls.__module__ == parametrize.__name__:  # the class of one parametrized camera is no model of its own
-            return
-        for name in ("optics", "defined"):
-            if not isinstance(inspect.getattr_static(cls, name), staticmethod):
-                raise TypeError(
-                    f"{cls.__name__}: {name} must be a @staticmethod of the coefficients k alone; got a "
-                    f"{type(inspect.getattr_static(cls, name)).__name__}"
-                )
-        cls._model = register(cls)
-        if "key" not in cls.__dict__:
-            cls.key = ""
-            return
-        known = MODELS.get(cls.key)
-        # a class that is defined again, in a notebook, takes its own place
-        if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
-            owner = f"{known.__module__}.{known.__qualname__}"
-            raise ValueError(f"{cls.__name__}: the key {cls.key!r} is that of {owner}; choose another")
-        MODELS[cls.key] = cls
+        if cls.__module__ != parametrize.__name__:  # the class of one parametrized camera is no model of its own
+            _add_model(cls)
 
     _model: ClassVar[str]
 
@@ -266,28 +254,10 @@ class Camera(BatchedModule):
         matrix: Tensor = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
         return matrix
 
-    @property
-    def fx(self) -> Tensor:
-        """(*B,) the horizontal focal length in pixels; gradients go to `intrinsics`."""
-        return self._intrinsic(0)
-
-    @property
-    def fy(self) -> Tensor:
-        """(*B,) the vertical focal length in pixels."""
-        return self._intrinsic(1)
-
-    @property
-    def cx(self) -> Tensor:
-        """(*B,) the principal point across in pixels; 0 is the middle of the leftmost ones."""
-        return self._intrinsic(2)
-
-    @property
-    def cy(self) -> Tensor:
-        """(*B,) the principal point down in pixels."""
-        return self._intrinsic(3)
-
-    def _intrinsic(self, index: int) -> Tensor:
-        return self.intrinsics[..., index].expand(self.batch_shape)
+    fx: Tensor = _intrinsic(0, "(*B,) the horizontal focal length in pixels; gradients go to `intrinsics`.")
+    fy: Tensor = _intrinsic(1, "(*B,) the vertical focal length in pixels.")
+    cx: Tensor = _intrinsic(2, "(*B,) the principal point across in pixels; 0 is the middle of the leftmost ones.")
+    cy: Tensor = _intrinsic(3, "(*B,) the principal point down in pixels.")
 
     @property
     def height(self) -> int:
@@ -445,29 +415,8 @@ class Camera(BatchedModule):
         Those of up to half a million pixels or patches are kept while nothing that they depend on can learn or has
         changed.
         """
-        rays, valid = self._kept(self._rays, self.tensors, stride, lambda: self.unproject(self._all_pixels(stride)))
+        rays, valid = over_image(self, self._rays, self.tensors, stride, self.unproject)
         return rays, valid
-
-    def _all_pixels(self, stride: int) -> Tensor:
-        """(*B, H, W, 2): the pixel grid for every camera."""
-        grid = self.pixel_grid(stride)
-        return grid.expand(*self.batch_shape, *grid.shape)
-
-    def _kept(
-        self, memo: Memo, inputs: Sequence[Tensor], stride: int, compute: Callable[[], tuple[Tensor, ...]]
-    ) -> tuple[Tensor, ...]:
-        """A copy of results over the image, kept where nothing learns and they are not too long; or new ones."""
-        if torch.compiler.is_compiling():  # nothing is kept then, and a comparison would bound sizes that are left open
-            return compute()
-        learns = torch.is_grad_enabled() and any(map(in_graph, inputs))
-        count = (
-            math.prod((*self.batch_shape, *self.size_for("pixel_grid")))
-            // max(as_whole(stride, "stride", "pixel_grid"), 1) ** 2
-        )
-        if learns or count > _MOST_KEPT:
-            return compute()
-        options = (self.form, stride)
-        return tuple(t.clone() for t in memo(inputs, options, compute))
 
     def plucker(self, extrinsics: Extrinsics | None = None, stride: int = 1) -> tuple[Tensor, Tensor]:
         """The line in the world that every pixel or patch sees, in Pluecker coordinates.
@@ -498,9 +447,6 @@ class Camera(BatchedModule):
             ray as the pixel goes right. And K (*B, *N, 3, 3), upper triangular, with the pixel as its principal point
             and a skew where the image has one there. Both are exact, and identities where `unproject` is not valid.
         """
-        pixels, _ = as_points(
-            pixels, "pixels", 2, self.batch_shape, self.tensors, f"{type(self).__name__}.local_pinhole"
-        )
         return local_pinhole(self, pixels)
 
     def perspective_field(self, gravity: Numbers, stride: int = 1) -> tuple[Tensor, Tensor, Tensor]:
@@ -521,16 +467,7 @@ class Camera(BatchedModule):
         Raises:
             ValueError: another shape, a gravity of length zero.
         """
-        owner = f"{type(self).__name__}.perspective_field"
-        down = as_vectors(gravity, "gravity", owner)
-        if is_concrete(down) and not bool((down != 0).any(-1).all()):
-            raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
-        down = down.to(self.intrinsics.device)
-        inputs = (*self.tensors, down)
-        latitude, up, valid = self._kept(
-            self._fields, inputs, stride, lambda: perspective_field(self, down, self._all_pixels(stride))
-        )
-        return latitude, up, valid
+        return perspective_field(self, gravity, stride)
 
     def backproject(self, depth: Numbers, kind: Literal["z", "distance"] = "z") -> tuple[Tensor, Tensor]:
         """The points of the camera frame that the pixels of a depth map show.
@@ -548,18 +485,7 @@ class Camera(BatchedModule):
         Raises:
             ValueError: another shape, integers, an unknown kind.
         """
-        owner = f"{type(self).__name__}.backproject"
-        depth = as_depth(depth, kind, self.size_for("backproject"), owner, self.intrinsics.device)
-        count = self.batch_shape.numel()
-        if self.batch_shape and (depth.ndim != 4 or len(self.batch_shape) > 1 or len(depth) not in (1, count)):
-            shape = tuple(self.batch_shape)
-            raise ValueError(f"{owner}: depth must be (B, 1, H, W) for cameras {shape}; got {tuple(depth.shape)}")
-        if depth.ndim == 4 and depth.shape[1] != 1:
-            raise ValueError(f"{owner}: depth must be (B, 1, H, W); got shape {tuple(depth.shape)}")
-        rays, valid = self.rays()
-        depth = depth[:, 0] if depth.ndim == 4 else depth
-        scale, good = depth_scale(depth, rays, valid, kind)
-        return rays * scale[..., None], good
+        return backproject(self, depth, kind)
 
     @property
     def field_of_view(self) -> Tensor:
@@ -639,40 +565,16 @@ class Camera(BatchedModule):
 
     # -- another model
 
-    @overload
     def convert(
         self,
-        model: type[CameraT],
+        model: type[Model] | str,
         *,
         count: int | None = None,
         image_size: Sequence[int] | None = None,
         max_angle: float | None = None,
         tolerance: float = 0.1,
         **options: Any,
-    ) -> Conversion[CameraT]: ...
-
-    @overload
-    def convert(
-        self,
-        model: str,
-        *,
-        count: int | None = None,
-        image_size: Sequence[int] | None = None,
-        max_angle: float | None = None,
-        tolerance: float = 0.1,
-        **options: Any,
-    ) -> Conversion[Camera]: ...
-
-    def convert(
-        self,
-        model: type[Camera] | str,
-        *,
-        count: int | None = None,
-        image_size: Sequence[int] | None = None,
-        max_angle: float | None = None,
-        tolerance: float = 0.1,
-        **options: Any,
-    ) -> Conversion[Camera]:
+    ) -> Conversion[Model]:
         """The camera of another model, or number of coefficients, that comes closest to this one.
 
         Where the models are related and the numbers allow, it is this camera exactly: its coefficients are taken over
@@ -702,7 +604,7 @@ class Camera(BatchedModule):
         """
         return convert(
             self,
-            as_model(model, f"{type(self).__name__}.convert"),
+            cast("type[Model]", as_model(model, f"{type(self).__name__}.convert")),
             MODELS,
             count=count,
             image_size=image_size,
@@ -714,16 +616,36 @@ class Camera(BatchedModule):
     def extra_repr(self) -> str:
         """Batch, size and, for a single camera, its numbers."""
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
-        if not self.batch_shape and is_concrete(self.intrinsics):
-            named = zip(
-                ("fx", "fy", "cx", "cy", *self.distortion_names), torch.cat(self.tensors, -1).tolist(), strict=True
-            )
-            parts += [f"{name}={value:.6g}" for name, value in named]
+        numbers = None if self.batch_shape else values_of(torch.cat(self.tensors, -1))
+        if numbers is not None:
+            names = "fx", "fy", "cx", "cy", *self.distortion_names
+            parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]
         elif self.distortion_names:
             parts.append(f"distortion=({' '.join(self.distortion_names)})")
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
         return ", ".join(parts)
+
+
+def _add_model(model: type[Camera]) -> None:
+    """Check what a new model states, and let `MODELS` know it."""
+    for name in ("optics", "defined"):
+        stated = inspect.getattr_static(model, name)
+        if not isinstance(stated, staticmethod):
+            raise TypeError(
+                f"{model.__name__}: {name} must be a @staticmethod of the coefficients k alone; got a "
+                f"{type(stated).__name__}"
+            )
+    model._model = register(model)
+    if "key" not in model.__dict__:
+        model.key = ""
+        return
+    known = MODELS.get(model.key)
+    # a class that is defined again, in a notebook, takes its own place
+    if known is not None and (known.__module__, known.__qualname__) != (model.__module__, model.__qualname__):
+        owner = f"{known.__module__}.{known.__qualname__}"
+        raise ValueError(f"{model.__name__}: the key {model.key!r} is that of {owner}; choose another")
+    MODELS[model.key] = model
 
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, cast
 
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import Numbers, as_points, no_camera, shown, working_dtype
+from camtorch._arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch._evaluation import new_cameras, per_row
 from camtorch._evaluation import rows_of as camera_rows
 from camtorch._module import Memo, remade
@@ -249,12 +250,14 @@ class Mixed(Camera):
     def expand(self, *batch: int | Sequence[int]) -> Self:
         """As `Camera.expand`: a batch of one becomes one of many, any other one keeps its dim."""
         sizes: Any = batch[0] if len(batch) == 1 and isinstance(batch[0], Sequence) else batch
-        count = len(self)
-        if len(sizes) == 1 and sizes[0] in (count, -1):
+        count, size = len(self), None
+        with suppress(TypeError, RuntimeError):
+            size = operator.index(sizes[0]) if len(sizes) == 1 else None
+        if size in (count, -1):
             return self
-        if len(sizes) != 1 or count != 1 or not isinstance(sizes[0], int) or sizes[0] < 1:
+        if count != 1 or size is None or size < 1:
             raise ValueError(f"Mixed: batch dims ({count},) do not expand to {shown(tuple(sizes))}")
-        return type(self)([self.groups[0][1].expand(*sizes)])
+        return type(self)([self.groups[0][1].expand(size)])
 
     def replace(
         self,
@@ -265,6 +268,7 @@ class Mixed(Camera):
         """The batch with other intrinsics (B, 4), or another image size; see `Camera.replace`."""
         if distortion is not None:
             self._refuse("distortion", "camera.by_groups(lambda group: group.replace(distortion=...)) replaces it")
+        as_image_size(image_size, "Mixed")
         if intrinsics is None:
             return self.by_groups(lambda group: group.replace(image_size=image_size))
         given = as_numbers_of(self, intrinsics, "intrinsics")
@@ -295,7 +299,10 @@ class Mixed(Camera):
         except IndexError as error:
             raise IndexError(f"Mixed: {index!r} of a batch ({len(self._places)},): {error}") from None
         except (TypeError, ValueError, RuntimeError):
-            raise TypeError(f"Mixed: it is indexed by whole numbers, slices and masks; got {shown(index)}") from None
+            raise TypeError(
+                "Mixed: it is indexed by whole numbers, masks, slices that go forwards, and lists, as [2, 1, 0], that "
+                f"may not; got {shown(index)}"
+            ) from None
         if taken.ndim == 0:
             i, row = self._places[int(taken)]
             camera = self._member(i)
@@ -346,7 +353,7 @@ class Listed(Mixed):
         return *kind(camera), *((t.dtype, t.requires_grad) for t in camera.tensors)
 
 
-def cat(cameras: Iterable[Camera]) -> Camera:
+def cat(cameras: Iterable[Camera], *_more: object) -> Camera:
     """One batch of cameras, one after the other, as `torch.cat` makes of tensors; a single camera is one row.
 
     Of one model and number of coefficients it is a batch of that model, of several it is a `Mixed`. What is fixed stays
@@ -359,6 +366,8 @@ def cat(cameras: Iterable[Camera]) -> Camera:
         TypeError: what is no camera. ValueError: no cameras, more than one batch dim, images of different sizes,
             different devices.
     """
+    if _more:
+        raise TypeError(f"cat: the cameras go in as one list, cat([a, b]); got {1 + len(_more)} arguments")
     members = _members(cameras, "cat")
     _check_sizes(members, "cat")
     groups = Mixed(members).groups

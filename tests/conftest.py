@@ -14,7 +14,7 @@ with warnings.catch_warnings():
 torch.set_num_threads(1)
 
 # the same examples on every machine and in every run; speed is not what these tests are about
-settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=10, database=None)
+settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=5, database=None)
 settings.load_profile("camtorch")
 
 

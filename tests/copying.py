@@ -28,5 +28,5 @@ class Doubling:
                     (path.parent / "waiting").touch()
                     time.sleep(60)
                 file.write(text + item.variant.encode())
-        listener.done(item.size / 2)
+        listener.done(item.size // 2)
         return {"size": 2 * len(text)}

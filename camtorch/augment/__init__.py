@@ -24,7 +24,7 @@ from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
 from camtorch.augment.sample import from_pitch_yaw, to_pitch_yaw
 from camtorch.rotations import mount_rotation
-from camtorch.warp.warp import outlines
+from camtorch.warp.boxes import outlines
 
 __all__ = [
     "LANDMARKS",

@@ -18,27 +18,14 @@ import torch
 from albumentations.core.type_definitions import Targets
 from torch import Tensor
 
-from camtorch._arguments import GUESS_CAMERA, no_camera
-from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
-from camtorch.augment.sample import Unknown, moves
+from camtorch.augment.sample import KINDS, Unknown, moves
 from camtorch.camera import Camera
 
 _OWNER = "albumentations.Transform"
-_KINDS = (
-    "gaze",
-    "directions",
-    "points",
-    "pitch_yaw",
-    "head_pose",
-    "pose",
-    "rvec",
-    "tvec",
-    "rotation",
-    "depth",
-    "distance",
-)
+_KINDS = [k for k in KINDS if k not in ("image", "mask", "keypoints", "polygons", "boxes", "landmarks")]
 
 
 class Transform(A.DualTransform):
@@ -72,16 +59,12 @@ class Transform(A.DualTransform):
     camera: Camera | None
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, p: float | None = None):
-        if not isinstance(augmentation, Augmentation):
-            raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
-        if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"{_OWNER}: camera must be a Camera; got {no_camera(camera)}")
+        check_front_end(_OWNER, augmentation, camera)
         super().__init__(p=augmentation.p if p is None else p)
         self.augmentation, self.camera = augmentation, camera
 
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
-        """What moves, by name, and the method that moves it."""
         moved = {name: getattr(self, f"apply_to_{name}") for name in ("images", "mask", "masks", "bboxes", "keypoints")}
         others = {name: self._mover(name) for name in _KINDS}
         return {"image": self.apply, **moved, **others, "camera": self.apply_to_camera}
@@ -99,13 +82,11 @@ class Transform(A.DualTransform):
         return result
 
     def get_params(self) -> dict[str, Any]:
-        """A draw, of plain numbers."""
         generator = torch.Generator().manual_seed(self.py_random.getrandbits(63))
         drawn = self.augmentation.drawn(1, 1.0, False, generator)
         return {"draw": {name: value.tolist() for name, value in drawn.items()}}
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
-        """Move what a sample holds by the draw in `params`."""
         camera = self._source(data)
         drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
         with torch.no_grad():
@@ -115,48 +96,21 @@ class Transform(A.DualTransform):
             return moved if isinstance(camera, Unknown) else {**moved, "camera": self.apply_to_camera(camera, change)}
 
     def _source(self, data: Mapping[str, Any]) -> Camera:
-        camera = data.get("camera", self.augmentation.camera if self.camera is None else self.camera)
-        known = next((data[name] for name in ("image", "mask") if data.get(name) is not None), None)
-        if camera is None and known is not None and not self.augmentation.needs_camera:
-            return Unknown.of(np.shape(known)[:2])
-        if not isinstance(camera, Camera):
-            raise ValueError(
-                f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation; got {camera!r}. "
-                f"{GUESS_CAMERA}"
-            )
-        if camera.image_size is None or camera.batch_shape:
-            raise ValueError(
-                f"{_OWNER}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} "
-                f"and batch dims {tuple(camera.batch_shape)}"
-            )
-        for name in ("image", "mask"):
-            size = np.shape(data[name])[:2] if data.get(name) is not None else camera.image_size
-            if size != camera.image_size:
-                raise ValueError(
-                    f"{_OWNER}: {name} is {size} (height, width), but the camera's image_size is {camera.image_size}. "
-                    "camera.resize, .crop and .pad give the camera of an edited image"
-                )
-        return camera
+        sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
+        return camera_of_sample(_OWNER, self.augmentation, data.get("camera", self.camera), sizes)
 
     # -- what moves
 
     def apply(self, img: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        """An image (H, W, C) or (H, W)."""
         return as_array(change.images(as_tensor("image", img))[0], img)
 
     def apply_to_mask(self, mask: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        """A mask likewise, by the nearest value."""
         return as_array(change.labels(as_tensor("mask", mask), self.augmentation.mask_fill)[0], mask)
 
     def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
-        moved = change.points(torch.as_tensor(keypoints[:, :2])[None])[0][0].numpy()
-        lost = (keypoints[:, :2] == -1).all(1, keepdims=True)
-        moved, mirroring = np.where(lost, -1, moved), self.augmentation.mirroring
-        if mirroring is not None and change.mirrored is not None:
-            order = mirroring.order("keypoints", "keypoints", len(moved))
-            moved = moved if order is None else moved[list(order)]
-        return np.concatenate((moved, keypoints[:, 2:]), 1)
+        moved = move_points(self.augmentation, change, torch.as_tensor(keypoints[:, :2])[None])[0][0]
+        return np.concatenate((moved.numpy(), keypoints[:, 2:]), 1)
 
     def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""
@@ -170,7 +124,6 @@ class Transform(A.DualTransform):
         return np.concatenate((moved.numpy().astype(bboxes.dtype), bboxes[:, 4:]), 1)
 
     def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
-        """The camera of the new image."""
         return change.target[0].clone()
 
     def _mover(self, kind: str) -> Callable[..., np.ndarray]:

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
-import difflib
-import inspect
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from camtorch._arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, fails, holds, shown
+from camtorch._arguments import (
+    GUESS_CAMERA,
+    as_flag,
+    as_mapping,
+    as_number,
+    as_part,
+    as_whole,
+    fails,
+    holds,
+    no_camera,
+    shown,
+)
 from camtorch._module import typed_as
-from camtorch._threads import on_one_thread
 from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.change import Change, Part, alone, as_one
+from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
-from camtorch.warp.sampling import Options, as_options
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
 _TRIES = 8
@@ -120,20 +130,11 @@ def draw(
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
 
 
-class EditOptions(TypedDict, total=False):
+class EditOptions(SampleOptions, total=False):
     """What every edit takes; see `Edit`."""
 
-    camera: Camera | None
     p: float
     same_on_batch: bool
-    fields: Mapping[str, str] | None
-    mode: str
-    padding_mode: str
-    fill: float | Sequence[float]
-    mask_fill: float
-    valid_mask: bool
-    antialias: bool | None
-    tolerance: float
 
 
 class Augmentation(SampleTransform):
@@ -199,61 +200,27 @@ class Augmentation(SampleTransform):
     ranges: dict[str, Range]
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
-    other_words: ClassVar[Mapping[str, str]] = {}
-    """Words that people try as keywords -> the keyword, for the hint of an error."""
     p: float
     same_on_batch: bool
-    options: Options
     min_filled: float | None
 
     def __init__(
         self,
         ranges: Mapping[str, Range] | None = None,
         *,
-        camera: Camera | None = None,
         p: float = 1.0,
         same_on_batch: bool = False,
-        fields: Mapping[str, str] | None = None,
-        mode: str = "bilinear",
-        padding_mode: str = "zeros",
-        fill: float | Sequence[float] = 0.0,
-        mask_fill: float = 0.0,
-        valid_mask: bool = False,
-        antialias: bool | None = False,
-        tolerance: float = 0.001,
         min_filled: float | None = None,
-        **unknown: object,
+        **options: Unpack[SampleOptions],
     ):
-        super().__init__(camera, fields, mask_fill, valid_mask)
-        for name in unknown:
-            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
-        self.p, self.same_on_batch = (
-            as_part(p, "p", self._name, "probability"),
-            as_flag(same_on_batch, "same_on_batch", self._name),
-        )
-        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        super().__init__(**options)
+        self.p = as_part(p, "p", self._name, "probability")
+        self.same_on_batch = as_flag(same_on_batch, "same_on_batch", self._name)
         self.ranges = dict(ranges or {})
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
         self._warned = False
         self.last: Change | None = None
         """The change of the last call: its `source`, `target` and `rotation`."""
-
-    @classmethod
-    def _meant(cls, word: str) -> str:
-        """The keyword that somebody may have meant."""
-        known = [
-            parameter.name
-            for owner in cls.__mro__
-            if "__init__" in vars(owner) and issubclass(owner, Augmentation)
-            for parameter in inspect.signature(vars(owner)["__init__"]).parameters.values()
-            if parameter.kind is not parameter.VAR_KEYWORD and parameter.name != "self"
-        ]
-        close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
-        return (
-            f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
-            if close
-            else f"; known are {', '.join(dict.fromkeys(known))}"
-        )
 
     # -- what a subclass writes
 
@@ -317,11 +284,13 @@ class Augmentation(SampleTransform):
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
             )
-        batch_type = type(camera) if isinstance(camera, Mixed) else None
+
+        def part(rows: list[int] | None, source: Camera) -> Part:
+            return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
+
         looks = may_look(applied) or count == 0
         if not looks or bool(applied.all()):  # traced, all rows move, and a gate chooses
-            parts = [self._part_of(rows, group, draw, True) for rows, group in groups]
-            return Change(count, parts, batch_type=batch_type, gate=None if looks or self.p == 1 else applied)
+            return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
         parts, chosen = [], applied.tolist()
         for rows, group in groups:
             rows = list(range(count)) if rows is None else rows
@@ -329,19 +298,15 @@ class Augmentation(SampleTransform):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
                 if here:
                     source = group[here] if group.batch_shape and len(here) < len(rows) else group
-                    parts.append(self._part_of([rows[n] for n in here], source, draw, moves))
+                    own = [rows[n] for n in here]
+                    parts.append(part(own, source) if moves else Part(own, None, source))
         sizes = {part.target.image_size for part in parts}
         if len(sizes) > 1 and len(before) == 1:
             found = sorted(map(str, sizes))
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {found}; with p < 1 the size must stay"
             )
-        return Change(count, parts, batch_type=batch_type)
-
-    def _part_of(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor], moves: bool) -> Part:
-        if not moves:
-            return Part(rows, None, source)
-        return self._part(rows, source, draw if rows is None else {name: value[rows] for name, value in draw.items()})
+        return Change(count, parts, batch_type=type(camera) if isinstance(camera, Mixed) else None)
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         as_mapping(draw, "draw", self._name, "what draw() returns")
@@ -377,8 +342,8 @@ class Augmentation(SampleTransform):
     def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What `new_camera` is given."""
         values = {name: value for name, value in draw.items() if name != "apply"}
-        batched = bool(source.batch_shape) or not _one_for_all(values)
-        if not batched:  # one map serves the whole batch
+        # one map serves the whole batch where all samples draw the same
+        if not source.batch_shape and all(holds(value == value[:1]) for value in values.values()):
             values = {name: value[0] for name, value in values.items()}
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
@@ -433,8 +398,7 @@ class Augmentation(SampleTransform):
 
     # -- applying
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def forward(
         self,
         sample: Mapping[str, Any] | None = None,
@@ -469,8 +433,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def inverse(
         self,
         sample: Mapping[str, Any] | None = None,
@@ -516,6 +479,70 @@ class Augmentation(SampleTransform):
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
 
 
-def _one_for_all(values: Mapping[str, Tensor]) -> bool:
-    """Whether all samples draw the same. Of none, nothing can be said."""
-    return all(holds(value == value[:1]) for value in values.values())
+# -- for front ends, which hold an augmentation and the camera of their images
+
+
+def check_front_end(owner: str, augmentation: object, camera: object) -> None:
+    """Raise a TypeError unless this is an augmentation, and that a camera or None."""
+    if not isinstance(augmentation, Augmentation):
+        raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
+    if camera is not None and not isinstance(camera, Camera):
+        raise TypeError(f"{owner}: camera must be a Camera; got {no_camera(camera)}")
+
+
+def check_single(
+    owner: str, camera: Camera, sizes: Sequence[tuple[str, tuple[int, ...]]], hint: str = ""
+) -> tuple[int, int]:
+    """The image_size of a single camera.
+
+    Raises:
+        ValueError: a batch, no image_size, or images, by name, of other sizes.
+    """
+    if camera.image_size is None or camera.batch_shape:
+        raise ValueError(
+            f"{owner}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} and "
+            f"batch dims {tuple(camera.batch_shape)}{hint}"
+        )
+    for name, size in sizes:
+        if size != camera.image_size:
+            raise ValueError(
+                f"{owner}: {name} is {size} (height, width), but the camera's image_size is {camera.image_size}. "
+                "camera.resize, .crop and .pad give the camera of an edited image"
+            )
+    return camera.image_size
+
+
+def camera_of_sample(
+    owner: str, augmentation: Augmentation, camera: object, sizes: Sequence[tuple[str, tuple[int, ...]]]
+) -> Camera:
+    """The single camera of a sample whose images are of these sizes: the one given, the augmentation's, or none known.
+
+    Raises:
+        ValueError: none is known, and the augmentation needs one; a batch; images of another size.
+    """
+    camera = augmentation.camera if camera is None else camera
+    if camera is None and sizes and not augmentation.needs_camera:
+        height, width = sizes[0][1]
+        camera = Unknown.of((height, width))
+    if not isinstance(camera, Camera):
+        how = "give one here, in the sample, or to the augmentation"
+        raise ValueError(f"{owner}: no camera; {how}; got {shown(camera)}. {GUESS_CAMERA}")
+    check_single(owner, camera, sizes)
+    return camera
+
+
+def move_points(augmentation: Augmentation, change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Keypoints (B, *N, 2) moved, and valid (B, *N); landmarks in their order in a mirror.
+
+    (-1, -1), by which front ends say that a point has no place, stays that, and is not valid.
+    """
+    lost = (pixels == -1).all(-1)
+    moved, valid = change.points(pixels)
+    moved, valid = torch.where(lost.unsqueeze(-1), -1.0, moved), valid & ~lost
+    mirrored, mirroring = change.mirrored, augmentation.mirroring
+    order = None if mirroring is None else mirroring.order("keypoints", "keypoints", pixels.shape[-2])
+    if mirrored is None or order is None:
+        return moved, valid
+    rows, index = mirrored.reshape(-1, *[1] * (valid.ndim - 1)), torch.tensor(order, device=pixels.device)
+    moved = torch.where(rows.unsqueeze(-1), moved.index_select(-2, index), moved)
+    return moved, torch.where(rows, valid.index_select(-1, index), valid)

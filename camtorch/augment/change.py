@@ -16,9 +16,10 @@ from camtorch._module import remade
 from camtorch.camera import Camera
 from camtorch.mixed import Listed, Mixed
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
+from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shutter import Shutters
-from camtorch.warp.warp import Warp, corners_of, in_order
+from camtorch.warp.warp import Warp
 
 _ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
 Moved = TypeVar("Moved", Tensor, tuple[Tensor, Tensor])
@@ -48,18 +49,16 @@ class Part:
         """After the change."""
         return self.camera if self.warp is None else self.warp.target
 
+    def by(self, change: Callable[[Warp], Warp]) -> Part:
+        """The part with each of its warps changed."""
+        shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
+        return replace(self, warp=None if self.warp is None else change(self.warp), shades=shades)
+
     def take(self, index: list[int]) -> Part:
         """These rows of the part, as all there is."""
         camera = _rows_of(self.camera, index)
-        if self.warp is None:
-            return Part(None, None, camera)
-
-        def of(warp: Warp) -> Warp:
-            return _rows_of_warp(warp, camera, index)
-
         light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
-        shades = None if self.shades is None else (of(self.shades[0]), of(self.shades[1]))
-        return Part(None, of(self.warp), camera, shades, light)
+        return replace(self.by(lambda warp: _rows_of_warp(warp, camera, index)), rows=None, camera=camera, light=light)
 
 
 def _rows_of(camera: Camera, index: list[int]) -> Camera:
@@ -103,22 +102,15 @@ def _joined(a: Part, b: Part) -> Part:
                 "go to the last lens of a chain"
             )
 
-        def of(warp: Warp) -> Warp:
-            return MirrorWarp(a.camera, warp.target, rotation, **warp.shutters)
-
-        shades = None if b.shades is None else (of(b.shades[0]), of(b.shades[1]))
-        return Part(a.rows, of(b.warp), a.camera, shades, b.light)
+        moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation, **warp.shutters))
+        return replace(moved, rows=a.rows, camera=a.camera)
     edit, size = b.warp.matrix, b.warp.target.image_size
     if isinstance(first, AffineWarp):
         matrix = after(edit, first.matrix)
-        return Part(a.rows, AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation), a.camera)
-
-    def moved(warp: Warp) -> Warp:
-        return MirrorWarp(a.camera, edited(warp.target, edit, size), rotation)
-
-    shades = None if a.shades is None else (moved(a.shades[0]), moved(a.shades[1]))
+        return replace(a, warp=AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation))
     light = None if a.light is None else b.warp(a.light, padding_mode="border")
-    return Part(a.rows, moved(first), a.camera, shades, light)
+    moved = a.by(lambda warp: MirrorWarp(a.camera, edited(warp.target, edit, size), rotation))
+    return replace(moved, light=light)
 
 
 def _optioned(warp: Warp, options: Options) -> Warp:
@@ -135,12 +127,6 @@ def _both_turns(first: Tensor | None, second: Tensor | None) -> Tensor | None:
         return first if second is None else second
     dtype = torch.promote_types(first.dtype, second.dtype)
     return (second.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
-
-
-def _intrinsics(cameras: Camera | Sequence[Camera]) -> Tensor:
-    """(n, 4), of all of them."""
-    rows = [cameras] if isinstance(cameras, Camera) else cameras
-    return torch.cat([camera.intrinsics.detach().reshape(-1, 4) for camera in rows])
 
 
 class Change:
@@ -189,7 +175,7 @@ class Change:
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
-        ours, theirs = _intrinsics(self.target), _intrinsics(camera)
+        ours, theirs = (one.intrinsics.detach().reshape(-1, 4) for one in (self.target, as_one(camera)))
         return ours.shape == theirs.shape and not fails(
             torch.isclose(ours.double(), theirs.to(ours.device).double(), _ROUNDED)
         )
@@ -235,7 +221,7 @@ class Change:
             return None
         device = self.parts[0].camera.intrinsics.device
         flags = [
-            torch.zeros(n, dtype=torch.bool, device=device) if t is None else (_handedness(t) < 0).expand(n)
+            torch.zeros(n, dtype=torch.bool, device=device) if t is None else (torch.linalg.det(t) < 0).expand(n)
             for t, n in zip(turns, self._counts, strict=True)
         ]
         rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
@@ -268,16 +254,8 @@ class Change:
 
     def with_options(self, options: Options) -> Change:
         """The change with its warps made anew by other options."""
-
-        def of(part: Part) -> Part:
-            if part.warp is None:
-                return part
-            shades = part.shades
-            if shades is not None:
-                shades = _optioned(shades[0], options), _optioned(shades[1], options)
-            return replace(part, warp=_optioned(part.warp, options), shades=shades)
-
-        return Change(self.count, [of(part) for part in self.parts], batch_type=self.batch_type, gate=self.gate)
+        parts = [part.by(lambda warp: _optioned(warp, options)) for part in self.parts]
+        return Change(self.count, parts, batch_type=self.batch_type, gate=self.gate)
 
     def row(self, i: int) -> Change:
         """The change of one sample."""
@@ -360,7 +338,11 @@ class Change:
 
     def points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (count, *N, 2), and valid (count, *N): on the image."""
-        return self.each(pixels, lambda part, warp, rows: warp.transform_points(rows), _where_they_are)
+        return self.each(
+            pixels,
+            lambda part, warp, rows: warp.transform_points(rows),
+            lambda camera, rows: (rows, camera.contains(rows)),
+        )
 
     def boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
@@ -411,11 +393,17 @@ class Change:
         Edits leave values as they are; another lens or mount sees the same distance at another depth.
         """
 
+        def ahead(camera: Camera, like: Tensor) -> Tensor:
+            """(n or 1, 1, H, W): the z of every pixel's ray, 0 without one."""
+            rays, valid = camera.rays()
+            z = (rays[..., 2] * valid).to(like)
+            return z.reshape(-1, 1, *z.shape[-2:])
+
         def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
             if isinstance(warp, AffineWarp):
                 return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
             wide = widen(rows)
-            before, after = (_forward(camera, wide) for camera in (warp.source, warp.target))
+            before, after = (ahead(camera, wide) for camera in (warp.source, warp.target))
             distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
             moved = warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
             return narrow(moved, rows.dtype)
@@ -423,22 +411,17 @@ class Change:
         return self.each(depth, move, lambda camera, rows: rows)
 
 
-def _handedness(rotation: Tensor) -> Tensor:
-    """(*B,): the determinant of orthogonal matrices, 1 or -1."""
-    x, y, z = rotation.unbind(-2)
-    triple: Tensor = (torch.linalg.cross(x, y) * z).sum(-1)
-    return triple
-
-
-def by_kinds(count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part]) -> Change:
+def by_kinds(
+    count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part], gate: Tensor | None = None
+) -> Change:
     """The change of samples by one camera or a batch of them: `part` makes the part of each kind of camera.
 
     Its arguments are those rows, None for all, and their cameras.
     """
     camera = alone(camera)
     if not isinstance(camera, Mixed):
-        return Change(count, [part(None, camera)])
-    return Change(count, [part(rows, source) for rows, source in camera.groups], batch_type=type(camera))
+        return Change(count, [part(None, camera)], gate=gate)
+    return Change(count, [part(rows, source) for rows, source in camera.groups], batch_type=type(camera), gate=gate)
 
 
 def as_one(camera: Camera | Sequence[Camera]) -> Camera:
@@ -449,17 +432,6 @@ def as_one(camera: Camera | Sequence[Camera]) -> Camera:
 def alone(camera: Camera) -> Camera:
     """A batch of one as the camera that it holds, which serves any number of samples."""
     return camera[0] if tuple(camera.batch_shape) == (1,) else camera
-
-
-def _forward(camera: Camera, like: Tensor) -> Tensor:
-    """(n or 1, 1, H, W): the z of every pixel's ray, 0 without one."""
-    rays, valid = camera.rays()
-    z = (rays[..., 2] * valid).to(like)
-    return z.reshape(-1, 1, *z.shape[-2:])
-
-
-def _where_they_are(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    return pixels, camera.contains(pixels)
 
 
 def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:

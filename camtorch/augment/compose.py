@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_flag, as_mapping
+from camtorch._arguments import as_mapping
 from camtorch.augment.augmentation import Augmentation, Range, draw
 from camtorch.augment.change import Change
 from camtorch.augment.edits import Edit, change_by
@@ -86,10 +86,9 @@ class Compose(Augmentation):
             ranges,
             camera=camera,
             fields=fields,
-            antialias=antialias is not None and as_flag(antialias, "antialias", name),
+            antialias=antialias,
             **options,
         )
-        self.antialias = antialias
         self.augmentations = nn.ModuleList(parts)
         self.needs_camera: bool = any(part.needs_camera for part in parts)
         self._check_options(parts)
@@ -132,7 +131,6 @@ class Compose(Augmentation):
     def drawn(
         self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """See `Augmentation.drawn`."""
         values = draw({}, count, p, same_on_batch, generator)
         for i, part in enumerate(self.parts):
             own = part.drawn(count, part.p, same_on_batch or part.same_on_batch, generator)
@@ -140,7 +138,6 @@ class Compose(Augmentation):
         return values
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
-        """The size of what comes out of images of a size."""
         for part in self.parts:
             size = part.size_after(size)
         return size
@@ -148,7 +145,6 @@ class Compose(Augmentation):
     # -- applying
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        """The last camera, and what the rays have become; see `Augmentation.new_camera`."""
         count = max((len(value) for value in values.values() if value.ndim), default=1)
         draw = {key: value.expand(count, *value.shape) if not value.ndim else value for key, value in values.items()}
         change = self._change(source, {"apply": torch.ones(count, dtype=torch.bool), **draw})
@@ -159,7 +155,6 @@ class Compose(Augmentation):
         return target, change.rotation
 
     def tell_of_empty_images(self, camera: Camera) -> None:
-        """What the augmentations tell of images of such a camera."""
         for part in self.parts:
             part.tell_of_empty_images(camera)
 

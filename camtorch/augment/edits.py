@@ -45,8 +45,7 @@ class Edit(Augmentation):
     def __init__(self, ranges: Mapping[str, Range] | None = None, *, antialias: bool | None = None, **options: Any):
         if options.get("min_filled") is not None:
             raise TypeError(f"{type(self).__name__}: there is no min_filled here; RandomCamera has it")
-        super().__init__(ranges, antialias=bool(antialias), **options)
-        self.antialias = antialias
+        super().__init__(ranges, antialias=antialias, **options)
 
     needs_camera = False
 
@@ -66,14 +65,12 @@ class Edit(Augmentation):
         """
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
-        """The size of what comes out of images of a size."""
         nothing = {n: torch.full(() if r.size is None else (r.size,), r.low).double() for n, r in self.ranges.items()}
         return self.edit(size, nothing)[1]
 
     # -- what follows from it
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        """The camera of the edited image, and the mirror or the turn; see `Augmentation.new_camera`."""
         matrix, size = self.edit(
             (source.height, source.width), {name: value.double() for name, value in values.items()}
         )
@@ -148,7 +145,17 @@ def _box_to(size: tuple[int, int], left: Any, top: Any, width: Any, height: Any)
     return _map(across, (0.5 - left) * across - 0.5, down, (0.5 - top) * down - 0.5)
 
 
-class RandomResizedCrop(Edit):
+class _Sized(Edit):
+    """An edit whose images come out in one size, (height, width), of which one number makes a square."""
+
+    image_size: tuple[int, int]
+
+    def __init__(self, size: Size, ranges: Mapping[str, Range] | None = None, **options: Any):
+        super().__init__(ranges, **options)
+        self.image_size = _as_size(size, self._name)
+
+
+class RandomResizedCrop(_Sized):
     """A box of the image at random, of another size: as of torchvision, one for every sample.
 
     Args:
@@ -174,23 +181,20 @@ class RandomResizedCrop(Edit):
             "ratio": Range(math.log(ratios.low), math.log(ratios.high)),
             "place": Range(0, 1, 2),
         }
-        super().__init__(ranges, **options)
-        self.image_size: tuple[int, int] | None = _as_size(size, name)
+        super().__init__(size, ranges, **options)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """The box, of whole pixels, to the size."""
-        (rows, cols), new = size, self.image_size
-        assert new is not None
+        rows, cols = size
         ratio = values["ratio"].exp()
         width = (values["scale"] * rows * cols * ratio).sqrt()
         width = torch.minimum(width.clamp(max=cols), rows * ratio)
         height = (width / ratio).round().clamp(1, rows)
         width = width.round().clamp(1, cols)
         left, top = ((values["place"] * torch.stack((cols - width, rows - height), -1)).round()).unbind(-1)
-        return _box_to(new, left, top, width, height), new
+        return _box_to(self.image_size, left, top, width, height), self.image_size
 
 
-class RandomCrop(Edit):
+class RandomCrop(_Sized):
     """A box of a size at a random place of the image.
 
     Args:
@@ -199,21 +203,18 @@ class RandomCrop(Edit):
     """
 
     def __init__(self, size: Size, **options: Unpack[EditOptions]):
-        super().__init__({"place": Range(0, 1, 2)}, **options)
-        self.image_size: tuple[int, int] | None = _as_size(size, self._name)
+        super().__init__(size, {"place": Range(0, 1, 2)}, **options)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """The box at its place."""
-        new = self.image_size
-        assert new is not None
-        if new[0] > size[0] or new[1] > size[1]:
+        (height, width), new = size, self.image_size
+        if new[0] > height or new[1] > width:
             raise ValueError(f"{self._name}: the box {new} must lie within the image, which is {size}; Pad enlarges it")
-        room = values["place"].new_tensor([size[1] - new[1], size[0] - new[0]])
+        room = values["place"].new_tensor([width - new[1], height - new[0]])
         left, top = (values["place"] * room).round().unbind(-1)
         return _map(1.0, -left, 1.0, -top), new
 
 
-class CenterCrop(Edit):
+class CenterCrop(_Sized):
     """The middle of the image, with `fill` around where it is smaller than that.
 
     Args:
@@ -222,15 +223,11 @@ class CenterCrop(Edit):
     """
 
     def __init__(self, size: Size, **options: Unpack[EditOptions]):
-        super().__init__(**options)
-        self.image_size: tuple[int, int] | None = _as_size(size, self._name)
+        super().__init__(size, **options)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """The middle, to the whole pixel."""
-        new = self.image_size
-        assert new is not None
-        top, left = ((before - now) // 2 for before, now in zip(size, new, strict=True))
-        return _map(1.0, -left, 1.0, -top), new
+        top, left = ((before - now) // 2 for before, now in zip(size, self.image_size, strict=True))
+        return _map(1.0, -left, 1.0, -top), self.image_size
 
 
 class Resize(Edit):
@@ -252,12 +249,10 @@ class Resize(Edit):
             raise ValueError(f"{self._name}: size must be positive; got {size!r}")
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """All of the image to the size."""
-        new = self.image_size
-        if new is None:
-            assert self.shorter is not None
+        height, width = size
+        if self.image_size is None and self.shorter is not None:
             height, width = (max(int(self.shorter * side / min(size)), 1) for side in size)
-            new = height, width
+        new = self.image_size or (height, width)
         return _box_to(new, 0, 0, size[1], size[0]), new
 
 
@@ -289,7 +284,6 @@ class Pad(Edit):
             self.padding = sides * (4 // len(sides))
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """All of the image, moved."""
         if self.least is not None:
             new = max(self.least[0], size[0]), max(self.least[1], size[1])
             top, left = ((now - before) // 2 for before, now in zip(size, new, strict=True))
@@ -327,11 +321,9 @@ class Rotate90(Edit):
         super().__init__({"times": Range(0, 1)}, **options)
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
-        """The size after the least number of turns."""
         return size[::-1] if self.times[0] % 2 else size
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """The turn; see `Camera.rot90`."""
         (low, high, step), (height, width) = self.times, size
         count = (high - low) // step + 1
         turns = (low + step * (values["times"] * count).floor().clamp(max=count - 1)).long() % 4
@@ -381,7 +373,6 @@ class HorizontalFlip(_Flip):
     """
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """The columns from right to left."""
         return _map(-1.0, size[1] - 1, 1.0, 0.0), size
 
 
@@ -392,7 +383,6 @@ class VerticalFlip(_Flip):
     """
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
-        """The rows from bottom to top."""
         return _map(1.0, 0.0, -1.0, size[0] - 1), size
 
 

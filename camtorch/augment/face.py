@@ -11,15 +11,16 @@ from torch import Tensor
 
 from camtorch._arguments import as_image_size, as_number, fails, no_camera, shown
 from camtorch._module import remade, typed_as
-from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, Part, alone
-from camtorch.augment.sample import Sample, SampleTransform, without_graph_in_workers
+from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import check_rotation, rotation_matrix
-from camtorch.warp.sampling import Options, as_options
 from camtorch.warp.warp import Warp
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
 
@@ -60,26 +61,17 @@ class FaceNormalizer(SampleTransform):
     distance: float
     image_size: tuple[int, int]
     axis: tuple[float, ...]
-    options: Options
 
     def __init__(
         self,
         *,
-        camera: Camera | None = None,
         focal: float = 960.0,
         distance: float = 600.0,
         image_size: Sequence[int] = (224, 224),
         axis: tuple[float, float] | None = None,
-        mode: str = "bilinear",
-        padding_mode: str = "zeros",
-        fill: float | Sequence[float] = 0.0,
-        antialias: bool = False,
-        tolerance: float = 0.001,
-        fields: Mapping[str, str] | None = None,
-        mask_fill: float = 0.0,
-        valid_mask: bool = False,
+        **options: Unpack[SampleOptions],
     ):
-        super().__init__(camera, fields, mask_fill, valid_mask)
+        super().__init__(**options)
         self.focal, self.distance = as_number(focal, "focal", self._name), as_number(distance, "distance", self._name)
         for name, value in (("focal", self.focal), ("distance", self.distance)):
             if not 0 < value < float("inf"):
@@ -94,7 +86,6 @@ class FaceNormalizer(SampleTransform):
             if len(given) != 2:
                 raise TypeError(f"{self._name}: axis must be a pixel (u, v); got {shown(axis)}")
             self.axis = as_number(given[0], "axis", self._name), as_number(given[1], "axis", self._name)
-        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
 
     def change(self, camera: Camera, head_rotation: Tensor, face_centre: Tensor) -> Change:
         """From `camera` to the virtual one.
@@ -136,8 +127,7 @@ class FaceNormalizer(SampleTransform):
         target = remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Normalise a sample, a dict or keyword arguments.
 
@@ -168,8 +158,7 @@ class FaceNormalizer(SampleTransform):
             moved["source_rotation"] = sample["rotation"].clone()
         return moved
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Move what was predicted on a normalised sample back to the frame and the image of its source camera.
 

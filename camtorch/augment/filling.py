@@ -13,7 +13,7 @@ from camtorch._module import remade
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch.camera import Camera
 from camtorch.rotations import rotation_matrix, rotation_vector, turn
-from camtorch.warp.warp import along_edges
+from camtorch.warp.boxes import along_edges
 
 _POINTS, _RIM = 1000, 16  # over the image, and along each of its edges
 _ROOT = 1.324717957244746

@@ -24,7 +24,7 @@ from camtorch._arguments import as_part, shown
 from camtorch._dtypes import narrow, widen
 from camtorch._module import Memo, remade
 from camtorch.augment import compose, edits, random_camera
-from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.augmentation import Augmentation, check_front_end, check_single, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
@@ -108,27 +108,20 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         keepdim: bool = False,
     ):
         name = type(self).__name__
-        if not isinstance(augmentation, Augmentation):
-            raise TypeError(f"{name}: augmentation must be one of camtorch.augment; got {type(augmentation).__name__}")
+        check_front_end(name, augmentation, camera)
         camera = augmentation.camera if camera is None else camera
         if not isinstance(camera, Camera):
             raise TypeError(f"{name}: camera must be the Camera of the images; got {type(camera).__name__}")
-        if camera.image_size is None or camera.batch_shape:
-            raise ValueError(
-                f"{name}: camera must be a single one with image_size=(height, width); got batch dims "
-                f"{tuple(camera.batch_shape)} and {camera.image_size}. with_cameras gives every sample its own"
-            )
-        p, p_batch = (
-            augmentation.p if p is None else as_part(p, "p", name, "probability"),
-            as_part(p_batch, "p_batch", name, "probability"),
-        )
+        own_size = check_single(name, camera, (), ". with_cameras gives every sample its own")
+        p = augmentation.p if p is None else as_part(p, "p", name, "probability")
+        p_batch = as_part(p_batch, "p_batch", name, "probability")
         same_on_batch = augmentation.same_on_batch if same_on_batch is None else same_on_batch
         super().__init__(p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
         self.augmentation, self.camera = augmentation, camera
         self.flags: dict[str, Any] = {"resample": Resample.get(augmentation.options["mode"]), "align_corners": False}
         self.flags["padding_mode"] = SamplePadding.get(augmentation.options["padding_mode"])
-        size = augmentation.size_after(camera.image_size)
-        if size != camera.image_size:
+        size = augmentation.size_after(own_size)
+        if size != own_size:
             self.flags["size"] = size
         self._kind = _kind(camera)
         self.keypoints_valid: Tensor | None = None
@@ -144,12 +137,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
         """Draw, as `Augmentation.draw` does after its gate; images must be of the camera's image_size."""
-        count, size = batch_shape[0], tuple(batch_shape[-2:])
-        if size != self.camera.image_size:
-            raise ValueError(
-                f"{type(self).__name__}: images are {size} (height, width), but the camera's image_size is "
-                f"{self.camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
-            )
+        count = batch_shape[0]
+        check_single(type(self).__name__, self.camera, [("images", tuple(batch_shape[-2:]))])
         if count:
             self.augmentation.tell_of_empty_images(self.camera)
         drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)
@@ -221,21 +210,11 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         self, input: Keypoints, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
     ) -> Keypoints:
         rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
-        moved, valid = self._move(params, rows, lambda change, pixels: change.points(pixels), back)
-        lost = (rows == -1).all(-1)
-        moved, valid, lost = self._mirrored(params, moved, valid, lost)
+        own = self.augmentation
+        moved, valid = self._move(params, rows, lambda change, pixels: move_points(own, change, pixels), back)
         result = input.clone()
-        result._data = torch.where(lost.unsqueeze(-1), -1.0, moved).reshape(input.shape)
-        self.keypoints_valid = (valid & ~lost).reshape(input.shape[:-1])
+        result._data, self.keypoints_valid = moved.reshape(input.shape), valid.reshape(input.shape[:-1])
         return result
-
-    def _mirrored(self, params: Params, *values: Tensor) -> list[Tensor]:
-        """Landmarks (B, N, ...) in their order in a mirror, where the augmentation has a table of them."""
-        mirroring = self.augmentation.mirroring
-        mirrored = None if mirroring is None else self.change(params, values[0].device).mirrored
-        if mirroring is None or mirrored is None:
-            return list(values)
-        return [mirroring.swapped("keypoints", "keypoints", value, mirrored, True) for value in values]
 
     def apply_transform_box(
         self, input: Boxes, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
@@ -289,6 +268,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
 
 
 class _Random(CameraAugmentation):
+    """An augmentation of camtorch under its own name, made of its own arguments."""
+
     _wraps: Callable[..., Augmentation]
 
     def __init__(
@@ -302,127 +283,44 @@ class _Random(CameraAugmentation):
         **options: Any,
     ):
         name = type(self).__name__
-        first, like = (given[0], given[1:]) if camera is None and given else (camera, given)
+        first, own = (given[0], given[1:]) if camera is None and given else (camera, given)
         if not isinstance(first, Camera):
-            shown = repr(first) if isinstance(first, str) else type(first).__name__
-            example = f"{name}(camera, {first!r})" if isinstance(first, str) else f"{name}(camera)"
-            raise TypeError(f"{name}: camera must be the Camera of the images and comes first: {example}; got {shown}")
-        own = self._wraps(*like, **options)
-        super().__init__(own, first, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
+            example, got = f"{name}(camera)", type(first).__name__
+            if isinstance(first, str):
+                example, got = f"{name}(camera, {first!r})", repr(first)
+            raise TypeError(f"{name}: camera must be the Camera of the images and comes first: {example}; got {got}")
+        made = self._wraps(*own, **options)
+        super().__init__(made, first, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
 
 
-class RandomMount(_Random):
-    """`camtorch.augment.RandomMount` for kornia: the camera turned and rolled where it stands, and zoomed.
+def _wrapped(wraps: type[Augmentation], what: str) -> type[_Random]:
+    """The class for kornia of an augmentation, with its name."""
+    name = wraps.__name__
+    doc = f"""`camtorch.augment.{name}` for kornia: {what}.
 
     Args:
         camera: of the images.
+        given, options: those of `camtorch.augment.{name}`; what comes first there follows the camera, or goes by name.
         p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
-        options: yaw, pitch, roll, zoom and so on, of `camtorch.augment.RandomMount`.
 
     Convention:
         as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
     """
-
-    _wraps = random_camera.RandomMount
-
-
-class RandomLens(_Random):
-    """`camtorch.augment.RandomLens` for kornia: another lens before the camera, which stays where it looks.
-
-    Args and Convention are as in `RandomMount`; after the camera comes `like`. Both may be given by name.
-    """
-
-    _wraps = random_camera.RandomLens
+    return type(name, (_Random,), {"_wraps": wraps, "__doc__": doc, "__module__": __name__})
 
 
-class RandomCamera(_Random):
-    """`camtorch.augment.RandomCamera` for kornia: another camera in the same place, turned and with another lens.
-
-    Args and Convention are as in `RandomMount`; after the camera comes `like`. Both may be given by name.
-    """
-
-    _wraps = random_camera.RandomCamera
-
-
-class RandomResizedCrop(_Random):
-    """`camtorch.augment.RandomResizedCrop` for kornia: a box at random, of another size.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.RandomResizedCrop`.
-    """
-
-    _wraps = edits.RandomResizedCrop
-
-
-class RandomCrop(_Random):
-    """`camtorch.augment.RandomCrop` for kornia: a box of a size at random.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.RandomCrop`.
-    """
-
-    _wraps = edits.RandomCrop
-
-
-class CenterCrop(_Random):
-    """`camtorch.augment.CenterCrop` for kornia: the middle of the image.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.CenterCrop`.
-    """
-
-    _wraps = edits.CenterCrop
-
-
-class Resize(_Random):
-    """`camtorch.augment.Resize` for kornia: the image in another size.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Resize`.
-    """
-
-    _wraps = edits.Resize
-
-
-class Pad(_Random):
-    """`camtorch.augment.Pad` for kornia: a rim around the image.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Pad`.
-    """
-
-    _wraps = edits.Pad
-
-
-class HorizontalFlip(_Random):
-    """`camtorch.augment.HorizontalFlip` for kornia: mirrored left to right, landmarks in their order in a mirror.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.HorizontalFlip`.
-    """
-
-    _wraps = edits.HorizontalFlip
-
-
-class VerticalFlip(_Random):
-    """`camtorch.augment.VerticalFlip` for kornia: mirrored top to bottom.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.VerticalFlip`.
-    """
-
-    _wraps = edits.VerticalFlip
-
-
-class Rotate90(_Random):
-    """`camtorch.augment.Rotate90` for kornia: turned by quarters.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Rotate90`.
-    """
-
-    _wraps = edits.Rotate90
-
-
-class Compose(_Random):
-    """`camtorch.augment.Compose` for kornia: several augmentations of camtorch, not of kornia, as one.
-
-    Args and Convention are as in `RandomMount`; after the camera come those of `camtorch.augment.Compose`.
-    """
-
-    _wraps = compose.Compose
+RandomMount = _wrapped(random_camera.RandomMount, "the camera turned and rolled where it stands, and zoomed")
+RandomLens = _wrapped(random_camera.RandomLens, "another lens before the camera, which stays where it looks")
+RandomCamera = _wrapped(random_camera.RandomCamera, "another camera in the same place, turned and with another lens")
+RandomResizedCrop = _wrapped(edits.RandomResizedCrop, "a box at random, of another size")
+RandomCrop = _wrapped(edits.RandomCrop, "a box of a size at random")
+CenterCrop = _wrapped(edits.CenterCrop, "the middle of the image")
+Resize = _wrapped(edits.Resize, "the image in another size")
+Pad = _wrapped(edits.Pad, "a rim around the image")
+HorizontalFlip = _wrapped(edits.HorizontalFlip, "mirrored left to right, landmarks in their order in a mirror")
+VerticalFlip = _wrapped(edits.VerticalFlip, "mirrored top to bottom")
+Rotate90 = _wrapped(edits.Rotate90, "turned by quarters")
+Compose = _wrapped(compose.Compose, "several augmentations of camtorch, not of kornia, as one")
 
 
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:

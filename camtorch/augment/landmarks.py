@@ -116,9 +116,12 @@ class Mirroring:
         owner: the augmentation, for errors.
     """
 
-    given: TableLike | Mapping[str, TableLike | None] | None
-    swap_sides: bool
-    owner: str
+    lateral: int
+    """The number of the lateral axis."""
+    by_name: tuple[str, ...]
+    """The fields that tables are given for by name."""
+    key: object
+    """Equal for those that do the same."""
 
     def __init__(
         self,
@@ -131,7 +134,7 @@ class Mirroring:
             raise ValueError(
                 f"{owner}: lateral_axis must be 'x', 'y' or 'z', of the head's frame; got {shown(lateral_axis)}"
             )
-        self.given, self.lateral_axis, self.owner = landmarks, lateral_axis, owner
+        self.lateral, self.owner = "xyz".index(lateral_axis), owner
         self.swap_sides = as_flag(swap_sides, "swap_sides", owner)
         self._named: dict[str, Table | None] | None = None
         self._one: Table | None = None
@@ -139,21 +142,8 @@ class Mirroring:
             self._named = {name: None if t is None else as_table(t, owner) for name, t in landmarks.items()}
         elif landmarks is not None:
             self._one = as_table(landmarks, owner)
-
-    @property
-    def key(self) -> object:
-        """Equal for those that do the same."""
-        return self._named, self._one, self.lateral_axis, self.swap_sides
-
-    @property
-    def by_name(self) -> tuple[str, ...]:
-        """The fields that tables are given for by name."""
-        return () if self._named is None else tuple(self._named)
-
-    @property
-    def lateral(self) -> int:
-        """The number of the lateral axis."""
-        return "xyz".index(self.lateral_axis)
+        self.by_name = tuple(self._named or ())
+        self.key = self._named, self._one, self.lateral, self.swap_sides
 
     def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
         """The order of `count` landmarks of a field in a mirror, or None if they keep theirs.

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
+from functools import lru_cache
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -21,13 +22,14 @@ from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.domain import Domain, domain_of
+from camtorch.projection.domain import domain_of
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
 from camtorch.projection.unproject import has_ray
 from camtorch.rotations import mount_rotation
-from camtorch.warp.light import vignetting
+from camtorch.warp.boxes import along_edges
 from camtorch.warp.shutter import RollingShutter
-from camtorch.warp.warp import Warp, along_edges
+from camtorch.warp.vignetting import vignetting
+from camtorch.warp.warp import Warp
 
 RangeLike = float | Sequence[float]
 
@@ -36,7 +38,7 @@ DRAWN = 16
 """How many coefficients have a draw of their own; more take turns."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
 _STEP = 1e-4
-_PARTS = -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step that is too long, in the order in which they are tried
+_PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step, in the order in which they are tried
 _REAL = "real"
 _FOCAL, _CENTRE, _DISTORTION, _CROP = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02), (0.9, 1.0)
 _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05)
@@ -127,7 +129,7 @@ class RandomCamera(Augmentation):
     ):
         super().__init__(**options)
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
-        self._memo, self._plane = Memo(), Memo()
+        self._memo = Memo()
         self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
         self._is_real = isinstance(like, str) and like == _REAL
         self.like = None if self._is_real else _as_like(like, self._name)
@@ -249,84 +251,41 @@ class RandomCamera(Augmentation):
             intrinsics, k, reach = drawn(values["lens"], size, self._among)
             base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
-        if any(t.dtype != dtype or t.device != device for t in (base.intrinsics, base.distortion)):
+        if any(t.dtype != dtype or t.device != device for t in base.tensors):
             base = base.each(lambda t: t.to(device, dtype))
-        jitters = "distortion" in values and base.distortion.shape[-1] > 0
         if self.fov == "source":
             intrinsics = usual = self._from_source(source, base, size)
         else:
-            intrinsics = self._sized(base, size, values.get("fov"))
-            usual = self._usual(base, size) if jitters else intrinsics
-        fx, fy, cx, cy = intrinsics.unbind(-1)
+            intrinsics = _sized(base, size, values.get("fov"))
+            usual = self._usual(base, size) if "fov" in values and "distortion" in values else intrinsics.detach()
+        focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
         for name in ("focal", "zoom"):
             if name in values:
-                fx, fy = fx * values[name], fy * values[name]
+                focal = focal * values[name].unsqueeze(-1)
+        sides = focal.new_tensor(size[::-1])
         if "centre" in values:
-            cx, cy = cx + values["centre"][..., 0] * size[1], cy + values["centre"][..., 1] * size[0]
+            centre = centre + values["centre"] * sides
         if self._is_real:
-            factor = covering(torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1), reach, size)
-            fx, fy = fx * factor, fy * factor
+            focal = focal * covering(_numbers(focal, centre), reach, size).unsqueeze(-1)
         distortion = base.distortion
-        if jitters:
-            intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
-            sized = remade(base, intrinsics=intrinsics, image_size=size).detach()
-            distortion = jittered(sized, values["distortion"], usual)
+        if "distortion" in values and distortion.shape[-1]:
+            drawn_to = remade(base, intrinsics=_numbers(focal, centre), image_size=size).detach()
+            distortion = jittered(drawn_to, values["distortion"], usual)
             if in_graph(base.distortion):
                 distortion = base.distortion + (distortion - base.distortion.detach())
-        if "crop" in values:
-            fx, fy, cx, cy = _cropped(fx, fy, cx, cy, size, values["crop"], values["place"])
-        intrinsics = torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
-        return remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
+        if "crop" in values:  # a part of the image, enlarged to the full size
+            share = values["crop"].unsqueeze(-1)
+            corner = (1 - share) * values["place"] * sides
+            focal, centre = focal / share, (centre + 0.5 - corner) / share - 0.5
+        return remade(base, intrinsics=_numbers(focal, centre), distortion=distortion, image_size=size)
 
     def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
-        """(*B, 4): intrinsics of the lens before anything was drawn; graph-free."""
+        """(*B, 4): intrinsics of the lens with the field of view in the middle of the range; graph-free."""
 
         def made() -> Tensor:
-            fov = base.intrinsics.new_tensor(self.ranges["fov"].middle) if "fov" in self.ranges else None
-            return self._sized(base, size, fov).detach()
+            return _sized(base, size, base.intrinsics.new_tensor(self.ranges["fov"].middle)).detach()
 
-        kept: Tensor = self._memo((base.intrinsics, base.distortion), (type(base), base.image_size, size), made)
-        return kept
-
-    def _sized(self, base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
-        """Intrinsics (*B, 4) of a lens before an image of another size, showing as much in width or a fov in degrees.
-
-        The old image is scaled to the new width, and cropped or padded evenly to the new height.
-        """
-        (height, width), (fx, fy, cx, cy) = size, base.intrinsics.unbind(-1)
-        if base.image_size is None:
-            cx, cy = cx + (width - 1) / 2, cy + (height - 1) / 2
-        elif base.image_size != size:
-            scale = width / base.image_size[1]
-            fx, fy, cx = fx * scale, fy * scale, (cx + 0.5) * scale - 0.5
-            cy = (cy - (base.image_size[0] - 1) / 2) * scale + (height - 1) / 2
-        if fov is not None:
-            focal = width / self._plane_width(base, fov)
-            fx, fy = focal, focal * fy / fx
-        return torch.stack(torch.broadcast_tensors(fx, fy, cx, cy), -1)
-
-    def _plane_width(self, base: Camera, fov: Tensor) -> Tensor:
-        """(*B,): how wide a field of view in degrees is on the plane of unit focal length."""
-        half = torch.deg2rad(fov) / 2
-        across, ahead = half.sin(), half.cos()
-        rays = torch.stack((-across, torch.zeros_like(half), ahead, across, torch.zeros_like(half), ahead), -1)
-        plane, rays = self._plane_of(base), rays.unflatten(-1, (2, 3))
-        if plane.batch_shape:
-            rays = rays.expand(*broadcast_shapes(rays.shape, (*plane.batch_shape, 2, 3)))
-        ends, valid = plane.project(rays)
-        if fails(valid):
-            raise ValueError(
-                f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees"
-            )
-        return ends[..., 1, 0] - ends[..., 0, 0]
-
-    def _plane_of(self, base: Camera) -> Camera:
-        """The lens with its image on the plane of unit focal length; the last one is kept, with what it tabulated."""
-        ones = base.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0])
-        if in_graph(base.distortion):
-            return remade(base, intrinsics=ones)
-        k = base.distortion
-        kept: Camera = self._plane((k,), (type(base),), lambda: remade(base, intrinsics=ones, distortion=k.clone()))
+        kept: Tensor = self._memo(base.tensors, (type(base), base.image_size, size), made)
         return kept
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
@@ -334,12 +293,43 @@ class RandomCamera(Augmentation):
 
         def narrowed() -> Tensor:
             fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
-            whole = remade(base, intrinsics=self._sized(base, size, fov), image_size=size)
+            whole = remade(base, intrinsics=_sized(base, size, fov), image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
-        numbers = source.intrinsics, source.distortion, base.intrinsics, base.distortion
-        kept: Tensor = self._memo(numbers, (type(source), source.image_size, size), narrowed)
+        kept: Tensor = self._memo(source.tensors + base.tensors, (type(source), source.image_size, size), narrowed)
         return kept
+
+
+def _numbers(focal: Tensor, centre: Tensor) -> Tensor:
+    """Intrinsics (*B, 4)."""
+    return torch.cat(torch.broadcast_tensors(focal, centre), -1)
+
+
+def _sized(base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
+    """Intrinsics (*B, 4) of a lens before an image of another size, showing as much in width or a fov in degrees.
+
+    The old image is scaled to the new width, and cropped or padded evenly to the new height.
+    """
+    focal, centre = base.intrinsics[..., :2], base.intrinsics[..., 2:]
+    middle = (focal.new_tensor(size[::-1]) - 1) / 2
+    if base.image_size is None:
+        centre = centre + middle
+    elif base.image_size != size:
+        scale = size[1] / base.image_size[1]
+        focal, centre = focal * scale, (centre - (focal.new_tensor(base.image_size[::-1]) - 1) / 2) * scale + middle
+    if fov is not None:
+        ends = torch.deg2rad(fov / 2).unsqueeze(-1) * focal.new_tensor([-1.0, 1.0])
+        rays = polar_rays(ends, torch.zeros_like(ends))
+        if base.batch_shape:
+            rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
+        pixels, valid = base.project(rays)
+        if fails(valid):
+            raise ValueError(
+                f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees"
+            )
+        wide = pixels[..., 1, :1] - pixels[..., 0, :1]
+        focal = base.intrinsics[..., :2] * (size[1] / wide)
+    return _numbers(focal, centre)
 
 
 class RandomMount(RandomCamera):
@@ -422,15 +412,6 @@ def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
     return (value, value) if isinstance(value, (int, float)) else value
 
 
-def _cropped(
-    fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor, size: tuple[int, int], share: Tensor, place: Tensor
-) -> tuple[Tensor, ...]:
-    """Intrinsics of a part of the image, `share` (*B,) of each side at `place` (*B, 2), enlarged to the full size."""
-    height, width = size
-    left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
-    return fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
-
-
 def _light(camera: Camera, loss: Tensor) -> Tensor:
     """(B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance."""
     height, width = camera.height, camera.width
@@ -468,34 +449,22 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
 
 @opaque(_shapes)
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
-    batch, count = amounts.shape[:-1], camera.distortion.shape[-1]
-    if count == 0:
-        return (camera.distortion.new_empty(*batch, 0),)
-    amounts = amounts.reshape(-1, DRAWN)
-    if count != DRAWN:
-        amounts = amounts[:, :count] if count < DRAWN else amounts[:, torch.arange(count) % DRAWN]
-    steps = amounts * _kept(_sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
+    count = camera.distortion.shape[-1]
+    measured = _kept(_sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
+    steps = amounts.reshape(-1, DRAWN)[:, [i % DRAWN for i in range(count)]] * measured
     given = camera.distortion.reshape(-1, count)
     p, q = (w.expand(len(steps), -1) for w in _rim(camera))
-    own = domain_of(camera._model, given, camera.optics)
-    seen = has_ray(own, *(w.reshape(len(given), -1) for w in (p, q))).view_as(p)
-    # nothing is asked for where the old lens shows nothing
-    p, q = torch.where(seen, p, 0.0), torch.where(seen, q, 0.0)
     given = given.expand_as(steps)
-    candidate, defined = _defined(camera, given + steps, given)
-    lenses = domain_of(camera._model, candidate, camera.optics)
-    fits = defined & has_ray(lenses, p, q).all(-1)
-    result = torch.where(fits.unsqueeze(-1), candidate, given)
-    (left,) = (~fits).nonzero(as_tuple=True)
-    if len(left):  # all that may come next at once: (parts, lenses left, n)
-        given, parts = given[left].expand(len(_PARTS), -1, -1), steps.new_tensor(_PARTS)[:, None, None]
-        candidate, defined = _defined(camera, given + parts * steps[left], given)
-        others = Domain(camera.optics, candidate.flatten(0, 1))
-        fits = has_ray(others, *(w[left].repeat(len(_PARTS), 1) for w in (p, q))).all(-1).view_as(defined) & defined
-        first = fits.to(torch.uint8).argmax(0) * len(left) + torch.arange(len(left), device=left.device)
-        some = fits.any(0)
-        result[left] = torch.where(some.unsqueeze(-1), others.k[first], given[0])
-    return (result.view(*batch, count),)
+    result, left = given.clone(), torch.arange(len(steps), device=steps.device)
+    for part in _PARTS:
+        candidate, defined = _defined(camera, given[left] + part * steps[left], given[left])
+        lenses = domain_of(camera._model, candidate, camera.optics)
+        fits = defined & has_ray(lenses, p[left], q[left]).all(-1)
+        result[left[fits]] = candidate[fits]
+        left = left[~fits]
+        if not len(left):
+            break
+    return (result.view(*amounts.shape[:-1], count),)
 
 
 _measured = Memo(24)  # of a batch of eight models
@@ -543,30 +512,37 @@ def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Ten
     return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
 
 
-def _rim(camera: Camera) -> tuple[Tensor, Tensor]:
+def _rim(camera: Camera) -> tuple[Tensor, ...]:
     """Planes (C, N) of points of the sensor in focal lengths: the outline of what the lens shows of the image.
 
-    Of both: the image's edges, and where the lens ends. What is mapped has no holes: a lens that is invertible on the
-    outline is so inside.
+    Of both: the image's edges, and where the lens ends on it; (0, 0) for what it does not show. What is mapped has no
+    holes: a lens that is invertible on the outline is so inside.
     """
-    height, width = camera.height, camera.width
-    corners = camera.intrinsics.new_tensor([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-    intrinsics = camera.intrinsics.reshape(-1, 1, 4)
+    intrinsics, k = camera.intrinsics.reshape(-1, 1, 4), camera.distortion.detach()
     focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
-    edges = (along_edges(corners, _EDGE_SAMPLES) - centre) / focal
-    # edited images have different intrinsics, and few kinds of coefficients
-    lenses, which = (
-        camera.distortion.detach().reshape(-1, camera.distortion.shape[-1]).unique(dim=0, return_inverse=True)
-    )
-    if len(lenses) > _measured.capacity // 2:
-        ends = _ends(camera, camera.distortion).to(edges).reshape(-1, _AZIMUTHS, 2)
-    else:
-        ends = torch.stack([_kept(_ends, camera, lens) for lens in lenses])[which].to(edges)
-    inside = camera.contains(ends * focal + centre)
-    ends = torch.where(inside.unsqueeze(-1), ends, edges[:, :1])
-    count = max(len(ends), len(edges))
-    rim = torch.cat([w.expand(count, -1, -1) for w in (edges, ends)], 1)
-    return rim[..., 0], rim[..., 1]
+    edges = (_border(camera.size_for("its rim")).to(focal) - centre) / focal
+    own = domain_of(camera._model, k.reshape(-1, k.shape[-1]), camera.optics)
+    rim = edges.expand(len(own.k), -1, -1) if len(edges) == 1 else edges
+
+    def seen(points: Tensor) -> Tensor:
+        return has_ray(own, *(w.reshape(len(own.k), -1) for w in points.unbind(-1))).view(points.shape[:-1])
+
+    if not bool(seen(rim).all()):
+        # edited images have different intrinsics, and few kinds of coefficients
+        lenses, which = own.k.unique(dim=0, return_inverse=True)
+        ends = _kept(_ends, camera, lenses).to(focal)[which]
+        ends = torch.where(camera.contains(ends * focal + centre).unsqueeze(-1), ends, rim[:, :1])
+        rim = torch.cat((rim, ends), 1)
+        rim = torch.where(seen(rim).unsqueeze(-1), rim, 0.0)
+    return rim.unbind(-1)
+
+
+@lru_cache(maxsize=16)
+def _border(size: tuple[int, int]) -> Tensor:
+    """(N, 2): pixels along the outer edges of images of a size."""
+    height, width = size
+    corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
+    return along_edges(corners, _EDGE_SAMPLES)
 
 
 def _ends(camera: Camera, distortion: Tensor) -> Tensor:

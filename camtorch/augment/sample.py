@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
+import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast
 
 import numpy as np
 import torch
@@ -24,12 +26,14 @@ from camtorch._arguments import (
     fails,
     no_camera,
 )
+from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
+from camtorch.warp.sampling import Options, as_options
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -67,40 +71,14 @@ class Field:
     """Whether its number of dims tells a batch from a single sample."""
 
 
-def _image(change: Change, images: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.images(images)
+def _planes(move: Move) -> Move:
+    """Of masks and the like, which also come without channels, (B, H, W)."""
 
+    def of(change: Change, value: Tensor, options: Mapping[str, float]) -> Tensor:
+        moved: Tensor = move(change, value.unsqueeze(1) if value.ndim == 3 else value, options)
+        return moved.squeeze(1) if value.ndim == 3 else moved
 
-def _mask(change: Change, masks: Tensor, options: Mapping[str, float]) -> Tensor:
-    flat = masks.ndim == 3
-    moved = change.labels(masks.unsqueeze(1) if flat else masks, options["mask_fill"])
-    return moved.squeeze(1) if flat else moved
-
-
-def _depth(change: Change, depth: Tensor, options: Mapping[str, float]) -> Tensor:
-    flat = depth.ndim == 3
-    moved = change.depth(depth.unsqueeze(1) if flat else depth)
-    return moved.squeeze(1) if flat else moved
-
-
-def _distance(change: Change, distance: Tensor, options: Mapping[str, float]) -> Tensor:
-    return _mask(change, distance, {"mask_fill": 0.0})
-
-
-def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    return change.points(pixels)
-
-
-def _boxes(change: Change, boxes: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    return change.boxes(boxes)
-
-
-def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(rays)
-
-
-def _pitch_yaw(change: Change, angles: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(angles, from_pitch_yaw, to_pitch_yaw)
+    return of
 
 
 def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
@@ -130,32 +108,41 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
     return torch.where(still.unsqueeze(-1), rvec.to(turned), rotation_vector(turned))
 
 
-def _rotation(change: Change, rotation: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(rotation, _columns, _columns)
-
-
 _MANY = 16
 _ROUNDING = 0.01
-_RAYS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays)
+
+
+def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
+    return change.rays(rays)
+
+
+def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+    return change.points(pixels)
+
+
+_DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays)
 _POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose)
+_MASKS = "(B, C, H, W) or (B, H, W)"
+_DEPTHS = "(B, 1, H, W) or (B, H, W), along"
+_PITCH_YAW = "(B, *N, 2) pitch and yaw of a gaze in radians"
 KINDS = {
-    "image": Field(3, 3, (), "(B, C, H, W)", _image, True),
-    "mask": Field(2, 3, (), "(B, C, H, W) or (B, H, W)", _mask),
-    "depth": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along z", _depth),
-    "distance": Field(2, 3, (), "(B, 1, H, W) or (B, H, W), along the ray", _distance),
+    "image": Field(3, 3, (), "(B, C, H, W)", lambda change, images, _: change.images(images), True),
+    "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
+    "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
+    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.labels(distance))),
     "keypoints": Field(2, 3, (2,), "(B, N, 2) pixels x, y", _pixels, True),
     "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
-    "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", _boxes, True),
+    "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
     "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
     "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _rays),
-    "gaze": _RAYS,
-    "directions": _RAYS,
-    "pitch_yaw": Field(1, _MANY, (2,), "(B, *N, 2) pitch and yaw of a gaze in radians", _pitch_yaw),
+    "gaze": _DIRECTIONS,
+    "directions": _DIRECTIONS,
+    "pitch_yaw": Field(1, _MANY, (2,), _PITCH_YAW, lambda c, angles, _: c.rays(angles, from_pitch_yaw, to_pitch_yaw)),
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector),
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _rays),
-    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation),
+    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
 _SINGLE_FILE = ("keypoints", "landmarks")  # which OpenCV has as (N, 1, 2)
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
@@ -294,9 +281,12 @@ class Unknown(Pinhole):
         return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
-def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
-    """A method that records no graph in a worker of a DataLoader, which tensors of a graph cannot leave."""
+def on_samples(method: Callable[P, R]) -> Callable[P, R]:
+    """A method that moves samples: on one thread of torch, and in a worker of a DataLoader, which no graph can leave,
+    without one.
+    """
 
+    @on_one_thread
     @functools.wraps(method)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling() or get_worker_info() is None:
@@ -307,16 +297,51 @@ def without_graph_in_workers(method: Callable[P, R]) -> Callable[P, R]:
     return wrapped
 
 
+class SampleOptions(TypedDict, total=False):
+    """What every transform of samples takes; see `Augmentation`."""
+
+    camera: Camera | None
+    fields: Mapping[str, str] | None
+    mode: str
+    padding_mode: str
+    fill: float | Sequence[float]
+    mask_fill: float
+    valid_mask: bool
+    antialias: bool | None
+    tolerance: float
+
+
 class SampleTransform(nn.Module):
     """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
 
     fields: dict[str, str]
     mask_fill: float
     valid_mask: bool
+    options: Options
+    """Of warps."""
+    antialias: bool | None
+    """As in `options`, but None where each warp says."""
+    other_words: ClassVar[Mapping[str, str]] = {}
+    """Words that people try as keywords -> the keyword, for the hint of an error."""
 
-    def __init__(self, camera: Camera | None, fields: Mapping[str, str] | None, mask_fill: float, valid_mask: bool):
+    def __init__(
+        self,
+        *,
+        camera: Camera | None = None,
+        fields: Mapping[str, str] | None = None,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+        fill: float | Sequence[float] = 0.0,
+        mask_fill: float = 0.0,
+        valid_mask: bool = False,
+        antialias: bool | None = False,
+        tolerance: float = 0.001,
+        **unknown: object,
+    ):
         super().__init__()
         self._name = type(self).__name__
+        for name in unknown:
+            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
         if camera is not None and not isinstance(camera, Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
         self.camera = camera
@@ -324,8 +349,25 @@ class SampleTransform(nn.Module):
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
         if wrong:
             raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
+        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        self.antialias = None if antialias is None else self.options["antialias"]
         self.mask_fill = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask = as_flag(valid_mask, "valid_mask", self._name)
+
+    @classmethod
+    def _meant(cls, word: str) -> str:
+        """The keyword that somebody may have meant."""
+        known = [
+            parameter.name
+            for owner in cls.__mro__
+            if "__init__" in vars(owner) and issubclass(owner, SampleTransform)
+            for parameter in inspect.signature(vars(owner)["__init__"]).parameters.values()
+            if parameter.kind is not parameter.VAR_KEYWORD and parameter.name != "self"
+        ]
+        close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
+        if close:
+            return f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
+        return f"; known are {', '.join(dict.fromkeys(known))}"
 
     mirroring: Mirroring | None = None
     """What changes places where an augmentation mirrors; None: it never does."""
@@ -388,27 +430,24 @@ class SampleTransform(nn.Module):
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
         camera = self._camera_of(named) if camera is None else camera
         batched = is_batch(named, camera)
-        counts: dict[str, int] = {}
+        count = -1
         for name, (found, value) in named.items():
-            if isinstance(value, (list, tuple)):
-                items = [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
-                for i, item in enumerate(items):
-                    check(found, f"{name}[{i}]", item, False, self._name)
-                    if not predicted:
-                        check_values(found, f"{name}[{i}]", item, self._name)
-                value = items
-            else:
-                check(found, name, value, batched, self._name)
+            several = isinstance(value, (list, tuple))
+            items = (
+                [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)] if several else [value]
+            )
+            for i, item in enumerate(items):
+                which = f"{name}[{i}]" if several else name
+                check(found, which, item, batched and not several, self._name)
                 if not predicted:
-                    check_values(found, name, value, self._name)
-                value = value if batched else value.unsqueeze(0)
-            named[name], counts[name] = (found, value), len(value)
-            count = next(iter(counts.values()))
-            if counts[name] != count:
-                raise ValueError(f"{self._name}: {name} is of {counts[name]} samples, other fields are of {count}")
+                    check_values(found, which, item, self._name)
+            value = items if several else value if batched else value.unsqueeze(0)
+            named[name], count = (found, value), len(value) if count < 0 else count
+            if len(value) != count:
+                raise ValueError(f"{self._name}: {name} is of {len(value)} samples, other fields are of {count}")
         self._check_cameras(camera, count, named, batched)
-        values = [v for _, value in named.values() for v in (value if isinstance(value, list) else [value])]
-        device = values[0].device if values else torch.device("cpu")
+        tensors = (v for _, value in named.values() for v in (value if isinstance(value, list) else [value]))
+        device = next((tensor.device for tensor in tensors), torch.device("cpu"))
         camera = alone(as_one(camera))
         camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
         return named, batched, count, camera
@@ -430,24 +469,24 @@ class SampleTransform(nn.Module):
             if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
                 raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
             for field, (found, value) in named.items():
-                # one for each sample where there are as many cameras
-                images = value if isinstance(value, list) else [value]
-                images = images[i : i + 1] if isinstance(value, list) and len(cameras) > 1 else images
-                for shape in {tuple(image.shape) for image in images if found in IMAGES}:
-                    size = shape[-2:]
-                    if size != one.image_size:
-                        if shape[-3:-1] == one.image_size:
-                            shape = shape if batched or isinstance(value, list) else shape[1:]
-                            to = "0, 3, 1, 2" if len(shape) == 4 else "2, 0, 1"
-                            raise ValueError(
-                                f"{self._name}: {field} is {shape}, with the channels last. A tensor goes in as "
-                                f"{field}.permute({to}), an array as {field}.transpose({to}); "
-                                "camtorch.augment.numpy takes arrays as they are"
-                            )
-                        raise ValueError(
-                            f"{self._name}: {field} is {size} (height, width), but the image_size of {name} is "
-                            f"{one.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
-                        )
+                if found in IMAGES:
+                    images = value if isinstance(value, list) else [value if batched else value[0]]
+                    for image in images[i : i + 1] if several and isinstance(value, list) else images:
+                        self._check_size(field, tuple(image.shape), name, one.image_size)
+
+    def _check_size(self, field: str, shape: tuple[int, ...], name: str, size: tuple[int, int]) -> None:
+        if shape[-2:] == size:
+            return
+        if shape[-3:-1] == size:
+            to = "0, 3, 1, 2" if len(shape) == 4 else "2, 0, 1"
+            raise ValueError(
+                f"{self._name}: {field} is {shape}, with the channels last. A tensor goes in as {field}.permute({to}), "
+                f"an array as {field}.transpose({to}); camtorch.augment.numpy takes arrays as they are"
+            )
+        raise ValueError(
+            f"{self._name}: {field} is {shape[-2:]} (height, width), but the image_size of {name} is {size}. "
+            "camera.resize, .crop and .pad give the camera of an edited image"
+        )
 
     def _moved(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
         """The sample after a change; `named` holds its fields as a batch."""
@@ -460,17 +499,16 @@ class SampleTransform(nn.Module):
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
 
         for name, (found, value) in named.items():
+            valid: Any
             if isinstance(value, list):
                 pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
                 put(name, [result.squeeze(0) for result, _ in pairs])
-                flags = [valid.squeeze(0) for _, valid in pairs if valid is not None]
-                if flags:
-                    self._put_valid(put, sample, f"{name}_valid", flags, batched)
+                valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
             else:
                 result, valid = self._one(change, found, value, options)
                 put(name, result)
-                if valid is not None:
-                    self._put_valid(put, sample, f"{name}_valid", valid, batched)
+            if valid is not None:
+                put(f"{name}_valid", self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"), batched))
         before = sample.get("image_valid")
         if before is not None:
             before = torch.as_tensor(before) != 0
@@ -498,43 +536,36 @@ class SampleTransform(nn.Module):
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
         mirroring = cast("Mirroring", self.mirroring)
-        mirroring.sides(named)  # that none lacks the other, whatever was drawn
-        kept: dict[str, tuple[str | None, Any]] = {}
-        for name in mirroring.by_name:
-            if name in moved and name not in named:
-                moved[name] = self._of_landmarks(moved[name], name)
-                kept[name] = None, moved[name]
-        for name, (found, value) in {**named, **kept}.items():
+        sides = mirroring.sides(named)  # that none lacks the other, whatever was drawn
+        kept = {name: (None, moved[name]) for name in mirroring.by_name if name in moved and name not in named}
+        for name, (_, value) in kept.items():  # what says something of each landmark, and does not move itself
+            several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
+            if not several and not isinstance(value, (Tensor, np.ndarray)):
+                raise TypeError(
+                    f"{self._name}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
+                    f"{type(value).__name__}"
+                )
+            moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
+        for name, (found, _) in {**named, **kept}.items():
             for key, flags in ((name, found is None), (f"{name}_valid", True)):
-                if isinstance(value, list):
-                    rows = torch.zeros(len(value), dtype=torch.bool) if mirrored is None else mirrored
-                    pairs = zip(moved.get(key, ()), rows, strict=False)
-                    new = [mirroring.swapped(name, found, v[None], row[None], flags)[0] for v, row in pairs]
-                    moved.update({key: new} if key in moved else {})
-                elif key in moved:
-                    now = moved[key] if batched else moved[key][None]
-                    rows = torch.zeros(len(now), dtype=torch.bool) if mirrored is None else mirrored
-                    swapped = mirroring.swapped(name, found, now, rows, flags)
-                    moved[key] = swapped if batched else swapped[0]
-        for left, right in mirroring.sides(named) if mirrored is not None else ():
-            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
-                if one not in moved or other not in moved:
+                if key not in moved:
                     continue
-                single = not (batched or isinstance(moved[one], list))
-                rows = cast("Tensor", mirrored)
-                pair = [moved[key].unsqueeze(0) if single else moved[key] for key in (one, other)]
-                for key, new in zip((one, other), exchanged(pair[0], pair[1], rows), strict=True):
-                    moved[key] = new.squeeze(0) if single else new
-
-    def _of_landmarks(self, value: Any, name: str) -> Tensor | list[Tensor]:
-        """What a field that does not move says of each landmark, which changes places with it."""
-        several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
-        if not several and not isinstance(value, (Tensor, np.ndarray)):
-            raise TypeError(
-                f"{self._name}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
-                f"{type(value).__name__}"
-            )
-        return [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
+                now, single = moved[key], not (batched or isinstance(moved[key], list))
+                now = now[None] if single else now
+                rows = torch.zeros(len(now), dtype=torch.bool) if mirrored is None else mirrored
+                if isinstance(now, list):
+                    pairs = zip(now, rows, strict=False)
+                    moved[key] = [mirroring.swapped(name, found, v[None], row[None], flags)[0] for v, row in pairs]
+                else:
+                    swapped = mirroring.swapped(name, found, now, rows, flags)
+                    moved[key] = swapped[0] if single else swapped
+        for left, right in sides if mirrored is not None else ():
+            for pair in ((left, right), (f"{left}_valid", f"{right}_valid")):
+                if all(key in moved for key in pair):
+                    single = not (batched or isinstance(moved[pair[0]], list))
+                    one, other = (moved[key].unsqueeze(0) if single else moved[key] for key in pair)
+                    for key, new in zip(pair, exchanged(one, other, cast("Tensor", mirrored)), strict=True):
+                        moved[key] = new.squeeze(0) if single else new
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
@@ -543,21 +574,18 @@ class SampleTransform(nn.Module):
         # geometry is computed in float32 at least; what came in half precision goes out in it
         return result.to(value.dtype) if value.dtype.is_floating_point else result, valid
 
-    def _put_valid(
-        self, put: Callable[[str, Any], None], sample: Sample, name: str, valid: Tensor | list[Tensor], batched: bool
-    ) -> None:
-        """Put the validity of a field, which stays invalid where it was; any number but zero is valid, as in COCO."""
-        given = sample.get(name)
-        if given is not None:
-            many = isinstance(valid, list)
-            before = [torch.as_tensor(b) != 0 for b in (given if many else [given])]
-            now = valid if isinstance(valid, list) else [valid if batched else valid.squeeze(0)]
-            if [b.shape for b in before] != [v.shape for v in now]:
-                shapes = ", ".join(str(tuple(v.shape)) for v in now)
-                raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
-            now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
-            valid = now if many else now[0] if batched else now[0].unsqueeze(0)
-        put(name, valid)
+    def _still(self, name: str, valid: Any, given: Any, batched: bool) -> Any:
+        """Flags of a batch, invalid where those given were; any number but zero is valid, as in COCO."""
+        if given is None:
+            return valid
+        many, single = isinstance(valid, list), not batched
+        now = valid if many else [valid.squeeze(0) if single else valid]
+        before = [torch.as_tensor(b) != 0 for b in (given if many else [given])]
+        if [b.shape for b in before] != [v.shape for v in now]:
+            shapes = ", ".join(str(tuple(v.shape)) for v in now)
+            raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
+        now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
+        return now if many else now[0].unsqueeze(0) if single else now[0]
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

@@ -16,11 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import GUESS_CAMERA, no_camera
-from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
-from camtorch.augment.sample import Unknown
 from camtorch.camera import Camera
 
 try:
@@ -79,16 +77,12 @@ class Transform(v2.Transform):
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, *, valid: bool = False):
         super().__init__()
-        if not isinstance(augmentation, Augmentation):
-            raise TypeError(f"{_OWNER}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
-        if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"{_OWNER}: camera must be a Camera; got {no_camera(camera)}")
+        check_front_end(_OWNER, augmentation, camera)
         self.augmentation = augmentation
         self.camera, self.valid = camera, bool(valid)
         self._flags: list[tuple[Tensor, Tensor]] = []
 
     def forward(self, *inputs: Any) -> Any:
-        """Move a sample, of one input or several."""
         outputs = super().forward(*inputs)
         if self.valid:
             _put(outputs, self._flags)
@@ -109,26 +103,8 @@ class Transform(v2.Transform):
         cameras = [one for one in flat_inputs if isinstance(one, Camera)]
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample has one camera; here are {len(cameras)}")
-        camera = cameras[0] if cameras else self.augmentation.camera if self.camera is None else self.camera
-        if camera is None and not self.augmentation.needs_camera:
-            size = next((size for one in flat_inputs if (size := _size(one)) is not None), None)
-            camera = None if size is None else Unknown.of(size)
-        if camera is None:
-            raise ValueError(
-                f"{_OWNER}: no camera; give one here, in the sample, or to the augmentation. {GUESS_CAMERA}"
-            )
-        if camera.image_size is None or camera.batch_shape:
-            raise ValueError(
-                f"{_OWNER}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} "
-                f"and batch dims {tuple(camera.batch_shape)}"
-            )
-        for one in flat_inputs:
-            size = _size(one)
-            if size not in (None, camera.image_size):
-                raise ValueError(
-                    f"{_OWNER}: {type(one).__name__} is {size} (height, width), but the camera's image_size is "
-                    f"{camera.image_size}. camera.resize, .crop and .pad give the camera of an edited image"
-                )
+        sizes = [(type(one).__name__, size) for one in flat_inputs if (size := _size(one)) is not None]
+        camera = camera_of_sample(_OWNER, self.augmentation, cameras[0] if cameras else self.camera, sizes)
         with torch.no_grad():
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.change(camera, self.augmentation.draw(1))
@@ -147,12 +123,7 @@ class Transform(v2.Transform):
         plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
         if isinstance(inpt, _PLACES):
             of_boxes = isinstance(inpt, tv_tensors.BoundingBoxes)
-            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else _points(change, plain)
-            mirroring = self.augmentation.mirroring
-            if mirroring is not None and change.mirrored is not None and not of_boxes and plain.ndim > 1:
-                order = mirroring.order("keypoints", "keypoints", plain.shape[-2])
-                if order is not None:
-                    moved, valid = moved[..., order, :], valid[..., order]
+            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else self._points(change, plain)
             if change.parts[0].warp is None:
                 moved = plain
             result = tv_tensors.wrap(moved, like=inpt, canvas_size=camera.image_size)
@@ -167,6 +138,14 @@ class Transform(v2.Transform):
         if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
             return tv_tensors.wrap(_images(change, plain), like=inpt)
         return inpt if isinstance(inpt, tv_tensors.TVTensor) else _images(change, plain)
+
+    def _points(self, change: Change, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (..., 2), and valid (...)."""
+        number = points.shape[-2] if points.ndim > 1 else 1
+        rows = _wide(points).reshape(1, math.prod(points.shape[:-2]), number, 2)
+        moved, valid = move_points(self.augmentation, change, rows)
+        moved = moved if points.is_floating_point() else moved.round()
+        return moved.reshape(points.shape).to(points.dtype), valid.reshape(points.shape[:-1])
 
 
 def _put(outputs: Any, flags: list[tuple[Tensor, Tensor]]) -> None:
@@ -219,27 +198,15 @@ def _labels(change: Change, masks: Tensor, fill: float) -> Tensor:
     return moved.reshape(*masks.shape[:-2], *moved.shape[-2:])
 
 
-def _points(change: Change, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (..., 2), and valid (...)."""
-    lost = (points == -1).all(-1)
-    moved, valid = (t[0] for t in change.points(_wide(points).reshape(1, math.prod(points.shape[:-1]), 2)))
-    moved = torch.where(lost.unsqueeze(-1), -1.0, moved.reshape(points.shape))
-    return (moved if points.is_floating_point() else moved.round()).to(points.dtype), valid.reshape(lost.shape) & ~lost
-
-
 def _boxes(change: Change, boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
     """Boxes (M, 4) between pixel edges, of one of torchvision's formats, and valid (M,)."""
-    one, two = _wide(boxes).chunk(2, -1)
-    if form == "XYXY":
-        low, high = one, two
-    elif form == "XYWH":
-        low, high = one, one + two
-    elif form == "CXCYWH":
-        low, high = one - two / 2, one + two / 2
-    else:
+    if form not in ("XYXY", "XYWH", "CXCYWH"):
         raise ValueError(
             f"{_OWNER}: boxes of the format {form} turn with no lens; v2.ConvertBoundingBoxFormat('XYXY') encloses them"
         )
+    one, two = _wide(boxes).chunk(2, -1)
+    low = one - two / 2 if form == "CXCYWH" else one
+    high = {"XYXY": two, "XYWH": one + two, "CXCYWH": one + two / 2}[form]
     whole = not boxes.is_floating_point()
     if whole:  # as torchvision reads them
         low, high = low.trunc(), high.trunc()

@@ -30,14 +30,7 @@ def opencv(owner: str) -> Any:
 
 
 class Cells(NamedTuple):
-    """A grid of equal squares, some of them black.
-
-    Args:
-        black: (rows, columns) bool.
-        x: of its left edge in the board's frame.
-        y: of its upper edge.
-        pitch: the side of a square.
-    """
+    """A grid (rows, columns) of squares of side `pitch`, some black; x, y: its top left in the board's frame."""
 
     black: NDArray[np.bool_]
     x: float
@@ -96,12 +89,11 @@ class Board:
 
     def looks_like(self, other: Board) -> bool:
         """Whether it is the same but for its size: its points are found at the same pixels."""
-
-        def shape(board: Board) -> dict[str, object]:
-            sides = {side: round(float(getattr(board, side)) / board.square, 6) for side in board.sides}
-            return {**board.options(), **sides}
-
-        return shape(self) == shape(other)
+        mine, its = (
+            board.options() | {side: round(float(getattr(board, side)) / board.square, 6) for side in board.sides}
+            for board in (self, other)
+        )
+        return mine == its
 
     def words(self, unit: str = "") -> str:
         """What it is, in a few words."""
@@ -119,8 +111,7 @@ def _grid_points(xs: NDArray[Any], ys: NDArray[Any]) -> NDArray[np.float64]:
 
 def _chessboard(columns: int, rows: int) -> NDArray[np.bool_]:
     """(rows, columns) squares, black at the top left."""
-    dark: np.ndarray = (np.arange(rows)[:, None] + np.arange(columns)) % 2 == 0
-    return dark
+    return np.asarray((np.arange(rows)[:, None] + np.arange(columns)) % 2 == 0)
 
 
 @dataclass(frozen=True)
@@ -175,9 +166,8 @@ class Charuco(Board):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 < self.marker < self.square:
-            raise ValueError(
-                f"Charuco: a marker must be smaller than its square; got {self.marker:g} in {self.square:g}"
-            )
+            got = f"{self.marker:g} in {self.square:g}"
+            raise ValueError(f"Charuco: a marker must be smaller than its square; got {got}")
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -250,14 +240,13 @@ class AprilGrid(Board):
         return first, first + 1, first + 2 * self.columns + 1, first + 2 * self.columns
 
     def cells(self) -> Iterator[Cells]:
-        points, gap = self.points(), self.square * self.spacing
+        gap = self.square * self.spacing
         for tag in range(self.columns * self.rows):
-            x, y, _ = points[self.corners_of(tag)[0]].tolist()
+            x, y, _ = self.points()[self.corners_of(tag)[0]].tolist()
             yield _tag(self.dictionary, tag, self.border, x, y, self.square)
-        step = self.square + gap
-        for row in range(self.rows + 1):
-            for column in range(self.columns + 1):
-                yield Cells(np.ones((1, 1), bool), column * step - gap, row * step - gap, gap)
+        for row, column in np.ndindex(self.rows + 1, self.columns + 1):
+            x, y = (number * (self.square + gap) - gap for number in (column, row))
+            yield Cells(np.ones((1, 1), bool), x, y, gap)
 
     def lengths(self, unit: str) -> str:
         tags = f"{self.dictionary} with a border of {self.border}"
@@ -299,10 +288,9 @@ def dictionary_of(name: str) -> Any:
 
 def _tag(dictionary: str, number: int, border: int, x: float, y: float, side: float) -> Cells:
     markers = dictionary_of(dictionary)
-    if number >= len(markers.bytesList):
-        raise ValueError(
-            f"board: the dictionary {dictionary} has {len(markers.bytesList)} markers, and the board needs more"
-        )
+    count = len(markers.bytesList)
+    if number >= count:
+        raise ValueError(f"board: the dictionary {dictionary} has {count} markers, and the board needs more")
     cells = markers.markerSize + 2 * border
     return Cells(markers.generateImageMarker(number, cells, borderBits=border) == 0, x, y, side / cells)
 

@@ -14,7 +14,6 @@ JSON: `{"camtorch_corners": 1, "board": {...}, "points": [[x, y, z], ...], "imag
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -105,15 +104,12 @@ def _numbers(values: Any, width: int) -> NDArray[np.float64]:
 
 def _image(record: dict[str, Any], count: int, folder: Path) -> ImageCorners:
     pixels, rows = np.full((count, 2), np.nan), _numbers(record["corners"], 3)
-    indices = rows[:, 0].astype(int)
-    if (indices != rows[:, 0]).any() or (indices < 0).any() or (indices >= count).any():
-        raise ValueError(
-            f"corners must begin with the number of a point, 0 to {count - 1}; got {rows[:, 0].tolist()!s:.60}"
-        )
-    numbers = indices.tolist()
+    numbers = rows[:, 0].tolist()
+    if not set(numbers) <= set(range(count)):
+        raise ValueError(f"corners must begin with the number of a point, 0 to {count - 1}; got {numbers!s:.60}")
     if len(set(numbers)) < len(numbers):
-        raise ValueError(f"a point appears twice: {next(n for n in numbers if numbers.count(n) > 1)}")
-    pixels[indices] = rows[:, 1:]
+        raise ValueError(f"a point appears twice: {next(int(n) for n in numbers if numbers.count(n) > 1)}")
+    pixels[rows[:, 0].astype(int)] = rows[:, 1:]
     size = None
     if record.get("width") is not None:
         size = int(record["height"]), int(record["width"])
@@ -126,11 +122,7 @@ def _image(record: dict[str, Any], count: int, folder: Path) -> ImageCorners:
 
 
 def write_corners(corners: Corners, path: str | os.PathLike[str]) -> None:
-    """Write a file of corners, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a file of corners, whole or not at all."""
     folder = Path(path).resolve().parent
     content = {
         _FORMAT: _VERSION,
@@ -151,10 +143,8 @@ def _record(image: ImageCorners, folder: Path) -> dict[str, Any]:
     record |= {name: text for name in ("camera", "view", "hash", "reason") if (text := getattr(image, name))}
     if image.image_size is not None:
         record |= {"width": image.image_size[1], "height": image.image_size[0]}
-    record["corners"] = [
-        [index, *pixel] for index, pixel in enumerate(image.pixels.tolist()) if math.isfinite(pixel[0])
-    ]
-    return record
+    seen = np.flatnonzero(np.isfinite(image.pixels[:, 0])).tolist()
+    return record | {"corners": [[i, *image.pixels[i].tolist()] for i in seen]}
 
 
 def image_points(images: Sequence[ImageCorners | None], count: int) -> NDArray[np.float64]:

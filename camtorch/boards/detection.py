@@ -31,15 +31,12 @@ NOT_FOUND = "no board found"
 
 
 class Detection(NamedTuple):
-    """What one image shows of a board.
-
-    Args:
-        pixels: (N, 2) of the board's points, NaN where unseen; all NaN if the image is of no use.
-        reason: why it is of no use, or empty.
-    """
+    """What one image shows of a board."""
 
     pixels: Pixels
+    """(N, 2) of the board's points, NaN where unseen; all NaN if the image is of no use."""
     reason: str = ""
+    """Why it is of no use, or empty."""
 
 
 def detect(board: Board, image: NDArray[Any]) -> Detection:
@@ -47,23 +44,15 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
 
     The points of a chessboard are told apart as its colours allow: where black is at the top left of the first one. If
     they allow several orders (`board.symmetries`), the first point is the one nearest to the image's top left corner.
-
-    Args:
-        board: what to look for.
-        image: (H, W) of grey values, uint8 or uint16.
+    image: (H, W) of grey values, uint8 or uint16.
 
     Raises:
         ImportError: there is no OpenCV. ValueError: a dictionary of markers that it does not have.
     """
     cv2 = opencv("finding boards in images")
     grey = _as_grey8(image)
-    if isinstance(board, Chessboard):
-        pixels = _chessboard(cv2, board, grey)
-    elif isinstance(board, Charuco):
-        pixels = _charuco(cv2, board, grey)
-    else:
-        assert isinstance(board, AprilGrid)
-        pixels = _aprilgrid(cv2, board, grey)
+    find: Any = {Chessboard: _chessboard, Charuco: _charuco, AprilGrid: _aprilgrid}[type(board)]
+    pixels = find(cv2, board, grey)
     nothing = np.full((len(board.points()), 2), np.nan)
     if pixels is None or np.isnan(pixels).all():
         return Detection(nothing, NOT_FOUND)
@@ -79,14 +68,10 @@ def largest_chessboard(image: NDArray[Any]) -> Chessboard | None:
     """The largest chessboard that an image shows, its longer side first, whatever its number of corners.
 
     Of a board that is hard to see it may be a part: `detect` says whether it is found by that size.
-
-    Args:
-        image: as `detect` takes it.
     """
     cv2 = opencv("finding boards in images")
-    least = (Chessboard.least, Chessboard.least)
-    flags = _flags(cv2) | cv2.CALIB_CB_LARGER
-    found, _, corners = cv2.findChessboardCornersSBWithMeta(_shrunk(cv2, _as_grey8(image)), least, flags)
+    small, least = _shrunk(cv2, _as_grey8(image)), (Chessboard.least, Chessboard.least)
+    found, _, corners = cv2.findChessboardCornersSBWithMeta(small, least, _flags(cv2) | cv2.CALIB_CB_LARGER)
     return Chessboard(max(corners.shape), min(corners.shape)) if found else None
 
 
@@ -96,8 +81,7 @@ def _as_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
         return np.ascontiguousarray(image)
     low, high = np.percentile(image, (0.1, 99.9))
     scaled = (image.astype(np.float32) - low) * (255 / max(high - low, 1))
-    stretched: np.ndarray = np.clip(scaled, 0, 255).astype(np.uint8)
-    return stretched
+    return np.asarray(np.clip(scaled, 0, 255), np.uint8)
 
 
 # -- chessboards
@@ -117,8 +101,7 @@ def _chessboard(cv2: Any, board: Chessboard, grey: NDArray[np.uint8]) -> Pixels 
 
 
 def _flags(cv2: Any) -> int:
-    flags: int = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    return flags
+    return int(cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
 
 
 def _shrunk(cv2: Any, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -127,8 +110,7 @@ def _shrunk(cv2: Any, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if shrunk <= 1:
         return grey
     height, width = (round(side / shrunk) for side in grey.shape)
-    small: np.ndarray = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    return small
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _moved_by_gradients(cv2: Any, board: Chessboard, grey: NDArray[np.uint8], pixels: Pixels) -> Pixels:
@@ -140,7 +122,7 @@ def _moved_by_gradients(cv2: Any, board: Chessboard, grey: NDArray[np.uint8], pi
     """
     differences = _third_differences(board.rows, board.columns)
     expected, strays = _mended(differences, pixels)
-    nearest = np.array([np.partition(np.linalg.norm(expected - corner, axis=1), 1)[1] for corner in expected])
+    nearest = _to_nearest(expected)
     tried = [np.where(strays[:, None], np.nan, expected)]
     for part in _WINDOWS:
         moved = [_refined(cv2, grey, one[None], part * side) for one, side in zip(expected, nearest, strict=True)]
@@ -148,6 +130,11 @@ def _moved_by_gradients(cv2: Any, board: Chessboard, grey: NDArray[np.uint8], pi
         far = np.linalg.norm(corners - expected, axis=1) > _STRAY * nearest
         tried.append(np.where((strays & far)[:, None], np.nan, corners))
     return min(tried, key=lambda c: float(np.square(differences @ np.where(np.isnan(c), expected, c)).sum()))
+
+
+def _to_nearest(pixels: Pixels) -> Pixels:
+    """(N,) the distance of each corner to the nearest other one."""
+    return np.partition(np.linalg.norm(pixels[:, None] - pixels, axis=-1), 1, axis=1)[:, 1]
 
 
 @functools.cache
@@ -168,8 +155,7 @@ def _mended(differences: Pixels, pixels: Pixels) -> tuple[Pixels, NDArray[np.boo
     for _ in range(len(pixels) // 10):
         # what moving one corner does best for all differences that it is in
         off = differences.T @ (differences @ mended) / np.maximum(weights, 1)[:, None]
-        nearest = np.array([np.partition(np.linalg.norm(mended - corner, axis=1), 1)[1] for corner in mended])
-        far = np.linalg.norm(off, axis=1) / np.maximum(nearest, 1e-9)
+        far = np.linalg.norm(off, axis=1) / np.maximum(_to_nearest(mended), 1e-9)
         worst = int(far.argmax())
         if far[worst] < _STRAY:
             break
@@ -183,8 +169,8 @@ def _refined(cv2: Any, grey: NDArray[np.uint8], pixels: Pixels, radius: float) -
     half = int(np.clip(round(radius), 2, 20))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     corners = pixels.astype(np.float32).reshape(-1, 1, 2)
-    refined: np.ndarray = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
-    return refined.reshape(-1, 2).astype(np.float64)
+    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
+    return np.asarray(refined.reshape(-1, 2), np.float64)
 
 
 def _ordered(board: Chessboard, grey: NDArray[np.uint8], pixels: Pixels) -> Pixels:
@@ -244,8 +230,7 @@ def _charuco(cv2: Any, board: Charuco, grey: NDArray[np.uint8]) -> Pixels | None
     lengths = float(board.square), float(board.marker)
     target = cv2.aruco.CharucoBoard((board.columns, board.rows), *lengths, dictionary_of(board.dictionary))
     target.setLegacyPattern(board.legacy)
-    most: Pixels | None = None
-    count = 0
+    most, count = None, 0
     for image, scale, margin in _passes(cv2, grey):
         detector = cv2.aruco.CharucoDetector(target, detectorParams=_parameters(cv2, margin))
         corners, ids, *_ = detector.detectBoard(image)

@@ -76,12 +76,9 @@ def outlines(black: NDArray[np.bool_]) -> list[list[tuple[int, int]]]:
 
 
 def page(board: Board, paper: tuple[float, float] | None, words: Sequence[str]) -> Page:
-    """A board on paper, in the middle, to scale, with a ruler below to check the print by.
+    """A board, of lengths in metres, in the middle of paper, to scale, with a ruler and words below.
 
-    Args:
-        board: its lengths in metres.
-        paper: (width, height) in mm, turned if the board fits better so; or None, for paper that fits it.
-        words: lines to print beside the ruler.
+    paper: (width, height) in mm, turned if the board fits better so; or None, for paper that fits it.
 
     Raises:
         ValueError: the board is too large.
@@ -104,7 +101,8 @@ def page(board: Board, paper: tuple[float, float] | None, words: Sequence[str]) 
         for c in board.cells()
         for line in outlines(c.black)
     ]
-    return Page(*paper, [*shapes, *_ruler(paper)], _foot(paper, words))
+    ruler, texts = _foot(paper, words)
+    return Page(*paper, [*shapes, *ruler], texts)
 
 
 def extent(board: Board) -> tuple[float, float, float, float]:
@@ -122,35 +120,24 @@ def largest(board: Board, paper: tuple[float, float]) -> float:
     return min(room[0] / (1000 * (right - left)), room[1] / (1000 * (bottom - top))) * (1 + 1e-9)
 
 
-def _length(paper: tuple[float, float]) -> int:
-    """Of the ruler, in whole centimetres."""
-    return 100 if paper[0] >= 140 else max(10 * int((paper[0] - 2 * _MARGIN) / 20), 10)
+def _foot(paper: tuple[float, float], words: Sequence[str]) -> tuple[list[Outline], list[Text]]:
+    """A ruler of whole centimetres, its length above it, and the words in lines beside it that fit on the page."""
 
+    def rectangle(x: float, y: float, width: float, height: float) -> Outline:
+        return [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
 
-def _ruler(paper: tuple[float, float]) -> list[Outline]:
-    x, y, length = _MARGIN, paper[1] - _MARGIN, _length(paper)
-    found = [_rectangle(x, y - _LINE / 2, length, _LINE)]
+    length = 100 if paper[0] >= 140 else max(10 * int((paper[0] - 2 * _MARGIN) / 20), 10)
+    x, y = _MARGIN, paper[1] - _MARGIN
+    ruler = [rectangle(x, y - _LINE / 2, length, _LINE)]
     for mark in range(0, length + 1, 5):
         high = 3.0 if mark % 50 == 0 else 2.0 if mark % 10 == 0 else 1.2
-        found.append(_rectangle(x + mark - _LINE / 2, y - high, _LINE, high - _LINE / 2))
-    return found
-
-
-def _rectangle(x: float, y: float, width: float, height: float) -> Outline:
-    return [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-
-
-def _foot(paper: tuple[float, float], words: Sequence[str]) -> list[Text]:
-    """The ruler's length above it, and the words in lines beside it that fit on the page."""
-    length = _length(paper)
-    found = [Text(_MARGIN, paper[1] - _MARGIN - 4, f"{length} mm, or the print is not to scale", 2.6)]
+        ruler.append(rectangle(x + mark - _LINE / 2, y - high, _LINE, high - _LINE / 2))
+    found = [Text(x, y - 4, f"{length} mm, or the print is not to scale", 2.6)]
     x = _MARGIN + max(length, 45) + 6
     size = min(_LETTER, (paper[0] - _MARGIN - x) / (_WIDTH * max(map(len, words), default=1)))
-    if size < _SMALLEST:  # of which nobody could read anything
-        return found
-    return found + [
-        Text(x, paper[1] - _MARGIN - 1.3 * _LETTER * line, text, size) for line, text in enumerate(reversed(words))
-    ]
+    if size >= _SMALLEST:  # else nobody could read anything
+        found += [Text(x, y - 1.3 * _LETTER * line, text, size) for line, text in enumerate(reversed(words))]
+    return ruler, found
 
 
 def as_svg(page: Page) -> str:

@@ -39,13 +39,8 @@ def agreeing(board: Board, poses: Mapping[str, Mapping[int, Array]]) -> dict[str
 
     A camera's place among the others is the same in all views, which only one turn in each view allows, unless the
     boards hardly move.
-
-    Args:
-        board: what all saw.
-        poses: camera -> view -> (4, 4) camera from board, with the points numbered as they were found.
-
-    Returns:
-        camera -> view -> number of the turn; for cameras that share no view with the others the first.
+    poses: camera -> view -> (4, 4) camera from board, with the points numbered as they were found. Returned is
+    camera -> view -> number of the turn; for cameras that share no view with the others the first.
     """
     turns = [matrix for _, matrix in turns_of(board)]
     size = float(np.ptp(board.points(), axis=0).max())

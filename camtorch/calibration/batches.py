@@ -53,6 +53,11 @@ def rows_of(camera: Camera, batch: torch.Size) -> Camera:
     return remade(camera, **tensors)
 
 
+def root_of(mean: Tensor, valid: Tensor) -> Tensor:
+    """The root of what is valid, of a perfect fit without a derivative, which it does not have; else infinite."""
+    return torch.where(valid & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), torch.where(valid, 0.0, torch.inf))
+
+
 def learns(modules: Sequence[BatchedModule], *tensors: Tensor) -> bool:
     """Whether a graph shall lead to any of them."""
     held = [getattr(module, name) for module in modules for name in module.tensor_names]

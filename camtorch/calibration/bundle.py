@@ -50,6 +50,23 @@ class Poses(NamedTuple):
         """(B, P, N, 3)."""
         return points @ self.rotations.mT + self.translations.unsqueeze(-2)
 
+    def of(self, index: Tensor | slice, dim: int = 0) -> Poses:
+        """Some of them, by batch row or by view."""
+        return Poses(*(t[index] if dim == 0 else t[:, index] for t in self))
+
+    def expand(self, batch: int) -> Poses:
+        """A batch of the same."""
+        return Poses(*(t.expand(batch, *t.shape[1:]) for t in self))
+
+    def with_views(self, index: Tensor, other: Poses) -> Poses:
+        """With others for some of the views."""
+        return Poses(*(t.index_copy(1, index, new) for t, new in zip(self, other, strict=True)))
+
+    @classmethod
+    def where(cls, which: Tensor, a: Poses, b: Poses) -> Poses:
+        """Those of a where which, bool (P,), and those of b elsewhere."""
+        return cls(*(torch.where(which.view(-1, *[1] * (x.ndim - 2)), x, y) for x, y in zip(a, b, strict=True)))
+
     @classmethod
     def none(cls, batch: int, count: int, like: Tensor) -> Poses:
         """That leave points where they are."""
@@ -72,15 +89,16 @@ class State(NamedTuple):
 
     def of(self, rows: Tensor) -> State:
         """Those of some problems, given by numbers."""
-        mounts, boards = (Poses(*(t[rows] for t in poses)) for poses in (self.mounts, self.boards))
-        return State(tuple(p[rows] for p in self.parameters), mounts, boards, self.bend[rows])
+        return State(
+            tuple(p[rows] for p in self.parameters), self.mounts.of(rows), self.boards.of(rows), self.bend[rows]
+        )
 
 
 class Free(NamedTuple):
     """What learns.
 
-    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: "poses", "positions" for their
-    translations alone, or "" for neither. bend: the shape of the board.
+    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: "poses", or "positions" for their
+    translations alone. bend: the shape of the board.
     """
 
     parameters: tuple[Tensor, ...]
@@ -117,20 +135,11 @@ def adjust(
     damping: float = FIRST_DAMPING,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Adjusted:
-    """The state of least squares near a given one, for each of B problems.
+    """The state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
     A point that was seen and has no pixel, because the camera's field of view ends before it, counts as far away: no
-    step is taken that loses points.
-
-    Args:
-        sights: what each camera sees; all of the same views.
-        state: where to start.
-        free: what learns.
-        loss: None, "huber" or "cauchy", of the length of each residual; see `robust`.
-        loss_scale: in px.
-        steps: at most.
-        damping: the first one.
-        progress: called after each step with its number and the costs (B,).
+    step is taken that loses points. The loss is one of `LOSSES` or None, of the length of each residual in px, see
+    `robust`. progress: called after each step with its number and the costs (B,).
     """
     problem = Bundle(sights, state, free, loss, loss_scale)
     counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.sights]).sum(0)
@@ -173,12 +182,8 @@ def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Ten
 def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
     """Points of boards that are bent, and the two slopes of their z, (..., N, 2).
 
-    z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points of the board: mrcal's
-    paraboloid.
-
-    Args:
-        points: (..., N, 3), the board about its middle.
-        bend: (B, 2), in the units of the points.
+    z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points (..., N, 3) of the
+    board about its middle: mrcal's paraboloid. bend: (B, 2), in the units of the points.
     """
     plane = points[..., :2]
     reach = plane.abs().amax(tuple(range(plane.ndim - 1)), keepdim=True)
@@ -204,22 +209,6 @@ class _Look(NamedTuple):
 class Bundle:
     """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
 
-    free: Free
-    loss: str | None
-    loss_scale: float
-    sights: list[Sight]
-    cameras: list[Camera]
-    are_shared: list[bool]
-    fixed: list[Camera | None]
-    learns_bend: bool
-    columns: tuple[tuple[int, int], ...]
-    width: int
-    unknowns: int
-    rounding: Tensor
-    low: Tensor
-    high: Tensor
-    is_bounded: bool
-
     def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
         batch = state.boards.translations.shape[0]
@@ -243,7 +232,7 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
-        self.width = {"poses": 6, "positions": 3, "": 0}[free.boards]
+        self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
         self.unknowns = len(self.columns) + self.width * int(views)
@@ -282,18 +271,15 @@ class Bundle:
 
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
         """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
-        points = (
-            bent(sight.points, state.bend)[0] if self.learns_bend or bool((state.bend != 0).any()) else sight.points
-        )
+        points = sight.points
+        if self.learns_bend or bool((state.bend != 0).any()):
+            points = bent(points, state.bend)[0]
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
         if c == 0:
             return turned, first, first
-        return (
-            turned,
-            first,
-            first @ state.mounts.rotations[:, c, None].mT + state.mounts.translations[:, c, None, None],
-        )
+        mounts = state.mounts
+        return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
 
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
         """What a camera makes of a state."""
@@ -375,8 +361,7 @@ class Bundle:
         columns = []
         if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
-        if self.width:
-            columns.append(by_first)
+        columns.append(by_first)
         at = []
         zero, one = torch.zeros_like(a), torch.ones_like(a)
         usual = ((a, zero), (zero, b), (one, zero), (zero, one))
@@ -404,10 +389,9 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            boards = Poses(
-                rotation_matrix(of_views[..., :3]) @ boards.rotations, boards.translations + of_views[..., 3:]
-            )
-        elif self.width == 3:
+            turned = rotation_matrix(of_views[..., :3]) @ boards.rotations
+            boards = Poses(turned, boards.translations + of_views[..., 3:])
+        else:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = [p.clone() for p in state.parameters]
         turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)

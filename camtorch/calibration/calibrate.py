@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings as python_warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_number, as_whole, shown
+from camtorch._arguments import as_flag, as_number, as_whole, shown
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
@@ -71,8 +71,14 @@ def as_model(
         start, model = model, type_before_parametrizations(model)
     model = as_kind(model, owner)
     if start is not None:
-        start = _as_start(start, model, owner)
-        if count is not None and count != start.distortion.shape[-1]:
+        if not isinstance(start, Camera):
+            raise TypeError(f"{owner}: start must be a camera; got {type(start).__name__}")
+        if type_before_parametrizations(start) is not model or start.batch_shape.numel() != 1:
+            raise ValueError(
+                f"{owner}: start must be one {model.__name__}, as start.convert({model.__name__}).camera is; got "
+                f"{type(start).__name__} with batch_shape={tuple(start.batch_shape)}"
+            )
+        if count not in (None, start.distortion.shape[-1]):
             raise ValueError(f"{owner}: count={count}, and the start has {start.distortion.shape[-1]} coefficients")
         count = start.distortion.shape[-1]
     count = model.default_count if count is None else as_whole(count, "count", owner)
@@ -94,31 +100,20 @@ def as_model(
     return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
 
-def _as_start(start: Camera, model: type[Camera], owner: str) -> Camera:
-    if not isinstance(start, Camera):
-        raise TypeError(f"{owner}: start must be a camera; got {type(start).__name__}")
-    if type_before_parametrizations(start) is not model:
-        raise ValueError(
-            f"{owner}: start is {type(start).__name__}, and the model {model.__name__}; "
-            f"start.convert({model.__name__}).camera is one"
-        )
-    if start.batch_shape.numel() != 1:
-        raise ValueError(f"{owner}: start must be one camera; got batch_shape={tuple(start.batch_shape)}")
-    return start
-
-
 def as_options(
     loss: str | None, loss_scale: float, bend: bool, progress: Callable[[int, float], None] | None, owner: str
-) -> None:
-    """Refuse what is no loss, no flag and no function."""
+) -> Callable[[int, Tensor], None] | None:
+    """Refuse what is no loss, no flag and no function; and the progress as `adjust` takes it."""
     if loss is not None and not (isinstance(loss, str) and loss in LOSSES):
         raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {shown(loss)}")
     if not 0 < as_number(loss_scale, "loss_scale", owner) < math.inf:
         raise ValueError(f"{owner}: loss_scale must be positive pixels; got {loss_scale}")
-    if not isinstance(bend, bool):
-        raise TypeError(f"{owner}: bend must be True or False; got {bend!r}")
-    if progress is not None and not callable(progress):
+    as_flag(bend, "bend", owner)
+    if progress is None:
+        return None
+    if not callable(progress):
         raise TypeError(f"{owner}: progress must be a function of the step and the cost; got {progress!r}")
+    return lambda number, cost: progress(number, float(cost))
 
 
 @dataclass(repr=False)
@@ -269,22 +264,10 @@ def calibrate(
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
     asked = as_model(model, count, start, fixed, owner)
-    as_options(loss, loss_scale, bend, progress, owner)
-    # about its middle a pose's turn and its shift keep apart
-    middle = middle_of([seen])
-    centred = seen.about(middle)
-    first = first_state(centred, asked, layout.image_size, loss, loss_scale)
-    free = Free((asked.free.to(seen.pixels.device),), (False,), bend=bend)
-    told = None if progress is None else lambda number, cost: progress(number, float(cost))
-    adjusted = adjusted_alone(centred, asked, first, free, layout.image_size, loss, loss_scale, progress=told)
-    sights = [sight_of(centred, asked)]
-    adjusted, optima = other_optima(0, centred, asked, sights, adjusted, free, layout.image_size, loss, loss_scale)
-    check_determined(adjusted, [asked.kind], [asked.names], sights, [owner])
-    free_parameters = free_count(adjusted, [seen.seen])
-    noise = noise_of(adjusted.residuals[0][0], seen.seen, adjusted.valid[0][0], loss, loss_scale, free_parameters)
-    (layout,), noise = counted_once([seen], adjusted, [layout], noise)
-    result = result_of(adjusted, 0, asked, seen, middle, layout, noise, (object_points, image_points))
-    result.twins = twins_of(result, optima)
+    told = as_options(loss, loss_scale, bend, progress, owner)
+    search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
+    found = results([search], search.alone(bend, told), search.free(bend), object_points, [image_points])
+    result = found.cameras[0]
     if not result.converged:
         python_warnings.warn(
             f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its warnings",
@@ -293,54 +276,100 @@ def calibrate(
     return result
 
 
-def middle_of(seen: Iterable[Observations]) -> Tensor:
+def middle_of(seen: Sequence[Observations]) -> Tensor:
     """(3,) of all points of boards that were seen."""
     points = torch.cat([s.points[s.seen] for s in seen])
     return (points.amin(0) + points.amax(0)) / 2
 
 
-def first_state(
-    seen: Observations, asked: Model, image_size: tuple[int, int], loss: str | None, loss_scale: float
-) -> State:
-    """Where to start from: nothing, or a camera that was given."""
-    if asked.start is None:
-        fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
-        return start_from_nothing(
-            seen, asked.kind, asked.count, image_size, fixed=fixed, loss=loss, loss_scale=loss_scale
+@dataclass
+class Search:
+    """The search for one camera: its model, what it saw, and the loss.
+
+    The boards are taken about their middle, where a pose's turn and its shift hardly depend on each other.
+    """
+
+    owner: str
+    """Who asks, and which camera it is, for messages."""
+    asked: Model
+    given: Observations
+    middle: Tensor
+    layout: Layout
+    loss: str | None
+    loss_scale: float
+
+    @cached_property
+    def seen(self) -> Observations:
+        """What was given, with the boards about their middle."""
+        return self.given.about(self.middle)
+
+    @property
+    def sight(self) -> Sight:
+        """It as one problem."""
+        seen = self.seen
+        return Sight(self.asked.kind, seen.points[None], seen.pixels[None], seen.seen[None].to(seen.pixels))
+
+    def free(self, bend: bool = False) -> Free:
+        """What learns where there is no other camera."""
+        return Free((self.asked.free.to(self.given.pixels.device),), (False,), bend=bend)
+
+    def alone(self, bend: bool = False, progress: Callable[[int, Tensor], None] | None = None) -> Adjusted:
+        """The optimum by what this camera saw, with other poses where those are better by the camera found."""
+        asked, seen, size = self.asked, self.seen, self.layout.image_size
+
+        def optimum(state: State) -> Adjusted:
+            return self.adjusted([self.sight], state, self.free(bend), steps=STEPS, progress=progress)
+
+        if asked.start is None:
+            fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
+            first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
+        else:
+            given = [
+                t.detach().to(seen.pixels).reshape(1, -1) for t in (asked.start.intrinsics, asked.start.distortion)
+            ]
+            first = poses_for(torch.cat(given, -1), seen, asked.kind, size)
+        adjusted = optimum(first)
+        for _ in range(_SECOND_LOOKS):
+            other = other_poses(adjusted.state, seen, asked.kind, size)
+            again = adjusted if other is adjusted.state else optimum(other)
+            if not bool(again.cost < adjusted.cost):
+                break
+            adjusted = again
+        return adjusted
+
+    def adjusted(self, sights: Sequence[Sight], state: State, free: Free, **options: Any) -> Adjusted:
+        """The optimum near a state."""
+        return adjust(sights, state, free, loss=self.loss, loss_scale=self.loss_scale, **options)
+
+    def other_optima(
+        self, camera: int, sights: Sequence[Sight], adjusted: Adjusted, free: Free
+    ) -> tuple[Adjusted, Optima | None]:
+        """An optimum, or a better one in another basin of this camera's model, and all; None where it has but one."""
+        state = adjusted.state
+        boards = _seen_from(state, camera)
+        learns, size = free.parameters[camera].cpu(), self.layout.image_size
+        starts = other_cameras(state.parameters[camera], learns, boards, self.seen, self.asked.kind, size)
+        if starts is None:
+            return adjusted, None
+        first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
+        parameters = tuple(starts if c == camera else p for c, p in enumerate(first.parameters))
+        others = self.adjusted(sights, first._replace(parameters=parameters), free)
+        ends = (
+            (others.state.parameters[camera], state.parameters[camera]),
+            (others.cost, adjusted.cost),
+            (others.converged, adjusted.converged),
         )
-    given = (t.detach().to(seen.pixels).reshape(1, -1) for t in (asked.start.intrinsics, asked.start.distortion))
-    return poses_for(torch.cat(tuple(given), -1), seen, asked.kind, image_size)
+        best = others.cost.argmin()[None]
+        variance = adjusted.cost / (2 * sum(int((sight.weights > 0).sum()) for sight in sights))
+        if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # one as good is no reason to leave the first
+            adjusted = self.adjusted(sights, others.state.of(best), free, steps=STEPS)
+        return adjusted, Optima(*map(torch.cat, ends))
 
 
-def sight_of(seen: Observations, asked: Model) -> Sight:
-    """What a camera sees, as one problem."""
-    return Sight(asked.kind, seen.points[None], seen.pixels[None], seen.seen[None].to(seen.pixels))
-
-
-def adjusted_alone(
-    seen: Observations,
-    asked: Model,
-    first: State,
-    free: Free,
-    image_size: tuple[int, int],
-    loss: str | None,
-    loss_scale: float,
-    progress: Callable[[int, Tensor], None] | None = None,
-) -> Adjusted:
-    """The optimum for one camera near a state, and with other poses where those are better by the camera found."""
-
-    def optimum(state: State) -> Adjusted:
-        sight = sight_of(seen, asked)
-        return adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=progress)
-
-    adjusted = optimum(first)
-    for _ in range(_SECOND_LOOKS):
-        other = other_poses(adjusted.state, seen, asked.kind, image_size)
-        again = adjusted if other is adjusted.state else optimum(other)
-        if not bool(again.cost < adjusted.cost):
-            break
-        adjusted = again
-    return adjusted
+def _seen_from(state: State, camera: int) -> Poses:
+    """The boards in the frame of one camera."""
+    rotations, translations = (t[:, camera, None] for t in state.mounts)
+    return Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
 
 
 class Optima(NamedTuple):
@@ -350,170 +379,122 @@ class Optima(NamedTuple):
     cost: Tensor
     converged: Tensor
 
-
-def other_optima(
-    camera: int,
-    seen: Observations,
-    asked: Model,
-    sights: Sequence[Sight],
-    adjusted: Adjusted,
-    free: Free,
-    image_size: tuple[int, int],
-    loss: str | None,
-    loss_scale: float,
-) -> tuple[Adjusted, Optima | None]:
-    """An optimum, or a better one in another basin of a camera's model, and all; None where it has but one.
-
-    Args:
-        camera: which of the cameras of the problem it is.
-        seen: what it saw.
-        asked: its model.
-        sights: what all cameras saw.
-        adjusted: the optimum.
-        free: what learns.
-        image_size: (height, width).
-        loss: as `calibrate` takes it.
-        loss_scale: px.
-    """
-    state = adjusted.state
-    rotations, translations = (t[:, camera, None] for t in state.mounts)
-    boards = Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
-    starts = other_cameras(
-        state.parameters[camera], free.parameters[camera].cpu(), boards, seen, asked.kind, image_size
-    )
-    if starts is None:
-        return adjusted, None
-    first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
-    parameters = tuple(starts if c == camera else p for c, p in enumerate(first.parameters))
-    others = adjust(sights, first._replace(parameters=parameters), free, loss=loss, loss_scale=loss_scale)
-    ends = (
-        (others.state.parameters[camera], state.parameters[camera]),
-        (others.cost, adjusted.cost),
-        (others.converged, adjusted.converged),
-    )
-    best = others.cost.argmin()[None]
-    variance = adjusted.cost / (2 * sum(int((sight.weights > 0).sum()) for sight in sights))
-    if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # one as good is no reason to leave the first
-        adjusted = adjust(sights, others.state.of(best), free, loss=loss, loss_scale=loss_scale, steps=STEPS)
-    return adjusted, Optima(*map(torch.cat, ends))
+    def twins(self, found: Calibration) -> tuple[tuple[float, ...], ...]:
+        """The parameters of those that the noise does not tell from the one found, and that are apart from it."""
+        if not found.converged:
+            return ()
+        as_good = self.converged & (self.cost - found.adjusted.cost[0] <= _AS_GOOD * found.sigma**2)
+        twins = [found.spread.parameters[0]]
+        for new in self.parameters[as_good][self.cost[as_good].argsort()]:
+            if all(bool(((new - p).abs() > _APART * found.std + _SAME * p.abs().clamp(min=1)).any()) for p in twins):
+                twins.append(new)
+        return tuple(tuple(p.tolist()) for p in twins[1:])
 
 
-def twins_of(found: Calibration, optima: Optima | None) -> tuple[tuple[float, ...], ...]:
-    """The parameters of optima that the noise does not tell from the one found, and that are apart from it."""
-    if optima is None or not found.converged:
-        return ()
-    as_good = optima.converged & (optima.cost - found.adjusted.cost[0] <= _AS_GOOD * found.sigma**2)
-    twins = [found.spread.parameters[0]]
-    for new in optima.parameters[as_good][optima.cost[as_good].argsort()]:
-        if all(bool(((new - p).abs() > _APART * found.std + _SAME * p.abs().clamp(min=1)).any()) for p in twins):
-            twins.append(new)
-    return tuple(tuple(p.tolist()) for p in twins[1:])
+class Results(NamedTuple):
+    """Of all cameras of a problem: the optimum, what belongs to each, and of all corners px.
 
-
-class Noise(NamedTuple):
-    """Of the corners: the inliers, bool (V, N), sigma, and what makes the covariance; px per coordinate.
-
-    Without a loss both are one number.
+    noise: (), what makes the covariance; without a loss it is sigma.
     """
 
-    inliers: Tensor
-    sigma: Tensor
-    spread: Tensor
-    loss: str | None
+    adjusted: Adjusted
+    cameras: list[Calibration]
+    rms: float
+    sigma: float
+    noise: Tensor
 
 
-def noise_of(residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: int) -> Noise:
-    """The inliers, bool (V, N), and sigma: that of all residuals, with a robust loss that of the inliers.
+def results(
+    searches: Sequence[Search], adjusted: Adjusted, free: Free, object_points: Any, image_points: Sequence[Any]
+) -> Results:
+    """What an optimum says; a better one in another basin of a model takes its place. Points are as they were passed.
 
-    A residual of an inlier is shorter than max(3 loss_scale, 3 sigma of the inliers).
-
-    Args:
-        residuals: (V, N, 2).
-        seen: (V, N) bool.
-        valid: (V, N) bool; where it is not, nothing fits.
-        loss: as `calibrate` takes it.
-        loss_scale: px.
-        free: the number of parameters that were free.
+    Raises:
+        ValueError: the data leave the problem open.
     """
+    sights, optima = [search.sight for search in searches], []
+    for c, search in enumerate(searches):
+        adjusted, found = search.other_optima(c, sights, adjusted, free)
+        optima.append(found)
+    for c, search in enumerate(searches):
+        check_determined(adjusted, c, search.asked.kind, search.asked.names, sights[c], search.owner)
+    given = [search.given for search in searches]
+    seen = torch.cat([one.seen for one in given])
+    residuals, valid = (torch.cat([t[0] for t in of_all]) for of_all in (adjusted.residuals, adjusted.valid))
+    views = torch.stack([one.seen.any(-1) for one in given]).any(0)
+    parameters = len(adjusted.equations.columns) + 6 * int(views.sum())
+    loss, loss_scale = searches[0].loss, searches[0].loss_scale
+    inliers, sigma, noise = _noise_of(residuals, seen, valid, loss, loss_scale, parameters)
+    # views that repeat others widen what is uncertain as if there were so many less
+    again = repeats(given, [r[0] for r in adjusted.residuals])
+    noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
+    cameras = []
+    for c, (search, passed, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
+        copies = search.layout.views[again[search.given.seen[again].any(-1)]].tolist()
+        layout = search.layout._replace(copies=tuple(sorted({*search.layout.copies, *copies})))
+        cameras.append(_result(adjusted, c, search, layout, own, sigma, noise, (object_points, passed)))
+    for camera, ends in zip(cameras, optima, strict=True):
+        camera.twins = () if ends is None else ends.twins(camera)
+    return Results(adjusted, cameras, _rms(residuals, seen), float(sigma), noise)
+
+
+def _rms(residuals: Tensor, seen: Tensor) -> float:
+    """Px per point."""
+    lengths = torch.where(seen, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
+    return float((lengths.square().sum() / seen.sum().clamp(min=1)).sqrt())
+
+
+def _noise_of(
+    residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The inliers, bool (V, N), sigma, and the noise that makes the covariance; without a loss both are one number.
+
+    Sigma is that of all residuals, with a robust loss that of the inliers, which are shorter than max(3 loss_scale,
+    3 sigma of the inliers). Where a corner is not valid nothing fits. free: the number of parameters that were free.
+    """
+
+    def sigma_of(lengths: Tensor) -> Tensor:
+        return (lengths.square().sum() / max(2 * len(lengths) - free, 1)).sqrt()
+
     lengths = torch.linalg.vector_norm(residuals, dim=-1)
     inliers = seen & valid
-    whole = sigma = _sigma_of(lengths[inliers], free)
+    whole = sigma = sigma_of(lengths[inliers])
     for _ in range(_ROUNDS):
         found = seen & valid & (lengths < _OUTLIER * max(loss_scale, float(sigma)))
         if torch.equal(found, inliers):
             break
-        inliers, sigma = found, _sigma_of(lengths[found], free)
+        inliers, sigma = found, sigma_of(lengths[found])
     if loss is None:
-        return Noise(inliers, whole, whole, loss)
-    return Noise(inliers, sigma, noise_under(loss, loss_scale, [residuals], [seen & valid], free), loss)
+        return inliers, whole, whole
+    return inliers, sigma, noise_under(loss, loss_scale, residuals, seen & valid, free)
 
 
-def counted_once(
-    seen: Sequence[Observations], adjusted: Adjusted, layouts: Sequence[Layout], noise: Noise
-) -> tuple[list[Layout], Noise]:
-    """With the views named that repeat others, and a noise as if there were so many less views of each."""
-    again = repeats(seen, [r[0] for r in adjusted.residuals])
-    total = len(seen[0].seen)
-    named = [
-        layout._replace(copies=tuple(sorted({*layout.copies, *layout.views[again[one.seen[again].any(-1)]].tolist()})))
-        for layout, one in zip(layouts, seen, strict=True)
-    ]
-    return named, noise._replace(spread=noise.spread * math.sqrt(total / (total - len(again))))
-
-
-def _sigma_of(lengths: Tensor, free: int) -> Tensor:
-    """The standard deviation of a coordinate from the lengths of residuals, (N,)."""
-    return (lengths.square().sum() / max(2 * len(lengths) - free, 1)).sqrt()
-
-
-def free_count(adjusted: Adjusted, seen: Sequence[Tensor]) -> int:
-    """How many parameters were free, poses of boards that were seen included. seen: (V, N) of each camera."""
-    views = torch.stack([s.any(-1) for s in seen]).any(0)
-    return len(adjusted.equations.columns) + 6 * int(views.sum())
-
-
-def result_of(
+def _result(
     adjusted: Adjusted,
     camera: int,
-    asked: Model,
-    seen: Observations,
-    middle: Tensor,
+    search: Search,
     layout: Layout,
-    noise: Noise,
+    inliers: Tensor,
+    sigma: Tensor,
+    noise: Tensor,
     passed: tuple[Any, Any],
 ) -> Calibration:
-    """The result for one of the cameras.
-
-    Args:
-        adjusted: the optimum, with the boards about their middle.
-        camera: which one.
-        asked: its model.
-        seen: what it saw, in the frame of the boards as they were passed.
-        middle: (3,) of the boards.
-        layout: of its image points.
-        noise: of its corners.
-        passed: the object points and image points as they came.
-    """
-    state, residuals = adjusted.state, adjusted.residuals[camera][0]
+    """The result for one of the cameras."""
+    asked, seen = search.asked, search.given
+    state, residuals, valid = adjusted.state, adjusted.residuals[camera][0], adjusted.valid[camera][0]
     parameters = state.parameters[camera][0]
     arguments = (parameters[:4], parameters[4:]) if asked.count else (parameters[:4],)
-    made = asked.kind(*arguments, image_size=layout.image_size)
-    rotations, translations = (t[0] for t in state.boards)
-    mount = tuple(t[0, camera] for t in state.mounts)
-    rotations, translations = mount[0] @ rotations, translations @ mount[0].mT + mount[1]
-    translations = translations - rotations @ middle
-    found = spread(adjusted, asked.kind, camera, noise.spread.reshape(1))
-    whole = torch.where(seen.seen, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
+    rotations, translations = (t[0] for t in _seen_from(state, camera))
     return Calibration(
-        camera=made,
-        extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations),
-        rms=float((whole.square().sum() / seen.seen.sum().clamp(min=1)).sqrt()),
-        sigma=float(noise.sigma),
-        residuals=layout.restore(torch.where(adjusted.valid[camera][0][..., None], residuals, torch.nan)),
-        inliers=layout.restore(noise.inliers),
+        camera=asked.kind(*arguments, image_size=layout.image_size),
+        extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
+        rms=_rms(residuals, seen.seen),
+        sigma=float(sigma),
+        residuals=layout.restore(torch.where(valid[..., None], residuals, torch.nan)),
+        inliers=layout.restore(inliers),
         parameter_names=asked.names,
-        spread=found,
-        converged=bool(adjusted.converged[0]) and bool((adjusted.valid[camera][0] | ~seen.seen).all()),
+        spread=spread(adjusted, asked.kind, camera, noise.reshape(1)),
+        converged=bool(adjusted.converged[0]) and bool((valid | ~seen.seen).all()),
         bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
         image_size=layout.image_size,
         views=tuple(layout.views.tolist()),
@@ -522,7 +503,7 @@ def result_of(
         image_points=passed[1],
         observations=seen,
         adjusted=adjusted,
-        point_inliers=noise.inliers,
-        loss=noise.loss,
+        point_inliers=inliers,
+        loss=search.loss,
         index=camera,
     )

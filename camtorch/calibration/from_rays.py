@@ -60,22 +60,23 @@ def fit(
     given_pixels = as_values(pixels, "pixels", owner).detach().double()
     given_rays = as_values(rays, "rays", owner).detach().double()
     dims = given_pixels.ndim - 1
-    is_pixels = dims > 0 and given_pixels.shape[-1] == 2
-    if not is_pixels or given_rays.shape[-1:] != (3,) or given_rays.shape[-1 - dims : -1] != given_pixels.shape[:-1]:
+    form = given_pixels.shape[-1:], given_rays.shape[-1:], given_rays.shape[-1 - dims : -1]
+    if dims < 1 or form != ((2,), (3,), given_pixels.shape[:-1]):
         raise ValueError(
             f"{owner}: pixels must be (*N, 2) and rays (*N, 3), or (*B, *N, 3); got pixels "
             f"{tuple(given_pixels.shape)} and rays {tuple(given_rays.shape)}"
         )
-    if given_rays.numel() == 0:
-        raise ValueError(f"{owner}: a camera takes {_LEAST} rays at least; got rays {tuple(given_rays.shape)}")
     batch = given_rays.shape[: given_rays.ndim - 1 - dims]
     seen = _observations(given_pixels, given_rays, weights, dims, owner)
-    counted = (seen.weights > 0).sum(-1)
-    if not bool((counted >= _LEAST).all()):
-        raise ValueError(f"{owner}: a camera takes {_LEAST} rays at least that are finite; got {counted.tolist()}")
+    counts = seen.weights > 0
+    if not counts.numel() or not bool((counts.sum(-1) >= _LEAST).all()):
+        raise ValueError(
+            f"{owner}: a camera takes {_LEAST} rays at least that are finite; got {counts.sum(-1).tolist()} of rays "
+            f"{tuple(given_rays.shape)}"
+        )
     lens = _unified(seen, owner)
     slopes = views.focal_at_axis(lens)
-    reach = torch.where(seen.weights > 0, angles_from_axis(seen.rays), 0.0).amax(-1)
+    reach = torch.where(counts, angles_from_axis(seen.rays), 0.0).amax(-1)
     names = asked.kind.names_of(asked.count) or ()
     starts = asked.kind.fit_start(names, *views.radii(lens, slopes, reach.clamp(max=math.pi)))
     ideal = slopes.new_tensor(asked.kind.ideal(asked.count)).expand(len(slopes), -1)
@@ -84,7 +85,6 @@ def fit(
     parts = parameters[:, :4].reshape(*batch, 4), parameters[:, 4:].reshape(*batch, asked.count)
     camera = asked.kind(*parts[: 1 + (asked.count > 0)], image_size=size)
     found, valid = fixed_camera(asked.kind, parameters[:, :4], parameters[:, 4:]).project(seen.rays)
-    counts = seen.weights > 0
     shown = valid & counts
     errors = torch.where(shown, torch.linalg.vector_norm(found - seen.pixels, dim=-1), 0.0)
     numbers = {
@@ -100,7 +100,7 @@ def fit(
 def _observations(pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: int, owner: str) -> fitting.Observations:
     """Rows of unit rays; what is not finite, or of no length, has no weight."""
     shape = rays.shape[:-1]
-    flat_rays = rays.reshape(-1, math.prod(shape[-dims:]), 3)
+    flat_rays = rays.reshape(math.prod(shape[:-dims]), math.prod(shape[-dims:]), 3)
     flat_pixels = pixels.to(rays.device).expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
     lengths = torch.linalg.vector_norm(flat_rays, dim=-1, keepdim=True)
     good = torch.isfinite(flat_rays).all(-1) & torch.isfinite(flat_pixels).all(-1) & (lengths[..., 0] > 0)

@@ -29,7 +29,7 @@ _NOWHERE = 10.0  # times the longer side: no corner at all, not even an outlier
 _SAME_PIXEL = 3  # corners of a view at one pixel
 _SAME_ERRORS = 0.1  # the squared distance of two views over their squared residuals: 1 where noise is independent
 _SAME_NOISE = 0.1  # px, the distance of two views that saving a file anew may make
-_NAMED = 8  # views, in a message
+_NAMED = 6  # views, in a message
 
 
 class Observations(NamedTuple):
@@ -68,14 +68,9 @@ class Layout(NamedTuple):
     """The numbers of the views, of those that were passed, that are no new evidence: see `_observed` and `repeats`."""
 
     def restore(self, values: Tensor) -> Any:
-        """Results of the observations in the form of the image points, NaN (of bool: False) where nothing was seen.
+        """Results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) where nothing was seen:
 
-        Args:
-            values: (V, N, k) or (V, N).
-
-        Returns:
-            (V', *, k) for one tensor of V' views, or a list of a tensor (*, k) for each view; k is missing where it is
-            in the values.
+        (V', *, k) for one tensor of V' views, or a list of a tensor (*, k) for each view.
         """
         empty = False if values.dtype == torch.bool else torch.nan
         rest = values.shape[2:]
@@ -90,7 +85,7 @@ class Layout(NamedTuple):
 def as_observations(
     object_points: Points, image_points: Points, image_size: Sequence[int], owner: str
 ) -> tuple[Observations, Layout]:
-    """What one camera sees.
+    """What one camera sees: the views that have corners, and the form to bring results back into.
 
     Args:
         object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3), in the board's frame.
@@ -98,10 +93,6 @@ def as_observations(
             unseen. In both, points may be OpenCV's (N, 1, 2), (1, N, 2).
         image_size: (height, width) in pixels.
         owner: the name of the function that asks, for messages.
-
-    Returns:
-        The views that have corners, detached, float64, on the device of the image points; and the form to bring
-        results back into.
 
     Warns:
         UserWarning: a view has no corner, or those of an earlier one, and is left out.
@@ -121,39 +112,27 @@ def as_rig_observations(
     image_sizes: Mapping[str, Sequence[int]],
     models: Mapping[str, Any],
     owner: str,
-) -> tuple[dict[str, Observations], dict[str, Layout]]:
+) -> dict[str, tuple[Observations, Layout]]:
     """What the cameras of a rig see: of every camera the same views of the same boards, by name in the models' order.
 
-    Args:
-        object_points: as `as_observations` takes them; of the boards, so the same for all cameras.
-        image_points: by the name of a camera, as `as_observations` takes them; None or NaN where a camera does not see
-            the board of a view.
-        image_sizes: by the name of a camera, (height, width).
-        models: by the name of a camera; only the names count.
-        owner: the name of the function that asks, for messages.
-
-    Warns:
-        UserWarning: no camera sees the board of a view, or all see the corners of an earlier one: it is left out.
+    Image points are None or NaN where a camera does not see the board of a view.
 
     Raises:
         ValueError: what `as_observations` refuses; names that differ; a camera that sees nothing; cameras that no
             board links. TypeError: no mappings.
     """
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
-        if not isinstance(given, Mapping):
+        if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
             raise TypeError(
                 f"{owner}: {argument} must map names of cameras to theirs, as {{'left': ..., 'right': ...}}; "
-                f"got {type(given).__name__}"
+                f"got {type(given).__name__} {shown(given)}"
             )
-        if not all(isinstance(name, str) for name in given):
-            raise TypeError(f"{owner}: names of cameras must be strings; {argument} has {list(given)!r:.60}")
         if not given or set(given) != set(models):
             raise ValueError(
                 f"{owner}: models, image_points and image_sizes must name the same cameras; {argument} has "
                 f"{list(given)}, and models {list(models)}"
             )
-    found = _observed(object_points, {name: image_points[name] for name in models}, image_sizes, owner)
-    return {name: seen for name, (seen, _) in found.items()}, {name: layout for name, (_, layout) in found.items()}
+    return _observed(object_points, {name: image_points[name] for name in models}, image_sizes, owner)
 
 
 def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
@@ -161,13 +140,7 @@ def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Ten
 
     Where the noise of two views is independent, corners differ by at least as much as both are wrong by; in such a pair
     they differ by less than a third of that. Images taken one after the other from a tripod have noise of their own.
-
-    Args:
-        cameras: what each saw of the same views.
-        residuals: of each, (V, N, 2).
-
-    Returns:
-        (R,) all but the first of each group that is alike.
+    Returned are all but the first of each group that is alike, (R,). residuals: of each camera (V, N, 2).
     """
     seen = torch.cat([one.seen for one in cameras], -1)
     pixels = torch.cat([one.pixels for one in cameras], 1)
@@ -193,24 +166,17 @@ def _observed(
     Views without corners are left out, and those that have the same corners in all cameras as an earlier one, in any
     order: noise makes those of no two photographs equal.
     """
-    rig = any(image_points)
-    labels = {name: f"image_points[{name!r}]" if rig else "image_points" for name in image_points}
+    labels = {name: f"image_points[{name!r}]" if name else "image_points" for name in image_points}
     sizes = {}
     for name in image_points:
-        size_name = f"image_sizes[{name!r}]" if rig else "image_size"
+        size_name = f"image_sizes[{name!r}]" if name else "image_size"
         if (size := as_image_size(image_sizes[name], owner, size_name)) is None:
             raise ValueError(f"{owner}: {size_name} is missing: (height, width) in pixels, as image.shape[:2]")
         sizes[name] = size_name, size
     views = {name: _in_views(given, 2, labels[name], owner) for name, given in image_points.items()}
-    for name, given in views.items():
-        if given.single:
-            shape = (*(given.shapes[0] or ()), 2)
-            raise ValueError(
-                f"{owner}: {labels[name]} must be (V, N, 2) or a list of (N_i, 2), one for each view; got shape {shape}"
-            )
-    counts = {labels[name]: len(given.rows) for name, given in views.items()}
     board = _in_views(object_points, 3, "object_points", owner).rows
-    if len(board) > 1 or any(rows is None for rows in board):
+    counts = {labels[name]: len(given.rows) for name, given in views.items()}
+    if len(board) > 1 or board[0] is None:
         counts["object_points"] = len(board)
     if len(set(counts.values())) > 1:
         raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {counts}")
@@ -218,7 +184,7 @@ def _observed(
     boards = [torch.empty(0, 3) if rows is None else rows for rows in (board * number if len(board) == 1 else board)]
     device = next(rows.device for given in views.values() for rows in given.rows if rows is not None)
     points = _padded(boards, max(map(len, boards)), 3, device)
-    pixels = {}
+    pixels, seen = {}, {}
     for name, given in views.items():
         for i, (rows, of_board) in enumerate(zip(given.rows, boards, strict=True)):
             if rows is not None and len(rows) not in (0, len(of_board)):
@@ -227,22 +193,20 @@ def _observed(
                     f"and {labels[name]}[{i}] are {len(rows)}; corners that were not found are rows of NaN"
                 )
         pixels[name] = _padded(given.rows, points.shape[1], 2, device)
-    seen = {name: ~of.isnan().any(-1) for name, of in pixels.items()}
-    for name in views:
+        seen[name] = ~pixels[name].isnan().any(-1)
         _check_corners(points, pixels[name], seen[name], labels[name], owner)
         _check_inside(pixels[name], seen[name], labels[name], *sizes[name], owner)
-    _check_links(list(views), torch.stack([of.any(-1) for of in seen.values()]), owner)
-    has = torch.stack([of.any(-1) for of in seen.values()]).any(0)
-    if not bool(has.all()):
-        warnings.warn(f"{owner}: left out, as nothing was seen in {_named(~has)}", UserWarning, stacklevel=5)
+    sees = torch.stack([of.any(-1) for of in seen.values()])
+    _check_links(list(views), sees, owner)
+    has = sees.any(0)
     # complex numbers have an order: by u, then by v
     corners = {name: torch.where(seen[name], torch.view_as_complex(of), torch.inf) for name, of in pixels.items()}
     ordered = np.concatenate([np.sort(of.numpy(force=True) + 0.0, 1) for of in corners.values()], 1)
     first: dict[bytes, int] = {}
     copy = has & torch.tensor([first.setdefault(row.tobytes(), i) != i for i, row in enumerate(ordered)], device=device)
-    if bool(copy.any()):
-        words = f"{owner}: left out, as the corners are those of another view in {_named(copy)}"
-        warnings.warn(words, UserWarning, stacklevel=5)
+    for left_out, why in ((~has, "nothing was seen"), (copy, "the corners are those of another view")):
+        if bool(left_out.any()):
+            warnings.warn(f"{owner}: left out, as {why} in {_views_of(left_out)}", UserWarning, stacklevel=5)
     kept = (has & ~copy).nonzero()[:, 0]
     found = {}
     for name, given in views.items():
@@ -260,19 +224,18 @@ class _Views(NamedTuple):
     rows: list[Tensor | None]
     shapes: list[tuple[int, ...] | None]
     stacked: bool
-    single: bool
-    """Whether it was one set of points, without a dim for views."""
 
 
 def _in_views(value: Points, size: int, name: str, owner: str) -> _Views:
+    """Image points have a dim for views, or are in a list; object points may be one set."""
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = list(value)
-    stacked = not isinstance(value, (list, tuple))
+    parts: list[Tensor | None]
+    listed, single = isinstance(value, (list, tuple)), False
     if isinstance(value, (list, tuple)):
         parts = [None if p is None else _as_float64(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
-        known = [part for part in parts if part is not None]
-        if single := bool(known) and all(part.ndim == 1 and len(part) for part in known):
-            stacked, parts = True, [_as_float64(value, size, name, owner)]  # rows of numbers
+        if any(p is not None for p in parts) and all(p is None or (p.ndim == 1 and len(p)) for p in parts):
+            listed, single, parts = False, True, [_as_float64(value, size, name, owner)]  # rows of numbers
     else:
         whole = _as_float64(value, size, name, owner)
         # (N, 1, size) is OpenCV's form of one set of points
@@ -286,13 +249,12 @@ def _in_views(value: Points, size: int, name: str, owner: str) -> _Views:
             rows.append(None if part is None else part.new_empty(0, size))
             continue
         flat = part.reshape(-1, part.shape[-1]) if part.ndim == 3 and 1 in part.shape[:2] else part
-        if flat.ndim != 2 or flat.shape[1] != size:
-            label, views = (name, () if single else (len(parts),)) if stacked else (f"{name}[{i}]", ())
-            form = f"(V, N, {size})" if views else f"(N, {size})"
-            raise ValueError(f"{owner}: {label} must be {form}; got shape {(*views, *part.shape)}")
+        if flat.ndim != 2 or flat.shape[1] != size or (single and size == 2):
+            shape = part.shape if listed or single else (len(parts), *part.shape)
+            form = f"(N, {size})" if listed or size == 3 else f"(V, N, {size}) or a list of (N_i, {size})"
+            raise ValueError(f"{owner}: {name}{f'[{i}]' * listed} must be {form}; got shape {tuple(shape)}")
         rows.append(flat)
-    shapes = [None if part is None else tuple(part.shape[:-1]) or (0,) for part in parts]
-    return _Views(rows, shapes, stacked, single)
+    return _Views(rows, [None if p is None else tuple(p.shape[:-1]) or (0,) for p in parts], not listed)
 
 
 def _as_float64(value: Any, size: int, name: str, owner: str) -> Tensor:
@@ -322,19 +284,11 @@ def _padded(views: Sequence[Tensor | None], count: int, size: int, device: torch
 
 
 def _check_corners(points: Tensor, pixels: Tensor, seen: Tensor, name: str, owner: str) -> None:
-    """Refuse corners from which no pose can be told.
-
-    Args:
-        points: (V, N, 3), NaN where padded.
-        pixels: (V, N, 2), NaN where unseen.
-        seen: (V, N).
-        name: of the argument that the pixels are, for messages.
-        owner: the name of the function that asks, for messages.
-    """
+    """Refuse corners from which no pose can be told; points (V, N, 3) and pixels (V, N, 2) are NaN where padded."""
 
     def refuse(views: Tensor, words: str) -> None:
         if bool(views.any()):
-            raise ValueError(f"{owner}: {_named(views)}: {words}")
+            raise ValueError(f"{owner}: {_views_of(views)}: {words}")
 
     refuse(pixels.isinf().any(-1).any(-1), f"{name} is infinite; what is unseen is NaN")
     number, has = seen.sum(-1), seen.any(-1)
@@ -388,33 +342,32 @@ def _check_inside(pixels: Tensor, seen: Tensor, name: str, size_name: str, size:
     exchanged = number > _FEW_OUTSIDE * total and int(outside(width, height, _RIM).sum()) <= _FEW_LEFT * number
     views = (out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)) | outside(height, width, _NOWHERE).any(-1)
     if exchanged or number > _MANY_OUTSIDE * total or bool(views.any()):
-        asked = (
-            f"{size_name} is (height, width), as image.shape[:2], and points are (u, v), u to the right"
-            if exchanged
-            else f"{size_name} is that of all images that the corners were found in, and unseen corners are NaN"
-        )
         raise ValueError(
             f"{owner}: {number} of {total} corners of {name} lie outside the image of {size_name} {size}, in "
-            f"{_named(views if bool(views.any()) else out.any(-1))}; they reach from {low} to {high}: {asked}"
+            f"{_views_of(views if bool(views.any()) else out.any(-1))}; they reach from {low} to {high}: {size_name} "
+            "is (height, width) of all images, as image.shape[:2], points are (u, v), and unseen corners NaN"
         )
 
 
 def _check_links(names: list[str], sees: Tensor, owner: str) -> None:
     """Refuse cameras, sees (C, V), of which some share no view, not even by way of others, with the first."""
-    linked = torch.zeros(len(names), dtype=torch.bool, device=sees.device)
-    linked[0] = True
+    linked = torch.arange(len(names), device=sees.device) == 0
     for _ in names:
         linked = linked | (sees & sees[linked].any(0)).any(-1)
-    apart = [name for name, is_linked in zip(names, linked.tolist(), strict=True) if not is_linked]
+    apart = [repr(name) for name, is_linked in zip(names, linked.tolist(), strict=True) if not is_linked]
     if apart:
         raise ValueError(
-            f"{owner}: {', '.join(map(repr, apart))} never sees a board in the same view as {names[0]!r}, nor as a "
+            f"{owner}: {', '.join(apart)} never sees a board in the same view as {names[0]!r}, nor as a "
             "camera that does: where it is cannot be told; take views that both see, or calibrate it alone"
         )
 
 
-def _named(views: Tensor) -> str:
+def _views_of(views: Tensor) -> str:
     """The views of a mask (V,) in words."""
-    numbers = views.nonzero()[:, 0].tolist()
-    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
-    return f"view{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers[:_NAMED]))}{more}"
+    return named(views.nonzero()[:, 0].tolist())
+
+
+def named(views: Sequence[int]) -> str:
+    """Views by their numbers, in words."""
+    more = f" and {len(views) - _NAMED} more" if len(views) > _NAMED else ""
+    return f"view{'s' * (len(views) > 1)} {', '.join(map(str, views[:_NAMED]))}{more}"

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from camtorch._arguments import Numbers, broadcast_shapes, no_camera, working_dtype
 from camtorch._threads import on_one_thread
-from camtorch.calibration.batches import as_tensor, as_vectors, learns, rows_of
+from camtorch.calibration.batches import as_tensor, as_vectors, learns, root_of, rows_of
 from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.camera import Camera
@@ -78,14 +78,11 @@ def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weight
     if learns([camera], task.points, task.pixels, task.weights):
         unknowns = attached(task.cost, unknowns, valid)
     mean = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
-    # of a perfect fit the root has no derivative
-    rms = torch.where(valid & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), torch.where(valid, 0.0, torch.inf))
     rotation, translation = unknowns.split(3, -1)
     translation = translation - (rotation_matrix(rotation) @ task.middles[..., None])[..., 0]
     rotation, translation = (t.to(task.dtype).view(*task.batch, 3) for t in (rotation, translation))
-    return Pose(
-        Extrinsics(rotation[..., None], translation), rms.to(task.dtype).view(task.batch), valid.view(task.batch)
-    )
+    rms, valid = root_of(mean, valid).to(task.dtype).view(task.batch), valid.view(task.batch)
+    return Pose(Extrinsics(rotation[..., None], translation), rms, valid)
 
 
 def _of_each_model(camera: Mixed, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> Pose:
@@ -98,16 +95,12 @@ def _of_each_model(camera: Mixed, object_points: Numbers, pixels: Numbers, weigh
     leads = [tuple(field.shape[:-2]) for field in fields]
     if any(lead not in ((), (1,), (count,)) for lead in leads):
         raise ValueError(f"{owner}: a Mixed of {count} cameras takes batch dims () or ({count},); got {leads}")
-    poses = []
+    found = []
     for rows, group in camera.groups:
         mine = [field[rows] if field.shape[:-2] == (count,) else field for field in fields]
-        poses.append(solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0]))
-    rotation, translation, rms, valid = (
-        camera._in_order(torch.cat(parts))
-        for parts in zip(
-            *((p.extrinsics.rotation, p.extrinsics.translation, p.rms, p.valid) for p in poses), strict=True
-        )
-    )
+        pose, rms, valid = solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0])
+        found.append((pose.rotation, pose.translation, rms, valid))
+    rotation, translation, rms, valid = (camera._in_order(torch.cat(parts)) for parts in zip(*found, strict=True))
     return Pose(Extrinsics(rotation[..., None], translation), rms, valid)
 
 
@@ -136,27 +129,30 @@ class _Task(NamedTuple):
         given = None if weights is None else as_tensor(weights, "weights", owner, device)
         shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
         if points.shape[-2] != count:
-            hint = ". Rows of fewer points are padded with NaN pixels"
-            raise ValueError(f"{owner}: {shapes} are not the same number of points{hint}")
+            raise ValueError(
+                f"{owner}: {shapes} are not the same number of points. Rows of fewer points are padded with NaN pixels"
+            )
         if count < _LEAST:
             raise ValueError(f"{owner}: it takes {_LEAST} points at least; got {shapes}")
-        if given is not None and given.shape[-1:] != (count,):
-            raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}; got shape {tuple(given.shape)}")
-        if given is not None and not bool((given >= 0).all()):
-            raise ValueError(f"{owner}: weights must not be negative; got {given.detach().min().item():.4g}")
-        lead = () if given is None else given.shape[:-1]
+        given = seen_at.new_ones(count)
+        if weights is not None:
+            given = as_tensor(weights, "weights", owner, device)
+            if given.shape[-1:] != (count,):
+                raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}; got shape {tuple(given.shape)}")
+            if not bool((given >= 0).all()):
+                raise ValueError(f"{owner}: weights must not be negative; got {given.detach().min().item():.4g}")
         try:
-            batch = broadcast_shapes(camera.batch_shape, points.shape[:-2], seen_at.shape[:-2], lead)
+            batch = broadcast_shapes(camera.batch_shape, points.shape[:-2], seen_at.shape[:-2], given.shape[:-1])
         except ValueError:
-            also = "" if given is None else f", weights {tuple(given.shape)}"
             raise ValueError(
-                f"{owner}: the batch dims of {shapes}{also} and the camera's {tuple(camera.batch_shape)} do not fit"
+                f"{owner}: the batch dims of {shapes}, weights {tuple(given.shape)} and the camera's "
+                f"{tuple(camera.batch_shape)} do not fit"
             ) from None
         dtype = working_dtype(points, seen_at, *camera.tensors)
-        points = points.double().expand(*batch, count, 3).reshape(-1, count, 3)
-        seen_at = seen_at.double().expand(*batch, count, 2).reshape(-1, count, 2)
-        given = seen_at.new_ones(count) if given is None else given.double()
-        given = given.expand(*batch, count).reshape(-1, count)
+        points, seen_at, given = (
+            t.double().expand(*batch, count, *size).reshape(-1, count, *size)
+            for t, size in ((points, (3,)), (seen_at, (2,)), (given, ()))
+        )
         rows = rows_of(camera, batch)
         with torch.no_grad():
             rays, seen = rows.unproject(seen_at)
@@ -164,16 +160,9 @@ class _Task(NamedTuple):
             seen = seen & torch.isfinite(points.square().sum(-1).square() + given)
             counts = (seen & (given > 0))[..., None]
             middles = torch.where(counts, points, 0.0).sum(-2) / counts.sum(-2).clamp(min=1)
-        return cls(
-            rows,
-            torch.where(seen[..., None], points - middles[:, None], 0.0),
-            torch.where(seen[..., None], seen_at, 0.0),
-            torch.where(seen, given, 0.0),
-            rays,
-            middles,
-            batch,
-            dtype,
-        )
+        points = torch.where(seen[..., None], points - middles[:, None], 0.0)
+        seen_at, given = torch.where(seen[..., None], seen_at, 0.0), torch.where(seen, given, 0.0)
+        return cls(rows, points, seen_at, given, rays, middles, batch, dtype)
 
     def cost(self, unknowns: Tensor) -> Tensor:
         """(B,) half the sum of squares at rotation vectors and translations (B, 6)."""
@@ -194,20 +183,17 @@ def _solved(task: _Task) -> tuple[Tensor, Tensor]:
     costs = torch.where(starts.valid, costs, torch.inf)
     best, every = costs.argmin(-1), torch.arange(len(costs), device=costs.device)
     found = _refined(task, every, starts.rotations[every, best], starts.translations[every, best])
-    found = found.only(starts.valid[every, best])
+    found = found._replace(costs=torch.where(starts.valid[every, best], found.costs, torch.inf))
     few = (weights > 0).sum(-1) <= _FEW
     others = costs.scatter(1, best[:, None], torch.inf).amin(-1)
     for those, factor, steps in ((few, _MUCH_WORSE, _STEPS), (~few, _WORSE, _FEW_STEPS)):
         (rows,) = (those & (others <= factor * costs.amin(-1)) & (others < torch.inf)).nonzero(as_tuple=True)
-        which = 1 - best[rows]
-        found = found.or_better(
-            rows, _refined(task, rows, starts.rotations[rows, which], starts.translations[rows, which], steps)
-        )
+        other = starts.rotations[rows, 1 - best[rows]], starts.translations[rows, 1 - best[rows]]
+        found = found.or_better(rows, _refined(task, rows, *other, steps))
     # of so few points on a plane the other minimum may be one of pixels, and none of rays
     (rows,) = (few & starts.valid[:, 0] & ~starts.valid[:, 1]).nonzero(as_tuple=True)
-    mirrored = _mirrored(points[rows], weights[rows], found.rotations[rows], found.translations[rows])
-    rows, rotations, translations = (t[mirrored.flat] for t in (rows, *mirrored[1:]))
-    found = found.or_better(rows, _refined(task, rows, rotations, translations))
+    flat, turned, moved = _mirrored(points[rows], weights[rows], found.rotations[rows], found.translations[rows])
+    found = found.or_better(rows[flat], _refined(task, rows[flat], turned[flat], moved[flat]))
     return torch.cat((rotation_vector(found.rotations), found.translations), -1), torch.isfinite(found.costs)
 
 
@@ -217,10 +203,6 @@ class _Found(NamedTuple):
     costs: Tensor
     rotations: Tensor
     translations: Tensor
-
-    def only(self, valid: Tensor) -> _Found:
-        """Those of valid rows."""
-        return self._replace(costs=torch.where(valid, self.costs, torch.inf))
 
     def or_better(self, rows: Tensor, other: _Found) -> _Found:
         """With the minima of some rows, where they are lower, in the place of those here."""
@@ -238,12 +220,8 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor,
     points, pixels, weights = (t.detach()[rows, None] for t in task[1:4])
     parameters = torch.cat(task.camera.tensors, -1).detach()
     parameters = parameters[None] if parameters.ndim == 1 else parameters[rows]
-    start = State(
-        (parameters,),
-        Poses.none(len(rows), 1, points),
-        Poses(rotations[:, None], translations[:, None]),
-        points.new_zeros(len(rows), 2),
-    )
+    boards = Poses(rotations[:, None], translations[:, None])
+    start = State((parameters,), Poses.none(len(rows), 1, points), boards, points.new_zeros(len(rows), 2))
     nothing = torch.zeros(parameters.shape[-1], dtype=torch.bool, device=points.device)
     problem = Bundle([Sight(task.camera, points, pixels, weights)], start, Free((nothing,), (False,)), None, 1.0)
     counts = (weights > 0).sum((-1, -2))
@@ -261,16 +239,10 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor,
     return _Found(torch.where(found.converged & complete, found.cost, torch.inf), rotations[:, 0], translations[:, 0])
 
 
-class _Mirrored(NamedTuple):
-    """Whether points are nearly on a plane, and poses whose normals of it mirror those of others."""
-
-    flat: Tensor
-    rotations: Tensor
-    translations: Tensor
-
-
-def _mirrored(points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor) -> _Mirrored:
-    """Mirrored at the line of sight to the points' middle."""
+def _mirrored(
+    points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Whether points are nearly on a plane, and poses whose normals of it are mirrored at the line of sight."""
     share = weights / weights.sum(-1, keepdim=True)
     centre = (share[..., None] * points).sum(-2)
     centred = points - centre[:, None]
@@ -282,4 +254,4 @@ def _mirrored(points: Tensor, weights: Tensor, rotations: Tensor, translations: 
         for v in (normalize(middle, dim=-1), normal)
     )
     mirrored = across_sight @ rotations @ in_plane
-    return _Mirrored(flat, mirrored, middle - (mirrored @ centre[..., None])[..., 0])
+    return flat, mirrored, middle - (mirrored @ centre[..., None])[..., 0]

@@ -43,17 +43,14 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
 
     Nothing is divided by z, so that rays may have any angle from the optical axis.
 
-    Args:
-        points: (B, N, 3) in any unit, float64.
-        rays: (B, N, 3) of unit length.
-        weights: (B, N), not negative; 0 for what is not seen, whose points and rays do not matter.
-
-    Returns:
-        Two poses a row, S = 2. A pose is valid if four points or more are seen that are not on a line, everything is
-        finite, and most of what is seen lies ahead on its rays; the second one if it is another minimum. Others are
-        finite and mean nothing.
+    Points and unit rays are (B, N, 3), weights (B, N) not negative, 0 for what is not seen. There are two poses
+    a row, S = 2. A pose is valid if four points or more are seen that are not on a line, everything is finite, and most
+    of what is seen lies ahead on its rays; the second one if it is another minimum. Others are finite and mean nothing.
     """
-    points, rays, weights = _cleaned(points, rays, weights)
+    # what is not finite, which a sum shows, has weight 0; what has no weight is zero
+    seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)
+    points, rays = torch.where(seen[..., None], points, 0.0), torch.where(seen[..., None], rays, 0.0)
+    weights = torch.where(seen, weights, 0.0)
     total = weights.sum(-1).clamp(min=_TINY)
     weights = weights / total[:, None]
     centre = (weights[..., None] * points).sum(-2)
@@ -70,13 +67,18 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     distances = _Distances.between(local, rays, weights)
     rotations = points.new_empty(len(points), 2, 3, 3)
     flat = extent[:, 0] <= _FLAT * size
-    for chosen, solve in ((flat, _planar_rotations), (~flat, _rotations_in_space)):
+    for chosen in (flat, ~flat):
         (rows,) = chosen.nonzero(as_tuple=True)
         if len(rows):
-            rotations[rows] = solve(local[rows], rays[rows], weights[rows], distances.of(rows))
+            some = _Distances(*(t[rows] for t in distances))
+            rotations[rows] = (
+                some.descended(_planar_starts(rays[rows], weights[rows], some), _STEPS)
+                if chosen is flat
+                else _rotations_in_space(local[rows], rays[rows], weights[rows], some)
+            )
     translations = distances.translations(rotations)
-    seen = local[:, None] @ rotations.mT + translations[:, :, None]
-    cosines = (normalize(seen, dim=-1) * rays[:, None]).sum(-1)
+    placed = local[:, None] @ rotations.mT + translations[:, :, None]
+    cosines = (normalize(placed, dim=-1) * rays[:, None]).sum(-1)
     # a plane behind its rays is as near to them as the plane ahead that it is by a point reflection
     side = torch.where(flat[:, None] & ((weights[:, None] * cosines.sign()).sum(-1) < 0), -1.0, 1.0).to(cosines)
     rotations = rotations * torch.stack((side, side, torch.ones_like(side)), -1)[:, :, None]
@@ -99,17 +101,6 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     )
 
 
-def _cleaned(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """With weight 0 and zeros for what is not finite, and zeros for what has no weight."""
-    # a sum shows what is not finite
-    seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)
-    return (
-        torch.where(seen[..., None], points, 0.0),
-        torch.where(seen[..., None], rays, 0.0),
-        torch.where(seen, weights, 0.0),
-    )
-
-
 def _frame(direction: Tensor) -> Tensor:
     """(..., 3, 3) rotations whose third column is the direction (..., 3), of unit length."""
     sign = torch.where(direction[..., 2] < 0, -1.0, 1.0)
@@ -125,16 +116,15 @@ def _sight(rays: Tensor, weights: Tensor) -> Tensor:
     return normalize((weights[..., None] * rays).sum(-2), dim=-1)
 
 
-def _products(vectors: Tensor) -> Tensor:
-    """(B, N, 6): the products of two components of (B, N, 3), in the order of `_PAIRS`."""
-    x, y, z = vectors.unbind(-1)
-    return torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
-
-
 def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
     """(B, 3, 3, 3, 3): the sum of (I - r r^T) x p p^T over points p, which is what is across their unit rays r."""
-    pairs = _products(points) * weights[..., None]
-    along = _products(rays).mT @ pairs
+
+    def products(vectors: Tensor) -> Tensor:
+        x, y, z = vectors.unbind(-1)
+        return torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
+
+    pairs = products(points) * weights[..., None]
+    along = products(rays).mT @ pairs
     across = pairs.sum(-2)[:, None] * pairs.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None] - along
     index = torch.tensor(_PAIRS, device=rays.device)
     return across[:, index[:, :, None, None], index]
@@ -183,10 +173,6 @@ class _Distances(NamedTuple):
         to_depth = (weighted.mT @ local).flatten(1) - (weighted.sum(1)[:, None] @ solution)[:, 0]
         return cls(form - moved.mT @ solution, -solution, to_depth)
 
-    def of(self, rows: Tensor) -> _Distances:
-        """Those of some rows."""
-        return _Distances(*(t[rows] for t in self))
-
     def translations(self, rotations: Tensor) -> Tensor:
         """(B, S, 3): the best to rotations (B, S, 3, 3)."""
         return rotations.flatten(2) @ self.to_translation.mT
@@ -220,11 +206,6 @@ class _Distances(NamedTuple):
             costs = torch.where(better, turned_costs, costs)
             damping = torch.where(better, damping / 10, damping * 10).clamp(1e-9, 1e3)
         return rotations
-
-
-def _planar_rotations(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
-    """(B, 2, 3, 3): of points in the plane z = 0 around its origin."""
-    return distances.descended(_planar_starts(rays, weights, distances), _STEPS)
 
 
 def _planar_starts(rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:

@@ -5,34 +5,17 @@ from __future__ import annotations
 import math
 import warnings as python_warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from camtorch._threads import on_one_thread
-from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State, adjust
-from camtorch.calibration.calibrate import (
-    STEPS,
-    Calibration,
-    Model,
-    adjusted_alone,
-    as_model,
-    as_options,
-    counted_once,
-    first_state,
-    free_count,
-    middle_of,
-    noise_of,
-    other_optima,
-    result_of,
-    sight_of,
-    twins_of,
-)
-from camtorch.calibration.observations import Observations, Points, as_rig_observations
+from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State
+from camtorch.calibration.calibrate import STEPS, Calibration, Search, as_model, as_options, middle_of, results
+from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
-from camtorch.calibration.verdict import check_determined
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
@@ -149,81 +132,44 @@ def calibrate_rig(
         ValueError: what `calibrate` refuses; names that differ; cameras that no board links.
     """
     owner = "calibrate_rig"
-    seen, layouts = as_rig_observations(object_points, image_points, image_sizes, models, owner)
-    as_options(loss, loss_scale, bend, progress, owner)
-    names = list(seen)
+    observed = as_rig_observations(object_points, image_points, image_sizes, models, owner)
+    told = as_options(loss, loss_scale, bend, progress, owner)
     for given in (count, start, fixed):
-        stray = [name for name in given if name not in seen] if isinstance(given, Mapping) else []
+        stray = [name for name in given if name not in observed] if isinstance(given, Mapping) else []
         if stray:
             raise ValueError(
-                f"{owner}: no camera is called {', '.join(map(repr, stray))}; there are {', '.join(names)}"
+                f"{owner}: no camera is called {', '.join(map(repr, stray))}; there are {', '.join(observed)}"
             )
-    asked = [
-        as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), f"{owner}: {name}")
-        for name in names
-    ]
-    middle = middle_of(seen.values())
-    centred = [s.about(middle) for s in seen.values()]
-    sights = [sight_of(s, m) for m, s in zip(asked, centred, strict=True)]
-    alone = [
-        _alone(m, s, loss, loss_scale, layout.image_size)
-        for m, s, layout in zip(asked, centred, layouts.values(), strict=True)
-    ]
-    device = sights[0].pixels.device
-    free = Free(tuple(a.free.to(device) for a in asked), tuple(c > 0 for c in range(len(asked))), bend=bend)
-    first = _joined(sights, alone, free)
-    told = None if progress is None else lambda number, cost: progress(number, float(cost))
-    adjusted = adjust(sights, first, free, loss=loss, loss_scale=loss_scale, steps=STEPS, progress=told)
-    optima = []
-    for c, (m, s, layout) in enumerate(zip(asked, centred, layouts.values(), strict=True)):
-        adjusted, found = other_optima(c, s, m, sights, adjusted, free, layout.image_size, loss, loss_scale)
-        optima.append(found)
-    parameters = free_count(adjusted, [s.seen for s in seen.values()])
-    residuals, valid, used = (
-        torch.cat(parts)
-        for parts in zip(
-            *((r[0], v[0], s.seen) for r, v, s in zip(adjusted.residuals, adjusted.valid, seen.values(), strict=True)),
-            strict=True,
-        )
-    )
-    owners = [f"{owner}: {name}" for name in names]
-    check_determined(adjusted, [a.kind for a in asked], [a.names for a in asked], sights, owners)
-    noise = noise_of(residuals, used, valid, loss, loss_scale, parameters)
-    named, noise = counted_once(list(seen.values()), adjusted, list(layouts.values()), noise)
-    layouts = dict(zip(names, named, strict=True))
-    each = noise.inliers.split([len(s.seen) for s in seen.values()])
-    cameras = {
-        name: result_of(
-            adjusted,
-            c,
-            asked[c],
-            seen[name],
-            middle,
-            layouts[name],
-            noise._replace(inliers=each[c]),
-            (object_points, image_points[name]),
-        )
-        for c, name in enumerate(names)
-    }
-    for camera, ends in zip(cameras.values(), optima, strict=True):
-        camera.twins = twins_of(camera, ends)
-    lengths = torch.where(used, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
-    rotations, translations = (t[0] for t in adjusted.state.boards)
+    middle = middle_of([seen for seen, _ in observed.values()])
+    searches = []
+    for name, (seen, layout) in observed.items():
+        of = f"{owner}: {name}"
+        asked = as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), of)
+        searches.append(Search(of, asked, seen, middle, layout, loss, loss_scale))
+    sights = [search.sight for search in searches]
+    learns = tuple(parameters for search in searches for parameters in search.free().parameters)
+    free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
+    first = _joined(sights, [_alone(search) for search in searches], free)
+    adjusted = searches[0].adjusted(sights, first, free, steps=STEPS, progress=told)
+    found = results(searches, adjusted, free, object_points, [image_points[name] for name in observed])
+    cameras = dict(zip(observed, found.cameras, strict=True))
+    state = found.adjusted.state
+    rotations, translations = (t[0] for t in state.boards)
     mounts = {
         name: Extrinsics(rotation_vector(r).unsqueeze(-1), t)
-        for name, r, t in zip(names, *(t[0] for t in adjusted.state.mounts), strict=True)
+        for name, r, t in zip(observed, *(t[0] for t in state.mounts), strict=True)
     }
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
-        rms=float((lengths.square().sum() / used.sum()).sqrt()),
-        sigma=float(noise.sigma),
+        rms=found.rms,
+        sigma=found.sigma,
         cameras=cameras,
-        mount_std=_mount_std(adjusted, asked, names, noise.spread),
-        converged=all(c.converged for c in cameras.values()),
-        bend=next(iter(cameras.values())).bend,
-        views=next(iter(cameras.values())).views,
-        adjusted=adjusted,
+        mount_std=_mount_std(found.adjusted, list(observed), found.noise),
+        converged=all(c.converged for c in found.cameras),
+        bend=found.cameras[0].bend,
+        views=found.cameras[0].views,
+        adjusted=found.adjusted,
     )
     if not result.converged:
         python_warnings.warn(
@@ -240,31 +186,26 @@ def _of(given: Any, name: str, otherwise: Any) -> Any:
 
 
 class _Alone(NamedTuple):
-    """A camera by itself: parameters (4 + n,), and the poses of boards (V,), where it has them, bool (V,)."""
+    """A camera by itself: parameters (1, 4 + n), and the poses of boards (1, V), where it has them, bool (V,)."""
 
     parameters: Tensor
     boards: Poses
     has_pose: Tensor
 
 
-def _alone(
-    asked: Model, seen: Observations, loss: str | None, loss_scale: float, image_size: tuple[int, int]
-) -> _Alone:
+def _alone(search: Search) -> _Alone:
     """What one camera says."""
-    has_pose = seen.seen.any(-1)
-    some = seen.of(has_pose)
-    first = first_state(some, asked, image_size, loss, loss_scale)
-    free = Free((asked.free.to(some.pixels.device),), (False,))
-    state = adjusted_alone(some, asked, first, free, image_size, loss, loss_scale).state
-    boards = Poses(*(t[0] for t in Poses.none(1, len(has_pose), some.pixels)))
-    for whole, part in zip(boards, state.boards, strict=True):
-        whole[has_pose] = part[0]
-    return _Alone(state.parameters[0][0], boards, has_pose)
+    has_pose = search.given.seen.any(-1)
+    state = replace(search, given=search.given.of(has_pose)).alone().state
+    (rows,) = has_pose.nonzero(as_tuple=True)
+    boards = Poses.none(1, len(has_pose), search.given.pixels).with_views(rows, state.boards)
+    return _Alone(state.parameters[0], boards, has_pose)
 
 
 def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
     """Where to start: mounts by what two cameras say of the same boards, boards by the camera that says it best."""
-    mounts = Poses(*(t[0] for t in Poses.none(1, len(alone), alone[0].parameters)))
+    mounts = Poses.none(1, len(alone), alone[0].parameters)
+    turns, shifts = mounts.rotations[0], mounts.translations[0]
     together = torch.stack([one.has_pose for one in alone]).double()
     together = together @ together.mT
     known = [0]
@@ -274,34 +215,26 @@ def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
         i, j = divmod(int(links.argmax()), len(rest))
         a, b = known[i], rest[j]
         rotation, translation = _between(alone[a], alone[b])
-        mounts.rotations[b] = rotation @ mounts.rotations[a]
-        mounts.translations[b] = rotation @ mounts.translations[a] + translation
+        turns[b], shifts[b] = rotation @ turns[a], rotation @ shifts[a] + translation
         known.append(b)
-    parameters = tuple(one.parameters[None] for one in alone)
-    boards, least = alone[0].boards, torch.full_like(alone[0].boards.translations[:, 0], torch.inf)
+    parameters = tuple(one.parameters for one in alone)
+    boards, least = alone[0].boards, torch.full_like(alone[0].boards.translations[0, :, 0], torch.inf)
     for c, one in enumerate(alone):
-        back = mounts.rotations[c].mT
-        own = Poses(back @ one.boards.rotations, (one.boards.translations - mounts.translations[c]) @ back.mT)
-        state = State(parameters, _batched(mounts), _batched(own), own.translations.new_zeros(1, 2))
+        own = Poses(turns[c].mT @ one.boards.rotations, (one.boards.translations - shifts[c]) @ turns[c])
+        state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
         bundle = Bundle(sights, state, free, "cauchy", 1.0)
         flat = bundle.flat(state)
         cost = torch.stack([bundle.look(k, flat).cost[0].sum(-1) for k in range(len(sights))]).sum(0)
         better = one.has_pose & (cost < least)
         least = torch.where(better, cost, least)
-        boards = Poses(
-            *(torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(own, boards, strict=True))
-        )
-    return State(parameters, _batched(mounts), _batched(boards), least.new_zeros(1, 2))
-
-
-def _batched(poses: Poses) -> Poses:
-    return Poses(*(t[None] for t in poses))
+        boards = Poses.where(better, own, boards)
+    return State(parameters, mounts, boards, least.new_zeros(1, 2))
 
 
 def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     """The pose from camera a to b that lies in the middle of those that each of the boards gives."""
     both = a.has_pose & b.has_pose
-    (from_a, at_a), (from_b, at_b) = ((t[both] for t in one.boards) for one in (a, b))
+    (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in one.boards) for one in (a, b))
     rotations = from_b @ from_a.mT
     translations = at_b - (rotations @ at_a[..., None])[..., 0]
     turned = (rotations[:, None] - rotations).flatten(2).norm(dim=-1)
@@ -311,14 +244,12 @@ def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     return rotations[middle], translations[middle]
 
 
-def _mount_std(adjusted: Adjusted, asked: list[Model], names: list[str], noise: Tensor) -> dict[str, Tensor]:
+def _mount_std(adjusted: Adjusted, names: list[str], noise: Tensor) -> dict[str, Tensor]:
     """(6,) by the name of a camera; zeros for the first one."""
     std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0], dim=-1) * noise
-    result = {}
-    for c, (name, model) in enumerate(zip(names, asked, strict=True)):
-        own = std.new_zeros(6)
-        for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
-            if camera == c and i >= 4 + model.count:
-                own[i - 4 - model.count] = value
-        result[name] = own
+    result = {name: std.new_zeros(6) for name in names}
+    for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
+        count = adjusted.state.parameters[camera].shape[-1]
+        if camera >= 0 and i >= count:
+            result[names[camera]][i - count] = value
     return result

@@ -39,36 +39,25 @@ _MUCH_WORSE = 0.05
 
 @dataclass
 class Trial:
-    """How a model fares.
-
-    Args:
-        model: its key.
-        count: of its coefficients.
-        calibration: by all views, or None where that failed.
-        rms: px per point of all views together, NaN where it failed.
-        held_out: px per point of views that the camera was not fitted to, only their poses; NaN where it failed.
-        errors: (V,) mean squared of each view, held out.
-        reason: why it failed, or empty.
-    """
+    """How a model, with a number of coefficients, fares."""
 
     model: str
     count: int
     calibration: Calibration | None
+    """By all views, or None where that failed."""
     rms: float
+    """Px per point of all views together, NaN where it failed."""
     held_out: float
+    """Px per point of views that the camera was not fitted to, only their poses; NaN where it failed."""
     errors: Array
+    """(V,) mean squared of each view, held out."""
     reason: str = ""
+    """Why it failed, or empty."""
 
 
 @dataclass
 class Selection:
-    """Which model was taken.
-
-    Args:
-        trials: of all models, in the order in which they were tried.
-        best: the one that was taken.
-        why: in words.
-    """
+    """Which model was taken of those that were tried, and why, in words."""
 
     trials: list[Trial]
     best: Trial
@@ -105,30 +94,26 @@ def select(
     coefficients if it is worse by no more than 1 %, or by no more than 5 % and the standard error of
     the difference by views.
 
-    Args:
-        object_points: as `calibrate` takes them.
-        image_points: likewise.
-        image_size: (height, width).
-        candidates: models and their numbers of coefficients.
-        loss: as `calibrate` takes it.
-        loss_scale: px.
-        fixed: as `calibrate` takes it; names that a model does not have are left out.
-        progress: called with the part that is done.
+    Arguments are those of `calibrate`; names in `fixed` that a model does not have are left out, and progress is called
+    with the part that is done. candidates: models and their numbers of coefficients.
 
     Raises:
         ValueError: bad points; no model can be fitted.
     """
-    tried = list(candidates)
     seen, layout = as_observations(object_points, image_points, image_size, "select")
-    views = _Views(
-        seen.points.cpu().numpy(), np.where(seen.seen[..., None].cpu(), seen.pixels.cpu(), np.nan), layout.image_size
-    )
-    trials: list[Trial] = []
-    for model, count in tried:
+    pixels = np.where(seen.seen[..., None].cpu(), seen.pixels.cpu(), np.nan)
+    views = _Views(seen.points.cpu().numpy(), pixels, layout.image_size)
+    tried, trials = list(candidates), []
+    for number, (model, count) in enumerate(tried, 1):
         names = [name for name in fixed if name in (*INTRINSICS, *(MODELS[model].names_of(count) or ()))]
-        trials.append(_tried(model, count, views, {"fixed": names, "loss": loss, "loss_scale": loss_scale}))
+        options = {"fixed": names, "loss": loss, "loss_scale": loss_scale}
+        try:
+            trials.append(_tried(model, count, views, options))
+        except ValueError as error:
+            nothing = np.full(len(pixels), np.nan)
+            trials.append(Trial(model, count, None, math.nan, math.nan, nothing, str(error)))
         if progress is not None:
-            progress(len(trials) / len(tried))
+            progress(number / len(tried))
     fitted = [trial for trial in trials if not trial.reason]
     if not fitted:
         raise ValueError(f"select: no model can be fitted; {trials[0].model}: {trials[0].reason}")
@@ -148,27 +133,22 @@ class _Views(NamedTuple):
 
 
 def _tried(model: str, count: int, views: _Views, options: dict[str, Any]) -> Trial:
-    total = len(views.points)
-    errors, all_views = np.full(total, np.nan), np.arange(total)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
-            whole = views.calibrated(all_views, model, count=count, **options)
-            if not whole.converged:
-                raise ValueError("no optimum was found")
-            folds = min(_FOLDS, total)
-            for fold in range(folds):
-                out = all_views % folds == fold
-                part = views.calibrated(np.flatnonzero(~out), whole.camera, **options)
-                posed = views.calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
-                squares = np.square(np.asarray(posed.residuals)).sum(-1)
-                errors[out] = np.nanmean(squares, axis=1)
-    except ValueError as error:
-        return Trial(model, count, None, math.nan, math.nan, errors, str(error))
+    numbers = np.arange(len(views.points))
+    errors = np.full(len(numbers), np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
+        whole = views.calibrated(numbers, model, count=count, **options)
+        if not whole.converged:
+            raise ValueError("no optimum was found")
+        for fold in range(min(_FOLDS, len(numbers))):
+            out = numbers % min(_FOLDS, len(numbers)) == fold
+            part = views.calibrated(np.flatnonzero(~out), whole.camera, **options)
+            posed = views.calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
+            errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
     weights = np.isfinite(views.pixels[..., 0]).sum(1)
     held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
     if not math.isfinite(held_out):
-        return Trial(model, count, None, math.nan, math.nan, errors, "views that it was not fitted to are lost")
+        raise ValueError("views that it was not fitted to are lost")
     return Trial(model, count, whole, whole.rms, held_out, errors)
 
 

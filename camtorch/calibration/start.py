@@ -62,7 +62,6 @@ def start_from_nothing(
     model: type[Camera],
     count: int,
     image_size: tuple[int, int],
-    *,
     fixed: Collection[str] = (),
     loss: str | None = None,
     loss_scale: float = 1.0,
@@ -72,37 +71,33 @@ def start_from_nothing(
     Unified cameras of all widths are tried, their axis in the middle of the image: the rays of the pixels give poses in
     closed form, and those a score. The best few are refined together, and the model is fitted to what is best then,
     from several starts. Errors count by the loss of Cauchy, in units of those that most corners have, so that gross
-    ones do not matter.
-
-    Args:
-        observations: what was seen.
-        model: of the camera.
-        count: of its coefficients.
-        image_size: (height, width).
-        fixed: names of parameters that are held: coefficients as in `Camera.ideal`, the principal point in the middle
-            of the image.
-        loss: that of the adjustment, which decides where several cameras are nearly as good.
-        loss_scale: px, of the loss.
+    ones do not matter. Parameters that are `fixed` are held: coefficients as in `Camera.ideal`, the principal point in
+    the middle of the image. The loss, in px, is that of the adjustment, and decides where several cameras are nearly as
+    good.
 
     Raises:
         ValueError: corners lie further from the axis than the model reaches.
     """
     few = _few(observations, image_size)
-    lens = _unified(few, image_size, fixed)
-    first = lens
+    lens = first = _unified(few, image_size, fixed)
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # what keeps the shape that it starts with takes that of a good lens
-        lens = _refined(lens, few, KannalaBrandt, 4, image_size, fixed, ("cauchy", lens.scale)).row(0)
-    lens = _refined(lens, few, model, count, image_size, fixed, (loss, loss_scale))
-    _check_reach(lens.row(0), few, image_size, first)
+        lens = _refined(lens, few, KannalaBrandt, 4, fixed, ("cauchy", lens.scale)).of(slice(1))
+    lens = _refined(lens, few, model, count, fixed, (loss, loss_scale))
+    _check_reach(lens.of(slice(1)), few, first)
     state = poses_for(lens.parameters[:1], observations, model, image_size, lens.scale)
     if len(lens.parameters) == 1:
         return state
-    boards = Poses(*(t.expand(len(lens.parameters), *t.shape[1:]) for t in state.boards))
-    sight, free = _sight(model, observations), _free(model, count, fixed)
-    state = _state(lens.parameters, boards)
-    found = adjust([sight], state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
+    lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
+    found = adjust(
+        [_sight(model, observations)],
+        lens.state,
+        _free(model, count, fixed),
+        loss=loss,
+        loss_scale=loss_scale,
+        steps=_MANY_STEPS,
+    )
     return found.state.of(found.cost.argmin()[None])
 
 
@@ -113,17 +108,10 @@ def poses_for(
     image_size: tuple[int, int],
     scale: float = _LEAST_SCALE,
 ) -> State:
-    """A known camera, B = 1, and the poses of all views.
-
-    Args:
-        parameters: (1, 4 + n) of the camera.
-        observations: what it saw.
-        model: of the camera.
-        image_size: (height, width).
-        scale: px, the error from which corners count less.
-    """
-    boards, _ = _posed(_camera(model, parameters, image_size), observations)
-    return _turned(_Lens(model, parameters, boards, scale), observations, image_size).state
+    """A known camera, parameters (1, 4 + n), and the poses of all views; scale: px, from which corners count less."""
+    lens = _Lens(model, parameters, Poses.none(1, 1, parameters), scale, image_size)
+    boards, _ = _posed(lens.camera, observations)
+    return _turned(lens._replace(boards=boards), observations).state
 
 
 def other_poses(state: State, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
@@ -132,22 +120,19 @@ def other_poses(state: State, observations: Observations, model: type[Camera], i
     While the camera was not known, a view may have taken the wrong one of the two poses that a plane seems to have, or
     have been led astray by outliers.
     """
-    parameters = state.parameters[0]
-    errors = _errors(_camera(model, parameters, image_size), state.boards, observations)[0]
+    lens = _Lens(model, state.parameters[0], state.boards, _LEAST_SCALE, image_size)
+    errors = lens.errors(observations)[0]
     # views whose errors are greater than those of many others
     rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
-    boards = Poses(*(t[:, rows] for t in state.boards))
-    lens = _Lens(model, parameters, boards, max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
-    others = _turned(lens, observations.of(rows), image_size).boards
+    boards = state.boards.of(rows, 1)
+    lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
+    others = _turned(lens, observations.of(rows)).boards
     cosine = ((boards.rotations * others.rotations).sum((-1, -2)) - 1) / 2
     shift = torch.linalg.vector_norm(others.translations - boards.translations, dim=-1)
     is_other = (cosine < math.cos(_OTHER)) | (shift > _OTHER * torch.linalg.vector_norm(boards.translations, dim=-1))
     if not bool(is_other.any()):
         return state
-    chosen = _chosen(is_other[0], others, boards)
-    return state._replace(
-        boards=Poses(*(t.index_copy(1, rows, new) for t, new in zip(state.boards, chosen, strict=True)))
-    )
+    return state._replace(boards=state.boards.with_views(rows, Poses.where(is_other[0], others, boards)))
 
 
 def other_cameras(
@@ -160,13 +145,7 @@ def other_cameras(
 ) -> Tensor | None:
     """(S, 4 + n) nearly the same camera all along the valley of its model, see `_ALONG`; None where it has none.
 
-    Args:
-        parameters: (1, 4 + n) at an optimum.
-        learns: (4 + n,) bool.
-        boards: (1, V), in the frame of the camera.
-        observations: what it saw.
-        model: of the camera.
-        image_size: (height, width).
+    parameters: (1, 4 + n) at an optimum. learns: (4 + n,) bool. boards: (1, V), in the frame of the camera.
     """
     count = parameters.shape[-1] - 4
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
@@ -174,8 +153,8 @@ def other_cameras(
     if not along or not bool(learns[names.index(along)]):
         return None
     fixed = [name for name, is_free in zip(names, learns.tolist(), strict=True) if not is_free]
-    lens = _Lens(model, parameters, boards, _LEAST_SCALE)
-    found = _fitted(lens, observations, model, count, image_size, fixed).parameters
+    lens = _Lens(model, parameters, boards, _LEAST_SCALE, image_size)
+    found = _fitted(lens, observations, model, count, fixed).parameters
     return torch.where(learns.to(found.device), found, parameters)
 
 
@@ -187,27 +166,27 @@ class _Lens(NamedTuple):
     boards: Poses
     scale: float
     """px: twice the error that most corners have."""
+    image_size: tuple[int, int]
 
     @property
     def state(self) -> State:
         """Where an adjustment starts."""
         return _state(self.parameters, self.boards)
 
-    def row(self, index: int) -> _Lens:
-        """One of them."""
-        return self.of(slice(index, index + 1))
+    @property
+    def camera(self) -> Camera:
+        return fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:], self.image_size)
+
+    def errors(self, some: Observations, boards: Poses | None = None) -> Tensor:
+        """(B, V, N) px, NaN for what is not seen."""
+        return _errors(self.camera, boards or self.boards, some)
 
     def of(self, rows: Tensor | slice) -> _Lens:
         """Some of them."""
-        return self._replace(parameters=self.parameters[rows], boards=Poses(*(t[rows] for t in self.boards)))
+        return self._replace(parameters=self.parameters[rows], boards=self.boards.of(rows))
 
     def adjusted(
-        self,
-        few: Observations,
-        free: Free,
-        steps: int,
-        worst: float,
-        loss: tuple[str | None, float] | None = None,
+        self, few: Observations, free: Free, steps: int, worst: float, loss: tuple[str | None, float] | None = None
     ) -> _Lens:
         """Nearer to what they saw, the best first, without those whose cost is above the least by the factor `worst`.
 
@@ -222,7 +201,7 @@ class _Lens(NamedTuple):
         errors = torch.linalg.vector_norm(found.residuals[0][rows[0]], dim=-1)
         errors = torch.where(found.valid[0][rows[0]], errors, _NO_PIXEL)[few.seen]
         scale = max(_LEAST_SCALE, 2 * float(errors.median()))
-        return _Lens(self.model, found.state.parameters[0], found.state.boards, scale).of(rows)
+        return self._replace(parameters=found.state.parameters[0], boards=found.state.boards, scale=scale).of(rows)
 
 
 def _state(parameters: Tensor, boards: Poses) -> State:
@@ -242,10 +221,6 @@ def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
     return Free((torch.tensor(learns, device="cpu"),), (False,))
 
 
-def _camera(model: type[Camera], parameters: Tensor, image_size: tuple[int, int]) -> Camera:
-    return fixed_camera(model, parameters[:, :4], parameters[:, 4:], image_size)
-
-
 def _few(observations: Observations, image_size: tuple[int, int]) -> Observations:
     """Of many views those with the most corners; of many corners enough, evenly from the image's middle outwards."""
     if len(observations.seen) > _VIEWS:
@@ -257,13 +232,9 @@ def _few(observations: Observations, image_size: tuple[int, int]) -> Observation
     order = torch.where(seen, distances, torch.inf).argsort(-1)
     share = torch.linspace(0, 1, _POINTS, dtype=pixels.dtype, device=pixels.device)
     index = order.gather(-1, (share * (seen.sum(-1, keepdim=True) - 1).clamp(min=0)).round().long())
-    once = torch.ones_like(index, dtype=torch.bool)
-    once[:, 1:] = index.diff(dim=-1) != 0
-    return observations._replace(
-        points=torch.take_along_dim(points, index[..., None], 1),
-        pixels=torch.take_along_dim(pixels, index[..., None], 1),
-        seen=seen.gather(-1, index) & once,
-    )
+    once = torch.nn.functional.pad(index.diff(dim=-1) != 0, (1, 0), value=True)
+    points, pixels = (torch.take_along_dim(t, index[..., None], 1) for t in (points, pixels))
+    return observations._replace(points=points, pixels=pixels, seen=seen.gather(-1, index) & once)
 
 
 def _middle(image_size: tuple[int, int], like: Tensor) -> Tensor:
@@ -280,14 +251,15 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     focal = reach / centre.new_tensor(radii)[:, None]
     alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
-    boards, errors = _posed(_camera(UCM, parameters, image_size), few)
+    lens = _Lens(UCM, parameters, Poses.none(1, 1, parameters), _LEAST_SCALE, image_size)
+    boards, errors = _posed(lens.camera, few)
     by_view = errors.nanmedian(-1).values.sort(-1).values
     score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
     score, rows = score.topk(_KEPT, largest=False)
-    lens = _Lens(UCM, parameters[rows], Poses(*(t[rows] for t in boards)), max(_LEAST_SCALE, 2 * float(score[0])))
-    lens = lens.adjusted(few, _free(UCM, 1, ("cx", "cy")), _FEW_STEPS, _WORSE).row(0)
+    lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
+    lens = lens.adjusted(few, _free(UCM, 1, ("cx", "cy")), _FEW_STEPS, _WORSE).of(slice(1))
     free = _free(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
-    return _turned(lens.adjusted(few, free, _FEW_STEPS, _WORSE), few, image_size)
+    return _turned(lens.adjusted(few, free, _FEW_STEPS, _WORSE), few)
 
 
 def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
@@ -318,9 +290,10 @@ def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
     return boards, errors
 
 
-def _resampled(camera: Camera, boards: Poses, some: Observations) -> Poses:
+def _resampled(lens: _Lens, some: Observations) -> Poses:
     """Poses (1, V) of which those that outliers spoilt are the best by handfuls of corners."""
-    usual = _errors(camera, boards, some)[0].nanmedian(-1).values
+    camera, boards = lens.camera, lens.boards
+    usual = lens.errors(some)[0].nanmedian(-1).values
     (bad,) = (usual > _BAD * usual.median().clamp(min=_LEAST_SCALE)).nonzero(as_tuple=True)
     if len(bad) == 0:
         return boards
@@ -335,10 +308,7 @@ def _resampled(camera: Camera, boards: Poses, some: Observations) -> Poses:
     best = usual.argmin(-1)
     changed = best < _HANDFULS
     rows = (torch.arange(len(bad), device=bad.device) * _HANDFULS + best)[changed]
-    boards = Poses(*(t.clone() for t in boards))
-    for poses, new in zip(boards, tried, strict=True):
-        poses[0, bad[changed]] = new[0, rows]
-    return boards
+    return boards.with_views(bad[changed], tried.of(rows, 1))
 
 
 def _rays(camera: Camera, some: Observations) -> tuple[Tensor, Tensor]:
@@ -356,42 +326,30 @@ def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
     return torch.where(some.seen, torch.where(valid.view(shape), errors, _NO_PIXEL), torch.nan)
 
 
-def _turned(lens: _Lens, some: Observations, image_size: tuple[int, int]) -> _Lens:
+def _turned(lens: _Lens, some: Observations) -> _Lens:
     """With the best of the poses that each view may have under a single camera: a plane has two that look alike."""
-    camera = _camera(lens.model, lens.parameters, image_size)
-    old = _resampled(camera, lens.boards, some)
-    rays, has_ray = (t[0] for t in _rays(camera, some))
-    errors = _errors(camera, old, some)
+    old = _resampled(lens, some)
+    rays, has_ray = (t[0] for t in _rays(lens.camera, some))
+    errors = lens.errors(some, old)
     weights = torch.where(has_ray, 1 / (1 + (errors[0] / lens.scale).square()), 0.0)
     found = poses_from_rays(some.points, rays, weights)
     first, second = (Poses(*(t[None, :, i] for t in found[:2])) for i in range(2))
-    usual, other, others = (_errors(camera, poses, some)[0].nanmedian(-1).values for poses in (old, first, second))
-    first = _chosen(usual <= other, old, first)
+    usual, other, others = (lens.errors(some, poses)[0].nanmedian(-1).values for poses in (old, first, second))
+    first = Poses.where(usual <= other, old, first)
     (rows,) = (others <= _IN_DOUBT * torch.minimum(usual, other)).nonzero(as_tuple=True)
     if len(rows) == 0:
         return lens._replace(boards=first)
     # each is a problem of its own
     both = Poses(*(torch.cat((a[0, rows], b[0, rows]))[:, None] for a, b in zip(first, second, strict=True)))
-    sight = Sight(
-        lens.model, *(t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None] for t in _sight(lens.model, some)[1:])
-    )
+    sight = _sight(lens.model, some)
+    sight = Sight(lens.model, *(t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None] for t in sight[1:]))
     free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     state = _state(lens.parameters, both)
     ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_STEPS)
-    a, b = (
-        Poses(*(t[part].transpose(0, 1) for t in ended.state.boards))
-        for part in (slice(len(rows)), slice(len(rows), None))
-    )
-    better = _chosen(ended.cost[: len(rows)] <= ended.cost[len(rows) :], a, b)
-    return lens._replace(boards=Poses(*(t.index_copy(1, rows, new) for t, new in zip(first, better, strict=True))))
-
-
-def _chosen(which: Tensor, a: Poses, b: Poses) -> Poses:
-    """Of poses (1, V) those of a where which, bool (V,)."""
-    return Poses(
-        torch.where(which[:, None, None], a.rotations, b.rotations),
-        torch.where(which[:, None], a.translations, b.translations),
-    )
+    halves = slice(len(rows)), slice(len(rows), None)
+    a, b = (Poses(*(t[half].transpose(0, 1) for t in ended.state.boards)) for half in halves)
+    better = Poses.where(ended.cost[halves[0]] <= ended.cost[halves[1]], a, b)
+    return lens._replace(boards=first.with_views(rows, better))
 
 
 def _refined(
@@ -399,29 +357,21 @@ def _refined(
     few: Observations,
     model: type[Camera],
     count: int,
-    image_size: tuple[int, int],
     fixed: Collection[str],
     loss: tuple[str | None, float],
 ) -> _Lens:
     """Cameras of another model that explain best what was seen, the best first; those that are nearly as good."""
     free = _free(model, count, fixed)
-    lens = _fitted(lens, few, model, count, image_size, fixed).adjusted(few, free, _STEPS, _WORSE, loss)
+    lens = _fitted(lens, few, model, count, fixed).adjusted(few, free, _STEPS, _WORSE, loss)
     return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
 
 
-def _fitted(
-    lens: _Lens,
-    few: Observations,
-    model: type[Camera],
-    count: int,
-    image_size: tuple[int, int],
-    fixed: Collection[str],
-) -> _Lens:
+def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> _Lens:
     """Cameras (S,) of another model that see the corners, as the boards lie, where they were seen."""
-    camera = _camera(lens.model, lens.parameters, image_size)
+    camera = lens.camera
     slopes = views.focal_at_axis(camera)
     rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)
-    inliers = few.seen & (_errors(camera, lens.boards, few) < _OUTLIER * lens.scale)
+    inliers = few.seen & (lens.errors(few) < _OUTLIER * lens.scale)
     reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
     names = model.names_of(count) or ()
     ideal = slopes.new_tensor(model.ideal(count))
@@ -435,40 +385,33 @@ def _fitted(
         sets.append((more, [*held, along]))
     sets += [(starts[:1], [*held, *names[order:]]) for order in _LOW_ORDERS if len(names) > order and not values]
     seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
-    template = _camera(model, torch.cat((slopes[0], ideal))[None], image_size)
+    template = fixed_camera(model, slopes[:1], ideal[None], lens.image_size)
     is_held = torch.tensor([name in held for name in names], dtype=torch.bool, device=slopes.device)
     fitted = []
     for some, stay in sets:
         some = torch.where(is_held, ideal, some)
         rows = fitting.Observations(*(t.expand(len(some), *t.shape[1:]) for t in seen))
         fitted.append(fitting.fit(template, rows, some[None], slopes.expand(len(some), -1), stay))
-    parameters = _distinct(torch.cat(fitted))
+    parameters = torch.cat(fitted)
+    # those that are not as good as the same as an earlier one
+    apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
+    parameters = parameters[~(~apart.any(-1)).tril(-1).any(-1)]
     for i, name in enumerate(("cx", "cy"), 2):
         if name in fixed:
-            parameters[:, i] = (image_size[3 - i] - 1) / 2
-    boards = Poses(*(t.expand(len(parameters), *t.shape[1:]) for t in lens.boards))
-    return _Lens(model, parameters, boards, lens.scale)
+            parameters[:, i] = (lens.image_size[3 - i] - 1) / 2
+    return _Lens(model, parameters, lens.boards.expand(len(parameters)), lens.scale, lens.image_size)
 
 
-def _distinct(parameters: Tensor) -> Tensor:
-    """Those of parameters (S, 4 + n) that are not as good as the same as an earlier one."""
-    apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
-    return parameters[~(~apart.any(-1)).tril(-1).any(-1)]
-
-
-def _check_reach(lens: _Lens, few: Observations, image_size: tuple[int, int], other: _Lens) -> None:
+def _check_reach(lens: _Lens, few: Observations, other: _Lens) -> None:
     """Raise a ValueError where the model has no pixel for many of the corners, or for some and errs with the others.
 
     other: a lens that reaches them.
     """
-    points = lens.boards.moved(few.points).flatten(1, 2)
-    _, valid = _camera(lens.model, lens.parameters, image_size).project(points)
+    _, valid = lens.camera.project(lens.boards.moved(few.points).flatten(1, 2))
     lost = few.seen & ~valid.view(few.seen.shape)
     most = _LOST * int(few.seen.sum()) if lens.scale <= _ERRS * other.scale else 0
     if int(lost.sum()) > most:
-        inliers = few.seen & (
-            _errors(_camera(other.model, other.parameters, image_size), other.boards, few)[0] < _OUTLIER * other.scale
-        )
+        inliers = few.seen & (other.errors(few)[0] < _OUTLIER * other.scale)
         furthest = math.degrees(float(angles_from_axis(other.boards.moved(few.points))[0][inliers].amax()))
         raise ValueError(
             f"calibrate: {lens.model.__name__} has no pixels for {int(lost.sum())} of {int(few.seen.sum())} corners, "

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from camtorch._arguments import Numbers, working_dtype
 from camtorch._module import BatchedModule
 from camtorch._threads import on_one_thread
-from camtorch.calibration.batches import as_tensor, learns, rows_of
+from camtorch.calibration.batches import as_tensor, learns, root_of, rows_of
 from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
@@ -74,11 +74,8 @@ def triangulate(
     if learns([*task.given, *task.poses], task.pixels):
         points = attached(task.cost, points, valid)
     mean = 2 * task.cost(points) / task.seen.sum(0).clamp(min=1)
-    # of a perfect fit the root has no derivative
-    rms = torch.where(valid & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), torch.where(valid, 0.0, torch.inf))
-    return Triangulation(
-        points.to(task.dtype).view(*task.shape, 3), rms.to(task.dtype).view(task.shape), valid.view(task.shape)
-    )
+    rms = root_of(mean, valid).to(task.dtype).view(task.shape)
+    return Triangulation(points.to(task.dtype).view(*task.shape, 3), rms, valid.view(task.shape))
 
 
 class _Task(NamedTuple):
@@ -120,10 +117,8 @@ class _Task(NamedTuple):
         matrices = torch.stack([pose.matrix().double() for pose in poses])
         in_rows = [rows_of(camera, torch.Size()) for camera in given]
         with torch.no_grad():
-            rays, seen = map(
-                torch.stack,
-                zip(*(camera.unproject(p) for camera, p in zip(in_rows, seen_at, strict=True)), strict=True),
-            )
+            found = [camera.unproject(p) for camera, p in zip(in_rows, seen_at, strict=True)]
+            rays, seen = map(torch.stack, zip(*found, strict=True))
         seen_at = torch.where(seen[..., None], seen_at, 0.0)
         return cls(given, poses, in_rows, matrices[:, :3, :3], matrices[:, :3, 3], seen_at, rays, seen, shape, dtype)
 

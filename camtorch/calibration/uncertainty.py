@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -51,10 +50,7 @@ class Spread(NamedTuple):
 
         What is seen is taken into the frame of every board by its pose, and back by the pose that the noise made of it;
         the mean of all these is projected by the camera that the noise made: mrcal's mean-pcam.
-
-        Args:
-            pixels: (B, M, 2).
-            distance: (B, M) from the camera; infinite for directions.
+        distance: (B, M) from the camera; infinite for directions.
         """
         parts = zip(pixels.split(_PIXELS, 1), distance.split(_PIXELS, 1), strict=True)
         return torch.cat([self._of_pixels(*part) for part in parts], 1)
@@ -77,14 +73,7 @@ class Spread(NamedTuple):
 
 
 def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) -> Spread:
-    """That of one camera at an optimum.
-
-    Args:
-        adjusted: the optimum.
-        model: the camera's class.
-        camera: which of the cameras it is.
-        noise: (B,) of the corners, px per coordinate.
-    """
+    """That of one camera, by its number, at an optimum; noise: (B,) of the corners, px per coordinate."""
     equations, state = adjusted.equations, adjusted.state
     parameters, mounts = state.parameters[camera], state.mounts
     shared = shared_factor(equations)
@@ -106,36 +95,25 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) 
     return Spread(model, parameters.expand(len(factor), -1), factor)
 
 
-def noise_under(
-    loss: str | None, loss_scale: float, residuals: Sequence[Tensor], seen: Sequence[Tensor], free: int
-) -> Tensor:
-    """(B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
+def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Tensor, free: int) -> Tensor:
+    """(*B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
 
     Without a loss it is sqrt(sum of squares / (2 N - free)). A robust loss with weights w of squares pulls with the
     force w r, which gives way by the mean of w + s dw/ds where residuals of squared length s move, and by the mean of w
     in the weighted problem: this is sqrt(mean(w^2 r^2) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator. It
     holds where outliers fall on all corners alike, and they widen the intervals of a Huber loss as they widen its
     estimates; of a view that is nothing but outliers it knows nothing.
-
-    Args:
-        loss: as `adjust` takes it.
-        loss_scale: likewise.
-        residuals: of each camera (B, V, N, 2).
-        seen: of each camera (B or 1, V, N) bool.
-        free: how many parameters were free, poses included.
+    residuals: (*B, V, N, 2). free: how many parameters were free, poses included.
     """
-    force = weight = slope = count = residuals[0].new_zeros(())
-    for moved, here in zip(residuals, seen, strict=True):
-        squares = moved.square().sum(-1)
-        _, weights = robust(loss, loss_scale, squares)
-        change = torch.zeros_like(weights)
-        if loss == "huber":
-            change = torch.where(weights < 1, -weights / 2, 0.0)
-        elif loss == "cauchy":
-            change = weights * (weights - 1)
-        terms = weights.square() * squares, weights, weights + change, torch.ones_like(weights)
-        sums = [(term * here).sum((-1, -2)) for term in terms]
-        force, weight, slope, count = (t + new for t, new in zip((force, weight, slope, count), sums, strict=True))
+    squares = residuals.square().sum(-1)
+    _, weights = robust(loss, loss_scale, squares)
+    change = torch.zeros_like(weights)
+    if loss == "huber":
+        change = torch.where(weights < 1, -weights / 2, 0.0)
+    elif loss == "cauchy":
+        change = weights * (weights - 1)
+    terms = weights.square() * squares, weights, weights + change, torch.ones_like(weights)
+    force, weight, slope, count = ((term * seen).sum((-1, -2)) for term in terms)
     return (force / (2 * count - free).clamp(min=1) * weight * count).sqrt() / slope.clamp(min=1)
 
 
@@ -162,31 +140,22 @@ def _frame_factor(equations: Equations, translations: Tensor, shared: Tensor) ->
 
     A view's own step is -R11^-1 (R12 s + e), where s are the shared unknowns and e noise that is independent of them.
     """
-    view, batch, count = equations.view, len(shared), shared.shape[-1]
-    width = view.shape[-2]
-    if not width:
-        return shared.new_zeros(batch, 6, count + 6)
-    corner, right = view[..., :width], view[..., width:-1]
+    view = equations.view
+    corner, right = view[..., :6], view[..., 6:-1]
     diagonal = corner.diagonal(dim1=-2, dim2=-1).abs()
     # a view in which too little is seen has no pose to go by
     seen = (diagonal > torch.finfo(view.dtype).eps * diagonal.amax(-1, keepdim=True)).all(-1)
-    eye = torch.eye(width, dtype=view.dtype, device=view.device)
+    eye = torch.eye(6, dtype=view.dtype, device=view.device)
     corner = torch.where(seen[..., None, None], corner, eye)
     inverse = torch.linalg.solve_triangular(corner, eye.expand_as(corner), upper=True)
     share = seen.to(view.dtype) / seen.sum(-1, keepdim=True).clamp(min=1)
     inverse = inverse * share[..., None, None]
-    if width == 6:
-        turn = inverse[..., :3, :]
-        # about the origin, not the board
-        shift = inverse[..., 3:, :] + _cross_matrix(translations) @ turn
-    else:
-        turn, shift = torch.zeros_like(inverse), inverse
-    carried = torch.cat((turn, shift), -2)
+    turn = inverse[..., :3, :]
+    # about the origin, not the board
+    carried = torch.cat((turn, inverse[..., 3:, :] + _cross_matrix(translations) @ turn), -2)
     by_shared = -(carried @ right).sum(1)
-    by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, V L)
-    missing = max(0, 6 - by_noise.shape[-1])
-    rows = torch.nn.functional.pad(by_noise.mT, (0, 0, 0, missing))
-    return torch.cat((by_shared @ shared, torch.linalg.qr(rows, mode="r").R.mT), -1)
+    by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, 6 V)
+    return torch.cat((by_shared @ shared, torch.linalg.qr(by_noise.mT, mode="r").R.mT), -1)
 
 
 def _cross_matrix(vectors: Tensor) -> Tensor:
@@ -205,15 +174,7 @@ def worst(covariances: Tensor) -> Tensor:
 
 @torch.no_grad()
 def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -> Tensor:
-    """The standard deviation in px, in its worst direction, of where a calibrated camera sees what is at a pixel.
-
-    Args:
-        spread: of a single problem.
-        pixels: (..., 2).
-        distance: of what is seen, from the camera in units of the board: one, or for each pixel (...).
-
-    Returns:
-        (...) float64; NaN where a pixel has no ray.
+    """`Calibration.uncertainty` of a single problem.
 
     Raises:
         ValueError: pixels of another shape, distances that are not positive or do not fit the pixels.
@@ -224,13 +185,13 @@ def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -
         as_values(value, name, owner, like.device).detach().to(like)
         for value, name in ((pixels, "pixels"), (distance, "distance"))
     )
+    shape = pixels.shape[:-1]
     if pixels.ndim == 0 or pixels.shape[-1] != 2:
         raise ValueError(f"{owner}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
     if not bool((distance > 0).all()):
         raise ValueError(
             f"{owner}: distance must be positive, in the unit of the board, or math.inf; got {distance.tolist()}"
         )
-    shape = pixels.shape[:-1]
     try:
         distance = distance.expand(shape)
     except RuntimeError:

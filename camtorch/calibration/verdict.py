@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Sight, State
+from camtorch.calibration.observations import named
 from camtorch.calibration.uncertainty import spread, worst
 from camtorch.projection.rays import angles_from_axis, image_edges
 
@@ -38,17 +39,18 @@ _OPEN = 0.02  # of the corners' extent: the uncertainty of projections that are 
 _OPEN_COEFFICIENT = 0.1  # standard deviation
 _MISFIT = 3.0  # px, the median residual of views that no camera fits
 _MOST_OF_A_VIEW = 0.8  # of its corners
-_NAMED = 6  # views, in a sentence
 
 _ROWS, _COLUMNS = ("top", "", "bottom"), ("left", "", "right")
+_OTHERS = {"pinhole": "brown_conrady", "brown_conrady": "", "kannala_brandt": "fisheye624", "fisheye62": "fisheye624"}
+_OTHERS |= dict.fromkeys(("fisheye624", "thin_prism_fisheye"), "")
+_WIDER = {"pinhole": "kannala_brandt", "brown_conrady": "kannala_brandt or fisheye624"}
+"""Models to try where another one does not fit, and where corners reach far from the axis."""
 
 
 class Zone(NamedTuple):
     """A ninth of the image."""
 
     name: str
-    corners: int
-    """How many were seen there."""
     share: float
     """The part of its cells that corners lie in or next to."""
     rays: float
@@ -60,18 +62,14 @@ class Zone(NamedTuple):
 class Survey:
     """Numbers of a calibration that sentences are made of, over a map of the image."""
 
-    shape: tuple[int, int]
-    pixels: Tensor
-
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
-        height, width = calibration.image_size
-        cell = max(height, width) / _CELLS
-        self.shape = max(1, round(height / cell)), max(1, round(width / cell))
+        cell = max(calibration.image_size) / _CELLS
+        rows, columns = self.shape = tuple(max(1, round(side / cell)) for side in calibration.image_size)
         low, high = image_edges(calibration.image_size, self.parameters)
         steps = [
             (torch.arange(count, device=low.device).to(low) + 0.5) / count * (high[i] - low[i]) + low[i]
-            for i, count in ((1, self.shape[0]), (0, self.shape[1]))
+            for i, count in ((1, rows), (0, columns))
         ]
         self.pixels = torch.stack(torch.meshgrid(*steps, indexing="ij")[::-1], -1)
         """(rows, columns, 2) the middle of each cell."""
@@ -170,8 +168,6 @@ class Survey:
     @cached_property
     def zones(self) -> list[Zone]:
         """Nine, by rows."""
-        low, high = image_edges(self.calibration.image_size, self.corners)
-        places = ((self.corners - low) / (high - low) * 3).long().clamp(0, 2)
         result = []
         for i, band in enumerate(torch.arange(self.shape[0], device="cpu").tensor_split(3)):
             for j, part in enumerate(torch.arange(self.shape[1], device="cpu").tensor_split(3)):
@@ -180,7 +176,6 @@ class Survey:
                 result.append(
                     Zone(
                         " ".join(filter(None, (_ROWS[i], _COLUMNS[j]))) or "middle",
-                        int(((places[:, 0] == j) & (places[:, 1] == i)).sum()),
                         float(self.covered[band][:, part].double().mean()),
                         len(known) / here.numel(),
                         float(known.amax()) if len(known) else math.nan,
@@ -202,18 +197,14 @@ class Survey:
         ]
 
     def good_within(self, limit: float, furthest: float = math.inf) -> tuple[float, float]:
-        """The angle from the axis up to which projections are known that well, and the part of the image within it.
+        """The angle from the axis up to which projections are known to `limit` px, and the part of the image within it.
 
-        Args:
-            limit: px.
-            furthest: radians, an angle beyond which they count as unknown.
+        furthest: radians, an angle beyond which they count as unknown.
         """
         known, angles = self.uncertainty.nan_to_num(torch.inf), self.angles
-        bad = angles[~((known <= limit) & (angles <= furthest))]
-        angle = float(bad[~bad.isnan()].amin()) if bool((~bad.isnan()).any()) else math.inf
-        within = angles < angle
-        found = float(angles[within].amax()) if bool(within.any()) else 0.0
-        return found, float(within.double().mean())
+        bad = ~((known <= limit) & (angles <= furthest)) & ~angles.isnan()
+        within = angles < torch.where(bad, angles, torch.inf).amin()
+        return float(torch.where(within, angles, 0.0).amax()), float(within.double().mean())
 
     @cached_property
     def normals(self) -> Tensor | None:
@@ -273,6 +264,27 @@ class Survey:
         _, gain = _more(Bundle([sight], wider, free, None, 1.0), wider, more - count)
         return bend, (more, gain / cost)
 
+    @property
+    def pattern_share(self) -> float:
+        """The part of the residuals' size that is a mean over a part of the image, 0 where chance may have done it."""
+        use = self.calibration.point_inliers
+        residuals, pixels = self.calibration.point_residuals[use], self.calibration.observations.pixels[use]
+        side = max(self.calibration.image_size) / _PATTERN
+        rows, columns = (math.ceil(length / side) for length in self.calibration.image_size)
+        place = ((pixels + 0.5) / side).long().clamp(min=0)
+        cell = place[:, 1].clamp(max=rows - 1) * columns + place[:, 0].clamp(max=columns - 1)
+        sums = residuals.new_zeros(rows * columns, 2).index_add_(0, cell, residuals)
+        counts = cell.bincount(minlength=rows * columns)
+        here = counts > 0
+        variance = float(residuals.square().mean()) if len(residuals) else 0.0
+        if variance == 0:
+            return 0.0
+        squares = float((sums[here].square().sum(-1) / counts[here]).sum() / variance)
+        free = 2 * int(here.sum())
+        if squares - free < _CERTAIN * math.sqrt(2 * free):
+            return 0.0
+        return math.sqrt((squares - free) / (2 * len(residuals)))
+
     @cached_property
     def learns(self) -> Tensor:
         """(4 + n,) bool: which parameters were free."""
@@ -308,7 +320,8 @@ def _more(bundle: Bundle, state: State, count: int) -> tuple[Tensor, float]:
 def warnings(calibration: Calibration) -> list[str]:
     """What the data do not carry, and what does not fit: each with what to do. Empty where all is well."""
     survey = Survey(calibration)
-    return [text for find in _FINDERS for text in find(survey)]
+    finders = (_search, _noise, _outliers, _bad_views, _views, _loose, _twins, _coverage, _angles, _pattern, _needless)
+    return [text for find in finders for text in find(survey)]
 
 
 def _search(survey: Survey) -> Iterator[str]:
@@ -320,36 +333,68 @@ def _search(survey: Survey) -> Iterator[str]:
 
 
 def _noise(survey: Survey) -> Iterator[str]:
-    calibration = survey.calibration
-    limit = _CORNER_NOISE * max(1.0, max(calibration.image_size) / 2000)
-    if calibration.sigma > limit:
+    sigma = survey.calibration.sigma
+    if sigma > _CORNER_NOISE * max(1.0, max(survey.calibration.image_size) / 2000):
         yield (
-            f"What is left is {_px(calibration.sigma)} per coordinate, far more than corners are wrong by: see whether "
+            f"What is left is {_px(sigma)} per coordinate, far more than corners are wrong by: see whether "
             "the board is flat and as described, and look at the worst views; images out of focus or smeared by motion "
             "do it too, and so does a model that is not that of the lens"
+        )
+
+
+def _outliers(survey: Survey) -> Iterator[str]:
+    calibration, seen = survey.calibration, survey.seen
+    inliers = calibration.point_inliers
+    bad = seen & ~inliers
+    per_view, count = bad.sum(-1), int(bad.sum())
+    lengths = torch.linalg.vector_norm(calibration.point_residuals, dim=-1)
+    usual = math.sqrt(float(lengths[inliers].square().mean()) / 2) if bool(inliers.any()) else 0.0
+    # of the lengths of normal errors so many are beyond three standard deviations, and none beyond six
+    if count > 3 + 2 * math.exp(-4.5) * int(seen.sum()) or bool((lengths[bad] > 6 * usual).any()):
+        most = int(per_view.argmax())
+        everywhere = int((per_view > 0).sum()) >= int(seen.any(-1).sum())
+        concentrated = "" if everywhere else f", {int(per_view[most])} of them in view {calibration.views[most]}"
+        robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
+        what = "corners are outliers" if count > 1 else "corners is an outlier"
+        yield f"{count} of {int(seen.sum())} {what}{concentrated}{robust}. Look at the views"
+    (lost,) = (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero(as_tuple=True)
+    if len(lost) and calibration.loss:
+        yield (
+            f"Nearly all corners of {_numbered(survey, lost)} are outliers, as where they are "
+            "numbered in another order: a robust loss bears corners that are wrong here and there, and such a view "
+            f"makes all parameters look less certain than they are. Leave {'them' if len(lost) > 1 else 'it'} out"
+        )
+
+
+def _bad_views(survey: Survey) -> Iterator[str]:
+    rms = survey.view_rms
+    usual = float(rms[~rms.isnan()].median())
+    (bad,) = (rms > max(_WORSE_VIEW * usual, survey.rounding)).nonzero(as_tuple=True)
+    if len(bad) and len(rms) >= _FEW_VIEWS:
+        yield (
+            f"{_numbered(survey, bad).capitalize()} fit{'s' * (len(bad) == 1)} worse than the others, "
+            f"up to {_px(float(rms[bad].amax()))} where {_px(usual)} is usual: look at the corners there, or leave "
+            f"{'them' if len(bad) > 1 else 'it'} out"
         )
 
 
 def _views(survey: Survey) -> Iterator[str]:
     calibration = survey.calibration
     if calibration.copies:
-        some, rest = calibration.copies[:_NAMED], len(calibration.copies) - _NAMED
-        more, many = f" and {rest} more" * (rest > 0), len(calibration.copies) > 1
         yield (
-            f"View{'s' * many} {', '.join(map(str, some))}{more} show{'s' * (not many)} another view again, its errors "
-            "too, as a copy of a file does: they count once. Take new photographs instead"
+            f"{named(calibration.copies).capitalize()} show{'s' * (len(calibration.copies) == 1)} another view again, "
+            "its errors too, as a copy of a file does: they count once. Take new photographs instead"
         )
     copies = [calibration.views.index(view) for view in calibration.copies if view in calibration.views]
     count = int(survey.seen.any(-1).sum()) - int(survey.seen[copies].any(-1).sum())
     if count < _FEW_VIEWS:
-        views = "view" if count == 1 else "views"
         yield (
-            f"Only {count} {views}: a bad one has nothing to be told by. Take 10 to 20, with the board tilted by 30 to "
-            "45 degrees to all sides"
+            f"Only {count} view{'s' * (count != 1)}: a bad one has nothing to be told by. Take 10 to 20, with the "
+            "board tilted by 30 to 45 degrees to all sides"
         )
 
 
-def _parallel(survey: Survey) -> Iterator[str]:
+def _loose(survey: Survey) -> Iterator[str]:
     loose = survey.loose_focal
     known = f"known to {_percent(loose)} only" if loose < 1 else "as good as unknown"
     if loose > _LOOSE_FOCAL and len(survey.seen) > 1 and survey.tilt < _ALIKE:
@@ -358,7 +403,14 @@ def _parallel(survey: Survey) -> Iterator[str]:
             f"greater distance: it is {known}. Tilt the board by 30 to 45 degrees to all sides"
         )
     elif loose > _LOOSE_FOCAL:
-        yield (f"The focal length is {known}. Take views in which the board is near and tilted, and fills the image")
+        yield f"The focal length is {known}. Take views in which the board is near and tilted, and fills the image"
+    std, longer = max(survey.calibration.std[2:4].tolist()), max(survey.calibration.image_size)
+    if std > _LOOSE_CENTRE * longer:
+        known = f"known to {_px(std)} only" if std < longer else "as good as unknown"
+        yield (
+            f"The principal point is {known}. Tilt the board to all sides, turn it by 90 degrees in "
+            'its plane, or hold it in the middle of the image with fixed=("cx", "cy")'
+        )
 
 
 def _twins(survey: Survey) -> Iterator[str]:
@@ -376,27 +428,15 @@ def _twins(survey: Survey) -> Iterator[str]:
         )
 
 
-def _centre(survey: Survey) -> Iterator[str]:
-    calibration = survey.calibration
-    std, longer = max(calibration.std[2:4].tolist()), max(calibration.image_size)
-    if std > _LOOSE_CENTRE * longer:
-        known = f"known to {_px(std)} only" if std < longer else "as good as unknown"
-        yield (
-            f"The principal point is {known}. Tilt the board to all sides, turn it by 90 degrees in "
-            'its plane, or hold it in the middle of the image with fixed=("cx", "cy")'
-        )
-
-
 def _coverage(survey: Survey) -> Iterator[str]:
     missing = survey.missing
-    if not missing:
-        return
-    known = max((zone.uncertainty for zone in missing if zone.rays >= 0.5), default=math.nan)
-    where = f", where projections are uncertain by up to {_px(known)}" if math.isfinite(known) else ""
-    yield (
-        f"Few corners or none in {_places(missing)} of the image{where}. Hold the board there, so near that its "
-        "corners reach the edges"
-    )
+    if missing:
+        known = max((zone.uncertainty for zone in missing if zone.rays >= 0.5), default=math.nan)
+        where = f", where projections are uncertain by up to {_px(known)}" if math.isfinite(known) else ""
+        yield (
+            f"Few corners or none in {_places(missing)} of the image{where}. Hold the board there, so near that its "
+            "corners reach the edges"
+        )
 
 
 def _angles(survey: Survey) -> Iterator[str]:
@@ -415,46 +455,12 @@ def _angles(survey: Survey) -> Iterator[str]:
         )
 
 
-def _needless(survey: Survey) -> Iterator[str]:
-    calibration = survey.calibration
-    names = calibration.parameter_names[4:]
-    ideal = calibration.spread.model.ideal(len(names))
-    values = survey.parameters[4:]
-    std, covariance = calibration.std[4:], calibration.covariance[4:, 4:]
-    series: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        if ideal[i] or not name[-1].isdigit():  # no term of a series
-            continue
-        series.setdefault(name.rstrip("0123456789"), []).append(i)
-    taken: list[int] = []
-    for members in series.values():
-        # the last terms of a series; together coefficients may say what each alone does not
-        for i in reversed(members):
-            some = [*taken, i]
-            scale = std[some]
-            if float(scale[-1]) == 0:
-                continue
-            correlation = covariance[some][:, some] / scale[:, None] / scale
-            scaled = (values[some] / scale)[:, None]
-            square = float((scaled.mT @ torch.linalg.pinv(correlation, hermitian=True) @ scaled)[0, 0])
-            if square > len(some) + 2 * math.sqrt(2 * len(some)):
-                break
-            taken = some
-    if taken:
-        found = [names[i] for i in sorted(taken)]
-        many = len(found) > 1
-        yield (
-            f"{_listed(found)} cannot be told from zero: the data do not need {'them' if many else 'it'}. "
-            f"{_fixed(found)} makes the rest more certain"
-        )
-
-
 def _pattern(survey: Survey) -> Iterator[str]:
     calibration = survey.calibration
     if calibration.rms <= survey.rounding:
         return
     bend, more = survey.gains
-    share = pattern_share(survey)
+    share = survey.pattern_share
     least = max(_GAIN, (_CERTAIN * calibration.sigma) ** 2 / max(float(calibration.adjusted.cost[0]), 1e-300))
     is_bent = bend[2] > least and share < 2 * _PATTERN_SHARE and len(survey.seen) >= _FEW_VIEWS
     if is_bent:
@@ -471,109 +477,46 @@ def _pattern(survey: Survey) -> Iterator[str]:
             f"by {_percent(more[1])}"
         )
     elif share > _PATTERN_SHARE:
-        size = share * calibration.rms
+        key, wide = calibration.spread.model.key, survey.reach > math.radians(40)
+        other = (_WIDER if wide else _OTHERS).get(key, _OTHERS.get(key, "kannala_brandt or fisheye624"))
+        tries = " or ".join(filter(None, (other, "" if any(calibration.bend) or is_bent else "bend=True")))
+        instead = f"Try {tries}" if tries else "See whether the board is flat and as described, and the corners sharp"
         yield (
-            f"The residuals have a pattern over the image, of {_px(size)}: the model is not that of the lens, or the "
-            f"board is not as described. {_instead(survey, is_bent)}"
+            f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
+            f"the lens, or the board is not as described. {instead}"
         )
 
 
-def _outliers(survey: Survey) -> Iterator[str]:
+def _needless(survey: Survey) -> Iterator[str]:
     calibration = survey.calibration
-    seen, inliers = survey.seen, calibration.point_inliers
-    bad = seen & ~inliers
-    count, total = int(bad.sum()), int(seen.sum())
-    lengths = torch.linalg.vector_norm(calibration.point_residuals, dim=-1)
-    usual = math.sqrt(float(lengths[inliers].square().mean()) / 2) if bool(inliers.any()) else 0.0
-    # of the lengths of normal errors so many are beyond three standard deviations, and none beyond six
-    if count > 3 + 2 * math.exp(-4.5) * total or bool((lengths[bad] > 6 * usual).any()):
-        number, views = int(bad.any(-1).sum()), int(seen.any(-1).sum())
-        per_view = bad.sum(-1)
-        most = int(per_view.argmax())
-        concentrated = f", {int(per_view[most])} of them in view {calibration.views[most]}" if number < views else ""
-        robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
-        what = "corners are outliers" if count > 1 else "corners is an outlier"
-        yield f"{count} of {total} {what}{concentrated}{robust}. Look at the views"
-    (lost,) = (bad.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero(as_tuple=True)
-    if len(lost) and calibration.loss:
-        numbers = ", ".join(str(calibration.views[i]) for i in lost[:_NAMED].tolist())
-        rest = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+    names = calibration.parameter_names[4:]
+    ideal = calibration.spread.model.ideal(len(names))
+    values = survey.parameters[4:]
+    std, covariance = calibration.std[4:], calibration.covariance[4:, 4:]
+    series: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        if not ideal[i] and name[-1].isdigit():  # else it is no term of a series
+            series.setdefault(name.rstrip("0123456789"), []).append(i)
+    taken: list[int] = []
+    for members in series.values():
+        # the last terms of a series; together coefficients may say what each alone does not
+        for i in reversed(members):
+            some = [*taken, i]
+            scale = std[some]
+            if float(scale[-1]) == 0:
+                continue
+            correlation = covariance[some][:, some] / scale[:, None] / scale
+            scaled = (values[some] / scale)[:, None]
+            square = float((scaled.mT @ torch.linalg.pinv(correlation, hermitian=True) @ scaled)[0, 0])
+            if square > len(some) + 2 * math.sqrt(2 * len(some)):
+                break
+            taken = some
+    if taken:
+        found = [names[i] for i in sorted(taken)]
         yield (
-            f"Nearly all corners of view{'s' * (len(lost) > 1)} {numbers}{rest} are outliers, as where they are "
-            "numbered in another order: a robust loss bears corners that are wrong here and there, and such a view "
-            f"makes all parameters look less certain than they are. Leave {'them' if len(lost) > 1 else 'it'} out"
+            f"{_listed(found)} cannot be told from zero: the data do not need {'them' if len(found) > 1 else 'it'}. "
+            f"{_fixed(found)} makes the rest more certain"
         )
-
-
-def _bad_views(survey: Survey) -> Iterator[str]:
-    rms = survey.view_rms
-    usual = float(rms[~rms.isnan()].median())
-    (bad,) = (rms > max(_WORSE_VIEW * usual, survey.rounding)).nonzero(as_tuple=True)
-    if len(bad) and len(rms) >= _FEW_VIEWS:
-        numbers = [str(survey.calibration.views[i]) for i in bad[:_NAMED].tolist()]
-        rest = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
-        yield (
-            f"View{'s' * (len(bad) > 1)} {', '.join(numbers)}{rest} fit{'s' * (len(bad) == 1)} worse than the others, "
-            f"up to {_px(float(rms[bad].amax()))} where {_px(usual)} is usual: look at the corners there, or leave "
-            f"{'them' if len(bad) > 1 else 'it'} out"
-        )
-
-
-_FINDERS: tuple[Callable[[Survey], Iterator[str]], ...] = (
-    _search,
-    _noise,
-    _outliers,
-    _bad_views,
-    _views,
-    _parallel,
-    _twins,
-    _centre,
-    _coverage,
-    _angles,
-    _pattern,
-    _needless,
-)
-
-
-def pattern_share(survey: Survey) -> float:
-    """The part of the residuals' size that is a mean over a part of the image, 0 where chance may have done it."""
-    calibration = survey.calibration
-    use = calibration.point_inliers
-    residuals, pixels = calibration.point_residuals[use], calibration.observations.pixels[use]
-    height, width = calibration.image_size
-    side = max(height, width) / _PATTERN
-    columns, rows = math.ceil(width / side), math.ceil(height / side)
-    place = ((pixels + 0.5) / side).long().clamp(min=0)
-    cell = place[:, 1].clamp(max=rows - 1) * columns + place[:, 0].clamp(max=columns - 1)
-    sums = residuals.new_zeros(rows * columns, 2).index_add_(0, cell, residuals)
-    counts = residuals.new_zeros(rows * columns).index_add_(0, cell, torch.ones_like(residuals[:, 0]))
-    here = counts > 0
-    variance = float(residuals.square().mean()) if len(residuals) else 0.0
-    if variance == 0 or not bool(here.any()):
-        return 0.0
-    squares = (sums[here].square().sum(-1) / counts[here]).sum() / variance
-    free = 2 * int(here.sum())
-    if float(squares) - free < _CERTAIN * math.sqrt(2 * free):
-        return 0.0
-    return math.sqrt((float(squares) - free) / (2 * len(residuals)))
-
-
-def _instead(survey: Survey, is_bent: bool) -> str:
-    """What else to try."""
-    key, calibration = survey.calibration.spread.model.key, survey.calibration
-    wide = survey.reach > math.radians(40)
-    others = {
-        "pinhole": "kannala_brandt" if wide else "brown_conrady",
-        "brown_conrady": "kannala_brandt or fisheye624" if wide else "",
-        "kannala_brandt": "fisheye624",
-        "fisheye62": "fisheye624",
-        "fisheye624": "",
-        "thin_prism_fisheye": "",
-    }
-    other = others.get(key, "kannala_brandt or fisheye624")
-    bend = "" if any(calibration.bend) or is_bent else "bend=True"
-    tries = " or ".join(filter(None, (other, bend)))
-    return f"Try {tries}" if tries else "See whether the board is flat and as described, and the corners sharp"
 
 
 @torch.no_grad()
@@ -586,9 +529,9 @@ def verdict(calibration: Calibration) -> str:
     # what the model makes of rays that no corner was near is not told by the noise
     fine, fine_share = survey.good_within(FINE, survey.reach + _BEYOND)
     rough, rough_share = survey.good_within(ROUGH)
-    whole = "the whole image" if rays > 0.99 else f"all of the image that has rays, {_percent(rays)}"
     usual = "one standard deviation in the worst direction, far away"
     if fine_share > 0.99 * rays:
+        whole = "the whole image" if rays > 0.99 else f"all of the image that has rays, {_percent(rays)}"
         largest = float(survey.uncertainty.nan_to_num(0.0).amax())
         good = (
             f"Good for measuring in {whole}, up to {_degrees(fine)} from the optical axis: projections are "
@@ -619,8 +562,9 @@ def verdict(calibration: Calibration) -> str:
 
 def _next(survey: Survey) -> str:
     """What to photograph next."""
-    loose = [z for z in survey.zones if z.rays >= 0.5 and z.uncertainty > max(FINE, 2 * survey.zones[4].uncertainty)]
-    wanted = survey.missing or sorted(loose, key=lambda z: -z.uncertainty)[:3]
+    middle = survey.zones[4].uncertainty
+    loose = [zone for zone in survey.zones if zone.rays >= 0.5 and zone.uncertainty > max(FINE, 2 * middle)]
+    wanted = survey.missing or sorted(loose, key=lambda zone: -zone.uncertainty)[:3]
     tilt = " Tilt the board by 30 to 45 degrees to all sides." if survey.tilt < _ALIKE else ""
     if wanted:
         return (
@@ -628,18 +572,14 @@ def _next(survey: Survey) -> str:
         )
     if tilt:
         return f"Next:{tilt}"
-    if survey.zones[4].uncertainty > FINE:
+    if middle > FINE:
         return "Next, take more views, near and tilted: four times as many halve the uncertainty."
     return "It needs no more views; four times as many would halve the uncertainty."
 
 
 @torch.no_grad()
 def check_determined(
-    adjusted: Adjusted,
-    models: Sequence[type[Camera]],
-    names: Sequence[Sequence[str]],
-    sights: Sequence[Sight],
-    owners: Sequence[str],
+    adjusted: Adjusted, camera: int, model: type[Camera], names: Sequence[str], sight: Sight, owner: str
 ) -> None:
     """Refuse a problem in which the views of a camera leave it open, as those of boards that are all parallel do.
 
@@ -647,43 +587,40 @@ def check_determined(
     fiftieth of the extent of the corners: a matter of where the boards were, which corners without noise cannot hide.
     Several views that no camera fits are wrong, not open, and what warnings are for.
 
-    Args:
-        adjusted: one problem, at its optimum.
-        models: of the cameras.
-        names: of their parameters.
-        sights: what they saw.
-        owners: the function that asks, and which of the cameras it is, for messages.
-
     Raises:
         ValueError: it is open, with what to do.
     """
-    for c, (model, of, sight, owner) in enumerate(zip(models, names, sights, owners, strict=True)):
-        noise = adjusted.cost.new_full((1,), _USUAL_NOISE)
-        found = spread(adjusted, model, c, noise)
-        seen = sight.weights[0] > 0
-        views = int(seen.any(-1).sum())
-        misfit = torch.linalg.vector_norm(adjusted.residuals[c][0], dim=-1)[seen].median()
-        if views > 1 and float(misfit) > _MISFIT:
-            continue
-        pixels = sight.pixels[0][seen]
-        pixels = pixels[:: max(1, len(pixels) // 512)][None]
-        sizes = worst(found.of_pixels(pixels, torch.full_like(pixels[..., 0], torch.inf)))[0]
-        sizes = sizes[~sizes.isnan()]
-        extent = float((pixels.amax((0, 1)) - pixels.amin((0, 1))).amax())
-        if not len(sizes) or float(sizes.median()) <= _OPEN * max(extent, 1.0):
-            continue
-        std, values = found.std[0], found.parameters[0]
-        limits = torch.cat((values[:2], values[:2])) * _OPEN
-        limits = torch.cat((limits, torch.full_like(values[4:], _OPEN_COEFFICIENT)))
-        open_ones = [name for name, is_open in zip(of, (std > limits).tolist(), strict=True) if is_open]
-        free = [name for name, size in zip(of, std.tolist(), strict=True) if size > 0]
-        hold = [name for name in free if name not in ("fx", "fy")] or free
-        what = "a single view of this board leaves" if views == 1 else f"these {views} views leave"
-        why = "" if views == 1 else ", as boards that are all nearly parallel do"
-        raise ValueError(
-            f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 "
-            f"views in which the board is tilted by 30 to 45 degrees to all sides, or hold parameters: {_fixed(hold)}"
-        )
+    found = spread(adjusted, model, camera, adjusted.cost.new_full((1,), _USUAL_NOISE))
+    seen = sight.weights[0] > 0
+    views = int(seen.any(-1).sum())
+    misfit = torch.linalg.vector_norm(adjusted.residuals[camera][0], dim=-1)[seen].median()
+    if views > 1 and float(misfit) > _MISFIT:
+        return
+    pixels = sight.pixels[0][seen]
+    pixels = pixels[:: max(1, len(pixels) // 512)][None]
+    sizes = worst(found.of_pixels(pixels, torch.full_like(pixels[..., 0], torch.inf)))[0]
+    sizes = sizes[~sizes.isnan()]
+    extent = float((pixels.amax((0, 1)) - pixels.amin((0, 1))).amax())
+    if not len(sizes) or float(sizes.median()) <= _OPEN * max(extent, 1.0):
+        return
+    std, values = found.std[0], found.parameters[0]
+    limits = torch.cat((_OPEN * values[:2], _OPEN * values[:2], torch.full_like(values[4:], _OPEN_COEFFICIENT)))
+    open_ones = [name for name, is_open in zip(names, (std > limits).tolist(), strict=True) if is_open]
+    free = [name for name, size in zip(names, std.tolist(), strict=True) if size > 0]
+    hold = [name for name in free if name not in ("fx", "fy")] or free
+    what = "a single view of this board leaves" if views == 1 else f"these {views} views leave"
+    why = "" if views == 1 else ", as boards that are all nearly parallel do"
+    raise ValueError(
+        f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 "
+        f"views in which the board is tilted by 30 to 45 degrees to all sides, or hold parameters: {_fixed(hold)}"
+    )
+
+
+# -- words
+
+
+def _numbered(survey: Survey, rows: Tensor) -> str:
+    return named([survey.calibration.views[i] for i in rows.tolist()])
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -1,87 +1,75 @@
-"""The command `camtorch board`: a board to print and to photograph."""
+"""The command `camtorch board`: a board to print and to photograph; and the board that a command's options say."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING
 
-from camtorch.cli.boards import add_board, parse_length
-from camtorch.cli.options import add_output
+from camtorch.boards import printing
+from camtorch.boards.boards import Board, board_of
+from camtorch.cli import targets
+from camtorch.io.writing import replacing
 
-if TYPE_CHECKING:
-    from camtorch.boards.boards import Board
-    from camtorch.cli.options import Commands
-
-_PAPERS = ("a4", "a3", "a2", "a1", "a0", "letter", "legal", "tabloid")
+_OWN = {"charuco": ("marker", "legacy", "dictionary"), "aprilgrid": ("spacing", "border", "dictionary")}
+"""Options of types of boards alone."""
 
 
-def parse_paper(text: str) -> str | tuple[float, float]:
-    """The name of a paper, or (width, height) in mm of "WIDTHxHEIGHT", as in 400x300mm."""
-    name = text.lower()
-    if name in (*_PAPERS, "board"):
-        return name
-    unit = next((unit for unit in ("mm", "cm", "in", "m") if name.endswith(unit)), "mm")
-    sides = name.removesuffix(unit).split("x")
-    if len(sides) != 2:
-        known = ", ".join(_PAPERS)
-        raise argparse.ArgumentTypeError(f"{text!r} is no paper: {known}, board, or WIDTHxHEIGHT, as in 400x300mm")
-    width, height = (1000 * parse_length(f"{side}{unit}") for side in sides)
-    return width, height
+def read_board(arguments: argparse.Namespace, square: float) -> Board:
+    """The board that the options of `add_board` say, with squares of `square` if they do not say that.
 
-
-def add(commands: Commands) -> None:
-    """Add the command to a command line."""
-    command = commands.add_parser(
-        "board",
-        help="draw a board to print, for camtorch calibrate",
-        description="Draw a board to print, to scale: camtorch board --board 9x6 --square 25mm -o board.pdf. "
-        "Print it at 100 % (no fit to page), on something flat.",
-        allow_abbrev=False,
-    )
-    command.set_defaults(run=run)
-    add_board(command, "by default as many whole millimetres as fit on the paper")
-    command.add_argument(
-        "--paper",
-        type=parse_paper,
-        default="a4",
-        metavar="NAME",
-        help=f"{', '.join(_PAPERS)}, WIDTHxHEIGHT as in 400x300mm, or board: as large as needed; a4 by default",
-    )
-    add_output(command, "board.pdf", "the drawing, a .pdf or .svg")
+    Raises:
+        ValueError: no --board, options of another type of board, numbers that no board has.
+    """
+    if arguments.board is None:
+        raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
+    kind, length = arguments.type or "chessboard", arguments.square or square
+    columns, rows = arguments.board
+    options = {"type": kind, "columns": columns, "rows": rows, "square": length}
+    for name in ("marker", "legacy", "spacing", "border", "dictionary"):
+        value = getattr(arguments, name)
+        if value in (None, False):
+            continue
+        if name not in _OWN.get(kind, ()):
+            kinds = " or ".join(f"--type {other}" for other in _OWN if name in _OWN[other])
+            raise ValueError(f"--{name} is for {kinds}; this is a {kind}")
+        options[name] = value
+    if kind == "charuco":
+        options.setdefault("marker", 0.75 * length)
+    return board_of(options)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
-    from camtorch.boards import printing
-    from camtorch.cli import targets
-    from camtorch.cli.boards import read_board, said
-    from camtorch.io.writing import replacing
-
     path = arguments.output
     if path.suffix.lower() not in (".pdf", ".svg"):
         raise ValueError(f"{path}: a board is drawn as .pdf or .svg")
     targets.check(path, force=arguments.force)
-    paper = printing.PAPERS.get(arguments.paper, arguments.paper)
-    if paper == "board":
-        paper = None
+    paper = None if arguments.paper == "board" else printing.PAPERS.get(arguments.paper, arguments.paper)
     board = read_board(arguments, 0.03)
     if arguments.square is None and paper is not None:
-        board = _fitting(arguments, board, paper)
-    page = printing.page(board, paper, (board.words("m"), "camtorch calibrate IMAGES -o camera.yml", said(board)))
+        # as large as whole millimetres of a square or tag allow
+        part = max(printing.largest(board, sides) for sides in (paper, paper[::-1]))
+        side = math.floor(1000 * part * board.square + 1e-6) / 1000
+        if side <= 0:
+            raise ValueError(f"on paper of {paper[0]:g} x {paper[1]:g} mm a square would be less than a millimetre")
+        board = read_board(arguments, side)
+    page = printing.page(board, paper, (board.words("m"), "camtorch calibrate IMAGES -o camera.yml", _said(board)))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as (file,):
         file.write(printing.as_pdf(page) if path.suffix.lower() == ".pdf" else printing.as_svg(page).encode())
     print(f"{path}: {board.words('m')}, on {page.width:.4g} x {page.height:.4g} mm; print it at 100 %")
 
 
-def _fitting(arguments: argparse.Namespace, board: Board, paper: tuple[float, float]) -> Board:
-    """The board as large as whole millimetres of a square or tag allow."""
-    from camtorch.boards import printing
-    from camtorch.cli.boards import read_board
-
-    part = max(printing.largest(board, sides) for sides in (paper, paper[::-1]))
-    side = math.floor(1000 * part * board.square + 1e-6) / 1000
-    if side <= 0:
-        raise ValueError(f"on paper of {paper[0]:g} x {paper[1]:g} mm a square would be less than a millimetre")
-    return read_board(argparse.Namespace(**vars(arguments) | {"square": side}), side)
+def _said(board: Board) -> str:
+    """The options that say which board it is."""
+    options = board.options()
+    words = f"--board {options.pop('columns')}x{options.pop('rows')}"
+    kind = options.pop("type")
+    if kind != "chessboard":
+        words = f"--type {kind} {words}"
+    for name, value in options.items():
+        if isinstance(value, bool):
+            words += f" --{name}" if value else ""
+        else:
+            words += f" --{name} {value:.6g}" if isinstance(value, float) else f" --{name} {value}"
+    return words

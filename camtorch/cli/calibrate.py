@@ -5,79 +5,33 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from camtorch.cli.boards import add_board, read_board
-from camtorch.cli.options import add_output, parse_path
+import numpy as np
+from numpy.typing import NDArray
+
+from camtorch.boards.boards import Board
+from camtorch.boards.corners import image_points
+from camtorch.boards.turns import agreeing, reordered
+from camtorch.calibration import selection
+from camtorch.calibration.calibrate import Calibration, calibrate
+from camtorch.calibration.rig import RigCalibration, calibrate_rig
+from camtorch.camera import MODELS, as_model
+from camtorch.cli import targets
+from camtorch.cli.board import read_board
+from camtorch.cli.searching import Views, found_corners, gather, read_frames, usable_views
 from camtorch.cli.terminal import note, progress
+from camtorch.io import CameraFileError, formats
+from camtorch.report.report import require_packages, write_report
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from camtorch.boards.boards import Board
-    from camtorch.boards.corners import ImageCorners
-    from camtorch.calibration.calibrate import Calibration
-    from camtorch.calibration.rig import RigCalibration
-    from camtorch.cli.options import Commands
-
-_LEAST_VIEWS = 3
-_WORST = 3
-"""Views that are named."""
-_OUTLYING = 2.0
-"""Times the rms of all views, from where a view is named as bad."""
-
-Views = dict[str, dict[str, "ImageCorners"]]
-"""View -> camera -> what its image shows."""
-
-
-def add(commands: Commands) -> None:
-    """Add the command to a command line."""
-    command = commands.add_parser(
-        "calibrate",
-        help="calibrate a camera or a rig from photographs or a video of a board",
-        description="Calibrate a camera from photographs of a board: camtorch calibrate images/*.jpg --board 9x6 "
-        "--square 25mm -o camera.yml --report report.html. A video, board.mp4, does as well: sharp frames that differ "
-        "are taken.",
-        allow_abbrev=False,
-    )
-    command.set_defaults(run=run)
-    command.add_argument("images", nargs="*", metavar="IMAGE", help="files, quoted patterns, or folders; or a video")
-    rigs = command.add_argument_group("several cameras, instead of IMAGE")
-    rigs.add_argument("--left", nargs="+", metavar="IMAGE", help="of the left camera of a pair")
-    rigs.add_argument("--right", nargs="+", metavar="IMAGE", help="of the right one")
-    rigs.add_argument("--rig", nargs="+", metavar="NAME=IMAGE", help="of any number of cameras: a folder or a pattern")
-    rigs.add_argument(
-        "--match",
-        choices=("name", "order"),
-        help="what says which images were taken together; by default names where they agree, else the order",
-    )
-    add_board(command, "if left out, distances are in squares")
-    lens = command.add_argument_group("camera")
-    lens.add_argument("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
-    lens.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
-    lens.add_argument("--fixed", metavar="NAMES", help="held parameters, as cx,cy (in the middle) or k3 (at 0)")
-    lens.add_argument("--loss", choices=("huber", "cauchy"), help="for corners of which some are wrong")
-    lens.add_argument("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
-    lens.add_argument("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
-    command.add_argument(
-        "--corners", type=parse_path, metavar="FILE", help="a .json to keep corners in, and to take them from"
-    )
-    command.add_argument(
-        "--report", type=parse_path, metavar="FILE", help="an .html to look at: how far the result can be trusted"
-    )
-    command.add_argument("--format", help="of OUT; by default what its name says, OpenCV's for .yml")
-    add_output(command, "camera.json", "the calibration")
+_WORST = 3  # views that are named
+_OUTLYING = 2.0  # times the rms of all views, from where a view is named as bad
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
-    from camtorch.cli import targets
-    from camtorch.cli.searching import found_corners, usable_views
-
     cameras = _cameras(arguments)
     given = tuple(path for paths in cameras.values() for path in paths)
     files = [path for path in (arguments.output, arguments.report, arguments.corners) if path is not None]
@@ -89,31 +43,29 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.corners is not None and not arguments.corners.exists():
         targets.check(arguments.corners, force=False)
     if arguments.report is not None:
-        from camtorch.report.report import require_packages
-
         require_packages()
     format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
-    board = read_board(arguments, 1.0) if arguments.board is not None else None
     corners = found_corners(
         cameras,
-        board,
+        read_board(arguments, 1.0) if arguments.board is not None else None,
         arguments.corners,
         arguments.match,
         measured=arguments.square is not None,
         force=arguments.force,
     )
-    unit = "" if corners.board is None or corners.board.square == 1 else "m"
-    if corners.board is not None and not unit and arguments.square is None:
+    board = corners.board
+    unit = "" if board is None or board.square == 1 else "m"
+    if board is not None and not unit and arguments.square is None:
         note("no --square is given: distances are in sides of a square")
     views, size_of = usable_views(corners)
-    words = "its points" if corners.board is None else corners.board.words(unit)
-    _tell_found(words, views, corners.images, size_of)
+    words = "its points" if board is None else board.words(unit)
+    for name, (height, width) in size_of.items():
+        seen = [of_view[name] for of_view in views.values() if name in of_view]
+        total, count = sum(image.camera == name for image in corners.images), sum(image.seen for image in seen)
+        print(f"{_head(name)}{words}: in {len(seen)} of {total} images of {width}x{height}, {count} corners")
     photographs = _photographs(views) if arguments.report is not None else {}
-    found: Calibration | RigCalibration
-    if list(size_of) == [""]:
-        found = _calibrated(arguments, corners.points, views, size_of[""], candidates)
-    else:
-        found = _calibrated_rig(arguments, corners.board, corners.points, views, size_of, candidates)
+    found = _calibrated(arguments, board, corners.points, views, size_of, candidates)
+    if isinstance(found, RigCalibration):
         _tell_mounts(found, unit)
     if arguments.bend:
         across, down = (f"{1000 * bend:.3g} mm" if unit == "m" else f"{bend:.3g}" for bend in found.bend)
@@ -121,10 +73,13 @@ def run(arguments: argparse.Namespace) -> None:
     _write(arguments, found, views, photographs, format)
 
 
+def _head(name: str) -> str:
+    """How lines about a camera begin; nothing where there is one only."""
+    return f"{name}: " if name else ""
+
+
 def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """The images by the names of cameras, "" for a single one; nothing where a file of corners shall say."""
-    from camtorch.cli.gathering import gather
-
     pair = {name: words for name in ("left", "right") if (words := getattr(arguments, name))}
     ways = [bool(arguments.images), bool(pair), bool(arguments.rig)]
     if sum(ways) > 1:
@@ -160,9 +115,6 @@ def _writable(
     Raises:
         ValueError: the name does not say the format; it holds no camera of the model.
     """
-    from camtorch.calibration.selection import CANDIDATES
-    from camtorch.camera import MODELS, as_model
-    from camtorch.io import CameraFileError, formats
 
     def failure(key: str, count: int) -> CameraFileError | None:
         kind = MODELS[key]
@@ -183,7 +135,7 @@ def _writable(
     if model is None:
         if count is not None:
             raise ValueError("--count is for a --model")
-        held = [(key, count) for key, count in CANDIDATES if failure(key, count) is None]
+        held = [(key, count) for key, count in selection.CANDIDATES if failure(key, count) is None]
         if not held:
             raise ValueError(
                 f"{path}: {format or path.suffix} holds none of the models that are tried; --model says one"
@@ -199,136 +151,78 @@ def _writable(
     return format, [(model, count)]
 
 
-def _tell_found(
-    words: str, views: Views, images: Sequence[ImageCorners], size_of: Mapping[str, tuple[int, int]]
-) -> None:
-    for name, (height, width) in size_of.items():
-        seen = [of_view[name] for of_view in views.values() if name in of_view]
-        total, points = sum(image.camera == name for image in images), sum(image.seen for image in seen)
-        head = f"{name}: " if name else ""
-        print(f"{head}{words}: in {len(seen)} of {total} images of {width}x{height}, {points} corners")
-
-
-def _options(arguments: argparse.Namespace) -> dict[str, Any]:
-    fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
-    return {"fixed": fixed, "loss": arguments.loss, "loss_scale": arguments.loss_scale}
-
-
-def _model_for(
-    arguments: argparse.Namespace,
-    points: NDArray[Any],
-    pixels: NDArray[Any],
-    size: tuple[int, int],
-    candidates: list[tuple[str, int]],
-    head: str,
-) -> tuple[str, int]:
-    """The one asked for, or the one that fits; that is said."""
-    from camtorch.calibration.selection import CANDIDATES, select
-
-    if len(candidates) == 1:
-        return candidates[0]
-    show = progress("trying models")
-    chosen = select(points, pixels, image_size=size, candidates=candidates, progress=show, **_options(arguments))
-    left_out = [f"{key} with {count}" if count else key for key, count in CANDIDATES if (key, count) not in candidates]
-    print(f"{head}models by cross-validation, px per point:")
-    print("\n".join(chosen.lines()))
-    if left_out:
-        note(f"{arguments.output.name} cannot hold {', '.join(left_out)}, which were not tried; a .json can")
-    return chosen.best.model, chosen.best.count
-
-
 def _calibrated(
-    arguments: argparse.Namespace,
-    points: NDArray[Any],
-    views: Views,
-    size: tuple[int, int],
-    candidates: list[tuple[str, int]],
-) -> Calibration:
-    from camtorch.boards.corners import image_points
-    from camtorch.calibration.calibrate import calibrate
-
-    pixels = image_points([of_view[""] for of_view in views.values()], len(points))
-    model, count = _model_for(arguments, points, pixels, size, candidates, "")
-    found = calibrate(model, points, pixels, image_size=size, count=count, bend=arguments.bend, **_options(arguments))
-    _check_converged(found)
-    _tell(found, [str(of_view[""].path) for of_view in views.values()], "")
-    return found
-
-
-def _calibrated_rig(
     arguments: argparse.Namespace,
     board: Board | None,
     points: NDArray[Any],
     views: Views,
     size_of: Mapping[str, tuple[int, int]],
     candidates: list[tuple[str, int]],
-) -> RigCalibration:
-    from camtorch.boards.corners import image_points
-    from camtorch.calibration.rig import calibrate_rig
-
+) -> Calibration | RigCalibration:
+    """The camera, or the rig where there are several; its numbers are printed."""
+    fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
+    options = {"fixed": fixed, "loss": arguments.loss, "loss_scale": arguments.loss_scale}
     pixels = {name: image_points([of_view.get(name) for of_view in views.values()], len(points)) for name in size_of}
     models, counts = {}, {}
     for name, size in size_of.items():
-        seen = pixels[name][[name in of_view for of_view in views.values()]]
-        models[name], counts[name] = _model_for(arguments, points, seen, size, candidates, f"{name}: ")
-    if board is not None and board.symmetries > 1:
-        pixels = _agreeing(arguments, board, points, pixels, size_of, models, counts)
-    found = calibrate_rig(
-        models, points, pixels, image_sizes=size_of, count=counts, bend=arguments.bend, **_options(arguments)
-    )
-    _check_converged(found)
-    for name, camera in found.cameras.items():
-        names = [str(of_view[name].path) if name in of_view else "" for of_view in views.values()]
-        _tell(camera, names, f"{name}: ")
+        models[name], counts[name] = candidates[0]
+        if len(candidates) > 1:
+            seen, show = pixels[name][[name in of_view for of_view in views.values()]], progress("trying models")
+            chosen = selection.select(points, seen, image_size=size, candidates=candidates, progress=show, **options)
+            models[name], counts[name] = chosen.best.model, chosen.best.count
+            print(f"{_head(name)}models by cross-validation, px per point:", *chosen.lines(), sep="\n")
+            left_out = [
+                f"{key} with {n}" if n else key for key, n in selection.CANDIDATES if (key, n) not in candidates
+            ]
+            if left_out:
+                note(f"{arguments.output.name} cannot hold {', '.join(left_out)}, which were not tried; a .json can")
+    found: Calibration | RigCalibration
+    if list(size_of) == [""]:
+        size, count = size_of[""], counts[""]
+        found = calibrate(models[""], points, pixels[""], image_size=size, count=count, bend=arguments.bend, **options)
+    else:
+        if board is not None and board.symmetries > 1:
+            poses = {}
+            for name, seen in pixels.items():
+                rows = np.flatnonzero(np.isfinite(seen[..., 0]).any(1))
+                alone = calibrate(
+                    models[name], points, seen[rows], image_size=size_of[name], count=counts[name], **options
+                )
+                poses[name] = dict(zip(rows.tolist(), alone.extrinsics.matrix().detach().cpu().numpy(), strict=True))
+            pixels = _agreeing(board, pixels, poses)
+        found = calibrate_rig(models, points, pixels, image_sizes=size_of, count=counts, bend=arguments.bend, **options)
+    if not found.converged:
+        raise ValueError(
+            f"no optimum was found (rms {found.rms:.4g} px), so nothing is written: are --board and the images right? "
+            "Another --model, or --loss huber where some corners are wrong, may help"
+        )
+    for name, camera in _each(found).items():
+        _tell(camera, [str(of_view[name].path) if name in of_view else "" for of_view in views.values()], _head(name))
     return found
 
 
+def _each(found: Calibration | RigCalibration) -> Mapping[str, Calibration]:
+    return found.cameras if isinstance(found, RigCalibration) else {"": found}
+
+
 def _agreeing(
-    arguments: argparse.Namespace,
-    board: Board,
-    points: NDArray[Any],
-    pixels: dict[str, NDArray[Any]],
-    size_of: Mapping[str, tuple[int, int]],
-    models: Mapping[str, str],
-    counts: Mapping[str, int],
+    board: Board, pixels: dict[str, NDArray[Any]], poses: Mapping[str, dict[int, NDArray[Any]]]
 ) -> dict[str, NDArray[Any]]:
     """The points of a board that looks the same after a turn, numbered alike in all cameras."""
-    import numpy as np
-
-    from camtorch.boards.turns import agreeing, reordered
-    from camtorch.calibration.calibrate import calibrate
-
-    poses = {}
-    for name, seen in pixels.items():
-        rows = np.flatnonzero(np.isfinite(seen[..., 0]).any(1))
-        alone = calibrate(
-            models[name], points, seen[rows], image_size=size_of[name], count=counts[name], **_options(arguments)
-        )
-        poses[name] = dict(zip(rows.tolist(), alone.extrinsics.matrix().detach().cpu().numpy(), strict=True))
-    turned, changed = agreeing(board, poses), 0
-    for name, turns in turned.items():
-        pixels[name] = reordered(board, pixels[name], [turns.get(view, 0) for view in range(len(pixels[name]))])
+    result, changed = {}, 0
+    for name, turns in agreeing(board, poses).items():
+        result[name] = reordered(board, pixels[name], [turns.get(view, 0) for view in range(len(pixels[name]))])
         changed += sum(turn > 0 for turn in turns.values())
     if changed:
         note(
             f"this board looks the same after a turn: {changed} views were turned for the cameras to agree. A board "
             "with an even and an odd number of corners, as 9x6, leaves no doubt"
         )
-    return pixels
-
-
-def _check_converged(found: Calibration | RigCalibration) -> None:
-    if not found.converged:
-        raise ValueError(
-            f"no optimum was found (rms {found.rms:.4g} px), so nothing is written: are --board and the images right? "
-            "Another --model, or --loss huber where some corners are wrong, may help"
-        )
+    return result
 
 
 def _tell(found: Calibration, names: Sequence[str], head: str) -> None:
     """The numbers of a camera, the views that fit badly, and what is to be said of it."""
-    import numpy as np
-
     corners = int(found.observations.seen.sum())
     print(
         f"{head}{found.camera.key}: rms {found.rms:.4g} px per point, sigma {found.sigma:.4g} px per coordinate, "
@@ -388,10 +282,8 @@ def _tell_mounts(found: RigCalibration, unit: str) -> None:
 
 def _photographs(views: Views) -> dict[Path, Path | NDArray[np.uint8]]:
     """What a report shows of the views: by the path of each that is there, its file, or the frame of a video."""
-    from camtorch.cli import frames
-
     paths = [image.path for of_view in views.values() for image in of_view.values()]
-    return {**{path: path for path in paths if path.exists()}, **frames.read(paths)}
+    return {**{path: path for path in paths if path.exists()}, **read_frames(paths)}
 
 
 def _write(
@@ -401,29 +293,19 @@ def _write(
     photographs: Mapping[Path, Path | NDArray[np.uint8]],
     format: str | None,
 ) -> None:
-    from camtorch.calibration.rig import RigCalibration
-    from camtorch.io import formats
-
-    path: Path = arguments.output
+    path, report = arguments.output, arguments.report
+    is_rig = isinstance(found, RigCalibration)
     path.parent.mkdir(parents=True, exist_ok=True)
     formats.save(found.rig if isinstance(found, RigCalibration) else found.camera, path, format)
     print(f"{path}: {f'{len(found.rig)} cameras' if isinstance(found, RigCalibration) else found.camera.key}")
-    if arguments.report is None:
+    if report is None:
         return
-    from camtorch.report.report import write_report
-
-    arguments.report.parent.mkdir(parents=True, exist_ok=True)
-
-    def images_of(name: str) -> list[Path | NDArray[np.uint8] | None]:
-        images = (of_view.get(name) for of_view in views.values())
-        return [None if image is None else photographs.get(image.path) for image in images]
-
-    def names_of(name: str) -> list[str]:
-        return [of_view[name].path.name if name in of_view else view for view, of_view in views.items()]
-
-    if isinstance(found, RigCalibration):
-        images = {name: images_of(name) for name in found.cameras}
-        write_report(found, arguments.report, images=images, names={name: names_of(name) for name in images})
-    else:
-        write_report(found, arguments.report, images=images_of(""), names=names_of(""))
-    print(f"{arguments.report}: the report")
+    report.parent.mkdir(parents=True, exist_ok=True)
+    images: dict[str, Any] = {}
+    names: dict[str, Any] = {}
+    for name in _each(found):
+        seen = [(view, of_view.get(name)) for view, of_view in views.items()]
+        images[name] = [None if image is None else photographs.get(image.path) for _, image in seen]
+        names[name] = [view if image is None else image.path.name for view, image in seen]
+    write_report(found, report, images=images if is_rig else images[""], names=names if is_rig else names[""])
+    print(f"{report}: the report")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,8 @@ from camtorch.io import CameraFileError, load, opencv
 from camtorch.models import MODELS
 from camtorch.rig import Rig
 
-_ASPECT = 0.01
-"""The part by which the aspect ratios of a camera and an image may differ, as sizes are rounded."""
-_WIDE = 100
-"""Degrees, horizontally, from which on lenses are rather fisheyes."""
+_ASPECT = 0.01  # the part by which the aspect ratios of a camera and an image may differ, as sizes are rounded
+_WIDE = 100  # degrees, horizontally, from which on lenses are rather fisheyes
 
 
 def read_rig(
@@ -112,6 +111,17 @@ def _of_model(path: Path, model: str) -> Rig:
     return opencv.read_rig(path, model)
 
 
+def _one(path: Path, rig: Rig, name: str | None = None) -> tuple[str, Camera]:
+    """The camera of that name, or the only one, and its name."""
+    if name is None and len(rig.cameras) > 1:
+        raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
+    name = next(iter(rig.cameras)) if name is None else name
+    camera = rig.camera_of(name)
+    if camera.batch_shape:
+        raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
+    return name, camera
+
+
 def read_camera(
     path: Path, name: str | None = None, model: str | None = None, size: tuple[int, int] | None = None
 ) -> Camera:
@@ -120,14 +130,13 @@ def read_camera(
     Raises:
         ValueError: there are several, or a batch.
     """
-    return _single(path, *_only(path, read_rig(path, name, model, size)))
+    return _one(path, read_rig(path, name, model, size))[1]
 
 
 def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
     """The camera to compare with: the only one of its file, or the one of that name; a model if the file needs one."""
     rig = read_rig(path, model=model if model is not None and _leaves_open(path) else None)
-    name, camera = _only(path, rig) if name is None or len(rig.cameras) == 1 else (name, rig.camera_of(name))
-    return _single(path, name, camera)
+    return _one(path, rig, None if len(rig.cameras) == 1 else name)[1]
 
 
 def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
@@ -148,13 +157,15 @@ def read_for_many(
     Where its file states no size, it is for the first image that has one, by which a lens is chosen, or guessed, too.
 
     Raises:
-        ValueError: as `read_camera`; no file is given.
+        ValueError: as `read_camera`; no file is given; it is for another size than all images, and not to be scaled.
     """
-    sized = ((image, size_of(image)) for image in images)
-    first, size = next((pair for pair in sized if pair[1]), (images[0], None))
+    sized = ((image, size) for image in images if (size := size_of(image)))
+    first, size = next(sized, (images[0], None))
     camera = _unfitted(first, size, arguments)[2]
-    if camera.image_size is None and size is not None:
-        camera = fitting(camera, arguments.camera, first, size, rescale=False)
+    if size is not None:
+        sizes = chain([size], (other for _, other in sized))  # read as far as one fits
+        if camera.image_size is None or all(_unfitting(camera, one, arguments.rescale) for one in sizes):
+            camera = fitting(camera, arguments.camera, first, size, arguments.rescale)
     return camera
 
 
@@ -167,8 +178,7 @@ def _unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Nam
         )
     is_file = not str(path).startswith((LENS, GUESS))
     rig = read_rig(path, arguments.name, arguments.from_model, None if is_file else size)
-    name, camera = _only(path, rig)
-    return rig, name, _single(path, name, camera)
+    return rig, *_one(path, rig)
 
 
 def stated(parts: Any, size: tuple[int, int]) -> Camera:
@@ -184,6 +194,12 @@ def stated(parts: Any, size: tuple[int, int]) -> Camera:
     if camera.image_size != size:
         raise ValueError(f"it is {size}, height and width, and the camera of its labels {camera.image_size}")
     return camera
+
+
+def settings_of(camera: Camera) -> dict[str, Any]:
+    """A camera as JSON, for the account of a job."""
+    values = {name: getattr(camera, name).detach().tolist() for name in ("intrinsics", "distortion")}
+    return {"model": camera.key, "image_size": camera.image_size, **values}
 
 
 def read_pair(
@@ -211,14 +227,12 @@ def read_pair(
         right = right or (second if left == first else first)
     if left == right:
         raise ValueError(f"{path}: --left-camera and --right-camera are both {left!r}")
-    names = left, right
     cameras = {}
-    for name, image, size in zip(names, images, sizes, strict=True):
-        camera = _single(path, name, rig.camera_of(name))
-        cameras[name] = fitting(camera, path, image, size, arguments.rescale)
+    for name, image, size in zip((left, right), images, sizes, strict=True):
+        cameras[name] = fitting(_one(path, rig, name)[1], path, image, size, arguments.rescale)
         if name not in rig.extrinsics:
             raise ValueError(f"{path}: {name} has no pose, so how the cameras stand to each other is not known")
-    return Rig(cameras, {name: rig.extrinsics[name] for name in names})
+    return Rig(cameras, {name: rig.extrinsics[name] for name in cameras})
 
 
 def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:
@@ -230,36 +244,21 @@ def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], resc
     if camera.image_size is None:
         camera.image_size = size
         note(f"{path} states no image size; taken to be for {_shown(size)}, as {image} is")
-    elif camera.image_size != size:
-        reason = _not_scaled(size, camera.image_size)
-        if reason or not rescale:
-            raise ValueError(
-                f"{image} is {_shown(size)}, but the camera in {path} is for {_shown(camera.image_size)}; "
-                f"{reason or '--rescale scales the camera to the image'}"
-            )
-        camera = camera.resize(*size)
-    return camera
+    if reason := _unfitting(camera, size, rescale):
+        own = _shown((camera.height, camera.width))
+        raise ValueError(f"{image} is {_shown(size)}, but the camera in {path} is for {own}; {reason}")
+    return camera if camera.image_size == size else camera.resize(*size)
 
 
-def _only(path: Path, rig: Rig) -> tuple[str, Camera]:
-    if len(rig.cameras) > 1:
-        raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
-    return next(iter(rig.cameras.items()))
-
-
-def _single(path: Path, name: str, camera: Camera) -> Camera:
-    if camera.batch_shape:
-        raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
-    return camera
-
-
-def _not_scaled(image: tuple[int, int], camera: tuple[int, int]) -> str:
-    """Why a camera for one (height, width) is not to be scaled to another; empty if it may be."""
-    if image == camera[::-1]:
-        return "width and height are exchanged, which scaling does not undo: is the photograph turned?"
-    shapes = image[1] / image[0], camera[1] / camera[0]
-    if max(shapes) <= (1 + _ASPECT) * min(shapes):
+def _unfitting(camera: Camera, size: tuple[int, int], rescale: bool) -> str:
+    """Why a camera is not one of images of that (height, width), if it is not."""
+    if camera.image_size == size:
         return ""
+    if size == (camera.width, camera.height):
+        return "width and height are exchanged, which scaling does not undo: is the photograph turned?"
+    shapes = size[1] / size[0], camera.width / camera.height
+    if max(shapes) <= (1 + _ASPECT) * min(shapes):
+        return "" if rescale else "--rescale scales the camera to the image"
     return (
         f"their aspect ratios, {shapes[0]:.4g} and {shapes[1]:.4g}, differ by more than {100 * _ASPECT:g} %: the image "
         "may be cropped, which --rescale does not undo"

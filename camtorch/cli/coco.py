@@ -6,10 +6,9 @@ pixels, half a pixel further.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camtorch.augment.sample import KEEP, kind_of
-from camtorch.cli import rle
-from camtorch.cli.labels import LabelsError
+from camtorch.cli.labels import Json, LabelsError, read_json
 
-Json = dict[str, Any]
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 Move = Callable[[Json], Json]
 """Labels of an image -> labels of the new one."""
 _STEP = 8.0  # pixels: between points of a polygon's edge that are moved
@@ -30,7 +28,6 @@ _COARSE = 8  # pixels between those of which it is asked whether the new image s
 _PARTS = 64  # of a way of some hundred pixels, three times in turn
 _LEAST = 0.01  # square pixels
 _FARTHEST = 1e6  # pixels
-_PACKED = ("keypoints", "boxes")
 _TURNED = ("gaze", "directions", "pitch_yaw", "points", "head_pose", "pose", "rvec", "tvec")
 _OWN = ("id", "image_id", "category_id", "iscrowd", "area", "bbox", "segmentation", "keypoints", "num_keypoints")
 
@@ -46,10 +43,6 @@ class DataSet:
     annotations: dict[Any, list[tuple[int, Json]]]
     """Id of an image -> its annotations, and their places in the file."""
 
-    def of(self, image: Json) -> list[tuple[int, Json]]:
-        """The annotations of an image."""
-        return self.annotations.get(image["id"], [])
-
 
 def read(path: Path) -> DataSet:
     """A file of annotations.
@@ -57,29 +50,14 @@ def read(path: Path) -> DataSet:
     Raises:
         LabelsError: no JSON, or no images and annotations that belong together.
     """
-    try:
-        content = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise LabelsError(f"{path}: no JSON: {error}") from None
-    if not isinstance(content, dict) or not isinstance(content.get("images"), list):
-        raise LabelsError(f'{path}: no file of COCO, which is an object with a list "images"')
-    images, annotations = content.pop("images"), content.pop("annotations", [])
-    if not isinstance(annotations, list):
-        raise LabelsError(f'{path}: "annotations" must be a list')
+    content = read_json(path, 'no file of COCO, which is an object with a list "images"')
+    images, annotations = content.pop("images", None), content.pop("annotations", [])
+    if not isinstance(images, list) or not isinstance(annotations, list):
+        raise LabelsError(f'{path}: no file of COCO: "images" and "annotations" must be lists')
     of: dict[Any, list[tuple[int, Json]]] = {}
     for i, image in enumerate(images):
-        if not isinstance(image, dict) or not isinstance(image.get("id"), (int, str)):
-            raise LabelsError(f"{path}: images[{i}]: must be an object with an id")
-        name = image.get("file_name")
-        if not isinstance(name, str) or not name or "\0" in name:
-            raise LabelsError(f"{path}: images[{i}]: file_name must be the name of a file; got {name!r:.60}")
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise LabelsError(f"{path}: images[{i}]: file_name must lie within the folder of images; got {name!r:.60}")
-        for side in ("width", "height"):
-            if type(image.get(side, 0)) not in (int, float):
-                raise LabelsError(f"{path}: images[{i}]: {side} must be a number; got {image[side]!r:.60}")
-        if image["id"] in of:
-            raise LabelsError(f"{path}: images[{i}]: another one has the id {image['id']!r:.60}")
+        if reason := _fault_of(image, of):
+            raise LabelsError(f"{path}: images[{i}]: {reason}")
         of[image["id"]] = []
     for i, one in enumerate(annotations):
         if not isinstance(one, dict) or not isinstance(one.get("image_id"), (int, str)):
@@ -90,97 +68,174 @@ def read(path: Path) -> DataSet:
     return DataSet(path, content, images, of)
 
 
+def _fault_of(image: Any, known: Mapping[Any, object]) -> str:
+    """What is wrong with an entry of an image."""
+    if not isinstance(image, dict) or not isinstance(image.get("id"), (int, str)):
+        return "must be an object with an id"
+    name = image.get("file_name")
+    if not isinstance(name, str) or not name or "\0" in name:
+        return f"file_name must be the name of a file; got {name!r:.60}"
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        return f"file_name must lie within the folder of images; got {name!r:.60}"
+    for side in ("width", "height"):
+        if type(image.get(side, 0)) not in (int, float):
+            return f"{side} must be a number; got {image[side]!r:.60}"
+    return f"another one has the id {image['id']!r:.60}" if image["id"] in known else ""
+
+
 # -- one image's annotations
 
 
-def labels_of(annotations: Sequence[Json], size: tuple[int, int], tell: Callable[[str], None]) -> Json:
-    """The annotations of an image of a (height, width) as labels of a sample, which `moved` takes up again.
+@dataclass
+class _Parts:
+    """What of an annotation moves; pixels, whose centres are whole numbers."""
 
-    `tell` hears of numbers that are not known and stay as they are.
+    entry: Json
+    keypoints: Array | None = None
+    """(N, 2)"""
+    box: Array | None = None
+    """(1, 4) x1, y1, x2, y2."""
+    mask: NDArray[np.uint8] | None = None
+    outlines: list[list[Array]] = field(default_factory=list)
+    """Points along each edge of each polygon; both of its corners are among them."""
+    turned: dict[str, str] = field(default_factory=dict)
+    """Name of an entry in the camera's frame -> that of its label."""
+
+    @classmethod
+    def of(cls, one: Json, size: tuple[int, int]) -> _Parts:
+        parts = cls(one)
+        if one.get("keypoints"):
+            parts.keypoints = _numbers(one["keypoints"], "keypoints", 3)[:, :2]
+        if one.get("bbox"):
+            numbers = _numbers(one["bbox"], "bbox", 4)
+            if len(numbers) != 1 or numbers[0, 2:].min() < 0:
+                raise ValueError(f"bbox must be [x, y, width, height]; got {one['bbox']!r:.80}")
+            parts.box = np.concatenate([numbers[:, :2], numbers[:, :2] + numbers[:, 2:]], 1) - 0.5
+        shape = one.get("segmentation") or []
+        if isinstance(shape, Mapping):
+            if shape.get("size") != list(size):
+                raise ValueError(
+                    f"segmentation has the size {shape.get('size')}, the image {list(size)}, height and width"
+                )
+            parts.mask = decoded(shape.get("counts"), size).astype(np.uint8)
+        elif isinstance(shape, list):
+            parts.outlines = [_outline(polygon) for polygon in shape]
+        else:
+            raise ValueError(f"segmentation must be a list of polygons, or an object of runs; got {shape!r:.80}")
+        return parts
+
+    def points(self) -> list[Array]:
+        return [*([] if self.keypoints is None else [self.keypoints]), *map(np.concatenate, self.outlines)]
+
+
+class Annotations:
+    """The annotations of an image as labels of a sample, and what becomes of them.
+
+    Args:
+        entries: of one image.
+        size: its (height, width).
+        tell: hears of numbers that are not known and stay as they are.
 
     Raises:
         ValueError: what is not as COCO has it; the text names the annotation.
     """
-    labels: Json = {}
-    for i, one in enumerate(annotations):
-        try:
-            labels |= _labels(one, i, size)
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"annotation {one.get('id')!r:.40}: {error}") from None
-        for name, value in one.items():
+
+    labels: Json
+    """One field for all keypoints and corners of polygons, and one for all boxes: many fields take long to move."""
+
+    def __init__(self, entries: Sequence[Json], size: tuple[int, int], tell: Callable[[str], None]):
+        self._size, self._parts, self.labels = size, list[_Parts](), {}
+        for i, one in enumerate(entries):
             try:
-                kind = None if name in _OWN else kind_of(name, value, {}, "")
-            except ValueError:  # numbers
-                kind = KEEP
-            if kind in _TURNED:
-                labels[_turned(name, one, i)] = value
-            elif kind is not None:
-                tell(f"{name!r} of annotations holds numbers that stay as they are")
-    return labels
+                parts = _Parts.of(one, size)
+            except (ValueError, TypeError) as error:
+                raise ValueError(f"annotation {one.get('id')!r:.40}: {error}") from None
+            for name, value in one.items():
+                try:
+                    kind = None if name in _OWN else kind_of(name, value, {}, "")
+                except ValueError:  # numbers
+                    kind = KEEP
+                if kind in _TURNED:
+                    parts.turned[name] = f"{name}_{i}_of_annotation_{one.get('id')}"
+                    self.labels[parts.turned[name]] = value
+                elif kind is not None:
+                    tell(f"{name!r} of annotations holds numbers that stay as they are")
+            if parts.mask is not None:
+                self.labels[f"mask_{i}"] = parts.mask
+            self._parts.append(parts)
+        points = [one for parts in self._parts for one in parts.points()]
+        boxes = [parts.box for parts in self._parts if parts.box is not None]
+        self._counts = {"keypoints": list(map(len, points)), "boxes": [1] * len(boxes)}
+        for name, arrays in (("keypoints", points), ("boxes", boxes)):
+            if arrays:
+                self.labels[name] = np.concatenate(arrays)
 
+    def moved(self, new: Json, move: Move) -> list[Json | None]:
+        """The annotations after a change of the camera; None for those of which nothing is seen any more.
 
-def packed(labels: Json) -> Json:
-    """Labels with one field for all keypoints and one for all boxes: many fields take long to move."""
-    result = {name: value for name, value in labels.items() if not name.startswith(_PACKED)}
-    for kind in _PACKED:
-        if own := [value for name, value in labels.items() if name.startswith(kind)]:
-            result[kind] = np.concatenate(own)
-    return result
+        Of keypoints those off the image get 0, 0, 0, and `num_keypoints` counts the others. Polygons are moved with
+        points between their corners where edges get curved, end at the rim of what can be mapped, and are clipped; runs
+        are moved as masks. The box is that of what is left of polygons or runs, else the one that encloses the moved
+        box, clipped. The area is that of what is left, or the old one's part of its box. `gaze`, `head_pose` and other
+        fields in the camera's frame turn with it.
 
+        Args:
+            new: `labels`, moved.
+            move: moves others, as these were.
+        """
+        pieces = {name: self._split(new, name) for name in self._counts}
+        return [self._moved(parts, i, new, pieces, move) for i, parts in enumerate(self._parts)]
 
-def _unpacked(labels: Json, new: Json) -> Json:
-    """What became of `labels`, of what became of them packed."""
-    new = dict(new)
-    for kind in _PACKED:
-        names = [name for name in labels if name.startswith(kind)]
-        ends = np.cumsum([len(labels[name]) for name in names])[:-1]
-        for mark in ("", "_valid"):
-            if kind + mark in new:
-                pieces = np.split(np.asarray(new.pop(kind + mark)), ends)
-                new |= {name + mark: piece for name, piece in zip(names, pieces, strict=True)}
-    return new
+    def _split(self, new: Json, name: str) -> Iterator[tuple[Array, Flags]]:
+        """Places and validity, annotation by annotation."""
+        counts = self._counts[name]
+        if not counts:
+            return iter(())
+        ends = np.cumsum(counts)[:-1]
+        return zip(*(np.split(np.asarray(new[name + mark]), ends) for mark in ("", "_valid")), strict=True)
 
-
-def _turned(name: str, one: Json, i: int) -> str:
-    return f"{name}_{i}_of_annotation_{one.get('id')}"
-
-
-def _labels(one: Json, i: int, size: tuple[int, int]) -> Json:
-    labels: Json = {}
-    if one.get("keypoints"):
-        labels[f"keypoints_{i}"] = _numbers(one["keypoints"], "keypoints", 3)[:, :2]
-    if one.get("bbox"):
-        numbers = _numbers(one["bbox"], "bbox", 4)
-        if len(numbers) != 1 or numbers[0, 2:].min() < 0:
-            raise ValueError(f"bbox must be [x, y, width, height]; got {one['bbox']!r:.80}")
-        labels[f"boxes_{i}"] = np.concatenate([numbers[:, :2], numbers[:, :2] + numbers[:, 2:]], 1) - 0.5
-    runs = one.get("segmentation")
-    if isinstance(runs, Mapping):
-        if runs.get("size") != list(size):
-            raise ValueError(f"segmentation has the size {runs.get('size')}, the image {list(size)}, height and width")
-        labels[f"mask_{i}"] = rle.decode(runs.get("counts"), size).astype(np.uint8)
-    for j, edges in enumerate(_outlines(one)):
-        labels[f"keypoints_{i}_{j}"] = np.concatenate(edges)
-    return labels
-
-
-def _outlines(one: Json) -> list[list[Array]]:
-    """Points along each edge of each polygon, between pixel centres; both of its corners are among them."""
-    polygons = one.get("segmentation") or []
-    if isinstance(polygons, Mapping):
-        return []
-    if not isinstance(polygons, list):
-        raise ValueError(f"segmentation must be a list of polygons, or an object of runs; got {polygons!r:.80}")
-    outlines = []
-    for polygon in polygons:
-        corners = _numbers(polygon, "segmentation", 2) - 0.5
-        if len(corners) < 3:
-            raise ValueError(f"segmentation: a polygon must have three corners; got {polygon}")
-        ends = np.roll(corners, -1, 0)
-        counts = np.maximum(np.ceil(np.linalg.norm(ends - corners, axis=1) / _STEP), 1).astype(int)
-        edges = zip(corners, ends, counts.tolist(), strict=True)
-        outlines.append([np.linspace(a, b, n + 1) if n > 1 else np.stack([a, b]) for a, b, n in edges])
-    return outlines
+    def _moved(
+        self, parts: _Parts, i: int, new: Json, pieces: Mapping[str, Iterator[tuple[Array, Flags]]], move: Move
+    ) -> Json | None:
+        one, (height, width) = parts.entry, new["camera"]["image_size"]
+        result = one | {name: new[label] for name, label in parts.turned.items()}
+        is_seen, box, area = True, None, None
+        if parts.keypoints is not None:
+            places, valid = next(pieces["keypoints"])
+            inside = ((parts.keypoints >= -0.5) & (parts.keypoints <= np.array(self._size[::-1]) - 0.5)).all(1)
+            flags = np.asarray(one["keypoints"][2::3])
+            shown = valid & inside & (flags > 0)
+            rows = np.where(shown[:, None], np.column_stack([places, flags]), 0.0)
+            result["keypoints"] = [n for x, y, v in rows.tolist() for n in (_rounded(x), _rounded(y), int(v))]
+            result["num_keypoints"] = int(shown.sum())
+            is_seen = bool(shown.any())
+        if parts.box is not None:
+            places, valid = next(pieces["boxes"])
+            low, high = (places + 0.5).reshape(2, 2).clip(0, (width, height))
+            if valid[0] and (high > low).all():
+                box = [*low, *(high - low)]
+                old, part = math.prod(one["bbox"][2:]), math.prod(high - low)
+                area = one["area"] * part / old if old and type(one.get("area")) in (int, float) else None
+        if parts.outlines:
+            moved = [_polygon(edges, *next(pieces["keypoints"]), move, self._size) for edges in parts.outlines]
+            clipped = [_clipped(polygon, width, height) for polygon in moved]
+            polygons = [polygon + 0.5 for polygon in clipped if _area(polygon) >= _LEAST]
+            result["segmentation"] = [[_rounded(v) for v in polygon.ravel()] for polygon in polygons]
+            area, corners = sum(map(_area, polygons)), np.concatenate([np.zeros((0, 2)), *polygons])
+            box = [*corners.min(0), *np.ptp(corners, 0)] if len(corners) else None
+        elif parts.mask is not None:
+            mask = new[f"mask_{i}"] > 0
+            counts = encoded(mask, as_text=isinstance(one["segmentation"]["counts"], str))
+            result["segmentation"] = {**one["segmentation"], "counts": counts, "size": [height, width]}
+            area, corners = int(mask.sum()), np.argwhere(mask)[:, ::-1]
+            box = [*corners.min(0), *(np.ptp(corners, 0) + 1)] if len(corners) else None
+        if one.get("bbox"):
+            result["bbox"] = None if box is None else [_rounded(v) for v in box]
+        if "area" in one and area is not None:
+            result["area"] = _rounded(area)
+        if one.get("bbox") or one.get("segmentation"):
+            is_seen = box is not None
+        return result if is_seen else None
 
 
 def _numbers(values: Any, name: str, step: int) -> Array:
@@ -191,68 +246,6 @@ def _numbers(values: Any, name: str, step: int) -> Array:
     return np.asarray(values, np.float64).reshape(-1, step)
 
 
-def moved(annotations: Sequence[Json], labels: Json, new: Json, move: Move, size: tuple[int, int]) -> list[Json | None]:
-    """The annotations of an image after a change of its camera; None for those of which nothing is seen any more.
-
-    Of keypoints those off the image get 0, 0, 0, and `num_keypoints` counts the others. Polygons are moved with points
-    between their corners where edges get curved, end at the rim of what can be mapped, and are clipped; runs are moved
-    as masks. The box is that of what is left of polygons or runs, else the one that encloses the moved box, clipped.
-    The area is that of what is left, or the old one's part of its box. `gaze`, `head_pose` and other fields in the
-    camera's frame turn with it.
-
-    Args:
-        annotations: of one image.
-        labels: `labels_of` them.
-        new: those labels, packed and moved.
-        move: moves others, as these were.
-        size: (height, width) of the image.
-    """
-    new = _unpacked(labels, new)
-    return [_moved(one, i, labels, new, move, size) for i, one in enumerate(annotations)]
-
-
-def _moved(one: Json, i: int, labels: Json, new: Json, move: Move, size: tuple[int, int]) -> Json | None:
-    result = {name: new.get(_turned(name, one, i), value) for name, value in one.items()}
-    height, width = new["camera"]["image_size"]
-    is_seen, box, area = True, None, None
-    if (name := f"keypoints_{i}") in labels:
-        inside = ((labels[name] >= -0.5) & (labels[name] <= np.array(size[::-1]) - 0.5)).all(1)
-        flags = np.asarray(one["keypoints"][2::3])
-        shown = new[f"{name}_valid"] & inside & (flags > 0)
-        rows = np.where(shown[:, None], np.column_stack([new[name], flags]), 0.0)
-        result["keypoints"] = [n for x, y, v in rows.tolist() for n in (_rounded(x), _rounded(y), int(v))]
-        result["num_keypoints"] = int(shown.sum())
-        is_seen = bool(shown.any())
-    if (name := f"boxes_{i}") in labels:
-        low, high = (new[name] + 0.5).reshape(2, 2).clip(0, (width, height))
-        if new[f"{name}_valid"][0] and (high > low).all():
-            box = [*low, *(high - low)]
-            old, part = math.prod(one["bbox"][2:]), math.prod(high - low)
-            area = one["area"] * part / old if old and type(one.get("area")) in (int, float) else None
-    if outlines := _outlines(one):
-        polygons = [
-            _clipped(_polygon(edges, f"keypoints_{i}_{j}", new, move, size), width, height)
-            for j, edges in enumerate(outlines)
-        ]
-        polygons = [polygon + 0.5 for polygon in polygons if _area(polygon) >= _LEAST]
-        result["segmentation"] = [[_rounded(v) for v in polygon.ravel()] for polygon in polygons]
-        area, corners = sum(map(_area, polygons)), np.concatenate([np.zeros((0, 2)), *polygons])
-        box = [*corners.min(0), *np.ptp(corners, 0)] if len(corners) else None
-    elif (name := f"mask_{i}") in labels:
-        mask = new[name] > 0
-        counts = rle.encode(mask, as_text=isinstance(one["segmentation"]["counts"], str))
-        result["segmentation"] = {**one["segmentation"], "counts": counts, "size": [height, width]}
-        area, corners = int(mask.sum()), np.argwhere(mask)[:, ::-1]
-        box = [*corners.min(0), *(np.ptp(corners, 0) + 1)] if len(corners) else None
-    if one.get("bbox"):
-        result["bbox"] = None if box is None else [_rounded(v) for v in box]
-    if "area" in one and area is not None:
-        result["area"] = _rounded(area)
-    if one.get("bbox") or one.get("segmentation"):
-        is_seen = box is not None
-    return result if is_seen else None
-
-
 def _rounded(value: float) -> float:
     return round(float(value), 2) + 0.0  # a sum with zero has no negative one
 
@@ -260,12 +253,21 @@ def _rounded(value: float) -> float:
 # -- polygons
 
 
-def _polygon(edges: list[Array], name: str, new: Json, move: Move, size: tuple[int, int]) -> Array:
+def _outline(polygon: Any) -> list[Array]:
+    corners = _numbers(polygon, "segmentation", 2) - 0.5
+    if len(corners) < 3:
+        raise ValueError(f"segmentation: a polygon must have three corners; got {polygon}")
+    ends = np.roll(corners, -1, 0)
+    counts = np.maximum(np.ceil(np.linalg.norm(ends - corners, axis=1) / _STEP), 1).astype(int)
+    edges = zip(corners, ends, counts.tolist(), strict=True)
+    return [np.linspace(a, b, n + 1) if n > 1 else np.stack([a, b]) for a, b, n in edges]
+
+
+def _polygon(edges: list[Array], places: Array, valid: Flags, move: Move, size: tuple[int, int]) -> Array:
     """What became of a polygon (K, 2): its corners, and as many points between them as its edges are curved."""
-    points, places = np.concatenate(edges), new[name]
-    there = new[f"{name}_valid"] | _has_place(places)
+    there = valid | _has_place(places)
     if not there.all():
-        places, there = _pulled_in(points, places, there, move, size)
+        places, there = _pulled_in(np.concatenate(edges), places, there, move, size)
     ends = np.cumsum([len(edge) for edge in edges])[:-1]
     pieces = zip(np.split(places, ends), np.split(there, ends), strict=True)
     corners = np.concatenate([_simplified(edge[there]) for edge, there in pieces])
@@ -273,8 +275,8 @@ def _polygon(edges: list[Array], name: str, new: Json, move: Move, size: tuple[i
     return once
 
 
-def _has_place(places: Array) -> NDArray[np.bool_]:
-    has: NDArray[np.bool_] = (places != -1).any(-1)
+def _has_place(places: Array) -> Flags:
+    has: Flags = (places != -1).any(-1)
     return has
 
 
@@ -290,9 +292,7 @@ def _simplified(line: Array) -> Array:
     return np.concatenate([_simplified(line[: far + 1]), _simplified(line[far:])[1:]])
 
 
-def _pulled_in(
-    points: Array, places: Array, there: NDArray[np.bool_], move: Move, size: tuple[int, int]
-) -> tuple[Array, NDArray[np.bool_]]:
+def _pulled_in(points: Array, places: Array, there: Flags, move: Move, size: tuple[int, int]) -> tuple[Array, Flags]:
     """Places of the points along a polygon, and which there are.
 
     What has no place takes that of the point where one last exists on the way to the middle of what the new image
@@ -345,3 +345,58 @@ def _clipped(polygon: Array, width: int, height: int) -> Array:
 def _area(polygon: Array) -> float:
     (x1, y1), (x2, y2) = polygon.T, np.roll(polygon, -1, 0).T
     return abs(float((x1 * y2 - x2 * y1).sum())) / 2
+
+
+# -- runs
+#
+# Down the columns, one after another, beginning with zeros; "Data format" of cocodataset.org. As a text each number is
+# groups of five bits, the lowest first, with a sixth one where more follow, as characters from "0" on; from the fourth
+# number on it is the difference to the one before last. pycocotools reads past the end of texts that are cut off.
+
+
+def decoded(counts: Any, size: tuple[int, int]) -> Flags:
+    """A mask (H, W) of runs, a list or a text.
+
+    Raises:
+        ValueError: no such runs, or not of that many pixels.
+    """
+    runs, (height, width) = _of_text(counts) if isinstance(counts, str) else counts, size
+    if not isinstance(runs, list) or not all(type(run) is int and 0 <= run < 1 << 32 for run in runs):
+        raise ValueError("counts are no runs of pixels")
+    if sum(runs) != height * width:
+        raise ValueError(f"counts are of {sum(runs)} pixels, and the size says {width}x{height}")
+    mask: Flags = np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
+    return mask
+
+
+def encoded(mask: Flags, *, as_text: bool) -> list[int] | str:
+    """The runs of a mask (H, W)."""
+    flat = np.concatenate([[False], mask.T.reshape(-1)])
+    runs: list[int] = np.diff(np.flatnonzero(flat[1:] != flat[:-1]), prepend=0, append=mask.size).tolist()
+    if not as_text:
+        return runs
+    text = ""
+    for i, run in enumerate(runs):
+        rest, more = run - runs[i - 2] if i > 2 else run, True
+        while more:
+            low, rest = rest & 31, rest >> 5
+            more = rest != (-1 if low & 16 else 0)
+            text += chr(low + 32 * more + 48)
+    return text
+
+
+def _of_text(text: str) -> list[int]:
+    runs: list[int] = []
+    value = shift = 0
+    for group in (ord(character) - 48 for character in text):
+        if not 0 <= group < 64 or shift > 60:
+            raise ValueError("counts are no runs of pixels")
+        value |= (group & 31) << shift
+        shift += 5
+        if not group & 32:
+            value -= group >> 4 << shift  # the sixth bit is 0 here, the fifth is the sign
+            runs.append(value + runs[-2] if len(runs) > 2 else value)
+            value = shift = 0
+    if shift:
+        raise ValueError("counts end within a number")
+    return runs

@@ -5,42 +5,18 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from camtorch.cli.options import add_calibration, add_force, parse_path
+from camtorch.cli import targets
+from camtorch.cli.cameras import read_rig
 from camtorch.cli.terminal import note
-
-if TYPE_CHECKING:
-    from camtorch.cli.options import Commands
-    from camtorch.convert.conversion import Conversion
-
-
-def add(commands: Commands) -> None:
-    """Add the command to a command line."""
-    command = commands.add_parser(
-        "convert",
-        help="write a calibration as another camera model, or in another format",
-        description="Write the cameras of a calibration file as cameras of another model, and print how good that is.",
-        allow_abbrev=False,
-    )
-    command.set_defaults(run=run)
-    command.add_argument("input", type=parse_path, metavar="IN", help="a calibration file")
-    command.add_argument("output", type=parse_path, metavar="OUT", help="the new one")
-    command.add_argument("--model", metavar="KEY", help="the model of OUT; by default that of IN")
-    command.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
-    command.add_argument("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")
-    command.add_argument("--format", help="of OUT; by default what its name says")
-    add_calibration(command, "which camera is saved, alone and without its pose")
-    add_force(command)
+from camtorch.convert.conversion import Conversion
+from camtorch.io import formats
+from camtorch.rig import Rig
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
-    from camtorch.cli import targets
-    from camtorch.cli.cameras import read_rig
-    from camtorch.io import formats
-    from camtorch.rig import Rig
-
     path = arguments.output
     if not path.is_dir():  # some formats are folders
         targets.check(path, force=arguments.force, inputs=_read(arguments.input))

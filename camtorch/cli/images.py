@@ -16,6 +16,7 @@ from camtorch._photographs import ORIENTATION, load_stored, stored_size
 from camtorch.cli import targets
 from camtorch.cli.terminal import note
 from camtorch.io.writing import replacing
+from camtorch.warp.warp import Warp
 
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 _DEEPEST = 65535
@@ -41,11 +42,7 @@ def read(path: Path, tell: Callable[[str], None] = note) -> tuple[Tensor, int | 
         ImageFileError: no such file, no image, a damaged one, floating-point pixels, or more than 16 bits deep.
     """
     try:
-        with warnings.catch_warnings():
-            # of a large photograph, which is what the user named
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            opened = Image.open(path)
-        with opened:
+        with _opened(path) as opened:
             count, cut = getattr(opened, "n_frames", 1), _is_cut(opened)
             orientation = opened.getexif().get(ORIENTATION)
             image = load_stored(opened)
@@ -57,34 +54,37 @@ def read(path: Path, tell: Callable[[str], None] = note) -> tuple[Tensor, int | 
                 tell(f"{path} is grey of 16 bits with transparency, which is not read")
             return _pixels(path, image), orientation
     except FileNotFoundError:
-        raise ImageFileError(f"{path}: no such file") from None
+        reason = "no such file"
     except UnidentifiedImageError:
-        raise ImageFileError(f"{path}: not an image that Pillow can read") from None
+        reason = "not an image that Pillow can read"
     except Image.DecompressionBombError:
-        most = 2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6
-        raise ImageFileError(f"{path}: more than {most:.0f} million pixels, which are not read") from None
+        reason = f"more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, which are not read"
     except ImageFileError:
         raise
     except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+        reason = getattr(error, "strerror", None) or str(error)
+    raise ImageFileError(f"{path}: {reason}")
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
     """(height, width) of what its first bytes say is an image; None of anything else."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
-                return stored_size(image)
+        with _opened(path) as image:
+            return stored_size(image)
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
         return None
 
 
+def _opened(path: Path) -> Image.Image:
+    with warnings.catch_warnings():
+        # of a large photograph, which is what the user named
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(path)
+
+
 def _is_cut(image: Image.Image) -> bool:
     """Whether Pillow reads 16 bits as 8, before it does: its decoders' arguments tell."""
-    if image.mode in _DEEP:
-        return False
-    for tile in getattr(image, "tile", ()):
+    for tile in () if image.mode in _DEEP else getattr(image, "tile", ()):
         arguments = tile[3] if isinstance(tile[3], tuple) else (tile[3],)
         if any(isinstance(argument, str) and ";16" in argument for argument in arguments):
             return True
@@ -111,30 +111,23 @@ def _pixels(path: Path, image: Image.Image) -> Tensor:
 
 
 def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """Refuse before the work what could not be written after it.
-
-    Args:
-        path: where an image is to go.
-        force: whether it may take the place of another file.
-        inputs: what is read, which it may not overwrite in any case.
-
-    Raises:
-        ValueError: see `targets.check`; an unknown file type, or one that stores other sizes.
-    """
+    """Refuse before the work what could not be written after it: see `targets.check` and `check_kind`."""
     targets.check(path, force=force, inputs=inputs)
     check_kind(path)
 
 
 def check_kind(path: Path) -> None:
-    """Refuse a name that says of no file type that images can be written as.
-
-    Raises:
-        ImageFileError: an unknown file type, or one that stores other sizes.
-    """
+    """Refuse, by an ImageFileError, a name of no file type that holds images of any size."""
     kind = Image.registered_extensions().get(path.suffix.lower())
     if kind not in Image.SAVE or kind in _OTHER_SIZES:
         why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"
         raise ImageFileError(f"{path}: {path.suffix or 'no suffix'}: {why}; try .png")
+
+
+def filled(warp: Warp) -> float:
+    """The part of new images that shows something."""
+    valid = warp.valid_mask()
+    return int(valid.sum()) / valid.numel()
 
 
 def in_colour(image: Tensor, paper: tuple[int, int, int] = (255, 255, 255)) -> Tensor:

@@ -1,11 +1,11 @@
-"""Labels of one image in a JSON file."""
+"""Labels of images in JSON files."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from camtorch.camera import Camera
 from camtorch.cli.terminal import note
 
-_LARGEST_FILE = 1 << 20
+Json = dict[str, Any]
 _FARTHEST = 1e6
 _SHAPES = {
     "keypoints": (2, True, "[[x, y], ...]"),
@@ -23,10 +23,30 @@ _SHAPES = {
     "gaze_from": (2, False, "[x, y]"),
 }
 """How many numbers, whether there are many of these, and both in words."""
+SHAPES = ", ".join(f'"{name}": {shape}' for name, (*_, shape) in _SHAPES.items())
 
 
 class LabelsError(ValueError):
     """A file of labels that cannot be read. The text names the file, the entry and the reason."""
+
+
+def read_json(path: Path, otherwise: str = f"must be an object, {{{SHAPES}}}") -> Json:
+    """The object in a file; `otherwise` is what is wrong with any other content.
+
+    Raises:
+        LabelsError: no JSON, or no object.
+    """
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"{constant} is none; null is, or leave it out")
+
+    try:
+        content = json.loads(path.read_bytes(), parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise LabelsError(f"{path}: no JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise LabelsError(f"{path}: {otherwise}; got {_short(content)}")
+    return content
 
 
 @dataclass
@@ -43,33 +63,14 @@ class Labels:
     """(K, 3) unit directions."""
 
 
-def entries_of(path: Path) -> dict[str, Any]:
-    """What the file of an image says, as `camtorch.data.MapSamples` takes it: fields, and perhaps the camera.
+def labels_of(entries: Json, path: Path, camera: Camera) -> Labels:
+    """Keypoints, boxes, and gaze with gaze_from, of what a file says of an image of `camera`, but for those that it
+    says are not valid. A note names what else it has.
 
     Raises:
-        LabelsError: no JSON, or no object.
+        LabelsError: numbers that are none, a box whose corners are swapped, a gaze of no direction, or from a pixel
+            that has no ray.
     """
-    if path.stat().st_size > _LARGEST_FILE:
-        raise LabelsError(f"{path}: larger than {_LARGEST_FILE >> 20} MiB, more than the labels of one image")
-    try:
-        entries = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise LabelsError(f"{path}: no JSON: {error}") from None
-    if not isinstance(entries, dict):
-        known = ", ".join(f'"{name}": {shape}' for name, (*_, shape) in _SHAPES.items())
-        raise LabelsError(f"{path}: must be an object, {{{known}}}; got {_short(entries)}")
-    return entries
-
-
-def read(path: Path, camera: Camera) -> Labels:
-    """Keypoints, boxes, and gaze with gaze_from, of an image of `camera`, as far as the file has them, and but for
-    those that it says are not valid. A note names what else it has.
-
-    Raises:
-        LabelsError: as `entries_of`; numbers that are none, a box whose corners are swapped, a gaze of no direction,
-            or from a pixel that has no ray.
-    """
-    entries = entries_of(path)
     values = {name: _numbers(path, name, entries[name]) for name in _SHAPES if name in entries}
     has_gaze = "gaze" in values and "gaze_from" in values
     shown = {name for name in values if has_gaze or not name.startswith("gaze")}

@@ -1,12 +1,13 @@
-"""The command line `camtorch`: its commands, a file each, and how errors are told. Degrees and WIDTHxHEIGHT only here.
+"""The command line `camtorch`: how a command is carried out, and how errors are told.
 
-What commands need is imported when one runs: torch takes a second, which `--help` and a wrong option do without.
+What a command needs is imported when it runs: torch takes a second, which `--help` and a wrong option do without.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import importlib.metadata
 import os
 import signal
@@ -14,18 +15,21 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from camtorch import __version__
-from camtorch.cli import augment, birdseye, board, calibrate, convert, dewarp, lenses, map, rectify, show
+from camtorch.cli import commands
 from camtorch.cli.terminal import note, say
-from camtorch.jobs.pool import lacks_memory, reason
+from camtorch.jobs import pool
 from camtorch.native import library
 
 _INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, **options: Any):
+        super().__init__(allow_abbrev=False, **options)
+
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message} (see {self.prog} --help)")
 
@@ -54,12 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             return main(argv)
     try:
         arguments = _parser().parse_args(argv)
-        arguments.prepare(arguments)
+        module = f"camtorch.cli.{arguments.command}"
+        if commands.uses_processes(arguments):
+            pool.prepare(module)  # they import what they need while this one does
         with _interrupts_end_the_process():
-            import torch  # noqa: F401 (not before, see above)
+            command = importlib.import_module(module)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            status: int = arguments.run(arguments) or 0
+            status: int = command.run(arguments) or 0
         for warning in caught:
             note(warning.message)
         if sys.stdout is not None:  # closed by whoever called
@@ -71,20 +77,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("interrupted")
         return _INTERRUPT
     except Exception as error:
-        if not (isinstance(error, (ValueError, ImportError, OSError)) or lacks_memory(error)):
+        if not (isinstance(error, (ValueError, ImportError, OSError)) or pool.lacks_memory(error)):
             raise
-        say(f"error: {reason(error)}")
+        say(f"error: {pool.reason(error)}")
         return 2
     return status
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.", allow_abbrev=False)
+    parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
-    parser.set_defaults(prepare=lambda arguments: None)
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (dewarp, rectify, birdseye, augment, map, convert, show, lenses, calibrate, board):
-        command.add(commands)
+    commands.add_all(parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND"))
     return parser
 
 

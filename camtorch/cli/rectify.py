@@ -5,93 +5,33 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from camtorch.cli.options import add_output, add_pair, parse_path, parse_range, parse_size
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from camtorch._drawing import BOX, GAZE, POINT
+from camtorch.cli import images, targets
+from camtorch.cli.cameras import read_pair
+from camtorch.cli.commands import FAR, NEAR
 from camtorch.cli.terminal import note
+from camtorch.extrinsics import Extrinsics
+from camtorch.io.formats import save
+from camtorch.io.writing import replacing
+from camtorch.rig import Rig
+from camtorch.stereo.matching import match, opencv
+from camtorch.stereo.point_cloud import write_ply
+from camtorch.stereo.rectification import Rectification, rectify
 
-if TYPE_CHECKING:
-    from PIL import Image
-    from torch import Tensor
-
-    from camtorch.cli.options import Commands
-    from camtorch.rig import Rig
-    from camtorch.stereo.rectification import Rectification
-
-_NEAR, _FAR = 3.0, 100.0
-"""Depths in baselines, of which disparities and points are by default."""
 _FRACTIONS, _UNKNOWN = 256, 0
 """Of a pixel in a PNG of disparities, as in KITTI's, and what stands where none is known."""
 _DEEPEST = 65535
 _LINES = 24  # over the longer side of the image of a pair
 
 
-def add(commands: Commands) -> None:
-    """Add the command to a command line."""
-    command = commands.add_parser(
-        "rectify",
-        help="rectify a stereo pair; disparities and points of it",
-        description="Rectify a stereo pair: camtorch rectify left.jpg right.jpg --camera rig.json -o out. The folder "
-        "OUT gets left.png and right.png, whose rows correspond, pair.png, both beside each other with lines along "
-        "rows, rectified.json, their cameras, and in perspective opencv.yml: R1, R2, P1, P2, Q.",
-        allow_abbrev=False,
-    )
-    command.set_defaults(run=run)
-    command.add_argument("left", type=parse_path, metavar="LEFT", help="the left camera's image")
-    command.add_argument("right", type=parse_path, metavar="RIGHT", help="the right camera's, of the same moment")
-    add_pair(command)
-    images = command.add_argument_group("rectified images")
-    images.add_argument(
-        "--projection",
-        choices=("perspective", "latlon", "cylindrical"),
-        default="perspective",
-        help="perspective (the default) goes to some 120 degrees; latlon and cylindrical, about the baseline, further",
-    )
-    images.add_argument(
-        "--fov", type=parse_range, metavar="DEGREES", help="of view, horizontal, or horizontal,vertical; else what fits"
-    )
-    images.add_argument("--size", type=parse_size, metavar="WxH", help="else what loses no detail")
-    images.add_argument("--vertical", action="store_true", help="LEFT is the upper of two: columns correspond")
-    images.add_argument(
-        "--align",
-        choices=("mean", "opencv"),
-        default="mean",
-        help="mean: look where both cameras look on average (the default); opencv: halve their rotation, as it does",
-    )
-    depth = command.add_argument_group('depth, with OpenCV: pip install "camtorch[stereo]"')
-    depth.add_argument(
-        "--disparity",
-        nargs="?",
-        type=parse_path,
-        const=Path(),
-        metavar="FILE",
-        help="pixels of disparity: a .png of 16 bits, 256 times as many, 0 where unknown, or an .npy, NaN where "
-        "unknown; OUT/disparity.png by default. And OUT/disparity_colours.png to look at",
-    )
-    depth.add_argument(
-        "--points", type=parse_path, metavar="FILE.ply", help="coloured points, in the left camera's frame and unit"
-    )
-    depth.add_argument(
-        "--depth",
-        nargs=2,
-        type=float,
-        metavar=("NEAR", "FAR"),
-        help=f"the depths to look for, in the unit of RIG's poses; FAR may be inf; else {_NEAR:g} to {_FAR:g} times "
-        "the distance of the cameras for points, and what is farther too for disparities",
-    )
-    add_output(command, "rectified", "the folder of the new images")
-
-
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
-    import torch
-
-    from camtorch.cli import images
-    from camtorch.cli.cameras import read_pair
-    from camtorch.cli.warping import warped
-    from camtorch.stereo.matching import opencv
-    from camtorch.stereo.rectification import rectify
-
     folder: Path = arguments.output
     matches = arguments.disparity is not None or arguments.points is not None
     if arguments.depth is not None:
@@ -124,22 +64,19 @@ def run(arguments: argparse.Namespace) -> None:
             align=arguments.align,
         )
         limits = _limits(rectification, arguments) if matches else (0.0, 0.0)
-        left, filled_left = warped(rectification.left, left, "rectifying the left image")
-        right, filled_right = warped(rectification.right, right, "rectifying the right image")
-        both = float(rectification.valid_masks()[2].double().mean())
+        left, right = rectification.left(left[None])[0], rectification.right(right[None])[0]
+        parts = [100 * int(mask.sum()) / mask.numel() for mask in rectification.valid_masks()]
         for name, image in (("left", left), ("right", right)):
             images.write(folder / f"{name}.png", images.from_tensor(image))
         images.write(folder / "pair.png", _side_by_side(left, right, arguments.vertical))
         _write_cameras(folder, rig, rectification)
-        _tell(rectification, rig, folder, (filled_left, filled_right, both))
+        _tell(rectification, rig, folder, parts)
         if matches:
             _match(rectification, (left, right), limits, arguments)
 
 
 def _check_targets(arguments: argparse.Namespace) -> None:
     """Refuse before the work what could not be written after it; fill in where disparities go."""
-    from camtorch.cli import images, targets
-
     folder: Path = arguments.output
     if arguments.disparity == Path():
         arguments.disparity = folder / "disparity.png"
@@ -165,7 +102,7 @@ def _limits(rectification: Rectification, arguments: argparse.Namespace) -> tupl
     Raises:
         ValueError: some that the file of disparities does not hold.
     """
-    near, far = arguments.depth or (_NEAR * abs(float(rectification.baseline)), math.inf)
+    near, far = arguments.depth or (NEAR * abs(float(rectification.baseline)), math.inf)
     least, most = rectification.disparity_range(near, far)
     path = arguments.disparity
     if path is not None and path.suffix.lower() == ".png":
@@ -182,10 +119,6 @@ def _limits(rectification: Rectification, arguments: argparse.Namespace) -> tupl
 
 def _write_cameras(folder: Path, rig: Rig, rectification: Rectification) -> None:
     """Of the rectified images: where they are in the rig, and what OpenCV's users take."""
-    from camtorch.extrinsics import Extrinsics
-    from camtorch.io.formats import save
-    from camtorch.rig import Rig
-
     cameras, poses = {}, {}
     for name, side in zip(rig, ("left", "right"), strict=True):
         cameras[name] = getattr(rectification, f"camera_{side}")
@@ -196,11 +129,10 @@ def _write_cameras(folder: Path, rig: Rig, rectification: Rectification) -> None
         rectification.save(folder / "opencv.yml")
 
 
-def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: tuple[float, ...]) -> None:
+def _tell(rectification: Rectification, rig: Rig, folder: Path, parts: list[float]) -> None:
     camera = rectification.camera_left
     fx, fy, cx, cy = camera.intrinsics.tolist()
-    across, down = camera.fov[:2].tolist()
-    left, right, both = (100 * part for part in parts)
+    (across, down), (left, right, both) = camera.fov[:2].tolist(), parts
     print(
         f"{folder}: {' and '.join(rig[name].key for name in rig)} rectified to {rectification.projection}, "
         f"{across:.1f} x {down:.1f} degrees, {camera.width}x{camera.height}, fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} "
@@ -217,14 +149,6 @@ def _match(
     arguments: argparse.Namespace,
 ) -> None:
     """Disparities and points of a rectified pair, as files."""
-    import numpy as np
-    from PIL import Image
-
-    from camtorch.cli import images
-    from camtorch.io.writing import replacing
-    from camtorch.stereo.matching import match
-    from camtorch.stereo.point_cloud import write_ply
-
     disparity, known = match(rectification, *pair, *limits)
     path: Path | None = arguments.disparity
     if path is not None:
@@ -244,7 +168,7 @@ def _match(
         )
     if arguments.points is not None:
         baseline = abs(float(rectification.baseline))
-        near, far = arguments.depth or (_NEAR * baseline, _FAR * baseline)
+        near, far = arguments.depth or (NEAR * baseline, FAR * baseline)
         points, valid = rectification.disparity_to_points(disparity, known)
         depth = points[..., 2] if rectification.projection == "perspective" else rectification.distance(points)
         valid = valid & (depth >= near) & (depth <= far)
@@ -258,12 +182,6 @@ def _match(
 
 def _side_by_side(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
     """Both images beside each other, or one above the other, with lines along what corresponds."""
-    import torch
-    from PIL import ImageDraw
-
-    from camtorch._drawing import BOX, GAZE, POINT
-    from camtorch.cli import images
-
     whole = torch.cat((images.in_colour(left), images.in_colour(right)), 1 if vertical else 2)
     image = images.from_tensor(whole)
     draw = ImageDraw.Draw(image)
@@ -279,11 +197,6 @@ def _side_by_side(left: Tensor, right: Tensor, vertical: bool) -> Image.Image:
 
 def _coloured(disparity: Tensor, known: Tensor) -> Image.Image:
     """Near things red, far ones blue, unknown ones black."""
-    import numpy as np
-    from PIL import Image
-
-    from camtorch.stereo.matching import opencv
-
     cv2 = opencv()
     found = disparity[known].abs().numpy()
     low, high = np.quantile(found, (0.01, 0.99)) if len(found) else (0.0, 1.0)

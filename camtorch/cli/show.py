@@ -4,38 +4,22 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from camtorch.cli.options import add_calibration, add_output, parse_path
+import numpy as np
+from PIL import Image
 
-if TYPE_CHECKING:
-    from camtorch.camera import Camera
-    from camtorch.cli.options import Commands
-
-
-def add(commands: Commands) -> None:
-    """Add the command to a command line."""
-    command = commands.add_parser(
-        "show", help="what a calibration says, in numbers and in an image", allow_abbrev=False
-    )
-    command.set_defaults(run=run)
-    command.add_argument("input", type=parse_path, metavar="FILE", help="a calibration file")
-    command.add_argument("--against", type=parse_path, metavar="OTHER", help="another calibration, to compare with")
-    add_calibration(command)
-    add_output(command, None, "an image: distortion, radius over angle")
+from camtorch.analysis.difference import difference
+from camtorch.analysis.summary import summarise
+from camtorch.camera import Camera
+from camtorch.cli import images
+from camtorch.cli.cameras import read_other, read_rig
+from camtorch.plot.axes import require_matplotlib
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
-    from camtorch.analysis.difference import difference
-    from camtorch.analysis.summary import summarise
-    from camtorch.cli import images
-    from camtorch.cli.cameras import read_other, read_rig
-
     path, output, against = arguments.input, arguments.output, arguments.against
     if output is not None:
-        from camtorch.plot.axes import require_matplotlib
-
         images.check_target(output, force=arguments.force, inputs=(path, against))
         require_matplotlib()
     cameras = read_rig(path, arguments.name, arguments.from_model, arguments.size).cameras
@@ -67,12 +51,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
-    import numpy as np
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
 
     from camtorch import plot
-    from camtorch.cli import images
 
     canvas = FigureCanvasAgg(plot.portrait(camera, other, title=title))
     canvas.draw()

@@ -7,16 +7,8 @@ from pathlib import Path
 
 
 def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """Refuse a path that no file can be written to.
-
-    Args:
-        path: where a file is to go.
-        force: whether it may take the place of another file.
-        inputs: what is read, which it may not overwrite in any case.
-
-    Raises:
-        ValueError: the file is one of the inputs, also by a link; it exists and `force` is not given; there is no
-            folder to write to, nor one to make it in.
+    """Refuse, by a ValueError, a path that no file can be written to: one of the inputs, also by a link; one that
+    exists, unless `force` is given; one without a folder to write to, or to make it in.
     """
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; name a file in it")

@@ -19,14 +19,7 @@ def note(text: object) -> None:
 
 
 def bar(what: str, total: float, unit: str = "", **options: Any) -> Any:
-    """A tqdm bar for work that takes more than a moment; a file or a pipe gets one twice a minute. Close it.
-
-    Args:
-        what: what goes on.
-        total: how much of it there is.
-        unit: what is counted, in the plural.
-        options: of tqdm.
-    """
+    """A tqdm bar for work that takes more than a moment; a file or a pipe gets one twice a minute. Close it."""
     from tqdm import tqdm  # type: ignore[import-untyped]  # not before: `--help` does without
 
     is_terminal = sys.stderr.isatty()

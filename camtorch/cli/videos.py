@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import importlib
 import os
 import re
@@ -59,14 +58,10 @@ def is_video(path: Path) -> bool:
 
 
 def check_kind(path: Path) -> None:
-    """Refuse a name that says of no format that videos can be written as.
-
-    Raises:
-        VideoFileError: an unknown suffix.
-    """
+    """Refuse, by a VideoFileError, a name that says of no format that videos can be written as."""
     if not is_video(path):
-        known = ", ".join(FORMATS)
-        raise VideoFileError(f"{path}: {path.suffix or 'no suffix'}: no video can be written as that; try {known}")
+        what = path.suffix or "no suffix"
+        raise VideoFileError(f"{path}: {what}: no video can be written as that; try {', '.join(FORMATS)}")
 
 
 @dataclass(frozen=True)
@@ -79,37 +74,28 @@ class Encoder:
     """Its quality; by default one at which hardly anything is lost."""
 
     def check(self) -> None:
-        """Refuse what no video can be written with.
-
-        Raises:
-            ImportError: PyAV is not installed. ValueError: no such encoder, or it knows no crf.
-        """
+        """Refuse what no video can be written with, and a PyAV that is not installed."""
         av = _av()
         if self.codec is None:
             return
         try:
-            codec = av.Codec(self.codec, "w")
+            kind = av.Codec(self.codec, "w").type
         except av.codec.codec.UnknownCodecError:
+            known = ", ".join(_QUALITIES)
             raise ValueError(
-                f"--codec {self.codec}: there is no such encoder; there are {', '.join(_QUALITIES)}, ffv1 and others"
+                f"--codec {self.codec}: there is no such encoder; there are {known}, ffv1 and others"
             ) from None
-        if codec.type != "video":
-            raise ValueError(f"--codec {self.codec}: an encoder of {codec.type}, not of video")
+        if kind != "video":
+            raise ValueError(f"--codec {self.codec}: an encoder of {kind}, not of video")
         if self.crf is not None and not _has_crf(self.codec):
             raise ValueError(f"--crf: {self.codec} has no such option")
-
-    def of(self, format: str) -> str:
-        """The encoder for files of a format."""
-        return self.codec or ("libvpx-vp9" if format == "webm" else "libx264")
 
 
 def _av() -> Any:
     try:
         return importlib.import_module("av")
     except ImportError:
-        raise ImportError(
-            "videos are read and written by PyAV, which is not installed: pip install 'camtorch[video]'"
-        ) from None
+        raise ImportError("videos take PyAV, which is not installed: pip install 'camtorch[video]'") from None
 
 
 def _has_crf(codec: str) -> bool:
@@ -142,21 +128,13 @@ def size_of(path: Path) -> tuple[int, int] | None:
 
 
 def length_of(path: Path) -> float:
-    """Seconds; 0 where that is not said.
-
-    Raises:
-        VideoFileError: it cannot be read. ImportError: PyAV is not installed.
-    """
+    """Seconds; 0 where that is not said."""
     with _opened(path) as (container, stream):
         return float(_length(container, stream))
 
 
 def frames(path: Path) -> Iterator[tuple[float, float, Any]]:
-    """Frames as they are stored: when each is shown, in seconds, the part of the video until then, and PyAV's frame.
-
-    Raises:
-        VideoFileError: it cannot be read. ImportError: PyAV is not installed.
-    """
+    """Frames as they are stored: when each is shown, in seconds, the part of the video until then, and PyAV's frame."""
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
         length, step = float(_length(container, stream)), float(1 / _rate(stream))
@@ -192,7 +170,7 @@ def sized(item: Item) -> Item:
         return item
     try:
         with _opened(item.inputs[0]) as (container, stream):
-            return replace(item, size=float(max(stream.frames or _length(container, stream) * _rate(stream), 1)))
+            return replace(item, size=max(int(stream.frames or _length(container, stream) * _rate(stream)), 1))
     except VideoFileError:
         return item
 
@@ -221,40 +199,23 @@ def _length(container: Any, stream: Any) -> Fraction:
 _PLANAR = re.compile(r"(yuv[aj]?4\d\dp|gray|gbra?p)(9|10|12|14|16)?(le)?|nv12|nv16|nv24")
 
 
-@dataclass(frozen=True)
-class _Plane:
-    """Where a plane of a format lies in a frame."""
-
-    index: int
-    channels: int
-    height: int
-    width: int
-    dtype: type[np.uint8 | np.uint16]
-    fill: int
-    """Of what shows nothing: black."""
-
-    def of(self, frame: Any) -> np.ndarray[Any, Any]:
-        """(H, W, C), the memory of the frame."""
-        plane = frame.planes[self.index]
-        values = np.frombuffer(plane, self.dtype)
-        row = plane.line_size // values.itemsize
-        lines = values[: self.height * row].reshape(self.height, row)
-        return lines[:, : self.width * self.channels].reshape(self.height, self.width, self.channels)
+def _plane(frame: Any, index: int) -> np.ndarray[Any, Any]:
+    """(H, W, C), the memory of a plane of a frame."""
+    own = [component for component in frame.format.components if component.plane == index]
+    plane, height, width = frame.planes[index], own[0].height, own[0].width
+    values = np.frombuffer(plane, np.uint8 if own[0].bits <= 8 else np.uint16)
+    row = plane.line_size // values.itemsize
+    return values[: height * row].reshape(height, row)[:, : width * len(own)].reshape(height, width, len(own))
 
 
-def _planes(frame: Any) -> list[_Plane]:
-    components, is_full = frame.format.components, _is_full(frame)
+def _black(frame: Any, index: int) -> int:
+    """The value of what shows nothing."""
+    first = next(component for component in frame.format.components if component.plane == index)
     is_yuv = frame.format.name.startswith(("yuv", "nv"))
-    planes = []
-    for index in range(len(frame.planes)):
-        own = [component for component in components if component.plane == index]
-        first = own[0]
-        black = 0 if is_full or first.is_alpha or not is_yuv else 16 << (first.bits - 8)
-        # PyAV's is_chroma is False for chroma of the full resolution
-        fill = 1 << (first.bits - 1) if is_yuv and first.index in (1, 2) else black
-        dtype = np.uint8 if first.bits <= 8 else np.uint16
-        planes.append(_Plane(index, len(own), first.height, first.width, dtype, fill))
-    return planes
+    # PyAV's is_chroma is False for chroma of the full resolution
+    if is_yuv and first.index in (1, 2):
+        return int(1 << (first.bits - 1))
+    return 0 if _is_full(frame) or first.is_alpha or not is_yuv else int(16 << (first.bits - 8))
 
 
 def _is_full(frame: Any) -> bool:
@@ -269,43 +230,57 @@ def _camera_of_plane(camera: Camera, size: tuple[int, int], left: bool) -> Camer
     MPEG-2 and what came after, rather than between.
     """
     height, width = size
-    down, across = (-(-whole // part) for whole, part in zip((camera.height, camera.width), size, strict=True))
+    down, across = -(-camera.height // height), -(-camera.width // width)
     if (down, across) == (1, 1):
         return camera
     bottom, right = down * height - camera.height, across * width - camera.width
-    camera = copy.deepcopy(camera.pad(0, right, 0, bottom).resize(height, width))
-    if left and across == 2:
-        with torch.no_grad():
-            camera.intrinsics[..., 2] += 0.25
-    return camera
+    camera = camera.pad(0, right, 0, bottom).resize(height, width)
+    shift = camera.intrinsics.new_tensor([0.0, 0.0, 0.25 if left and across == 2 else 0.0, 0.0])
+    return camera.replace(intrinsics=camera.intrinsics.detach() + shift)
 
 
 class _Frames:
-    """Warps frames of one size."""
+    """Warps frames of one size.
+
+    Args:
+        warp: of images.
+        frame: as all are.
+    """
 
     def __init__(self, warp: Warp, frame: Any):
-        """By a warp of images, for frames like this one."""
-        new = _av().VideoFrame(warp.target.width, warp.target.height, frame.format.name)
-        left = not frame.format.name.startswith("yuvj")
-        self.size, self._format = (new.height, new.width), frame.format.name
-        self._pairs = []
-        for old, made in zip(_planes(frame), _planes(new), strict=True):
-            before = _camera_of_plane(warp.source, (old.height, old.width), left)
-            after = _camera_of_plane(warp.target, (made.height, made.width), left)
-            of_plane = Warp(before, after, warp.rotation, fill=float(old.fill), tolerance=warp.tolerance)
-            self._pairs.append((old, made, of_plane.requires_grad_(False)))
+        self.size, self._format = (warp.target.height, warp.target.width), frame.format.name
+        left, new, self._warps = not self._format.startswith("yuvj"), self._new(), list[Warp]()
+        for index in range(len(frame.planes)):
+            sizes = (_plane(one, index).shape[:2] for one in (frame, new))
+            before, after = (
+                _camera_of_plane(camera, (height, width), left)
+                for camera, (height, width) in zip((warp.source, warp.target), sizes, strict=True)
+            )
+            fill = float(_black(frame, index))
+            of_plane = Warp(before, after, warp.rotation, fill=fill, tolerance=warp.tolerance)
+            self._warps.append(of_plane.requires_grad_(False))
+
+    def _new(self) -> Any:
+        return _av().VideoFrame(self.size[1], self.size[0], self._format)
 
     def __call__(self, frame: Any) -> Any:
         """The new frame, at the same time."""
-        new = _av().VideoFrame(self.size[1], self.size[0], self._format)
-        for old, made, warp in self._pairs:
-            values = torch.from_numpy(old.of(frame)).permute(2, 0, 1)[None]
+        new = self._new()
+        for index, warp in enumerate(self._warps):
+            values = torch.from_numpy(_plane(frame, index)).permute(2, 0, 1)[None]
             with torch.no_grad():
-                made.of(new)[:] = warp(values)[0].permute(1, 2, 0).numpy()
-        new.pts, new.time_base, new.duration = frame.pts, frame.time_base, frame.duration
-        new.color_range, new.colorspace = frame.color_range, frame.colorspace
-        new.color_primaries, new.color_trc = frame.color_primaries, frame.color_trc
+                _plane(new, index)[:] = warp(values)[0].permute(1, 2, 0).numpy()
+        _copy(frame, new, "pts", "time_base", "duration", *_COLOURS)
         return new
+
+
+_COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")
+"""What the colours of a frame mean."""
+
+
+def _copy(one: Any, other: Any, *names: str) -> None:
+    for name in names:
+        setattr(other, name, getattr(one, name))
 
 
 # -- from file to file
@@ -337,7 +312,6 @@ def remake(
         VideoFileError: what is not a video, ends too early, changes its size, or cannot be written so.
     """
     av = _av()
-    format = FORMATS[target.suffix.lower()]
     with _opened(source) as (container, stream):
         first, _ = next(_decoded(container, stream), (None, None))
         if first is None:
@@ -346,9 +320,10 @@ def remake(
     target.parent.mkdir(parents=True, exist_ok=True)
     with replacing(target) as (file,), _opened(source) as (container, stream):
         # exact: no random identifiers
-        output = av.open(file, "w", format=format, options={"fflags": "+bitexact"})
+        output = av.open(file, "w", format=FORMATS[target.suffix.lower()], options={"fflags": "+bitexact"})
         try:
-            count = _Remake(source, target, container, stream, output, encoder, first, listener).run(warp)
+            new = _Remake(source, target, container, stream, output, encoder, first, listener)
+            count = new.run(_Frames(warp, new.first))
         except BaseException:
             with contextlib.suppress(av.error.FFmpegError):
                 output.close()
@@ -357,53 +332,50 @@ def remake(
     return facts | {"frames": count}
 
 
+@dataclass
 class _Remake:
     """A video on its way from file to file."""
 
-    def __init__(
-        self,
-        source: Path,
-        target: Path,
-        container: Any,
-        stream: Any,
-        output: Any,
-        encoder: Encoder,
-        first: Any,
-        listener: Listener,
-    ):
-        self.source, self.target, self.container, self.stream = source, target, container, stream
-        self.output, self.encoder, self.listener = output, encoder, listener
-        self.codec = encoder.of(output.format.name)
-        self.others = [other for other in container.streams if other.type in ("audio", "subtitle")]
-        self.rate = _rate(stream)
-        self.size = first.height, first.width
+    source: Path
+    target: Path
+    container: Any
+    stream: Any
+    output: Any
+    encoder: Encoder
+    first: Any
+    """Frame."""
+    listener: Listener
+    _first_stamp: int | None = None
+    _stamp: int | None = None
+    """Of the last frame."""
+
+    def __post_init__(self) -> None:
+        streams, first, format = self.container.streams, self.first, self.output.format.name
+        self.codec = self.encoder.codec or ("libvpx-vp9" if format == "webm" else "libx264")
+        self.others = [other for other in streams if other.type in ("audio", "subtitle")]
+        self.rate, self.size = _rate(self.stream), (first.height, first.width)
         self.pixels = _pixels(first.format.name, self.codec)
         if first.interlaced_frame:
-            listener.note(f"{source}: is interlaced; two moments get mixed within its frames")
-        self.first = _converted(first, self.pixels)
-        # formats and encoders that know no time stamps but multiples of one step
-        whole = output.format.name == "avi" or self.codec == "mpeg4"
-        self.tick = 1 / self.rate if whole else first.time_base or 1 / self.rate
-        self.begin = float((container.start_time or 0) / 1e6)
-        self._first_stamp: int | None = None
-        self._stamp: int | None = None
-        """Of the last frame."""
-
-    def run(self, warp: Warp) -> int:
-        """How many frames were written."""
-        lost = sorted({one.type for one in self.container.streams if one not in (self.stream, *self.others)})
-        if lost:
+            self.listener.note(f"{self.source}: is interlaced; two moments get mixed within its frames")
+        if lost := sorted({one.type for one in streams if one not in (self.stream, *self.others)}):
             self.listener.note(f"{self.source}: its other streams, {', '.join(lost)}, are left out")
-        frames = _Frames(warp, self.first)
+        # formats and encoders that know no time stamps but multiples of one step
+        whole = format == "avi" or self.codec == "mpeg4"
+        self.tick = 1 / self.rate if whole else first.time_base or 1 / self.rate
+        self.first = _converted(first, self.pixels)
+
+    def run(self, frames: _Frames) -> int:
+        """How many frames were written."""
         stream, copies = self._new_stream(frames.size), self._copied_streams()
         self.stream.thread_type = "AUTO"
+        begin = float((self.container.start_time or 0) / 1e6)
         count, end, last, shown = 0, 0.0, 0.0, time.monotonic()
         # the encoder works in a thread of its own, the decoder in those of ffmpeg
         with ThreadPoolExecutor(1) as writer:
             at_work: deque[Future[None]] = deque()
             for frame, packet in _decoded(self.container, self.stream, *self.others):
                 if packet is not None:
-                    last = max(last, float((packet.pts or packet.dts) * packet.time_base) - self.begin)
+                    last = max(last, float((packet.pts or packet.dts) * packet.time_base) - begin)
                     packet.stream = copies[packet.stream.index]
                     at_work.append(writer.submit(self.output.mux, packet))
                 else:
@@ -411,7 +383,7 @@ class _Remake:
                         was, now = f"{self.size[1]}x{self.size[0]}", f"{frame.width}x{frame.height}"
                         raise VideoFileError(f"{self.source}: its frames are {was}, then {now}")
                     self._date(frame)
-                    end = float(frame.pts * frame.time_base + 1 / self.rate) - self.begin
+                    end = float(frame.pts * frame.time_base + 1 / self.rate) - begin
                     count += 1
                     at_work.append(writer.submit(self._encode, stream, frames(_converted(frame, self.pixels))))
                 if len(at_work) > _AHEAD:
@@ -439,9 +411,7 @@ class _Remake:
             stamp = None if frame.dts is None or self._first_stamp is None else frame.dts - self._first_stamp
         if stamp is None:
             stamp = 0 if self._stamp is None else self._stamp + round(1 / self.rate / frame.time_base)
-        if self._stamp is not None:
-            stamp = max(stamp, self._stamp + 1)
-        frame.pts = self._stamp = stamp
+        frame.pts = self._stamp = stamp if self._stamp is None else max(stamp, self._stamp + 1)
 
     def _encode(self, stream: Any, frame: Any) -> None:
         """Write a frame; None in the end."""
@@ -464,8 +434,7 @@ class _Remake:
             )
         stream.width, stream.height, stream.pix_fmt = width, height, frame.format.name
         context = stream.codec_context
-        context.color_range, context.colorspace = frame.color_range, frame.colorspace
-        context.color_primaries, context.color_trc = frame.color_primaries, frame.color_trc
+        _copy(frame, context, *_COLOURS)
         context.thread_count = _THREADS
         if _has_crf(self.codec):
             crf = _QUALITIES.get(self.codec, 20) if self.encoder.crf is None else self.encoder.crf

@@ -104,27 +104,17 @@ def convert(
     batch = source.batch_shape
     tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source.tensors]
     parts = []
-    for numbers in zip(*(t.split(_ROWS) for t in tensors), strict=True):
-        rays = reference(_with_numbers(source, *numbers), image_size, limit)
+    for intrinsics, distortion in zip(*(t.split(_ROWS) for t in tensors), strict=True):
+        rays = reference(remade(source, intrinsics=intrinsics, distortion=distortion), image_size, limit)
         parts.append(
             _with_fewest_coefficients(_Task(rays, model, models, build, image_size, limit, float(tolerance)), counts)
         )
     most = max(part.parameters.shape[-1] for part in parts)
     result = _Result(*map(torch.cat, zip(*(part.padded(most) for part in parts), strict=True)))
-    return Conversion(
-        build(result.parameters.reshape(*batch, most)).freeze_like(source),
-        rms=result.rms.reshape(batch),
-        max_error=result.max_error.reshape(batch),
-        max_angle=result.max_angle.reshape(batch),
-        valid_fraction=result.valid_fraction.reshape(batch),
-        exact=result.exact.reshape(batch),
-        source_name=type_before_parametrizations(source).__name__,
-    )
-
-
-def _with_numbers(source: Camera, intrinsics: Tensor, distortion: Tensor) -> Camera:
-    """A frozen camera of the source's model with these rows of numbers, even if they are none."""
-    return remade(source, intrinsics=intrinsics, distortion=distortion)
+    camera = build(result.parameters.reshape(*batch, most)).freeze_like(source)
+    names = ("rms", "max_error", "max_angle", "valid_fraction", "exact")
+    numbers: dict[str, Any] = {name: getattr(result, name).reshape(batch) for name in names}
+    return Conversion(camera, **numbers, source_name=type_before_parametrizations(source).__name__)
 
 
 class _Task(NamedTuple):
@@ -140,8 +130,9 @@ class _Task(NamedTuple):
 
     def of(self, rows: Tensor) -> _Task:
         """Those of the rows."""
-        camera = self.source.camera
-        return self._replace(source=self.source.of(_with_numbers(camera, *(t[rows] for t in camera.tensors)), rows))
+        intrinsics, distortion = (t[rows] for t in self.source.camera.tensors)
+        camera = remade(self.source.camera, intrinsics=intrinsics, distortion=distortion)
+        return self._replace(source=self.source.of(camera, rows))
 
 
 class _Result(NamedTuple):

@@ -12,7 +12,7 @@ from torch.nn.functional import max_pool2d
 
 from camtorch.convert import views
 from camtorch.least_squares.jacobians import to_sensor
-from camtorch.projection.rays import image_edges, ray_fan
+from camtorch.projection.rays import ray_fan
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -90,7 +90,8 @@ def measure(target: Camera, k: Tensor, exact: Tensor, source: Reference) -> Meas
     max_error = errors.amax(-1)
     if bool((max_error > _ROUNDING).any()):
         max_error = torch.maximum(max_error, _climbed(source, errors, error_within))
-        max_error = torch.maximum(max_error, error_within(_rim(source, max_angle)).amax(-1))
+        rim = ray_fan(max_angle[:, None] * (1 - 1e-12), _RIM)
+        max_error = torch.maximum(max_error, error_within(views.seen(source.camera, source.image_size, rim)).amax(-1))
     rms = (errors.square().sum(-1) / inside.sum(-1).clamp(min=1)).sqrt()
     rms, max_error = (torch.where(some, number, torch.inf) for number in (rms, max_error))
     every = source.all_rays
@@ -116,13 +117,3 @@ def _climbed(source: Reference, errors: Tensor, error_at: Callable[[views.Sample
         step = step / 3
     largest: Tensor = found.amax(-1)
     return largest
-
-
-def _rim(source: Reference, angle: Tensor) -> views.SampledRays:
-    """The rays at an angle (C,) from the axis, as far as they are on the image."""
-    rays = ray_fan(angle[:, None] * (1 - 1e-12), _RIM).flatten(1, 2)
-    pixels, valid = source.camera.project(rays)
-    if source.image_size is not None:
-        low, high = image_edges(source.image_size, pixels)
-        valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
-    return views.SampledRays(rays, pixels, valid)

@@ -112,12 +112,18 @@ def sample_with_rings(camera: Camera, image_size: tuple[int, int] | None, side: 
     """`sample`, and rays on circles around the axis, over which the errors of a radial lens change."""
     whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
-    rays = ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS).flatten(1, 2)
+    rings = seen(camera, image_size, ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS))
+    return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
+
+
+def seen(camera: Camera, image_size: tuple[int, int] | None, fan: Tensor) -> SampledRays:
+    """Rays (C, A, N, 3), of which those count that are on the image."""
+    rays = fan.flatten(1, 2)
     pixels, valid = camera.project(rays)
     if image_size is not None:
         low, high = image_edges(image_size, pixels)
         valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
-    return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, (rays, pixels, valid), strict=True)))
+    return SampledRays(rays, pixels, valid)
 
 
 def _reach(camera: Camera, limit: float) -> Tensor:

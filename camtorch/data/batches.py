@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from camtorch._arguments import is_list, shown
-from camtorch.augment.sample import IMAGES, Sample
+from camtorch.augment.sample import Sample
 from camtorch.camera import Camera
 from camtorch.data.columns import PARTS, to_columns
 from camtorch.data.moving import Mover, Moves
@@ -21,7 +21,7 @@ _OWNER = "MapBatches"
 _CHANNELS = 4
 
 
-class MapBatches:
+class MapBatches(Mover):
     """Augments, or warps, batches of rows: the function of Ray Data's `map_batches`, and of whatever calls like it.
 
         rows = ray.data.read_images("images/", include_paths=True)
@@ -64,20 +64,16 @@ class MapBatches:
         epoch: int = 0,
         fields: Mapping[str, str] | None = None,
     ):
-        self._move = Mover(transform, _OWNER, seed, epoch, fields)
+        super().__init__(transform, seed, epoch, fields)
         self._keys = [key] if isinstance(key, str) else list(key) if is_list(key) else []
         if not (key is None or isinstance(key, str) or is_list(key)) or not all(isinstance(k, str) for k in self._keys):
             raise TypeError(f"{_OWNER}: key must be the name of a column, or several in a list; got {shown(key)}")
-        if self._move.draws and not self._keys:
+        if self._seeded is not None and not self._keys:
             raise ValueError(
                 f'{_OWNER}: key must name the column whose value names a row, as in key="path" after '
                 "read_images(..., include_paths=True): what a row draws follows from it, and not from its place; "
                 f"got key={key!r}"
             )
-
-    def set_epoch(self, epoch: int) -> None:
-        """Draw for this epoch from now on; engines that were given the function before do not hear of it."""
-        self._move.set_epoch(epoch)
 
     def __call__(self, batch: Mapping[str, Any]) -> Batch:
         """A batch, moved row by row.
@@ -86,15 +82,10 @@ class MapBatches:
             ValueError: columns of several lengths, no column of the key, and what the augmentation raises. TypeError:
                 no dict of columns.
         """
-        if not isinstance(batch, Mapping):
-            raise TypeError(
-                f'{_OWNER}: a batch must be a dict of arrays, as of batch_format="numpy"; got {type(batch).__name__}'
-            )
-        try:
-            counts = {name: len(column) for name, column in batch.items()}
-        except TypeError:
-            kinds = {name: type(column).__name__ for name, column in batch.items()}
-            raise TypeError(f"{_OWNER}: columns must be arrays or lists; got {kinds}") from None
+        if not isinstance(batch, Mapping) or not all(hasattr(column, "__len__") for column in batch.values()):
+            kind = shown(batch) if isinstance(batch, Mapping) else type(batch).__name__
+            raise TypeError(f'{_OWNER}: a batch must be a dict of arrays, as of batch_format="numpy"; got {kind}')
+        counts = {name: len(column) for name, column in batch.items()}
         if len(set(counts.values())) > 1:
             raise ValueError(f"{_OWNER}: all columns must have as many rows; got {counts}")
         missing = [name for name in self._keys if name not in batch]
@@ -103,8 +94,9 @@ class MapBatches:
         rows = []
         for i in range(len(next(iter(batch.values()), ()))):
             row = {name: column[i] for name, column in batch.items()}
-            key = self._key(row)
-            with self._move.naming(key):
+            values = [row[name].item() if isinstance(row[name], np.generic) else row[name] for name in self._keys]
+            key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None
+            with self._naming(key):
                 rows.append(self._row(key, row))
         if not rows:
             return dict(batch)
@@ -114,10 +106,6 @@ class MapBatches:
             if name in names and _is_objects(column) and not _is_objects(result[name]):
                 result[name] = _objects(list(result[name]))
         return result
-
-    def _key(self, row: Mapping[str, Any]) -> Key | None:
-        values = [row[name].item() if isinstance(row[name], np.generic) else row[name] for name in self._keys]
-        return None if not values else values[0] if len(values) == 1 else tuple(values)
 
     def _row(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
         """What has changed in a row."""
@@ -129,11 +117,10 @@ class MapBatches:
                 continue
             value = _dense(value)
             field = _singular(name, value)
-            if self._move.kind(field, value) is not None or name.endswith("_valid"):
+            if self._kind(field, value) is not None or name.endswith("_valid"):
                 column_of[field], sample[field] = name, value
         if camera:
-            sizes = [v.shape[:2] for f, v in sample.items() if self._move.kind(f, v) in IMAGES and np.ndim(v) in (2, 3)]
-            sample["camera"] = self._move.camera({k: _dense(v) for k, v in camera.items()}, sizes[0] if sizes else None)
+            sample["camera"] = self._camera({part: _dense(value) for part, value in camera.items()}, sample)
         moved = self._move(key, sample)
         result: Sample = {}
         for name, value in moved.items():

@@ -15,10 +15,9 @@ from camtorch.data.moving import Mover, Moves
 
 _OWNER = "MapSamples"
 _ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "npy")
-_VALID = "_valid"
 
 
-class MapSamples:
+class MapSamples(Mover):
     """Augments, or warps, samples of a WebDataset pipeline, one by one: the function of its `.map`.
 
         samples = wds.WebDataset("train-{00..15}.tar").decode("rgb8")
@@ -59,15 +58,11 @@ class MapSamples:
         epoch: int = 0,
         fields: Mapping[str, str] | None = None,
     ):
-        self._move = Mover(transform, _OWNER, seed, epoch, fields)
+        super().__init__(transform, seed, epoch, fields)
         for name, value in (("key", key), ("labels", labels)):
             if not isinstance(value, str):
                 raise TypeError(f"{_OWNER}: {name} must name an entry of a sample; got {shown(value)}")
         self._key, self._labels = key, labels
-
-    def set_epoch(self, epoch: int) -> None:
-        """Draw for this epoch from now on; workers that run already do not hear of it."""
-        self._move.set_epoch(epoch)
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """A sample, moved.
@@ -79,9 +74,9 @@ class MapSamples:
             raise TypeError(
                 f"{_OWNER}: a sample must be a dict of entries, before .to_tuple; got {type(sample).__name__}"
             )
-        if self._move.draws and self._key not in sample:
+        if self._seeded is not None and self._key not in sample:
             raise ValueError(f"{_OWNER}: no {self._key!r} to name the sample; it has {', '.join(map(str, sample))}")
-        with self._move.naming(sample.get(self._key)):
+        with self._naming(sample.get(self._key)):
             return self._moved(sample)
 
     def _moved(self, sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -101,17 +96,14 @@ class MapSamples:
                 fields[field], entry_of[field] = value, name
         lists = set()
         for name, value in labels.items():
-            if name == "camera" or value is None:
+            if name == "camera" or value is None or not (name.endswith("_valid") or self._kind(name, value)):
                 continue
-            if name.endswith(_VALID) or self._move.kind(name, value) is not None:
-                if isinstance(value, list):
-                    lists.add(name)
-                    value = _array(name, value, self._move.kind(name, value))
-                fields[name] = value
+            if isinstance(value, list):
+                lists.add(name)
+            fields[name] = _array(name, value, self._kind(name, value)) if isinstance(value, list) else value
         camera = labels.get("camera")
         if camera is not None:
-            sizes = [v.shape[:2] for n, v in fields.items() if self._move.kind(n, v) in IMAGES]
-            fields["camera"] = camera if isinstance(camera, Camera) else self._move.camera(camera, *sizes[:1] or [None])
+            fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
         result, told = dict(sample), dict(labels)
         for name, value in self._move(sample.get(self._key), fields).items():
             if name in entry_of:
@@ -131,14 +123,14 @@ class MapSamples:
         if entry.startswith("__"):
             return None
         stem, _, ending = entry.rpartition(".")
-        if entry in self._move.fields:
+        if entry in self._fields:
             return entry
         name = stem if ending in _ENDINGS else entry
         if not stem and ending in _ENDINGS and ending != "npy":
             name = "image"
         if ending in _ENDINGS and isinstance(value, (bytes, bytearray)):
             raise ValueError(f'{_OWNER}: {entry} is not decoded; .decode("rgb8") before .map makes arrays of images')
-        if self._move.kind(name or entry, value) is None:
+        if self._kind(name or entry, value) is None:
             if ending in _ENDINGS and np.ndim(value) >= 2:
                 raise ValueError(
                     f"{_OWNER}: whether {entry} moves is not known; fields={{{entry!r}: KIND}} says so, where KIND is "

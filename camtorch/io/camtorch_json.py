@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -71,7 +70,8 @@ def _camera(record: Record) -> Camera:
         arguments.append(_tensor(record["distortion"], len(names)))
     size = None
     if "image_size" in record:
-        height, width = (side.side() for side in _two(record["image_size"]))
+        record["image_size"].numbers(2)
+        height, width = (side.side() for side in record["image_size"])
         size = (height, width)
     _same_batch(record, *arguments)
     try:
@@ -87,29 +87,17 @@ def _same_batch(record: Record, *tensors: Tensor) -> None:
         record.fail(f"batch dims that differ: {', '.join(map(str, sorted(shapes)))}")
 
 
-def _two(record: Record) -> Record:
-    if len(record) != 2:
-        record.fail(f"a size is [height, width]; this has {len(record)} numbers")
-    return record
-
-
 def _tensor(record: Record, last: int) -> Tensor:
     """Numbers (*B, last)."""
-    values, shape = _flat(record, 0)
-    if not shape or shape[-1] != last or math.prod(shape) != len(values):
-        record.fail(f"numbers (*B, {last}); these are {tuple(shape)}")
-    return torch.tensor(values, dtype=torch.float64).reshape(shape)
-
-
-def _flat(record: Record, depth: int) -> tuple[list[float], list[int]]:
-    if not isinstance(record.value, list):
-        return [record.number()], []
-    if depth > _DEEPEST_BATCH:
-        record.fail("nested too deeply")
-    parts = [_flat(item, depth + 1) for item in record]
-    if any(shape != parts[0][1] for _, shape in parts):
-        record.fail(f"rows of different lengths: {len(set(map(str, (shape for _, shape in parts))))} of them")
-    return [value for values, _ in parts for value in values], [len(parts), *(parts[0][1] if parts else [])]
+    try:
+        values = torch.tensor(record.value, dtype=torch.float64)
+    except (ValueError, TypeError, RuntimeError) as error:
+        record.fail(f"not numbers (*B, {last}): {error}")
+    if not 0 < values.ndim <= _DEEPEST_BATCH or values.shape[-1] != last:
+        record.fail(f"numbers (*B, {last}); these are {tuple(values.shape)}")
+    if not bool(values.isfinite().all()):
+        record.fail("numbers that are not finite")
+    return values
 
 
 def render(rig: Rig, path: str) -> str:

@@ -18,7 +18,7 @@ from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import decoded
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
-from camtorch.io.writing import Lossy, left_over, number
+from camtorch.io.writing import Lossy, all_left_over, number
 from camtorch.rig import Rig
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
@@ -62,11 +62,10 @@ def read(path: str, content: bytes) -> Rig:
     """The cameras, called by their ids, and the poses of the images beside them, by the names of the images."""
     cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
     beside = _images_beside(path)
-    if beside is None:
-        return Rig(cameras)
-    if not os.path.exists(beside):
-        if (lost := left_over(beside)) is not None:
-            Record(beside, None, "file").fail(f"missing; an interrupted save left {lost}: rename it, or delete it")
+    if beside is None or not os.path.exists(beside):
+        if beside is not None and (lost := all_left_over([beside])):
+            name = os.path.basename(lost[0])
+            Record(beside, None, "file").fail(f"missing; an interrupted save left {name}: rename it, or delete it")
         return Rig(cameras)
     images = colmap_images.read(beside)
     if unknown := set(images.cameras) - cameras.keys():
@@ -90,19 +89,16 @@ def _from_text(path: str, content: bytes) -> dict[str, Camera]:
     number, position = 1, 0
     for line in _LINE.finditer(content):
         number, position = number + content.count(b"\n", position, line.start()), line.start()
-        record = Record(path, decoded(path, line[1]).split(maxsplit=_MOST_WORDS), f"line {number}")
-        record.few(len(cameras))
-        words = record.value
+        words = decoded(path, line[1]).split(maxsplit=_MOST_WORDS)
+        record = Record(path, words, f"line {number}")
         if len(words) < 4:
             record.fail(f"less than an id, a model, a width and a height: {len(words)} words")
         first, name, width, height, *values = record
-        identity = str(first.whole(0, LARGEST_ID, "camera id"))
-        if identity in cameras:
-            record.fail(f"a second camera has the id {identity}")
         if name.value not in _MODELS:
             name.fail(f"the model {name.value!r:.60} is not known here; known are {', '.join(_MODELS)}")
         size = height.side(), width.side()
-        cameras[identity] = _camera(record, name.value, size, [value.number() for value in values])
+        identity = first.whole(0, LARGEST_ID, "camera id")
+        _add(cameras, identity, record, name.value, size, [value.number() for value in values])
     return cameras
 
 
@@ -120,19 +116,16 @@ def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
     (count,) = take("<Q")
     if count > len(content) // 24:
         record.fail(f"{count} cameras, for which the file is too small")
-    record.few(count)
     for _ in range(count):
         identity, model, width, height = take("<IiQQ")
         name = _IDS.get(model) or record.fail(f"the model {model} is not known here; known are {sorted(_IDS)}")
-        if str(identity) in cameras:
-            record.fail(f"a second camera has the id {identity}")
         if identity > LARGEST_ID:
             record.fail(f"{identity} is no camera id")
-        height, width = Record(path, [str(width), str(height)], record.place).size()
+        size = Record(path, [str(width), str(height)], record.place).size()
         values = list(take(f"<{_parameters(name)}d"))
         if not all(map(math.isfinite, values)):
             record.fail(f"parameters that are not finite: {values}")
-        cameras[str(identity)] = _camera(record, name, (height, width), values)
+        _add(cameras, identity, record, name, size, values)
     if position < len(content):
         record.place = f"byte {position}"
         record.fail(f"{len(content) - position} bytes after the last camera")
@@ -144,18 +137,24 @@ def _parameters(name: str) -> int:
     return focals + 2 + count
 
 
-def _camera(record: Record, name: str, size: tuple[int, int], values: list[float]) -> Camera:
+def _add(
+    cameras: dict[str, Camera], identity: int, record: Record, name: str, size: tuple[int, int], values: list[float]
+) -> None:
     _, key, focals, _ = _MODELS[name]
+    if str(identity) in cameras:
+        record.fail(f"a second camera has the id {identity}")
+    record.few(len(cameras))
     if len(values) != _parameters(name):
         record.fail(f"{len(values)} parameters; {name} has {_parameters(name)}")
     if key == "equirectangular":
         if values != [size[1], size[0]]:
             record.fail(f"a panorama of {values[0]:g} x {values[1]:g} in an image of {size[1]} x {size[0]}")
-        return record.camera(key, panorama(size), [], size)
-    fx, fy = values[0], values[focals - 1]
-    cx, cy, *distortion = values[focals:]
-    distortion += [0.0] * (_COUNTS.get(name, 0) - len(distortion))
-    return record.camera(key, [fx, fy, cx - 0.5, cy - 0.5], distortion, size)
+        intrinsics, distortion = panorama(size), []
+    else:
+        cx, cy, *distortion = values[focals:]
+        intrinsics = [values[0], values[focals - 1], cx - 0.5, cy - 0.5]
+        distortion += [0.0] * (_COUNTS.get(name, 0) - len(distortion))
+    cameras[str(identity)] = record.camera(key, intrinsics, distortion, size)
 
 
 # -- writing
@@ -180,18 +179,16 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
     binary = path.endswith(".bin")
     contents = {path: (_as_bytes if binary else _as_text)(entries)}
     beside = _images_beside(path)
+    suffix = os.path.splitext(path)[1]
     if rig.extrinsics:
         if beside is None:
-            lossy.fail(
-                "extrinsics",
-                f"no place: COLMAP has them in images{os.path.splitext(path)[1]} beside cameras, so "
-                f"call the file cameras{os.path.splitext(path)[1]}, or name a folder",
-            )
+            way = f"call the file cameras{suffix}, or name a folder"
+            lossy.fail("extrinsics", f"no place: COLMAP has them in images{suffix} beside cameras, so {way}")
         content = colmap_images.content(lossy, rig, identities, beside, binary)
         if content is not None:
             contents[beside] = content
             # COLMAP opens no folder without its points
-            points = os.path.join(os.path.dirname(path), "points3D" + os.path.splitext(path)[1])
+            points = os.path.join(os.path.dirname(path), f"points3D{suffix}")
             if not os.path.exists(points):
                 contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
@@ -208,16 +205,13 @@ def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]
         if [fx, fy, cx, cy] != panorama((height, width)):
             lossy.fail(name, "a part of a panorama; COLMAP has the whole sphere only")
         return "EQUIRECTANGULAR", [float(width), float(height)]
-    fitting = []
-    for model, (_, k, focals, count) in _MODELS.items():
-        if k == key and (focals == 2 or fx == fy) and not any(distortion[count:]):
-            exact = len(distortion) == _COUNTS.get(model, count)
-            fitting.append((not exact, _parameters(model), model, count))
+    fitting = [
+        (len(distortion) != _COUNTS.get(model, count), _parameters(model), model, count)
+        for model, (_, k, focals, count) in _MODELS.items()
+        if k == key and (focals == 2 or fx == fy) and not any(distortion[count:])
+    ]
     if not fitting:
-        most = max(count for _, k, _, count in _MODELS.values() if k == key)
-        if any(distortion[most:]):
-            lost = [n for n, value in zip(camera.distortion_names[most:], distortion[most:], strict=True) if value]
-            lossy.fail(name, f"{' '.join(lost)} would be lost; COLMAP has {most} coefficients for {key}")
+        lossy.at_most(name, camera, distortion, (max(count for _, k, _, count in _MODELS.values() if k == key),))
         lossy.fail(name, f"fx = {fx!r} and fy = {fy!r}; COLMAP's model has one focal length")
     _, _, model, count = min(fitting)
     values = (distortion + [0.0] * count)[:count]

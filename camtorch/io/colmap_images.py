@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import struct
 from array import array
-from typing import Any, BinaryIO, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from camtorch.io import poses
 from camtorch.io.parsing import check_ordinary
@@ -57,11 +57,22 @@ def read(path: str) -> Images:
         CameraFileError: it is none, or two images have one name.
     """
     check_ordinary(path)
+    unit, entries = ("byte", _from_bytes) if path.endswith(".bin") else ("line", _from_text)
+    names: list[str] = []
+    cameras: list[str] = []
+    values, places, has_points = array("d"), array("q"), False
     with open(path, "rb", buffering=1 << 16) as file:
-        images = (_from_bytes if path.endswith(".bin") else _from_text)(path, file)
-    if (twice := repeated(images.names)) is not None:
-        row = images.names.index(twice, images.names.index(twice) + 1)
-        images.record(row).fail(f"a second image is called {twice!r:.60}")
+        for place, pose, camera, name, with_points in entries(path, file):
+            if len(names) >= _MOST_IMAGES:
+                Record(path, None, f"{unit} {place}").fail(f"more than {_MOST_IMAGES} images")
+            values.extend(pose)
+            cameras.append(camera)
+            names.append(name)
+            places.append(place)
+            has_points = has_points or with_points
+    images = Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, unit, places)
+    if (twice := repeated(names)) is not None:
+        images.record(names.index(twice, names.index(twice) + 1)).fail(f"a second image is called {twice!r:.60}")
     finite = np.isfinite(images.values).all(1)
     if not finite.all():
         row = int(finite.argmin())
@@ -69,66 +80,53 @@ def read(path: str) -> Images:
     return images
 
 
-def _from_text(path: str, file: BinaryIO) -> Images:
-    names: list[str] = []
-    cameras: list[str] = []
-    identities: dict[bytes, str] = {}
-    values, places = array("d"), array("q")
-    line_number = passed = 0
-    has_points = False
+_Entry = tuple[int, Iterable[float], str, str, bool]
+"""The place of an image, its pose, the id of its camera, its name, and whether it has points."""
+
+
+def _from_text(path: str, file: BinaryIO) -> Iterator[_Entry]:
+    number = passed = 0
+    known: dict[bytes, str] = {}
     while line := file.readline(_LONGEST_LINE):
-        line_number += 1
+        number += 1
+        record = Record(path, None, f"line {number}")
         words = line.split(None, 9)
         if not words or words[0].startswith(b"#"):
             passed += 1
             if passed > _MOST_COMMENTS:
-                Record(path, None, f"line {line_number}").fail(f"more than {_MOST_COMMENTS} lines without an image")
+                record.fail(f"more than {_MOST_COMMENTS} lines without an image")
             continue
-        record = Record(path, None, f"line {line_number}")
         if len(words) < 10:
             _text(record, line)
             record.fail(f"less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {len(words)} words")
-        if len(names) >= _MOST_IMAGES:
-            record.fail(f"more than {_MOST_IMAGES} images")
         try:
-            values.extend(map(float, words[1:8]))
+            pose = list(map(float, words[1:8]))
         except ValueError:
-            for word in words[1:8]:
-                Record(path, _text(record, word), record.place).number()
-        if words[8] not in identities:
+            pose = [Record(path, _text(record, word), record.place).number() for word in words[1:8]]
+        if words[8] not in known:
             identity = Record(path, _text(record, words[8]), record.place).whole(0, LARGEST_ID, "camera id")
-            identities[words[8]] = str(identity)
-        cameras.append(identities[words[8]])
-        name = words[9].strip()
-        if len(name) > _LONGEST_NAME:
-            record.fail(f"the name of the image has no end within {_LONGEST_NAME} bytes")
-        names.append(_text(record, name))
-        places.append(line_number)
+            known[words[8]] = str(identity)
+        name = _text(record, words[9].strip())
         points = file.readline(_LONGEST_LINE)  # of the image; the line may be empty
-        line_number += 1
-        has_points = has_points or not (points.isspace() or not points)
-    return Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, "line", places)
+        yield number, pose, known[words[8]], name, not (points.isspace() or not points)
+        number += 1
 
 
 def _text(record: Record, content: bytes) -> str:
+    if len(content) > _LONGEST_NAME:
+        record.fail(f"the name of the image has no end within {_LONGEST_NAME} bytes")
     try:
         return content.decode()
     except UnicodeDecodeError:
         record.fail("not text")
 
 
-def _from_bytes(path: str, file: BinaryIO) -> Images:
+def _from_bytes(path: str, file: BinaryIO) -> Iterator[_Entry]:
     size = os.fstat(file.fileno()).st_size
-    names: list[str] = []
-    cameras: list[str] = []
-    values, places = array("d"), array("q")
-    has_points = False
-    position = 8
     (count,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
     if size < 8 or count > (size - 8) // (_HEAD.size + 9):
         Record(path, None, "byte 0").fail(f"{count} images, for which the file is too small")
-    if count > _MOST_IMAGES:
-        Record(path, None, "byte 0").fail(f"{count} images; more than {_MOST_IMAGES} are not read")
+    position = 8
     for _ in range(count):
         record = Record(path, None, f"byte {position}")
         file.seek(position)
@@ -136,21 +134,15 @@ def _from_bytes(path: str, file: BinaryIO) -> Images:
         end = block.find(b"\0", _HEAD.size)
         if end + 9 > len(block) or (end < 0 and len(block) < _HEAD.size + _LONGEST_NAME):
             record.fail("the file ends within this image")
-        if end < 0 or end - _HEAD.size > _LONGEST_NAME:
-            record.fail(f"the name of the image has no end within {_LONGEST_NAME} bytes")
+        name = _text(record, block[_HEAD.size : end] if end > 0 else block)
         _, *pose, camera = _HEAD.unpack_from(block)
         (points,) = struct.unpack_from("<Q", block, end + 1)
-        places.append(position)
-        position += end + 9 + points * _POINT
-        if position > size:
+        if position + end + 9 + points * _POINT > size:
             record.fail(f"{points} points, for which the file is too small")
-        values.extend(pose)
-        cameras.append(str(camera))
-        names.append(_text(record, block[_HEAD.size : end]))
-        has_points = has_points or points > 0
+        yield position, pose, str(camera), name, points > 0
+        position += end + 9 + points * _POINT
     if position < size:
         Record(path, None, f"byte {position}").fail(f"{size - position} bytes after the last image")
-    return Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, "byte", places)
 
 
 # -- writing
@@ -174,8 +166,8 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
         there = read(path)
         if [entry[:2] for entry in entries] == list(zip(there.names, map(int, there.cameras), strict=True)):
             its = poses.as_float64(there.values)
-            rotations, translations = quaternion_vector(its[:, :4]), its[:, 4:]
-            if _close(rotations, posed.rotation) and _close(translations, posed.translation):
+            theirs = torch.cat((quaternion_vector(its[:, :4]), its[:, 4:]), -1)
+            if torch.allclose(theirs, torch.cat((posed.rotation, posed.translation), -1), rtol=_SAME, atol=_SAME):
                 return None
         if there.has_points:
             Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
@@ -183,14 +175,11 @@ def content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binar
     for name in ("rigs", "frames"):
         if os.path.exists(os.path.join(folder, name + suffix)):
             lossy.fail("extrinsics", f"would contradict {name}{suffix} beside them; write to another folder")
-    return _as_bytes(entries) if binary else _as_text(entries)
-
-
-def _close(one: Tensor, other: Tensor) -> bool:
-    return torch.allclose(one, other, rtol=_SAME, atol=_SAME)
-
-
-def _as_text(entries: list[tuple[Any, ...]]) -> bytes:
+    if binary:
+        parts = [struct.pack("<Q", len(entries))]
+        for i, (name, camera, values) in enumerate(entries, 1):
+            parts += [_HEAD.pack(i, *values, camera), name.encode(), b"\0", struct.pack("<Q", 0)]
+        return b"".join(parts)
     lines = [
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
@@ -200,10 +189,3 @@ def _as_text(entries: list[tuple[Any, ...]]) -> bytes:
     for i, (name, camera, values) in enumerate(entries, 1):
         lines += [f"{i} {' '.join(map(number, values))} {camera} {name}", ""]
     return ("\n".join(lines) + "\n").encode()
-
-
-def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
-    parts = [struct.pack("<Q", len(entries))]
-    for i, (name, camera, values) in enumerate(entries, 1):
-        parts += [_HEAD.pack(i, *values, camera), name.encode(), b"\0", struct.pack("<Q", 0)]
-    return b"".join(parts)

@@ -16,62 +16,30 @@ Value = float | list[list[float]]
 """A number, or the rows of a matrix."""
 
 
-def _words(matrix: list[list[float]], separator: str) -> str:
-    return separator.join(number(value) for row in matrix for value in row)
-
-
-def _scalar(value: float) -> str:
-    return number(value) if isinstance(value, float) else str(value)
-
-
-def as_yaml(values: dict[str, Value]) -> str:
-    """The text of a file as `cv2.FileStorage` writes YAML."""
-    lines = ["%YAML:1.0", "---"]
-    for key, value in values.items():
-        if isinstance(value, (int, float)):
-            lines.append(f"{key}: {_scalar(value)}")
-        else:
-            lines += [f"{key}: !!opencv-matrix", f"   rows: {len(value)}", f"   cols: {len(value[0])}", "   dt: d"]
-            lines.append(f"   data: [ {_words(value, ', ')} ]")
-    return "\n".join(lines) + "\n"
-
-
-def as_json(values: dict[str, Value]) -> str:
-    """The text of a file as `cv2.FileStorage` writes JSON."""
-    whole = {
-        key: value
-        if isinstance(value, (int, float))
-        else {
-            "type_id": "opencv-matrix",
-            "rows": len(value),
-            "cols": len(value[0]),
-            "dt": "d",
-            "data": [v for row in value for v in row],
-        }
-        for key, value in values.items()
-    }
-    return json.dumps(whole, indent=4, allow_nan=False) + "\n"
-
-
-def as_xml(values: dict[str, Value]) -> str:
-    """The text of a file as `cv2.FileStorage` writes XML."""
-    lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
-    for key, value in values.items():
-        if isinstance(value, (int, float)):
-            lines.append(f"<{key}>{_scalar(value)}</{key}>")
-        else:
-            lines += [f'<{key} type_id="opencv-matrix">', f"  <rows>{len(value)}</rows>"]
-            lines += [f"  <cols>{len(value[0])}</cols>", "  <dt>d</dt>", "  <data>"]
-            lines.append(f"    {_words(value, ' ')}</data></{key}>")
-    return "\n".join([*lines, "</opencv_storage>"]) + "\n"
-
-
-_TEXTS = {".yml": as_yaml, ".yaml": as_yaml, ".json": as_json, ".xml": as_xml}
-
-
 def text_for(path: str | os.PathLike[str], values: dict[str, Value]) -> str:
-    """The text of a file whose name says YAML, JSON or XML; of any other name YAML."""
-    return _TEXTS.get(os.path.splitext(os.fspath(path))[1].lower(), as_yaml)(values)
+    """The text of a file as `cv2.FileStorage` writes it, by its name JSON, XML, or else YAML."""
+    yaml, xml, whole = ["%YAML:1.0", "---"], ['<?xml version="1.0"?>', "<opencv_storage>"], dict[str, Any]()
+    for key, value in values.items():
+        if isinstance(value, (int, float)):
+            text = number(value) if isinstance(value, float) else str(value)
+            yaml.append(f"{key}: {text}")
+            xml.append(f"<{key}>{text}</{key}>")
+            whole[key] = value
+            continue
+        rows, cols, data = len(value), len(value[0]), [v for row in value for v in row]
+        yaml += [f"{key}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {cols}", "   dt: d"]
+        yaml.append(f"   data: [ {', '.join(map(number, data))} ]")
+        xml += [f'<{key} type_id="opencv-matrix">', f"  <rows>{rows}</rows>", f"  <cols>{cols}</cols>", "  <dt>d</dt>"]
+        xml += ["  <data>", f"    {' '.join(map(number, data))}</data></{key}>"]
+        whole[key] = {"type_id": "opencv-matrix", "rows": rows, "cols": cols, "dt": "d", "data": data}
+    suffix = _suffix(path)
+    if suffix == ".json":
+        return json.dumps(whole, indent=4, allow_nan=False) + "\n"
+    return "\n".join([*xml, "</opencv_storage>"] if suffix == ".xml" else yaml) + "\n"
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    return os.path.splitext(os.fspath(path))[1].lower()
 
 
 def write(path: str | os.PathLike[str], values: dict[str, Value]) -> None:
@@ -80,7 +48,7 @@ def write(path: str | os.PathLike[str], values: dict[str, Value]) -> None:
     Raises:
         ValueError: a name that says none of YAML, JSON and XML.
     """
-    if os.path.splitext(os.fspath(path))[1].lower() not in _TEXTS:
+    if _suffix(path) not in (".yml", ".yaml", ".json", ".xml"):
         raise ValueError(f"{os.fspath(path)}: files of OpenCV are called .yml, .json or .xml")
     with replacing(path) as (file,):
         file.write(text_for(path, values).encode())

@@ -1,10 +1,8 @@
 """`load` and `save`: each format is asked whether a file is its own; none is known here but by its module.
 
 To add a format, write one file beside this one, as `protocol.py` says, and name it in one of the two lists below.
-One of keys and values (YAML, JSON, XML) has `NAMES`, `matches(keys)`, `parse(record)` and `render(rig, path)`, like
-`basalt.py`; any other has `NAMES`, `matches(path, content)`, `read(path, content)` and `files(rig, path)`, like
-`colmap.py`. `Record` reads values, with errors that say where they stand; `parsing.decoded` gives the text of a
-content; `poses` has rotations; `writing.Lossy` says what would be lost.
+`Record` reads values, with errors that say where they stand; `parsing.decoded` gives the text of a content; `poses`
+has rotations; `writing.Lossy` says what would be lost.
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ import numpy as np
 
 from camtorch.camera import Camera
 from camtorch.io import poses
-from camtorch.io._errors import CameraFileError
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
@@ -32,20 +31,8 @@ _MODELS = {
 _AXES = np.array([1.0, -1.0, -1.0, 1.0])  # of Nerfstudio's cameras by ours
 _RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
 _TANGENTIAL = ("p1", "p2")
-_CORE = (
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "w",
-    "h",
-    "camera_angle_x",
-    "camera_angle_y",
-    "x_fov",
-    "y_fov",
-    "distortion_params",
-)
-_OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL)
+_CORE = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL, "distortion_params")
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -86,9 +73,8 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
     values = {key: record.value[key] for key in _OF_A_CAMERA if key in record}
     merged = Record(record.path, values, record.place)
     if frame is not None:
-        for key in _OF_A_CAMERA:
-            same = key not in frame or values.setdefault(key, frame.value[key]) == frame.value[key]
-            if not same and not _equal(record[key], frame[key]):
+        for key in filter(frame.__contains__, _OF_A_CAMERA):
+            if values.setdefault(key, frame.value[key]) != frame.value[key]:
                 record[key].fail("a frame says otherwise; Nerfstudio would take this one for all frames")
         merged.place = frame.place
     model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV"  # as instant-ngp has it
@@ -97,24 +83,14 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
     size = (merged["h"].side(), merged["w"].side()) if "h" in merged and "w" in merged else None
     key = _MODELS[model]
     if key == "equirectangular":
-        if size is None:
-            merged.need("w", "h")
-        assert size is not None
+        size = merged["h"].side(), merged["w"].side()
         return merged.camera(key, panorama(size), [], size)
     focals = [focal for focal in (_focal(merged, "x", "w"), _focal(merged, "y", "h")) if focal is not None]
     if not focals:
-        merged.need("fl_x")
+        merged["fl_x"].number()
     centre = [merged[c].number() if c in merged else merged[side].side() / 2 for c, side in (("cx", "w"), ("cy", "h"))]
     key, distortion = _distortion(merged, key)
     return merged.camera(key, [focals[0], focals[-1], centre[0] - 0.5, centre[1] - 0.5], distortion, size)
-
-
-def _equal(one: Record, other: Record) -> bool:
-    """Whether both are the same number, however written."""
-    try:
-        return one.number() == other.number()
-    except CameraFileError:
-        return False
 
 
 def _focal(record: Record, axis: str, side: str) -> float | None:

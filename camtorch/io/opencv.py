@@ -6,16 +6,14 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from camtorch._arguments import check_path, shown
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
-from camtorch.io._errors import CameraFileError
 from camtorch.io.filestorage import Value, text_for
-from camtorch.io.parsing import read_mapping
+from camtorch.io.parsing import parse_mapping, read_bytes
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy
@@ -64,16 +62,13 @@ def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | 
         OSError: no such file, or it cannot be opened. ValueError: an unknown model.
     """
     check_path(path, "io.opencv.read")
-    return _File(Record(path, read_mapping(path))).camera(_known(model), name).requires_grad_(False)
+    return _File(Record(path, parse_mapping(path, read_bytes(path)))).camera(_known(model), name).requires_grad_(False)
 
 
 def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
     """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
     check_path(path, "io.opencv.read_rig")
-    rig = parse(Record(path, read_mapping(path)), _known(model))
-    for layer in (*rig.cameras.values(), *rig.extrinsics.values()):
-        layer.requires_grad_(False)
-    return rig
+    return parse(Record(path, parse_mapping(path, read_bytes(path))), _known(model)).requires_grad_(False)
 
 
 def _known(model: str | None) -> str | None:
@@ -90,109 +85,97 @@ def matches(keys: dict[str, Any]) -> bool:
 def parse(record: Record, model: str | None = None) -> Rig:
     """The cameras of a file, called by the ends of their keys; `X2 = R X1 + T` of a pair, R also as a vector `om`."""
     file = _File(record)
-    names = sorted(file.by_name(_MATRIX), key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
+    names = sorted(file.matrices, key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
+    record.few(len(names))
     if not names:
         file.camera(model, None)
-    record.few(len(names))
     cameras = {name or "camera": file.camera(model, name) for name in names}
     extrinsics = {}
     keys = next((keys for keys in _POSES if all(key in record for key in keys)), None)
     if names in _PAIRS and keys is not None:
         here = poses.pose(record, [0.0] * 3, [0.0] * 3)
-        there = file.pose(*keys) if keys[0] == "R" else file.pose_by_vectors(*keys)
-        extrinsics = dict(zip(names, (here, there), strict=True))
+        extrinsics = dict(zip(names, (here, file.pose(*keys)), strict=True))
     return Rig(cameras, extrinsics)
 
 
 class _File:
-    """The keys of a file."""
+    """The keys of a file, and those of matrices, distortions and xi by the names of the cameras."""
 
     def __init__(self, record: Record):
-        self.record, self.path = record, record.path
+        self.record = record
         # a pattern may take time that is quadratic in the length of a key
         self.keys = [key for key in record.keys() if len(key) <= _LONGEST_KEY]  # noqa: SIM118
-        self.found: dict[re.Pattern[str], Any] = {}
-        self.check_that_none_is_left_over()
-
-    def check_that_none_is_left_over(self) -> None:
-        """Refuse what may be the distortion of a camera that has none: without it all would be wrong in silence."""
-        cameras, lenses, xis = (self.by_name(pattern) for pattern in (_MATRIX, _DISTORTION, _XI))
-        known = [*lenses.values(), *xis.values()]
-        orphans = [key for name, key in (lenses | xis).items() if name not in cameras]
-        if not cameras.keys() <= lenses.keys():
+        self.matrices, self.lenses, self.xis = map(self.by_name, (_MATRIX, _DISTORTION, _XI))
+        # without what may be the distortion of a camera that has none all would be wrong in silence
+        orphans = [key for name, key in (self.lenses | self.xis).items() if name not in self.matrices]
+        if not self.matrices.keys() <= self.lenses.keys():
             like = [k for k in self.keys if _LIKE_DISTORTION.fullmatch(k) and not _NO_DISTORTION.fullmatch(k)]
-            orphans += [k for k in like if k not in known and isinstance(self.record.value[k], (list, dict))]
-        if cameras and orphans:
+            known = {*self.lenses.values(), *self.xis.values()}
+            orphans += [k for k in like if k not in known and isinstance(record.value[k], (list, dict))]
+        if self.matrices and orphans:
             self.fail(orphans[0], "looks like the distortion of a camera; there is none of this name")
 
-    def camera(self, model: str | None, name: str | None) -> Camera:
-        end, key, distortion_key = self.keys_of_camera(name)
-        intrinsics = self.record[key].intrinsics(self.numbers(key))
-        distortion = self.numbers(distortion_key) if distortion_key else []
-        xi_key = self.by_name(_XI).get(end)
-        if xi_key:  # cv2.omnidir
-            xi = self.record[xi_key]
-            distortion = [*(self.numbers(xi_key) if isinstance(xi.value, (dict, list)) else [xi.number()]), *distortion]
-        fitting, place = (("mei",), xi_key) if xi_key else self.fitting()
-        if place is not None and model is not None and model not in fitting:
-            self.fail(place, f"says that the model is {fitting[0]}; do not name {model}, or correct the file")
-        kind = model or ("mei" if xi_key else self.model(distortion, place))
-        lens = self.record[distortion_key or xi_key or key]
-        return self.record[key].camera(kind, intrinsics, distortion, self.image_size(), lens)
+    def fail(self, place: str, reason: object) -> NoReturn:
+        Record(self.record.path, None, self.record.place_of(place)).fail(reason)
 
-    def keys_of_camera(self, name: str | None) -> tuple[str, str, str | None]:
-        """The camera's name, and the keys of its matrix and distortion, None where it has no distortion."""
-        matrices, distortions = self.by_name(_MATRIX), self.by_name(_DISTORTION)
-        if not matrices:
-            self.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
-        if name is None and len(matrices) > 1:
-            self.fail(
-                ", ".join(matrices.values()),
-                f"several cameras; choose one by its name, as in name={min(matrices)!r} or --name {min(matrices)}",
-            )
-        name = next(iter(matrices)) if name is None else name
-        if name not in matrices:
-            there = f"there are {sorted(matrices)}" if any(matrices) else "the only one has no name"
-            self.fail(", ".join(matrices.values()), f"no camera is called {name!r:.60}; {there}")
-        return name, matrices[name], distortions.get(name)
+    def find(self, pattern: re.Pattern[str]) -> str | None:
+        return next(filter(pattern.fullmatch, self.keys), None)
 
     def by_name(self, pattern: re.Pattern[str]) -> dict[str, str]:
-        if pattern in self.found:
-            known: dict[str, str] = self.found[pattern]
-            return known
+        """The keys of a pattern by the names of the cameras."""
         named: dict[str, str] = {}
         for key in self.keys:
             if match := pattern.fullmatch(key):
                 if match[1] in named:
                     self.fail(key, f"one camera has this and {named[match[1]]}")
                 named[match[1]] = key
-        self.found[pattern] = named
         return named
 
-    def fitting(self) -> tuple[Sequence[str], str | None]:
-        """The models that the flag of fisheyes leaves open, and its key, None where there is none."""
+    def camera(self, model: str | None, name: str | None) -> Camera:
+        """The camera of a name, or the only one."""
+        keys = ", ".join(self.matrices.values())
+        if not keys:
+            self.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
+        if name is None and len(self.matrices) > 1:
+            one = min(self.matrices)
+            self.fail(keys, f"several cameras; choose one by its name, as in name={one!r} or --name {one}")
+        name = next(iter(self.matrices)) if name is None else name
+        if name not in self.matrices:
+            there = f"there are {sorted(self.matrices)}" if any(self.matrices) else "the only one has no name"
+            self.fail(keys, f"no camera is called {name!r:.60}; {there}")
+        key, lens, xi = self.matrices[name], self.lenses.get(name), self.xis.get(name)
+        intrinsics = self.record[key].intrinsics(self.numbers(key))
+        distortion = self.numbers(lens) if lens else []
+        if xi:  # cv2.omnidir
+            is_matrix = isinstance(self.record[xi].value, (dict, list))
+            distortion = [*(self.numbers(xi) if is_matrix else [self.record[xi].number()]), *distortion]
+        stated, place = (("mei",), xi) if xi else self.stated()
+        if place is not None and model is not None and model not in stated:
+            self.fail(place, f"says that the model is {stated[0]}; do not name {model}, or correct the file")
+        kind = model or ("mei" if xi else self.model(distortion, stated))
+        return self.record[key].camera(kind, intrinsics, distortion, self.image_size(), self.record[lens or xi or key])
+
+    def stated(self) -> tuple[tuple[str, ...], str | None]:
+        """The models that the flag of fisheyes leaves open, and its key; none where there is no flag."""
         key = self.find(_FISHEYE)
         if key is None:
-            return list(MODELS), None
+            return (), None
         flag = self.record[key].value
         if not isinstance(flag, (str, float, bool)):
             self.fail(key, "is neither true nor false")
         no = str(flag).strip().lower() in ("", "0", "0.", "0.0", "false", "no", "off", "n")
         return ("brown_conrady", "pinhole") if no else ("kannala_brandt",), key
 
-    def model(self, distortion: list[float], flag: str | None) -> str:
-        """The model where nobody names it; `flag` is the key of the flag of fisheyes."""
+    def model(self, distortion: list[float], stated: tuple[str, ...]) -> str:
+        """The model where nobody names it."""
         if (other := self.find(_OTHER_LENS)) is not None:
-            self.fail(
-                other,
-                "the file may mean another model than OpenCV's own two; name it, as in model='kannala_brandt' "
-                "or --from-model kannala_brandt",
-            )
-        if flag is not None and "kannala_brandt" in self.fitting()[0]:
+            name = "model='kannala_brandt' or --from-model kannala_brandt"
+            self.fail(other, f"the file may mean another model than OpenCV's own two; name it, as in {name}")
+        if "kannala_brandt" in stated:
             return "kannala_brandt"
-        if len(distortion) == _FISHEYE_COUNT and flag is None:
+        if len(distortion) == _FISHEYE_COUNT and not stated:
             warnings.warn(
-                f"{self.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
+                f"{self.record.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
                 "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt'); "
                 "on the command line, --from-model says which",
                 AmbiguousModelWarning,
@@ -201,20 +184,17 @@ class _File:
         return "brown_conrady" if distortion else "pinhole"
 
     def pose(self, rotation_key: str, translation_key: str) -> Extrinsics:
+        """R or a rotation vector, and T."""
         rotation, translation = self.numbers(rotation_key), self.numbers(translation_key)
-        for key, values, count in ((rotation_key, rotation, 9), (translation_key, translation, 3)):
+        for key, values in ((rotation_key, rotation), (translation_key, translation)):
+            count = 9 if key == "R" else 3
             if len(values) != count:
                 self.fail(key, f"{len(values)} numbers where {count} belong")
-        rows = [rotation[i : i + 3] for i in (0, 3, 6)]
         poses.check_near(self.record[translation_key], translation)
-        matrix = [[*row, t] for row, t in zip(rows, translation, strict=True)]
+        if rotation_key != "R":
+            return poses.pose(self.record[rotation_key], rotation, translation)
+        matrix = [[*rotation[3 * i : 3 * i + 3], t] for i, t in enumerate(translation)]
         return poses.from_matrices(self.record[rotation_key], matrix)
-
-    def pose_by_vectors(self, rotation_key: str, translation_key: str) -> Extrinsics:
-        rotation, translation = self.numbers(rotation_key), self.numbers(translation_key)
-        if (len(rotation), len(translation)) != (3, 3):
-            self.fail(f"{rotation_key}, {translation_key}", "are not three numbers each")
-        return poses.pose(self.record[translation_key], rotation, translation)
 
     def image_size(self) -> tuple[int, int] | None:
         height, width = self.find(_HEIGHT), self.find(_WIDTH)
@@ -225,36 +205,24 @@ class _File:
             self.fail("image_height" if height is None else "image_width", "missing, while the other side is given")
         return self.record[height].side(), self.record[width].side()
 
-    def find(self, pattern: re.Pattern[str]) -> str | None:
-        if pattern not in self.found:
-            self.found[pattern] = next(filter(pattern.fullmatch, self.keys), None)
-        key: str | None = self.found[pattern]
-        return key
-
     def numbers(self, key: str) -> list[float]:
         """An OpenCV matrix, a list, or a list of rows as one list."""
         record = self.record[key]
         if isinstance(record.value, dict):
-            if "sizes" in record:  # of any other number of dimensions
-                sizes = self.numbers_of_list(record["sizes"])
+            if "sizes" in record:  # of any other number of dimensions; of one, XML has no list
+                says, parts = "sizes say", record["sizes"]
+                sizes = parts.numbers() if isinstance(parts.value, list) else [parts.number()]
             else:
-                sizes = [Record(self.path, record.value.get(s), f"{key}.{s}").number() for s in ("rows", "cols")]
+                says = "rows and cols say"
+                sizes = [Record(record.path, record.value.get(s), f"{key}.{s}").number() for s in ("rows", "cols")]
             data = record.value.get("data")
             if not isinstance(data, list) or len(data) != math.prod(sizes):
                 count = f"{len(data)} numbers" if isinstance(data, list) else "no list"
-                says = "sizes say" if "sizes" in record else "rows and cols say"
                 self.fail(f"{key}.data", f"{count}, where {says} {' x '.join(f'{s:g}' for s in sizes)}")
             return record["data"].numbers()
         if not isinstance(record.value, list):
             self.fail(key, "is neither an OpenCV matrix nor a list of numbers")
         return [item.number() for row in record for item in (row if isinstance(row.value, list) else [row])]
-
-    def numbers_of_list(self, record: Record) -> list[float]:
-        """Those of a list, or of a single number, which XML cannot tell from it."""
-        return record.numbers() if isinstance(record.value, list) else [record.number()]
-
-    def fail(self, place: str, reason: object) -> NoReturn:
-        raise CameraFileError(self.path, self.record.place_of(place), reason) from None
 
 
 # -- writing
@@ -265,8 +233,6 @@ def render(rig: Rig, path: str) -> str:
     lossy = Lossy(path, NAMES.title)
     lossy.no_images(rig)
     names, ends = list(rig.cameras), list(rig.cameras)
-    if not names:
-        lossy.fail("cameras", "none")
     if len(names) == 1:
         ends = [names[0] if re.fullmatch(_NAMES, names[0]) else ""]
     elif not all(name and re.fullmatch(_NAMES, name) for name in names):

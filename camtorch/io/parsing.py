@@ -9,7 +9,6 @@ import ast
 import json
 import os
 import re
-from collections.abc import Callable
 from typing import Any, NoReturn
 
 from camtorch.io._errors import CameraFileError
@@ -23,7 +22,8 @@ _LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
 _DEEPEST = 100
 _MOST_DIRECTIVES = 100  # libyaml compares each with all
 _MOST_VALUES = 1 << 17
-_MOST_TOKENS = 1 << 18  # of a Python literal
+_LARGEST_LITERAL = 1 << 15  # of which Python 3.10 can parse any: it crashes on deeper sums than that has room for
+_OPTIMIZATION_INPUTS = re.compile(r"('optimization_inputs'\s*:\s*)b'[^'\\\n]*'")  # megabytes, which are not read
 _MOST_JSON_UNITS = 1 << 20  # of 32 bytes, what a number takes in memory
 _BYTES_PER_UNIT = 4  # of the file, where there are more
 _START = 1 << 16  # of a text, where its kind shows
@@ -76,21 +76,15 @@ def decoded(path: str | os.PathLike[str], content: bytes) -> str:
         raise CameraFileError(path, f"byte {error.start}", reason) from None
 
 
-def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The keys of a file. Values are text, lists and mappings: numbers stay text until someone asks, but for JSON's.
+def parse_mapping(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
+    """The keys of a content. Values are text, lists and mappings: numbers stay text until someone asks, but for JSON's.
 
     Raises:
         CameraFileError: nothing known, a key twice, tags other than `!!opencv-matrix`, no mapping, too large.
-        OSError: the file cannot be opened.
     """
-    return parse_mapping(path, read_bytes(path))
-
-
-def parse_mapping(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
-    """The keys of a content, as `read_mapping`; `path` is for the errors."""
     try:
         keys = parse_archive(path, content) if content.startswith(b"PK\3\4") else _from_text(path, content)
-    except RecursionError:
+    except (RecursionError, MemoryError):
         raise CameraFileError(path, "content", "nested too deeply") from None
     if not isinstance(keys, dict):
         raise CameraFileError(path, "content", "not keys and values")
@@ -99,12 +93,11 @@ def parse_mapping(path: str | os.PathLike[str], content: bytes) -> dict[str, Any
 
 def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
     text = decoded(path, content)
-    first = next(re.finditer(r"\S", text), None)
     if _is_literal(text):
         return _from_literal(path, text)
-    if first and first[0] == "{":
+    if re.match(r"\s*\{", text):
         return _from_json(path, text)
-    if first and first[0] == "<":
+    if re.match(r"\s*<", text):
         return parse_storage(path, content)
     return _from_yaml(path, text)
 
@@ -141,15 +134,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 # -- Python literals, as mrcal writes them
 
 
-_TOKEN = re.compile(
-    r"""(?P<mark>[][{}(),:])|b?'(?P<text>[^'\\\n]*(?:\\.[^'\\\n]*){0,999})'"""
-    r"""|b?"(?P<quoted>[^"\\\n]*(?:\\.[^"\\\n]*){0,999})"|(?P<comment>\#[^\n]*)|(?P<word>[^][\s{}(),:'"#]+)"""
-)
-
-
-_as_json_text = json.JSONEncoder(ensure_ascii=False).encode
-
-
 def _is_literal(text: str) -> bool:
     """Whether this is the start of one: a brace, perhaps after comments, and a key in quotes unlike JSON's."""
     # Python's regular expressions remember every repetition of a group
@@ -158,35 +142,34 @@ def _is_literal(text: str) -> bool:
 
 
 def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
-    """Texts, numbers, lists, tuples and mappings, written as JSON line by line; numbers and other words as texts.
+    """Texts, numbers, lists, tuples and mappings."""
+    text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)
+    if len(text) > _LARGEST_LITERAL:
+        raise CameraFileError(path, "size", f"more than {_LARGEST_LITERAL >> 10} KiB of a Python literal")
+    try:
+        return _value_of(path, ast.parse(text, mode="eval").body)
+    except SyntaxError as error:
+        raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
 
-    `ast.literal_eval` takes seconds for 2 MB of additions and passes over keys that stand there twice.
-    """
-    _check_count(path, text)
-    comma = ""  # that has been read: JSON has none before a closing bracket
 
-    def as_json(token: re.Match[str]) -> str:
-        nonlocal comma
-        kind, value = str(token.lastgroup), token[0]
-        if kind == "comment":
-            return ""
-        before = "" if value in ("]", "}", ")") else comma
-        comma = "," if value == "," else ""
-        if kind == "mark":
-            return before + {",": "", "(": "[", ")": "]"}.get(value, value)
-        content: str | bytes = token[kind]
-        if "\\" in token[kind]:
-            try:
-                content = ast.literal_eval(value)
-            except (SyntaxError, ValueError):
-                return before + value  # which JSON refuses, at its line
-        content = content.decode("latin-1") if isinstance(content, bytes) else content
-        return before + _as_json_text(content)
-
-    text, count = _TOKEN.subn(as_json, text, _MOST_TOKENS)
-    if count == _MOST_TOKENS:
-        raise CameraFileError(path, "content", "too many values")
-    return _from_json(path, text)
+def _value_of(path: str | os.PathLike[str], node: ast.expr) -> Any:
+    """A node as JSON has it. `ast.literal_eval` alone passes over keys that stand there twice."""
+    if isinstance(node, (ast.List, ast.Tuple)):
+        return [_value_of(path, item) for item in node.elts]
+    if isinstance(node, ast.Dict):
+        keys: list[Any] = [key and _value_of(path, key) for key in node.keys]
+        if not all(isinstance(key, str) for key in keys):
+            raise CameraFileError(path, f"line {node.lineno}", "a key that is no text")
+        if (twice := repeated(keys)) is not None:
+            raise CameraFileError(path, f"line {node.lineno}", f"the key {twice!r:.60} stands there twice")
+        return dict(zip(keys, [_value_of(path, value) for value in node.values], strict=True))
+    try:
+        value = ast.literal_eval(node)
+    except ValueError:
+        raise CameraFileError(path, f"line {node.lineno}", "no text, number, list or mapping") from None
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
+    return float(value) if type(value) is int else value
 
 
 # -- YAML
@@ -203,12 +186,11 @@ def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
     text = re.sub(r"\A%YAML[^\n]*", "", text)
     if text.count("\n%") > _MOST_DIRECTIVES:
         raise CameraFileError(path, "content", "too many YAML directives")
-    event: Any = None
-    tree = Tree(path, lambda: f"line {event.start_mark.line + 1}")
+    tree = _YamlTree(path)
     try:
         # events, not yaml.load: no recursion, no tags, and none of YAML 1.1's ideas of what is a number
         for event in yaml.parse(text, loader or yaml.SafeLoader):
-            _take(yaml, tree, event)
+            tree.take(event, type(event).__name__)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         reason = getattr(error, "problem", None) or getattr(error, "reason", None) or "not YAML"
@@ -220,111 +202,84 @@ def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
     return tree.root
 
 
-def _take(yaml: Any, tree: Tree, event: Any) -> None:
-    if tree.documents > 1 and isinstance(event, yaml.NodeEvent):
-        # rostopic ends a message with ---, which begins an empty document
-        if not isinstance(event, yaml.ScalarEvent) or event.value:
-            tree.fail("a second document in the file")
-    elif isinstance(event, yaml.ScalarEvent):
-        _check_tag(tree, event, ("str",))
-        tree.add(event.value, event.anchor)
-    elif isinstance(event, yaml.SequenceStartEvent):
-        _check_tag(tree, event, ("seq",))
-        tree.open([], event.anchor)
-    elif isinstance(event, yaml.MappingStartEvent):
-        _check_tag(tree, event, ("map", "opencv-matrix", "opencv-nd-matrix"))
-        tree.open({}, event.anchor)
-    elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
-        tree.close()
-    elif isinstance(event, yaml.AliasEvent):
-        tree.alias(event.anchor)
-    elif isinstance(event, yaml.DocumentStartEvent):
-        tree.documents += 1
-        if tree.documents > 2:
-            tree.fail("a third document in the file")
+class _YamlTree:
+    """Lists and mappings, built of the events of a parser."""
 
-
-def _check_tag(tree: Tree, event: Any, names: tuple[str, ...]) -> None:
-    if event.tag is None or event.tag == "!" or event.tag in [f"tag:yaml.org,2002:{name}" for name in names]:
-        return
-    if event.tag == "tag:yaml.org,2002:opencv-matrix":
-        tree.fail("expected keys and values after !!opencv-matrix")
-    tree.fail(f"could not determine a constructor for the tag {event.tag!r:.80}: nothing is constructed here")
-
-
-class Tree:
-    """Lists and mappings, built from the outside in by a parser that has no recursion.
-
-    Args:
-        path: the file, for the errors.
-        place: says where in it the parser is, for the errors.
-    """
-
-    path: str | os.PathLike[str]
-    place: Callable[[], str]
-
-    def __init__(self, path: str | os.PathLike[str], place: Callable[[], str]):
-        self.path, self.place = path, place
+    def __init__(self, path: str | os.PathLike[str]):
+        self.path = path
+        self.line = 0
         self.root: Any = None
-        self._open: list[list[Any]] = []  # container, key that waits for its value, anchor, how many values
-        self._anchors: dict[str, tuple[Any, int]] = {}
-        self._count = self.documents = 0
+        self.open: list[list[Any]] = []  # container, key that waits for its value, anchor, how many values
+        self.anchors: dict[str, tuple[Any, int]] = {}
+        self.count = self.documents = 0
 
     def fail(self, reason: object) -> NoReturn:
-        """Raise the CameraFileError of this place."""
-        raise CameraFileError(self.path, self.place(), reason) from None
+        raise CameraFileError(self.path, f"line {self.line}", reason) from None
 
-    def open(self, container: list[Any] | dict[Any, Any], anchor: str | None = None) -> None:
-        """Begin a list or a mapping."""
-        if len(self._open) >= _DEEPEST:
+    def take(self, event: Any, kind: str) -> None:
+        """The next event, of a class of that name."""
+        self.line = event.start_mark.line + 1
+        if kind == "DocumentStartEvent":
+            self.documents += 1
+            if self.documents > 2:
+                self.fail("a third document in the file")
+        elif self.documents > 1:
+            # rostopic ends a message with ---, which begins an empty document
+            text = getattr(event, "value", "")
+            if text or kind in ("SequenceStartEvent", "MappingStartEvent", "AliasEvent"):
+                self.fail("a second document in the file")
+        elif kind == "ScalarEvent":
+            self.check_tag(event.tag, "str")
+            self.put(event.value, 1, event.anchor)
+        elif kind in ("SequenceStartEvent", "MappingStartEvent"):
+            is_list = kind == "SequenceStartEvent"
+            self.check_tag(event.tag, *(("seq",) if is_list else ("map", "opencv-matrix", "opencv-nd-matrix")))
+            self.begin([] if is_list else {}, event.anchor)
+        elif kind in ("SequenceEndEvent", "MappingEndEvent"):
+            container, key, anchor, count = self.open.pop()
+            if key is not None:
+                self.fail(f"the key {key!r:.60} has no value")
+            self.put(container, count, anchor)
+        elif kind == "AliasEvent":
+            value, count = self.anchors.get(event.anchor) or self.fail(f"nothing is called {event.anchor!r:.60}")
+            if value is None:
+                self.fail("a recursive value")
+            self.put(value, count)
+
+    def check_tag(self, tag: str | None, *names: str) -> None:
+        if tag not in (None, "!", *(f"tag:yaml.org,2002:{name}" for name in names)):
+            if tag == "tag:yaml.org,2002:opencv-matrix":
+                self.fail("expected keys and values after !!opencv-matrix")
+            self.fail(f"could not determine a constructor for the tag {tag!r:.80}: nothing is constructed here")
+
+    def begin(self, container: list[Any] | dict[Any, Any], anchor: str | None) -> None:
+        if len(self.open) >= _DEEPEST:
             raise CameraFileError(self.path, "content", "nested too deeply")
-        if self._open and isinstance(self._open[-1][0], dict) and self._open[-1][1] is None:
+        if self.open and isinstance(self.open[-1][0], dict) and self.open[-1][1] is None:
             self.fail("a key that is no text")
         if anchor:
-            self._anchors[anchor] = (None, 0)
-        self._open.append([container, None, anchor, 1])
+            self.anchors[anchor] = (None, 0)
+        self.open.append([container, None, anchor, 1])
 
-    def close(self) -> None:
-        """End it."""
-        container, key, anchor, count = self._open.pop()
-        if key is not None:
-            self.fail(f"the key {key!r:.60} has no value")
-        self._put(container, count, anchor)
-
-    def add(self, value: Any, anchor: str | None = None) -> None:
-        """A text, which in a mapping is a key and a value in turn."""
-        self._put(value, 1, anchor)
-
-    def alias(self, anchor: str) -> None:
-        """The value that has that name, by reference."""
-        if anchor not in self._anchors:
-            self.fail(f"nothing is called {anchor!r:.60}")
-        value, count = self._anchors[anchor]
-        if value is None:
-            self.fail("a recursive value")
-        self._put(value, count, None)
-
-    def _put(self, value: Any, count: int, anchor: str | None) -> None:
-        self._count += 1
-        if self._count > _MOST_VALUES:
+    def put(self, value: Any, count: int, anchor: str | None = None) -> None:
+        """A value of so many values, which in a mapping is a key or what belongs to it."""
+        self.count += 1
+        top: list[Any] = self.open[-1] if self.open else [None, None, None, 0]
+        top[3] += count
+        if max(self.count, top[3]) > _MOST_VALUES:  # an alias costs nothing here, but whoever walks through it pays
             self.fail(f"too many values: more than {_MOST_VALUES} are not read")
         if anchor:
-            self._anchors[anchor] = (value, count)
-        if not self._open:
-            self.root = value
-            return
-        top = self._open[-1]
-        top[3] += count
-        if top[3] > _MOST_VALUES:  # an alias costs nothing here, but whoever walks through it pays
-            self.fail(f"too many values: more than {_MOST_VALUES} are not read")
+            self.anchors[anchor] = (value, count)
         container, key = top[:2]
-        if isinstance(container, list):
+        if container is None:
+            self.root = value
+        elif isinstance(container, list):
             container.append(value)
-        elif key is None:
-            if not isinstance(value, str):
-                self.fail("a key that is no text")
-            if value in container:
-                self.fail(f"the key {value!r:.60} stands there twice")
-            top[1] = value
-        else:
+        elif key is not None:
             container[key], top[1] = value, None
+        elif not isinstance(value, str):
+            self.fail("a key that is no text")
+        elif value in container:
+            self.fail(f"the key {value!r:.60} stands there twice")
+        else:
+            top[1] = value

@@ -42,8 +42,12 @@ class Record:
         """Raise the CameraFileError of this place."""
         raise CameraFileError(self.path, self.place or "content", reason) from None
 
+    def _check(self, kind: type, what: str) -> None:
+        """Raise a CameraFileError unless a value of a kind stands here."""
+        if not isinstance(self.value, kind):
+            self.fail(f"{what}, but {self._found()}")
+
     def _found(self) -> str:
-        """What stands there, for an error."""
         if isinstance(self.value, dict):
             return f"keys and values, {', '.join(f'{key!r:.30}' for key in islice(self.value, 3)) or 'none'}"
         if isinstance(self.value, list):
@@ -54,13 +58,11 @@ class Record:
 
     def keys(self) -> list[str]:
         """The keys of a mapping."""
-        if not isinstance(self.value, dict):
-            self.fail(f"not keys and values, but {self._found()}")
+        self._check(dict, "not keys and values")
         return list(self.value)
 
     def __contains__(self, key: str) -> bool:
-        if not isinstance(self.value, dict):
-            self.fail(f"not keys and values, but {self._found()}")
+        self._check(dict, "not keys and values")
         return key in self.value
 
     def __getitem__(self, key: str) -> Record:
@@ -70,11 +72,6 @@ class Record:
             more = ", ..." if len(self.value) > _SHOWN else ""
             Record(self.path, None, self.place_of(key)).fail(f"missing; there is {there}{more}")
         return found
-
-    def need(self, *keys: str) -> None:
-        """Raise a CameraFileError unless all of these keys are here."""
-        for key in keys:
-            self[key]
 
     def get(self, key: str) -> Record | None:
         """The value of a key, or None."""
@@ -88,23 +85,20 @@ class Record:
     # -- lists
 
     def __iter__(self) -> Iterator[Record]:
-        if not isinstance(self.value, list):
-            self.fail(f"no list, but {self._found()}")
+        self._check(list, "no list")
         for i, item in enumerate(self.value):
             yield Record(self.path, item, f"{self.place}[{i}]")
 
     def __len__(self) -> int:
-        if not isinstance(self.value, list):
-            self.fail(f"no list, but {self._found()}")
+        self._check(list, "no list")
         return len(self.value)
 
     # -- values
 
     def text(self) -> str:
         """A text."""
-        if not isinstance(self.value, str):
-            self.fail(f"no text, but {self._found()}")
-        return self.value
+        self._check(str, "no text")
+        return str(self.value)
 
     def number(self) -> float:
         """A finite number."""
@@ -141,13 +135,8 @@ class Record:
         """A list of finite numbers, of that many if given."""
         if count is not None and len(self) != count:
             self.fail(f"{len(self)} numbers where {count} belong")
-        if (
-            isinstance(self.value, list)
-            and set(map(type, self.value)) == {float}
-            and all(map(math.isfinite, self.value))
-        ):
-            return list(self.value)
-        return [item.number() for item in self]
+        plain = isinstance(self.value, list) and all(type(v) is float and math.isfinite(v) for v in self.value)
+        return list(self.value) if plain else [item.number() for item in self]
 
     def rows(self, rows: int, columns: int) -> list[list[float]]:
         """A list of lists of finite numbers."""
@@ -174,15 +163,12 @@ class Record:
         kind = self.model(key)
         arguments = [torch.tensor(intrinsics, dtype=torch.float64)]
         if distortion:
-            if kind.names_of(len(distortion)) is None or not kind.names_of(len(distortion)):
-                (self if lens is None else lens).fail(
-                    f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}"
-                )
+            if not kind.names_of(len(distortion)):
+                there = self if lens is None else lens
+                there.fail(f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
             arguments.append(torch.tensor(distortion, dtype=torch.float64))
         try:
             return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # cut out, it may be off centre
-        except CameraFileError:
-            raise
         except (ValueError, TypeError) as error:
             self.fail(error)
 

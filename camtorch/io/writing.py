@@ -28,8 +28,8 @@ def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[l
     loss of power took: that saves a hundredth of a second a file. Where a path is a link, what it points to is
     replaced, and the link stays. Files keep their rights; new ones get those that the process gives to new files.
 
-    Of several files the old ones are moved aside first: a crash leaves some of them missing, and `left_over` finds
-    where they are, but never new ones beside old ones.
+    Of several files the old ones are moved aside first: a crash leaves some of them missing, and `all_left_over`
+    finds where they are, but never new ones beside old ones.
 
     Raises:
         OSError: no such folder, a place that is taken by anything but an ordinary file, a full disk.
@@ -72,11 +72,6 @@ def _replace_together(new: dict[str, str]) -> None:
         raise
     for name in old.values():
         _unlink(name)
-
-
-def left_over(path: str) -> str | None:
-    """The name of a file beside `path` that a crash within `replacing` left there: the old one, or the new one."""
-    return min(map(os.path.basename, all_left_over([path])), default=None)
 
 
 def all_left_over(paths: Iterable[str]) -> list[str]:

@@ -32,12 +32,9 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> tuple[list[Found], list[tuple[Path, str]]]:
     """Files, each once, in natural order.
 
-    Args:
-        words: files, whatever their suffix; patterns, as a quoted 'in/**/*.jpg', of files with any of the suffixes;
-            folders, of which files with any of the suffixes are taken, and those of all folders in them. What begins
-            with a dot is left out. Links are followed.
-        suffixes: in lower case.
-        output: the folder of outputs, of which nothing is taken where it lies within a folder that is read.
+    Words are files, whatever their suffix; patterns, as a quoted 'in/**/*.jpg'; and folders, with all folders in them.
+    What begins with a dot is left out, and what is in the folder of outputs, where that lies within a folder that is
+    read. Links are followed.
 
     Returns:
         Files with their places: below a folder that is read, or the folder before the first wildcard of a pattern, the

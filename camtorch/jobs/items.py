@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -23,12 +24,11 @@ class Item:
     """All that is written, of no other item."""
     variant: str = ""
     """What the outputs depend on beside what is in the inputs and the settings of the job: a seed, for example."""
-    size: float = 1.0
+    size: int = 1
     """How much work it is: the frames of a video."""
 
     @property
     def name(self) -> str:
-        """What it is called."""
         return str(self.inputs[0])
 
 
@@ -38,7 +38,7 @@ class Listener:
 
     note: Callable[[str], None]
     """Of what the user should know; where it begins with the item's name, that is left out."""
-    done: Callable[[float], object]
+    done: Callable[[int], object]
     """Of how much of `Item.size` is done."""
 
 
@@ -51,11 +51,7 @@ shown as it is.
 
 
 def check(items: Sequence[Item], others: Iterable[Path] = ()) -> None:
-    """Refuse items that would write over each other, or over what is read, by them or in `others`.
-
-    Raises:
-        ValueError: two items have the same output; an output is an input.
-    """
+    """Refuse, by a ValueError, items that would write over each other, or over what is read, by them or in `others`."""
     read = {os.path.realpath(path): path for path in (*(path for item in items for path in item.inputs), *others)}
     of_place: dict[str, Item] = {}
     for item in items:
@@ -78,35 +74,36 @@ class Shard:
     """How many of them are on this machine."""
 
     @classmethod
-    def of_environment(cls, environment: Mapping[str, str] | None = None) -> Shard:
-        """That of a process which torchrun or srun started, by what they set; else all items. See `unmarked`.
+    def of_environment(cls) -> Shard:
+        """That of a process which torchrun or srun started, by what they set; else all items.
+
+        RANK and WORLD_SIZE may be left over in a shell: without torchrun's own mark they only give a warning.
 
         Raises:
             ValueError: what they set is missing, or no numbers that fit.
         """
-        known = os.environ if environment is None else environment
+        known = os.environ
         for mark, rank, count, local in (
             ("TORCHELASTIC_RUN_ID", "RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"),
             # a script that sbatch runs has no step: SLURM_NTASKS is what was asked for, and nobody else works
             ("SLURM_STEP_ID", "SLURM_PROCID", "SLURM_NTASKS", "SLURM_NTASKS_PER_NODE"),
         ):
-            if known.get(mark, "") == "":
-                continue
-            values = [known.get(name, "") for name in (rank, count)]
-            if not all(value.isascii() and value.isdigit() for value in values) or int(values[0]) >= int(values[1]):
-                raise ValueError(f"{rank}={values[0]!r} and {count}={values[1]!r} do not say which shard of how many")
-            here = known.get(local, "")
-            return cls(int(values[0]), int(values[1]), max(1, int(here)) if here.isdigit() else 1)
-        return cls()
-
-    @staticmethod
-    def unmarked(environment: Mapping[str, str] | None = None) -> str:
-        """RANK and WORLD_SIZE where they name a shard, but not by torchrun: they may be left over; else empty."""
-        known = os.environ if environment is None else environment
+            if known.get(mark, ""):
+                values = [known.get(name, "") for name in (rank, count)]
+                if not all(value.isascii() and value.isdigit() for value in values) or int(values[0]) >= int(values[1]):
+                    raise ValueError(
+                        f"{rank}={values[0]!r} and {count}={values[1]!r} do not say which shard of how many"
+                    )
+                here = known.get(local, "")
+                return cls(int(values[0]), int(values[1]), max(1, int(here)) if here.isdigit() else 1)
         rank, count = known.get("RANK", ""), known.get("WORLD_SIZE", "")
-        is_whole = rank in ("", "0") and count in ("", "1")
-        is_marked = any(known.get(mark, "") for mark in ("TORCHELASTIC_RUN_ID", "SLURM_STEP_ID"))
-        return "" if is_whole or is_marked else f"RANK={rank} WORLD_SIZE={count}"
+        if rank not in ("", "0") or count not in ("", "1"):
+            warnings.warn(
+                f"RANK={rank} WORLD_SIZE={count} is set, but not by torchrun or srun, and was not heeded: "
+                "all files were asked for; --shard 1/4 makes the first of four parts",
+                stacklevel=2,
+            )
+        return cls()
 
     def of(self, items: Sequence[T]) -> Sequence[T]:
         """Its part of all items."""

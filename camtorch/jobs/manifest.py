@@ -29,27 +29,16 @@ except ImportError:  # Windows: a shard can be run twice at the same time there
 
 
 class Manifest:
-    """The account of a job in a folder, to be used in a `with` block.
+    """The account of a kind of job in a folder, that of its outputs, which is made if need be; for a `with` block.
 
-    Args:
-        folder: that of the outputs; made if there is none.
-        job: what kind of job it is, a word.
-        settings: all that outputs depend on beside their inputs; JSON.
-        shard: whose account.
-
-    Raises:
-        OSError: no such folder can be made, or written to. BlockingIOError: another process does the same right now.
+    `settings` are all that outputs depend on beside their inputs, JSON. A second process with the same account is
+    refused by a BlockingIOError.
     """
-
-    folder: Path
-    shard: Shard
-    settings: str
-    """A hash of them."""
 
     def __init__(self, folder: Path, job: str, settings: Json, shard: Shard | None = None):
         self.folder, self.shard, self._job, self._stated = folder, shard or Shard(), job, settings
         text = json.dumps(settings, sort_keys=True, allow_nan=False)
-        self.settings = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        self.settings: str = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
         self._begun: set[str] = set()
         self._records: dict[tuple[str, ...], list[dict[str, Json]]] = {}
 
@@ -107,11 +96,7 @@ class Manifest:
 
 
 def lock(file: IO[bytes], *, wait: bool) -> None:
-    """Have a file alone until it is closed; a file system that knows no locks gives none.
-
-    Raises:
-        BlockingIOError: another process has it, and `wait` is false.
-    """
+    """Have a file alone until it is closed, or raise a BlockingIOError; some file systems know no locks."""
     if fcntl is not None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -15,7 +15,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-Work = Callable[[T, Callable[[float], None]], Any]
+Work = Callable[[T, Callable[[int], object]], Any]
 """What is done with a task; the function that it gets as well adds to what is done."""
 
 _HOW = "spawn" if sys.platform == "win32" else "forkserver"
@@ -37,15 +37,12 @@ def prepare(module: str) -> None:
 
 
 def run(
-    work: Work[T], tasks: Iterable[T], processes: int, add: Callable[[float], None]
+    work: Work[T], tasks: Iterable[T], processes: int, add: Callable[[int], object]
 ) -> Generator[tuple[T, Any], None, None]:
-    """Tasks with what `work` returned, as they are done.
+    """Tasks with what `work` returned, as they are done; with one process here, by one thread as well.
 
-    Args:
-        work: is pickled once for each process, and must not raise.
-        tasks: are pickled, and taken as processes get free.
-        processes: how many; with one, the work is done here, by one thread as well.
-        add: is called here with what was done since it was called last.
+    `work` is pickled once for each process, and must not raise; tasks are pickled, and taken as processes get free;
+    `add` is called here with what was done since it was called last.
 
     Raises:
         ChildProcessError: a process was killed. What `tasks` raise, or an interrupt: processes are then ended at once.
@@ -65,11 +62,11 @@ def run(
 
 
 def _run_in_processes(
-    work: Work[T], tasks: Iterator[T], processes: int, add: Callable[[float], None]
+    work: Work[T], tasks: Iterator[T], processes: int, add: Callable[[int], object]
 ) -> Generator[tuple[T, Any], None, None]:
     prepare(type(work).__module__)
     context = multiprocessing.get_context(_HOW)
-    done, seen = context.Value("d", 0.0), 0.0
+    done, seen = context.Value("q", 0), 0
     others = multiprocessing.active_children()
     # pickled here, as multiprocessing would share the memory of tensors
     executor = ProcessPoolExecutor(processes, context, _begin, (pickle.dumps(work), done))
@@ -120,12 +117,11 @@ def _end_with_parent() -> None:
 
 
 def _work_on(task: Any) -> Any:
-    return _work(task, _add)
+    def add(part: int) -> None:
+        with _done.get_lock():
+            _done.value += part
 
-
-def _add(part: float) -> None:
-    with _done.get_lock():
-        _done.value += part
+    return _work(task, add)
 
 
 def reason(error: Exception) -> str:

@@ -27,8 +27,8 @@ class Report:
     """Names, and why; in the order of items."""
     notes: dict[str, list[str]] = field(default_factory=dict)
     """What was noted, and of which items."""
-    results: dict[Item, Json] = field(default_factory=dict)
-    """What `Work` returned, now or then; in the order of items."""
+    results: list[Json] = field(default_factory=list)
+    """What `Work` returned, now or then."""
 
 
 def run(
@@ -39,19 +39,13 @@ def run(
     processes: int = 1,
     resume: bool = False,
     force: bool = False,
-    watch: Callable[[float, float], None] = lambda done, kept: None,
+    add: Callable[[int], object] = lambda part: None,
 ) -> Report:
     """Have items made.
 
-    Args:
-        items: see `items.check`.
-        work: makes one; see there.
-        manifest: open.
-        processes: how many work; with one it is this one.
-        resume: keep what the manifest knows, where inputs, settings and outputs are those it says; make anew what else
-            the job had begun.
-        force: overwrite what the job did not begin.
-        watch: is told how much of the items' sizes is done, and how much of that was kept, whenever that changes.
+    With `resume`, what the manifest knows is kept, where inputs, settings and outputs are those it says, and what else
+    the job had begun is made anew; with `force` also what it did not begin is overwritten. `add` is told how much more
+    of the items' sizes is done. With one of `processes` it is this one that works.
 
     Raises:
         FileExistsError: outputs exist, and neither `resume` nor `force`. As `pool.run`.
@@ -60,14 +54,7 @@ def run(
     if there and not (resume or force):
         more = f", and {len(there) - 1} more of {sum(len(item.outputs) for item in items)}" if len(there) > 1 else ""
         raise FileExistsError(f"{there[0]}: exists already{more}")
-    report = Report()
-    failed: dict[Item, str] = {}
-    done = kept = 0.0
-
-    def add(part: float) -> None:
-        nonlocal done
-        done += part
-        watch(done, kept)
+    report, failed = Report(), dict[Item, str]()
 
     def tasks() -> Iterator[_Task]:
         for item in items:
@@ -79,29 +66,27 @@ def run(
                 manifest.begin(item)
             yield _Task(item, manifest.records(item) if resume else [])
 
+    def plain(item: Item, text: str) -> str:
+        return text.removeprefix(item.name).lstrip(": ")
+
     _remove_left_over(items)
     try:
         attempt = _Attempt(work, manifest.settings)
         with contextlib.closing(pool.run(attempt, tasks(), processes, add)) as outcomes:
-            for (item, _), outcome in outcomes:
-                for text in outcome.notes:
-                    report.notes.setdefault(text.removeprefix(item.name).lstrip(": "), []).append(item.name)
-                if outcome.record is None:
-                    failed[item] = outcome.failure.removeprefix(item.name).lstrip(": ")
+            for (item, _), (record, is_new, failure, notes) in outcomes:
+                for text in notes:
+                    report.notes.setdefault(plain(item, text), []).append(item.name)
+                if record is None:
+                    failed[item] = plain(item, failure)
                     continue
-                report.results[item] = outcome.record["result"]
-                if outcome.is_new:
-                    manifest.made(item, outcome.record)
-                    report.made += 1
-                else:
-                    report.kept += 1
-                    kept += item.size
-                    watch(done, kept)
+                report.results.append(record["result"])
+                report.made, report.kept = report.made + is_new, report.kept + (not is_new)
+                if is_new:
+                    manifest.made(item, record)
     except BaseException:
         _remove_left_over(items)
         raise
     report.failed = [(item.name, failed[item]) for item in items if item in failed]
-    report.results = {item: report.results[item] for item in items if item in report.results}
     return report
 
 
@@ -117,19 +102,18 @@ def pending(items: Iterable[Item], manifest: Manifest, *, resume: bool = False) 
 class _Task(NamedTuple):
     item: Item
     records: list[dict[str, Json]]
-    """By which it may be as it should already."""
+    """By which its outputs may be as they should already."""
 
     def __str__(self) -> str:
         return self.item.name
 
 
-@dataclass
-class _Outcome:
-    record: dict[str, Json] | None = None
-    """For the manifest."""
-    is_new: bool = True
-    failure: str = ""
-    notes: list[str] = field(default_factory=list)
+class _Outcome(NamedTuple):
+    record: dict[str, Json] | None
+    """For the manifest; None of what failed."""
+    is_new: bool
+    failure: str
+    notes: list[str]
 
 
 @dataclass(frozen=True)
@@ -139,28 +123,28 @@ class _Attempt:
     work: Work
     settings: str
 
-    def __call__(self, task: _Task, add: Callable[[float], None]) -> _Outcome:
-        item, outcome, done = task.item, _Outcome(), 0.0
+    def __call__(self, task: _Task, add: Callable[[int], object]) -> _Outcome:
+        (item, records), notes, done = task, list[str](), 0
 
-        def advance(to: float) -> None:
+        def advance(to: int) -> None:
             nonlocal done
             add(min(to, item.size) - done)
             done = min(to, item.size)
 
         try:
             terms = _terms(item, self.settings)
-            outcome.record = _standing(item, task.records, terms)
-            outcome.is_new = outcome.record is None
-            if outcome.record is None:
-                with warnings.catch_warnings(record=True) as caught:
-                    warnings.simplefilter("always", UserWarning)
-                    result = self.work(item, Listener(outcome.notes.append, advance))
-                outcome.notes += dict.fromkeys(str(warning.message) for warning in caught)
-                outcome.record = {**terms, "hashes": list(map(hash_of, item.outputs)), "result": result}
+            known = _standing(item, records, terms)
+            if known is not None:
+                return _Outcome(known, False, "", notes)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", UserWarning)
+                result = self.work(item, Listener(notes.append, advance))
+            notes += dict.fromkeys(str(warning.message) for warning in caught)
+            return _Outcome({**terms, "hashes": list(map(hash_of, item.outputs)), "result": result}, True, "", notes)
         except Exception as error:
-            outcome.failure = pool.reason(error)
-        advance(item.size)
-        return outcome
+            return _Outcome(None, False, pool.reason(error), notes)
+        finally:
+            advance(item.size)
 
 
 def _terms(item: Item, settings: str) -> dict[str, Json]:

@@ -91,7 +91,8 @@ def _forward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJa
     """Once forward, on a row more for each direction: vmap would take Python's word for many operations."""
     count = k.shape[-1] + 3
     directions = torch.eye(count, dtype=k.dtype, device=k.device)
-    with warnings.catch_warnings(), forward_ad.dual_level():
+    # under inference mode there would be no derivatives
+    with torch.inference_mode(False), warnings.catch_warnings(), forward_ad.dual_level():
         # on its first use forward mode loads what calls the deprecated torch.jit.script
         warnings.simplefilter("ignore", DeprecationWarning)
         along = directions[:, None, :3].expand(-1, rays.shape[1], -1).repeat(len(rays), 1, 1)

@@ -8,30 +8,13 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from camtorch.least_squares.equations import System
+
 State = tuple[Tensor, ...]
 """What is looked for: tensors (B, ...), a row for each problem."""
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-15, 1e8
 _GOOD, _FAIR = 0.75, 0.25  # parts of what a step promised that were kept
-
-
-class System(Protocol):
-    """Problems linearised at a state."""
-
-    decrement: Tensor
-    """(R,) by how much their costs would fall, were they linear."""
-
-    @property
-    def firm_decrement(self) -> Tensor:
-        """(R,) likewise, but for combinations of unknowns that hardly matter, along which no problem is linear."""
-        ...
-
-    def step(self, damping: Tensor) -> tuple[State, Tensor]:
-        """The damped step of Gauss and Newton, zero where there is none, and (R,) by how much the linear costs fall.
-
-        damping: (R,), in units of squared columns.
-        """
-        ...
 
 
 class Problem(Protocol):
@@ -64,11 +47,7 @@ class Minimum(NamedTuple):
 def rounding_of(pixels: Tensor, weights: Tensor) -> Tensor:
     """(B,) the weighted sums of squares of the rounding of pixels: eps of the dtype times the largest coordinate.
 
-    The projections of all models are rounded by 0.2 to 0.4 of that, root mean square.
-
-    Args:
-        pixels: (B, ..., 2), those that residuals are to.
-        weights: (B, ...) of the squares, 0 where a pixel does not count.
+    The projections of all models are rounded by 0.2 to 0.4 of that, root mean square. weights: (B, ...) of the squares.
     """
     largest = torch.where(weights > 0, pixels.abs().amax(-1), 0.0).flatten(1).amax(-1)
     return (torch.finfo(pixels.dtype).eps * largest).square() * weights.flatten(1).sum(-1)

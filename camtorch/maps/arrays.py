@@ -5,13 +5,11 @@ from __future__ import annotations
 import base64
 import io
 import re
-import warnings
 import zipfile
 from typing import Any
 
 import numpy as np
 
-from camtorch.io._errors import CameraFileError
 from camtorch.maps.protocol import MOST_PIXELS
 
 Arrays = dict[str, np.ndarray]
@@ -21,7 +19,8 @@ _LETTERS = {np.dtype(code): letter for letter, code in _TYPES.items()}
 _HEADER = 24  # bytes before the data in base64, which say the type once more
 _LINE = 76  # characters of base64 in a line
 _MOST_ARRAYS = 100
-_MOST_NUMBERS = 2 * MOST_PIXELS + _MOST_ARRAYS
+_MOST_NUMBERS = 2 * MOST_PIXELS
+_MOST_BYTES = 8 * _MOST_NUMBERS + (1 << 20)
 
 
 def as_archive(arrays: dict[str, Any]) -> bytes:
@@ -31,38 +30,20 @@ def as_archive(arrays: dict[str, Any]) -> bytes:
     return file.getvalue()
 
 
-def from_archive(path: str, content: bytes) -> Arrays:
+def from_archive(content: bytes) -> Arrays:
     """The arrays of an archive; pickled objects are not read.
 
     Raises:
-        CameraFileError: another archive, a damaged one, arrays of other than numbers, or too large ones.
+        ValueError: arrays of other than numbers, or too large ones; and whatever NumPy makes of a damaged archive.
     """
-    arrays: Arrays = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            entries = archive.infolist()
-            if len(entries) > _MOST_ARRAYS:
-                raise ValueError(f"{len(entries)} arrays")
-            total = 0
-            for entry in entries:
-                with archive.open(entry) as file:
-                    version = np.lib.format.read_magic(file)
-                    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else _later_header
-                    shape, fortran, dtype = header(file)
-                    count = int(np.prod([1, *shape], dtype=object))
-                    total += max(count, 0)
-                    if dtype.kind not in "fiu" or not 0 <= count <= total <= _MOST_NUMBERS:
-                        raise ValueError(f"{entry.filename}: {dtype} of shape {shape} is no part of a map")
-                    data = file.read(count * dtype.itemsize)
-                array = np.frombuffer(data, dtype, count)
-                arrays[entry.filename.removesuffix(".npy")] = array.reshape(shape, order="F" if fortran else "C")
-    except Exception as error:  # whatever a damaged header makes of NumPy's parser
-        raise CameraFileError(path, "content", f"no archive of NumPy's that holds a map: {error}") from None
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+            raise ValueError(f"more than {_MOST_BYTES} bytes")
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays: Arrays = dict(file)
+    if any(not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" for array in arrays.values()):
+        raise ValueError("arrays of other than numbers")
     return arrays
-
-
-def _later_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    return np.lib.format.read_array_header_2_0(file)
 
 
 def as_storage(arrays: dict[str, Any], *, xml: bool) -> bytes:
@@ -108,44 +89,34 @@ _XML_NUMBER = re.compile(rb"^<([\w.-]{1,99})>(\d{1,9})</[\w.-]{1,99}>\s*$", re.M
 _YAML_END = re.compile(rb"^\S", re.MULTILINE)
 
 
-def from_storage(path: str, content: bytes) -> Arrays:
+def from_storage(content: bytes) -> Arrays:
     """The matrices of a YAML or XML file that `cv2.FileStorage` wrote, (rows, columns[, channels]), and whole numbers.
 
     Raises:
-        CameraFileError: a matrix that is damaged, too large or of another type.
+        ValueError: a matrix that is damaged, too large or of another type.
     """
     xml = content.lstrip()[:1] == b"<"
     arrays: Arrays = {}
     for found in (_XML_NUMBER if xml else _YAML_NUMBER).finditer(content):
         arrays[found[1].decode()] = np.array(int(found[2]))
     for count, found in enumerate((_XML_MATRIX if xml else _YAML_MATRIX).finditer(content)):
-        name = found[1].decode()
-        if count >= _MOST_ARRAYS:
-            raise CameraFileError(path, "content", f"more than {_MOST_ARRAYS} matrices")
+        name, letter = found[1].decode(), found[5].decode()
         rows, columns, channels = int(found[2]), int(found[3]), int(found[4] or 1)
         coded = found[6] is not None and found[6] != b"["
-        if xml:
-            end = content.find(b"</data>", found.end())
-        elif coded:
+        if xml or not coded:
+            end = content.find(b"</data>" if xml else b"]", found.end())
+        else:
             following = _YAML_END.search(content, found.end())
             end = following.start() if following else len(content)
-        else:
-            end = content.find(b"]", found.end())
-        letter = found[5].decode()
-        if end < 0 or letter not in _TYPES or rows * columns * channels > _MOST_NUMBERS:
-            raise CameraFileError(
-                path, name, f"{rows}x{columns} of type {channels}{letter} without an end, or too large"
-            )
-        dtype = np.dtype(_TYPES[letter])
-        data = content[found.end() : end]
+        what = f"{name}: {rows}x{columns} of type {channels}{letter}"
+        if end < 0 or letter not in _TYPES or rows * columns * channels > _MOST_NUMBERS or count >= _MOST_ARRAYS:
+            raise ValueError(f"{what} without an end, or too large")
+        dtype, data = np.dtype(_TYPES[letter]), content[found.end() : end]
         try:
             values = _from_base64(data, dtype) if coded else _from_words(data, dtype)
-            shape = (rows, columns, channels) if channels > 1 else (rows, columns)
-            arrays[name] = values.reshape(shape)
+            arrays[name] = values.reshape((rows, columns, channels) if channels > 1 else (rows, columns))
         except ValueError as error:
-            raise CameraFileError(
-                path, name, f"no {rows}x{columns} matrix of type {channels}{letter}: {error}"
-            ) from None
+            raise ValueError(f"{what}: {error}") from None
     return arrays
 
 
@@ -154,13 +125,8 @@ def _from_base64(data: bytes, dtype: np.dtype) -> np.ndarray:
 
 
 def _from_words(data: bytes, dtype: np.dtype) -> np.ndarray:
-    text = data.decode("ascii", "replace").replace(",", " ").lower().replace(".nan", "nan").replace(".inf", "inf")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            values = np.fromstring(text, np.float64, sep=" ")
-        except DeprecationWarning as error:
-            raise ValueError(str(error)) from None
+    text = data.lower().replace(b",", b" ").replace(b".nan", b"nan").replace(b".inf", b"inf")
+    values = np.array(text.split(), np.float64)
     if dtype.kind != "f":
         limits = np.iinfo(dtype)
         if not ((values >= limits.min) & (values <= limits.max) & (values == np.rint(values))).all():

@@ -12,34 +12,37 @@ from typing import Any
 import numpy as np
 
 from camtorch._arguments import shown
-from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.mesh import Mesh
-from camtorch.maps.protocol import Given, Options
+from camtorch.maps.protocol import Options
 from camtorch.maps.tables import Table, table
-
-_ORDERS = {"yx": slice(None, None, -1), "xy": slice(None)}  # of x and y
 
 
 class DepthAI(Table):
     """The format: see the module."""
 
     name = "depthai"
-    options: tuple[str, ...] = ("step", "order")
+    options = ("step", "order")
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """Raises ValueError: an order that is none."""
-        order = "yx" if options.order is None else options.order
-        if not isinstance(order, str) or order not in _ORDERS:
-            raise ValueError(f"Warp.save: order must be 'yx' (loadMeshFiles) or 'xy' (setWarpMesh); got {shown(order)}")
-        return np.ascontiguousarray(mesh.nodes[..., _ORDERS[order]], "<f4").tobytes(), {"order": order}
+        """See `Table`."""
+        order = _order(options)
+        return np.ascontiguousarray(_ordered(mesh.nodes, order), "<f4").tobytes(), {"order": order}
 
-    def unpack(
-        self, path: str, content: bytes, columns: Floats, rows: Floats, given: Given
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Raises CameraFileError: no such order."""
-        order = given.order or "yx"
-        if not isinstance(order, str) or order not in _ORDERS:
-            raise CameraFileError(path, "order", f"must be 'yx' or 'xy'; got {order!r:.60}")
-        nodes = table(path, content, "<f4", (len(rows), len(columns), 2)).astype(np.float64)
-        return nodes[..., _ORDERS[order]], {"order": order}
+    def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
+        """See `Table`."""
+        order = _order(given)
+        nodes = table(content, "<f4", (len(rows), len(columns), 2)).astype(np.float64)
+        return _ordered(nodes, order), {"order": order}
+
+
+def _order(options: Options) -> str:
+    order = "yx" if options.order is None else options.order
+    if order not in ("yx", "xy"):
+        raise ValueError(f"order must be 'yx' (loadMeshFiles) or 'xy' (setWarpMesh); got {shown(order)}")
+    return order
+
+
+def _ordered(nodes: Floats, order: str) -> Floats:
+    """Nodes (..., 2) of x and y in an order, or back."""
+    return nodes[..., ::-1] if order == "yx" else nodes

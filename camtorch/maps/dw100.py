@@ -10,7 +10,6 @@ https://docs.kernel.org/userspace-api/media/drivers/dw100.html
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.mesh import Mesh, held, rounded
-from camtorch.maps.protocol import Given, Options
+from camtorch.maps.protocol import Options
 from camtorch.maps.tables import Table, table
 
 _PARTS = 16
@@ -30,8 +29,8 @@ class DW100(Table):
     """The format: see the module."""
 
     name = "dw100"
-    options: tuple[str, ...] = ("clip",)
-    steps: Sequence[int] = (16,)
+    options = ("clip",)
+    steps = (16,)
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """Raises CameraFileError: sizes that the hardware does not take, positions off 0 to 4095.9375."""
@@ -44,8 +43,7 @@ class DW100(Table):
         parts = rounded(held(path, self.name, mesh, low, high, clip=bool(options.clip)), exact, _PARTS, low, high)
         return (parts[..., 1] << 16 | parts[..., 0]).astype("<u4").tobytes(), {}
 
-    def unpack(
-        self, path: str, content: bytes, columns: Floats, rows: Floats, given: Given
-    ) -> tuple[Floats, dict[str, Any]]:
-        words = table(path, content, "<u4", (len(rows), len(columns)))
+    def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
+        """See `Table`."""
+        words = table(content, "<u4", (len(rows), len(columns)))
         return np.stack((words & _MOST, words >> 16), -1) / _PARTS, {}

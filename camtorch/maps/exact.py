@@ -38,9 +38,10 @@ class Exact:
                 f"{owner}: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
                 "cameras, so take each ct.Warp(source[i], target[i], rotation[i])"
             )
-        if moments := warp._moments():
+        shutter = warp.target_shutter
+        if shutter is not None and shutter.blurs:
             raise ValueError(
-                f"{owner}: the blur of an exposure takes each pixel from {len(moments)} positions, and a map holds "
+                f"{owner}: the blur of an exposure takes each pixel from {shutter.samples} positions, and a map holds "
                 "one; a target_shutter with exposure=0 has one"
             )
         self.warp = warp

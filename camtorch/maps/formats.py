@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from camtorch._arguments import as_image_size, as_whole
@@ -20,57 +20,63 @@ from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.onnx import ONNX
 from camtorch.maps.opencv import OpenCV
-from camtorch.maps.protocol import SIZES, Given, MapFormat, Options, named_sizes, sizes_in
+from camtorch.maps.protocol import SIZES, MapFormat, Options, named_sizes
 from camtorch.maps.report import MapReport, measure
 from camtorch.maps.stmap import STMap
-from camtorch.maps.texture_mesh import TextureMesh
+from camtorch.maps.texture_mesh import GLTF, OBJ
 from camtorch.maps.ti_ldc import TILDC
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
 # in the order in which they are asked
-_FORMATS: tuple[MapFormat, ...] = (
-    OpenCV("opencv", fixed=False),
-    OpenCV("opencv_fixed", fixed=True),
-    STMap(),
-    DW100(),
-    TILDC(),
-    DepthAI(),
-    TextureMesh("obj", (".obj",)),
-    TextureMesh("gltf", (".glb", ".gltf")),
-    ONNX(),
-)
-FORMATS = tuple(format.name for format in _FORMATS)
+_FORMATS: dict[str, MapFormat] = {
+    format.name: format
+    for format in (
+        OpenCV("opencv"),
+        OpenCV("opencv_fixed"),
+        STMap(),
+        DW100(),
+        TILDC(),
+        DepthAI(),
+        OBJ(),
+        GLTF(),
+        ONNX(),
+    )
+}
+FORMATS = tuple(_FORMATS)
 
 _LARGEST_FILE = 1 << 31
 _LARGEST_DESCRIPTION = 1 << 16
 
 
 def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, **said: Any) -> MapReport:
-    """See `Warp.save`; `said` are the fields of `Options`."""
-    name, options = _path(path, "Warp.save"), Options(**said)
+    """See `Warp.save`; `said` are fields of `Options`."""
+    name = _path(path, "Warp.save")
     chosen = _chosen(name, format)
-    if options.step is not None:
-        options = replace(options, step=as_whole(options.step, "step", "Warp.save"))
-    if options.block is not None:
-        options = replace(options, block=as_image_size(options.block, "Warp.save", "block"))
-    for option in fields(options):
-        if getattr(options, option.name) is not None and option.name not in chosen.options:
+    if said["step"] is not None:
+        said["step"] = as_whole(said["step"], "step", "Warp.save")
+    if said["block"] is not None:
+        said["block"] = as_image_size(said["block"], "Warp.save", "block")
+    for option, value in said.items():
+        if value is not None and option not in chosen.options:
             takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
-            raise ValueError(f"Warp.save: {chosen.name} has no {option.name}{takes}")
+            raise ValueError(f"Warp.save: {chosen.name} has no {option}{takes}")
+    if chosen.suffixes and not name.lower().endswith(chosen.suffixes):
+        raise ValueError(f"{name}: files of {chosen.name} are called {', '.join(chosen.suffixes)}")
     exact = Exact(warp, "Warp.save")
     if not exact.shown.any():
         raise ValueError(f"Warp.save: {name}: no pixel of the target shows anything of the source's image")
-    encoded = chosen.encode(name, exact, options)
-    facts = {key: encoded.facts.get(key) for key in ("step", "v", "order")}
-    read = chosen.decode(name, encoded.content, Given(exact.source_size, exact.target_size, **facts))
-    files = _files(name, chosen)
-    report = measure(name, read, exact, files, encoded.facts)
+    options = Options(**said, source_size=exact.source_size, target_size=exact.target_size)
+    content, facts = chosen.encode(name, exact, options)
+    files = (name, _description(name)) if chosen.described else (name,)
+    report = measure(name, chosen.decode(content, options), exact, files, facts)
     with replacing(*files) as opened:
-        opened[0].write(encoded.content)
+        opened[0].write(content)
         if chosen.described:
-            opened[1].write(as_json(_described(report)).encode())
+            errors = {"max_error": round(report.max_error, 6), "rms_error": round(report.rms_error, 6)}
+            sizes = named_sizes(report.source_size, report.target_size)
+            opened[1].write(as_json({"format": chosen.name, **sizes, **facts, **errors}).encode())
     return report
 
 
@@ -104,33 +110,39 @@ def load_map(
             format. ImportError: a library that the format needs is missing; the error names the extra.
     """
     name = _path(path, "load_map")
-    given: dict[str, Any] = {
-        "step": None if step is None else as_whole(step, "step", "load_map"),
-        "v": v,
-        "order": order,
-    }
-    for key, size in (("source_size", source_size), ("target_size", target_size)):
-        given[key] = as_image_size(size, "load_map", key)
+    given = Options(
+        step=None if step is None else as_whole(step, "step", "load_map"),
+        v=v,
+        order=order,
+        source_size=as_image_size(source_size, "load_map", "source_size"),
+        target_size=as_image_size(target_size, "load_map", "target_size"),
+    )
     content = _content(name)
+    chosen: MapFormat | None
     if format is not None:
         chosen = _named(format)
     else:
-        chosen = next((known for known in _FORMATS if known.matches(name, content)), None) or _from_description(name)
-    described = _read_description(name) if chosen.described else {}
+        chosen = next((known for known in _FORMATS.values() if known.matches(name, content)), None)
+    described = _read_description(name) if chosen is None or chosen.described else {}
+    chosen = chosen or _FORMATS.get(str(described.get("format")))
+    if chosen is None:
+        reason = f"no format that is known by its content; say format, one of {', '.join(FORMATS)}"
+        raise CameraFileError(name, "content", reason)
     if described.get("format", chosen.name) != chosen.name:
         raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
-    facts = {key: _as_fact(value) for key, value in described.items() if key not in _SIZES_AND_ERRORS}
+    facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
     stated: dict[str, Any] = {key: facts[key] for key in ("step", "order") if key in facts}
-    if sizes := sizes_in(described):
-        stated["source_size"], stated["target_size"] = sizes
-    given |= stated
-    if given["step"] is not None and not isinstance(given["step"], int):
-        raise CameraFileError(name, "step", f"{given['step']!r:.60} is no number of pixels")
+    if all(key in facts for key in SIZES):
+        rows, columns, height, width = (facts[key] for key in SIZES)
+        stated |= {"source_size": (rows, columns), "target_size": (height, width)}
     try:
-        read = chosen.decode(name, content, Given(**given))
-    except MemoryError as error:
-        raise CameraFileError(name, "content", f"cannot be read: {error or 'out of memory'}") from None
-    read.facts = {**facts, **read.facts}
+        read = chosen.decode(content, replace(given, **stated))
+    except ImportError:
+        raise
+    except Exception as error:  # whatever a damaged file makes of the library that reads it
+        reason = f"no map of {chosen.name}: {str(error) or type(error).__name__}"
+        raise CameraFileError(name, "content", reason) from None
+    read.facts = {**{key: facts[key] for key in facts if key not in _NO_FACTS}, **read.facts}
     return read
 
 
@@ -141,11 +153,7 @@ def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[s
         ValueError: as `Warp.save`, of the path and the format.
     """
     name = _path(path, "Warp.save")
-    return _files(name, _chosen(name, format))
-
-
-def _files(path: str, format: MapFormat) -> tuple[str, ...]:
-    return (path, _description(path)) if format.described else (path,)
+    return (name, _description(name)) if _chosen(name, format).described else (name,)
 
 
 def check_map(
@@ -168,18 +176,12 @@ def check_map(
     return measure(_path(path, "check_map"), read, exact, (), read.facts)
 
 
-_SIZES_AND_ERRORS = ("format", *SIZES, "max_error", "rms_error")
+_NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
 
 
 def _description(path: str) -> str:
     """The file that says what a bare table does not."""
     return path + ".json"
-
-
-def _described(report: MapReport) -> dict[str, Any]:
-    sizes = named_sizes(report.source_size, report.target_size)
-    errors = {"max_error": round(report.max_error, 6), "rms_error": round(report.rms_error, 6)}
-    return {"format": report.format, **sizes, **report.facts, **errors}
 
 
 def _read_description(path: str) -> dict[str, Any]:
@@ -190,26 +192,12 @@ def _read_description(path: str) -> dict[str, Any]:
     with open(beside, "rb") as file:
         content = file.read(_LARGEST_DESCRIPTION + 1)
     try:
-        described = json.loads(content[:_LARGEST_DESCRIPTION])
+        described = json.loads(content)
+        if not isinstance(described, dict) or len(content) > _LARGEST_DESCRIPTION:
+            raise ValueError("no mapping, or too long")
     except (ValueError, RecursionError) as error:
         raise CameraFileError(beside, "content", f"no description of a map: {error}") from None
-    if not isinstance(described, dict) or len(content) > _LARGEST_DESCRIPTION:
-        raise CameraFileError(beside, "content", "no description of a map")
     return described
-
-
-def _as_fact(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _from_description(path: str) -> MapFormat:
-    name = _read_description(path).get("format")
-    found = next((known for known in _FORMATS if known.name == name), None)
-    if found is None:
-        raise CameraFileError(
-            path, "content", f"no format that is known by its content; say format, one of {', '.join(FORMATS)}"
-        )
-    return found
 
 
 def _content(path: str) -> bytes:
@@ -239,18 +227,17 @@ def _chosen(path: str, format: str | None) -> MapFormat:
     if format is not None:
         return _named(format)
     suffix = os.path.splitext(path)[1].lower()
-    for known in _FORMATS:
-        if suffix and suffix in known.suffixes:
-            return known
-    suffixes = dict.fromkeys(suffix for known in _FORMATS for suffix in known.suffixes)
-    raise ValueError(
-        f"{path}: the name does not say the format; names on {', '.join(suffixes)} do, for the others say which, as in "
-        f"format='dw100' or --format dw100; known are {', '.join(FORMATS)}"
-    )
+    suffixes = {suffix: known for known in reversed(_FORMATS.values()) for suffix in known.suffixes}
+    if suffix not in suffixes:
+        raise ValueError(
+            f"{path}: the name does not say the format; names on {', '.join(suffixes)} do, for the others say which, "
+            f"as in format='dw100' or --format dw100; known are {', '.join(FORMATS)}"
+        )
+    return suffixes[suffix]
 
 
 def _named(format: str) -> MapFormat:
-    found = next((known for known in _FORMATS if known.name == str(format).lower()), None)
+    found = _FORMATS.get(str(format).lower())
     if found is None:
         raise ValueError(f"format: {format!r} is no format of a map that is known here; known are {', '.join(FORMATS)}")
     return found

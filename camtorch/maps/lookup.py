@@ -15,7 +15,8 @@ from camtorch.maps.exact import Exact
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
-_OUTSIDE = -9.0  # a position of `grid_sample` that no image reaches
+OUTSIDE = -9.0
+"""A position of `grid_sample` that no image reaches."""
 _FAR = 100.0  # positions beyond are drawn in, as by `Warp`: float32 does not hold all of them, nor do integers
 
 
@@ -60,7 +61,7 @@ class LookupMap:
         """(1, H', W', 2) float32, as of `Warp.grid`: for `grid_sample(..., align_corners=False)`, -9 for nothing."""
         height, width = self.source_size
         size = self.positions.new_tensor([width, height])
-        grid = ((2 * self.positions + 1) / size - 1).nan_to_num(_OUTSIDE, _OUTSIDE, _OUTSIDE)
+        grid = ((2 * self.positions + 1) / size - 1).nan_to_num(OUTSIDE, OUTSIDE, OUTSIDE)
         return grid.clamp(-_FAR, _FAR).float()[None]
 
     def valid_mask(self) -> Tensor:
@@ -74,41 +75,28 @@ class LookupMap:
 
         Args:
             images: of the source.
-            mode: of `torch.nn.functional.grid_sample`.
-            padding_mode: likewise.
+            mode: "nearest", "bilinear" or "bicubic".
+            padding_mode: "zeros", "border" or "reflection".
 
         Raises:
             ValueError: another shape or size.
         """
-        shape = tuple(getattr(images, "shape", ()))
-        if (
-            not isinstance(images, Tensor)
-            or len(shape) != 4
-            or shape[-2:] != self.source_size
-            or images.is_complex()
-            or images.is_sparse
-        ):
-            what = images.dtype if isinstance(images, Tensor) else type(images).__name__
+        size = self.source_size
+        if not isinstance(images, Tensor) or images.is_complex() or images.is_sparse or images.shape[2:] != size:
+            what = f"{images.dtype} {tuple(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
             raise ValueError(
-                f"LookupMap: images must be a dense tensor (B, C, {self.source_size[0]}, {self.source_size[1]}) of "
-                f"real numbers; got {what} {shape}"
+                f"LookupMap: images must be a dense tensor (B, C, {size[0]}, {size[1]}) of real numbers; got {what}"
             )
-        if mode == "nearest" and not images.is_floating_point():
-            return self._picked(images, padding_mode)
-        values = images if images.is_floating_point() else widen(images)
-        grid = self.grid().to(values).expand(shape[0], -1, -1, -1)
-        return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
-
-    def _picked(self, images: Tensor, padding_mode: str) -> Tensor:
-        """The nearest of integers or bool, moved and not computed with: no float holds every id."""
-        height, width = self.source_size
-        # which pixel it is, counted from 1: float64 does hold that
-        place = torch.arange(1, height * width + 1, dtype=torch.float64, device=images.device).view(1, 1, height, width)
-        grid = self.grid().to(place)
-        index = F.grid_sample(place, grid, "nearest", padding_mode, align_corners=False)[0, 0].long()
+        grid = self.grid().to(images.device, torch.float64)
+        if mode != "nearest" or images.is_floating_point():
+            values = widen(images)
+            grid = grid.to(values).expand(len(values), -1, -1, -1)
+            return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
+        # which pixel it is, counted from 1, as no float holds every id
+        place = torch.arange(1, math.prod(size) + 1, device=images.device).to(grid).view(1, 1, *size)
+        index = F.grid_sample(place, grid, mode, padding_mode, align_corners=False)[0, 0].long()
         pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
-        pixels = torch.cat((torch.zeros_like(pixels[..., :1]), pixels), -1)
-        return pixels[..., index].view(images.dtype)
+        return F.pad(pixels, (1, 0))[..., index].view(images.dtype)
 
     def error(self, warp: Warp) -> Tensor:
         """(H', W') float64: how far it is from a warp, in pixels of the source; NaN where the warp shows nothing.

@@ -14,28 +14,23 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
-from camtorch.maps.protocol import MOST_PIXELS, Encoded, Given, Options, checked
+from camtorch.maps.lookup import OUTSIDE, LookupMap
+from camtorch.maps.protocol import MOST_PIXELS, MapFormat, Options, checked
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")
-_OUTSIDE = -9.0  # as of `Warp.grid`
 
 
-class ONNX:
-    """The format: see the module."""
+class ONNX(MapFormat):
+    """The format: see the module. What runtimes do in their own ways is refused."""
 
     name = "onnx"
-    suffixes: tuple[str, ...] = (".onnx",)
-    options: tuple[str, ...] = ("dtype",)
-    described = False
+    suffixes = (".onnx",)
+    options = ("dtype",)
 
-    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
-        """Raises ValueError: an antialiased warp, a bicubic one with an edge that runtimes differ in; a suffix."""
-        if not path.lower().endswith(self.suffixes):
-            raise ValueError(f"{path}: models of ONNX are called {self.suffixes[0]}")
+    def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
+        """See `MapFormat`."""
         warp, dtype = exact.warp, options.dtype or "float32"
         if dtype not in _DTYPES:
             raise ValueError(f"Warp.save: dtype must be one of {_DTYPES}; got {dtype!r}")
@@ -46,37 +41,30 @@ class ONNX:
                 f"Warp.save: mode='bicubic' with padding_mode={warp.padding_mode!r} is not the same in every ONNX "
                 "runtime; 'bilinear' is, or padding_mode='zeros'"
             )
-        model = _model(exact, dtype)
-        return Encoded(model.SerializeToString(), {"dtype": dtype, "opset": _OPSET})
+        return _model(exact, dtype).SerializeToString(), {"dtype": dtype, "opset": _OPSET}
 
-    def matches(self, path: str, content: bytes) -> bool:
-        return path.lower().endswith(self.suffixes)
-
-    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
-        """Raises CameraFileError: no model of one GridSample with a constant grid."""
+    def decode(self, content: bytes, given: Options) -> LookupMap:
+        """See `MapFormat`. It reads models of one GridSample with a constant grid."""
         onnx = _needed()
-        try:
-            model = onnx.load_model_from_string(content)
-            samples = [node for node in model.graph.node if node.op_type == "GridSample"]
-            if len(samples) != 1:
-                raise ValueError(f"{len(samples)} GridSample nodes; one is read")
-            grids = [t for t in model.graph.initializer if t.name == samples[0].input[1]]
-            if not grids or grids[0].data_location == onnx.TensorProto.EXTERNAL:
-                raise ValueError("a grid that is no constant in this file")
-            attributes = {a.name: onnx.helper.get_attribute_value(a) for a in samples[0].attribute}
-            if attributes.get("align_corners", 0):
-                raise ValueError("align_corners=1")
-            grid = onnx.numpy_helper.to_array(grids[0]).astype(np.float64)
-            if grid.ndim != 4 or grid.shape[0] != 1 or grid.shape[3] != 2 or not 0 < grid.size <= 2 * MOST_PIXELS:
-                raise ValueError(f"a grid of shape {grid.shape}")
-            images = model.graph.input[0].type.tensor_type
-            sides = [int(dim.dim_value) for dim in images.shape.dim[2:4]]
-            kind = onnx.helper.tensor_dtype_to_np_dtype(images.elem_type).name
-        except Exception as error:  # whatever protobuf raises
-            raise CameraFileError(path, "content", f"no ONNX model of a warp: {error}") from None
-        size = checked(path, "source_size", sides if all(sides) else given.source_size)
+        model = onnx.load_model_from_string(content)
+        samples = [node for node in model.graph.node if node.op_type == "GridSample"]
+        if len(samples) != 1:
+            raise ValueError(f"{len(samples)} GridSample nodes; one is read")
+        grids = [t for t in model.graph.initializer if t.name == samples[0].input[1]]
+        if not grids or grids[0].data_location == onnx.TensorProto.EXTERNAL:
+            raise ValueError("a grid that is no constant in this file")
+        attributes = {a.name: onnx.helper.get_attribute_value(a) for a in samples[0].attribute}
+        if attributes.get("align_corners", 0):
+            raise ValueError("align_corners=1")
+        grid = onnx.numpy_helper.to_array(grids[0]).astype(np.float64)
+        if grid.ndim != 4 or grid.shape[0] != 1 or grid.shape[3] != 2 or not 0 < grid.size <= 2 * MOST_PIXELS:
+            raise ValueError(f"a grid of shape {grid.shape}")
+        images = model.graph.input[0].type.tensor_type
+        sides = [int(dim.dim_value) for dim in images.shape.dim[2:4]]
+        kind = onnx.helper.tensor_dtype_to_np_dtype(images.elem_type).name
+        size = checked("source_size", sides if all(sides) else given.source_size)
         positions = ((grid[0] + 1) * (size[1], size[0]) - 1) / 2
-        positions[(grid[0] == _OUTSIDE).all(-1) | ~np.isfinite(positions).all(-1)] = np.nan
+        positions[(grid[0] == OUTSIDE).all(-1) | ~np.isfinite(positions).all(-1)] = np.nan
         return LookupMap(torch.from_numpy(positions), size, self.name, {"dtype": kind})
 
 
@@ -96,7 +84,7 @@ def _model(exact: Exact, dtype: str) -> Any:
     warp, (height, width) = exact.warp, exact.source_size
     with torch.no_grad():
         grid = warp.grid().float().cpu().numpy()  # what the warp itself samples by
-    mapped = ~(grid == _OUTSIDE).all(-1)
+    mapped = ~(grid == OUTSIDE).all(-1)
     fill = np.array(warp.fill, np.float32).reshape(1, -1, 1, 1)
     constants = {
         "grid": grid,

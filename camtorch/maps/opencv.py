@@ -9,6 +9,8 @@ Pixels without a position get -32768, which `cv2.remap` fills by BORDER_CONSTANT
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -16,7 +18,7 @@ from camtorch.io._errors import CameraFileError
 from camtorch.maps.arrays import Arrays, as_archive, as_storage, from_archive, from_storage
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.protocol import MOST_PIXELS, SIZES, Encoded, Given, Options, checked, suffix_of
+from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, Options, checked
 
 _NOWHERE = -32768
 _LONGEST = 32766  # pixels: cv2.remap wants sides below SHRT_MAX
@@ -24,77 +26,66 @@ _PARTS = 32  # of a pixel
 _PAIRS = (("map1", "map2"), ("map_x", "map_y"), ("mapx", "mapy"), ("mapX", "mapY"), ("map1x", "map1y"), ("x", "y"))
 
 
-class OpenCV:
-    """A format: see the module.
+class OpenCV(MapFormat):
+    """The formats: see the module. "opencv_fixed" is in fixed point."""
 
-    Args:
-        name: its key.
-        fixed: whether it is in fixed point.
-    """
+    suffixes = (".yml", ".yaml", ".xml", ".npz")
 
-    suffixes: tuple[str, ...] = (".yml", ".yaml", ".xml", ".npz")
-    options: tuple[str, ...] = ()
-    described = False
-    name: str
-    fixed: bool
+    def __init__(self, name: str):
+        self.name = name
 
-    def __init__(self, name: str, *, fixed: bool):
-        self.name, self.fixed = name, fixed
-
-    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
-        """Raises CameraFileError for sides that cv2.remap does not take. ValueError: another suffix."""
-        suffix = suffix_of(path, self)
+    def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
+        """See `MapFormat`."""
         sides = (*exact.source_size, *exact.target_size)
         if max(sides) > _LONGEST:
             raise CameraFileError(path, "size", f"a side of {max(sides)} px; cv2.remap takes at most {_LONGEST}")
         positions = exact.positions.clip(_NOWHERE, -_NOWHERE - 1)
         positions[~exact.mapped] = _NOWHERE
-        if self.fixed:
+        if self.name == "opencv_fixed":
             parts = np.rint(positions * _PARTS).astype(np.int32)
             whole, rest = parts >> 5, (parts & (_PARTS - 1)).astype(np.uint16)
             maps = {"map1": whole.astype("<i2"), "map2": (rest[..., 1] * _PARTS + rest[..., 0]).astype("<u2")}
         else:
             maps = {name: positions[..., i].astype("<f4") for i, name in enumerate(("map1", "map2"))}
         keys = {**maps, **dict(zip(SIZES[:2], exact.source_size, strict=True))}
-        return Encoded(as_archive(keys) if suffix == ".npz" else as_storage(keys, xml=suffix == ".xml"))
+        if path.lower().endswith(".npz"):
+            return as_archive(keys), {}
+        return as_storage(keys, xml=path.lower().endswith(".xml")), {}
 
     def matches(self, path: str, content: bytes) -> bool:
-        """Which of both it is the types of its matrices say, so float maps match any."""
-        start = content[:100].lstrip()
-        return not self.fixed and start.startswith((b"PK\3\4", b"%YAML", b"<?xml", b"<opencv_storage"))
+        """See `MapFormat`. Which of the two it is the types of its matrices say."""
+        return content[:100].lstrip().startswith((b"PK\3\4", b"%YAML", b"<?xml", b"<opencv_storage"))
 
-    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
-        """Raises CameraFileError: see `camtorch.maps.arrays`; no pair of maps that is known; no size of the source."""
-        arrays = from_archive(path, content) if content.startswith(b"PK") else from_storage(path, content)
-        positions, fixed = _positions(path, arrays)
+    def decode(self, content: bytes, given: Options) -> LookupMap:
+        """See `MapFormat`."""
+        arrays = from_archive(content) if content.startswith(b"PK") else from_storage(content)
+        positions, fixed = _positions(arrays)
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan
         stated = [arrays[key].item() for key in SIZES[:2] if key in arrays and arrays[key].size == 1]
-        size = checked(path, "source_size", stated if len(stated) == 2 else given.source_size)
+        size = checked("source_size", stated if len(stated) == 2 else given.source_size)
         return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if fixed else "opencv", {})
 
 
-def _positions(path: str, arrays: Arrays) -> tuple[Floats, bool]:
+def _positions(arrays: Arrays) -> tuple[Floats, bool]:
     """(H', W', 2) of what `cv2.remap` takes, and whether that is fixed-point."""
-    first = second = None
-    for names in _PAIRS:
-        if names[0] in arrays:
-            first, second = arrays[names[0]], arrays.get(names[1])
-            break
-    if first is None:
-        raise CameraFileError(path, "map1", f"no map of that name; it has {', '.join(arrays) or 'nothing'}")
-    if first.ndim in (2, 3) and first.size > 2 * MOST_PIXELS:
-        raise CameraFileError(path, "map1", f"more than {MOST_PIXELS} pixels")
-    pair = second is not None and second.shape == first.shape[:2]
-    if first.size and first.dtype.kind == "f" and first.ndim == 2 and pair and second is not None:
+    names = next((names for names in _PAIRS if names[0] in arrays), None)
+    if names is None:
+        raise ValueError(f"no map of that name; it has {', '.join(arrays) or 'nothing'}")
+    first, second = arrays[names[0]], arrays.get(names[1])
+    if first.size > 2 * MOST_PIXELS:
+        raise ValueError(f"more than {MOST_PIXELS} pixels")
+    if second is not None and second.size and second.shape != first.shape[:2]:
+        raise ValueError(f"maps of shapes {first.shape} and {second.shape}")
+    second = second if second is not None and second.size else None
+    if first.size and first.dtype.kind == "f" and first.ndim == 2 and second is not None:
         return np.stack((first, second), -1).astype(np.float64), False
     if first.size and first.ndim == 3 and first.shape[2] == 2:
         if first.dtype.kind == "f":
             return first.astype(np.float64), False
-        if first.dtype == np.int16 and (second is None or second.size == 0):
+        if first.dtype == np.int16 and second is None:
             return first.astype(np.float64), True
-        if first.dtype == np.int16 and pair and second is not None and second.dtype in (np.uint16, np.int16):
+        if first.dtype == np.int16 and second is not None and second.dtype in (np.uint16, np.int16):
             rest = second.astype(np.int64)
-            fractions = np.stack((rest & (_PARTS - 1), rest // _PARTS & (_PARTS - 1)), -1)
-            return first + fractions / _PARTS, True
+            return first + np.stack((rest & (_PARTS - 1), rest // _PARTS & (_PARTS - 1)), -1) / _PARTS, True
     shapes = " and ".join(f"{a.dtype} {a.shape}" for a in (first, second) if a is not None)
-    raise CameraFileError(path, "map1", f"no maps of cv2.remap: {shapes}")
+    raise ValueError(f"no maps of cv2.remap: {shapes}")

@@ -47,18 +47,14 @@ class MapReport:
         """One line, as the command line prints it."""
         (rows, columns), (height, width) = self.source_size, self.target_size
         part = 100 * self.shown / (height * width)
-        facts = "".join(f"; {name.replace('_', ' ')} {_shown(value)}" for name, value in self.facts.items())
         stray = f"; {self.stray} pixels are drawn that the warp leaves empty" if self.stray else ""
+        # sizes are (height, width), and printed as everywhere
+        facts = {k: "x".join(map(str, v[::-1])) if isinstance(v, tuple) else v for k, v in self.facts.items()}
         return (
             f"{self.path}: {self.format}, {width}x{height} from {columns}x{rows}, off by at most "
             f"{self.max_error:.3g} px, rms {self.rms_error:.3g} px, over the {part:.4g} % that show the image{stray}"
-            f"{facts}"
+            + "".join(f"; {name.replace('_', ' ')} {value}" for name, value in facts.items())
         )
-
-
-def _shown(value: Any) -> str:
-    # sizes are (height, width), and printed as everywhere
-    return "x".join(map(str, reversed(value))) if isinstance(value, tuple) else str(value)
 
 
 def measure(path: str, read: LookupMap, exact: Exact, files: tuple[str, ...], facts: dict[str, Any]) -> MapReport:

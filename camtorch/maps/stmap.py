@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import tempfile
 from types import ModuleType
@@ -19,10 +20,9 @@ import numpy as np
 import torch
 
 from camtorch._arguments import shown
-from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.protocol import MOST_PIXELS, SIZES, Encoded, Given, Options, checked, suffix_of
+from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, Options, checked
 
 _WAYS = ("up", "down")
 _KEYS = ("v", *SIZES[:2])
@@ -32,18 +32,18 @@ _MOST_CHANNELS = 4  # of the largest map
 _EXR = b"\x76\x2f\x31\x01"
 
 
-class STMap:
+class STMap(MapFormat):
     """The format: see the module."""
 
     name = "stmap"
-    suffixes: tuple[str, ...] = (".exr", ".tif", ".tiff")
-    options: tuple[str, ...] = ("v",)
-    described = False
+    suffixes = (".exr", ".tif", ".tiff")
+    options = ("v",)
 
-    def encode(self, path: str, exact: Exact, options: Options) -> Encoded:
-        """Raises ValueError: a way that v does not run, or another suffix. ImportError: the extra is missing."""
-        suffix = suffix_of(path, self)
-        way = _way("up" if options.v is None else options.v)
+    def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
+        """See `MapFormat`."""
+        way = "up" if options.v is None else options.v
+        if way not in _WAYS:
+            raise ValueError(f"Warp.save: v must be 'up' (as Nuke has it) or 'down'; got {shown(way)}")
         height, width = exact.source_size
         parts = (exact.positions + 0.5) / (width, height)
         if way == "up":
@@ -51,33 +51,29 @@ class STMap:
         pixels = np.zeros((*exact.target_size, 3), np.float32)
         pixels[..., :2] = np.where(exact.mapped[..., None], parts, -1.0)
         facts = {"v": way, "source_height": height, "source_width": width}
-        return Encoded((_as_exr if suffix == ".exr" else _as_tiff)(pixels, facts), {"v": way})
+        return (_as_exr if path.lower().endswith(".exr") else _as_tiff)(pixels, facts), {"v": way}
 
     def matches(self, path: str, content: bytes) -> bool:
+        """See `MapFormat`."""
         return content.startswith((_EXR, *_TIFF))
 
-    def decode(self, path: str, content: bytes, given: Given) -> LookupMap:
-        """Raises CameraFileError: damaged, no float image, no size of the source. ImportError: the extra is missing."""
-        read = _from_exr if content.startswith(_EXR) else _from_tiff
-        pixels, stated = read(path, content)
+    def decode(self, content: bytes, given: Options) -> LookupMap:
+        """See `MapFormat`."""
+        pixels, stated = (_from_exr if content.startswith(_EXR) else _from_tiff)(content)
+        if any(plane.ndim != 2 or plane.dtype.kind != "f" or not plane.size for plane in pixels):
+            raise ValueError("red and green are not float")
         way = stated.get("v", given.v or "up")
         if way not in _WAYS or (given.v is not None and given.v != way):
-            raise CameraFileError(path, "v", f"runs {way!r}, and was said to run {given.v!r}")
+            raise ValueError(f"v runs {way!r}, and was said to run {given.v!r}")
         says = all(key in stated for key in _KEYS[1:])
-        size = checked(path, "source_size", [stated[key] for key in _KEYS[1:]] if says else given.source_size)
-        parts = pixels[..., :2].astype(np.float64)
+        size = checked("source_size", [stated[key] for key in _KEYS[1:]] if says else given.source_size)
+        parts = np.stack(pixels, -1).astype(np.float64)
         nowhere = (parts == -1).all(-1) | ~np.isfinite(parts).all(-1)
         if way == "up":
             parts[..., 1] = 1 - parts[..., 1]
         positions = parts * (size[1], size[0]) - 0.5
         positions[nowhere] = np.nan
         return LookupMap(torch.from_numpy(positions), size, self.name, {"v": way})
-
-
-def _way(v: str) -> str:
-    if not isinstance(v, str) or v not in _WAYS:
-        raise ValueError(f"Warp.save: v must be 'up' (as Nuke has it) or 'down'; got {shown(v)}")
-    return v
 
 
 def _needed(name: str, package: str) -> ModuleType:
@@ -99,30 +95,27 @@ def _as_exr(pixels: np.ndarray, facts: dict[str, Any]) -> bytes:
             return written.read()
 
 
-def _from_exr(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
+def _from_exr(content: bytes) -> tuple[list[np.ndarray], dict[str, Any]]:
     openexr = _needed("OpenEXR", "OpenEXR")
     with tempfile.TemporaryDirectory() as folder:
         file = os.path.join(folder, "map.exr")
         with open(file, "wb") as copy:
             copy.write(content)
-        try:
-            header = openexr.File(file, header_only=True).parts[0].header
-            (left, top), (right, bottom) = header["dataWindow"]
-            pixels = (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1)
-            if pixels * len(header["channels"]) > _MOST_CHANNELS * MOST_PIXELS:
-                raise ValueError(f"{len(header['channels'])} channels of {pixels} pixels")
-            with openexr.File(file, separate_channels=True) as image:
-                if not image.parts:
-                    raise ValueError("cut off, or its pixels are damaged")
-                channels = image.parts[0].channels
-                planes = [np.array(channels[name].pixels) for name in "RG"]
-            found = {key: header[_PREFIX + key] for key in _KEYS if _PREFIX + key in header}
-            stated = {key: value for key, value in found.items() if isinstance(value, (str, int))}
-        except Exception as error:  # whatever its C++ raises
-            raise CameraFileError(path, "content", f"no EXR with red and green: {error}") from None
-    if any(plane.ndim != 2 or plane.dtype.kind != "f" or plane.shape != planes[0].shape for plane in planes):
-        raise CameraFileError(path, "content", "red and green are not float, or not of one size")
-    return np.stack(planes, -1), stated
+        header = openexr.File(file, header_only=True).parts[0].header
+        (left, top), (right, bottom) = header["dataWindow"]
+        _check_size((int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) * len(header["channels"]))
+        with openexr.File(file, separate_channels=True) as image:
+            if not image.parts:
+                raise ValueError("cut off, or its pixels are damaged")
+            channels = image.parts[0].channels
+            planes = [np.array(channels[name].pixels) for name in "RG"]
+    found = {key: header[_PREFIX + key] for key in _KEYS if _PREFIX + key in header}
+    return planes, {key: value for key, value in found.items() if isinstance(value, (str, int))}
+
+
+def _check_size(count: int) -> None:
+    if count > _MOST_CHANNELS * MOST_PIXELS:
+        raise ValueError(f"{count} numbers")
 
 
 def _as_tiff(pixels: np.ndarray, facts: dict[str, Any]) -> bytes:
@@ -132,22 +125,15 @@ def _as_tiff(pixels: np.ndarray, facts: dict[str, Any]) -> bytes:
     return file.getvalue()
 
 
-def _from_tiff(path: str, content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
+def _from_tiff(content: bytes) -> tuple[list[np.ndarray], dict[str, Any]]:
     tifffile = _needed("tifffile", "tifffile")
-    try:
-        with tifffile.TiffFile(io.BytesIO(content)) as file:
-            page = file.pages[0]
-            if len(page.shape) != 3 or np.prod(page.shape, dtype=object) > _MOST_CHANNELS * MOST_PIXELS:
-                raise ValueError(f"{page.dtype} of shape {page.shape}")
-            pixels, text = page.asarray(), page.description
-            if page.axes.startswith("S"):  # planes one after the other
-                pixels = np.moveaxis(pixels, 0, -1)
-            if pixels.ndim != 3 or pixels.shape[2] < 2 or not pixels.size or pixels.dtype.kind != "f":
-                raise ValueError(f"{pixels.dtype} of shape {pixels.shape}")
-    except Exception as error:  # whatever a damaged file makes of its tags
-        raise CameraFileError(path, "content", f"no TIFF of float with red and green: {error}") from None
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        page = file.pages[0]
+        _check_size(math.prod(page.shape))
+        pixels, text = page.asarray(), page.description
+        pixels = pixels if page.axes.startswith("S") else np.moveaxis(pixels, -1, 0)  # planes one after the other
     try:
         stated = json.loads(text)
     except (ValueError, RecursionError):
         stated = None
-    return pixels, stated if isinstance(stated, dict) else {}
+    return [pixels[0], pixels[1]], stated if isinstance(stated, dict) else {}

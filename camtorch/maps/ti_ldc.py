@@ -14,7 +14,6 @@ Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +22,7 @@ import numpy as np
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.mesh import Mesh, held, rounded
-from camtorch.maps.protocol import Given, Options
+from camtorch.maps.protocol import Options
 from camtorch.maps.tables import Table, table
 
 _PARTS = 8
@@ -40,9 +39,9 @@ class TILDC(Table):
     """The format: see the module."""
 
     name = "ti_ldc"
-    options: tuple[str, ...] = ("step", "block", "clip")
-    step: int = 8
-    steps: Sequence[int] = tuple(1 << m for m in range(8))
+    options = ("step", "block", "clip")
+    step = 8
+    steps = tuple(1 << m for m in range(8))
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
         """Raises CameraFileError: sizes, offsets or padding that the LDC does not take. ValueError: a bad block."""
@@ -66,10 +65,9 @@ class TILDC(Table):
         facts = {"line_offset": pitch, "block_size": size, "pixel_padding": padding, "source_block": largest}
         return lines.tobytes(), facts
 
-    def unpack(
-        self, path: str, content: bytes, columns: Floats, rows: Floats, given: Given
-    ) -> tuple[Floats, dict[str, Any]]:
-        lines = table(path, content, "<i2", (len(rows), _pitch(len(columns)) // 2))
+    def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
+        """See `Table`."""
+        lines = table(content, "<i2", (len(rows), _pitch(len(columns)) // 2))
         offsets = lines[:, : 2 * len(columns)].reshape(len(rows), len(columns), 2) / _PARTS
         return np.stack(np.meshgrid(columns, rows), -1) + offsets, {}
 

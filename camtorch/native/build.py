@@ -77,8 +77,8 @@ def build(
         directory: where the library goes; by default where camtorch looks for it.
         sources: the folder of `kernel.c` and `dispatch.c`; by default this file's.
         extra: more words for the compiler, which compiles and links with them.
-        compiler: its command; by default the environment's CC, else the first of cc, gcc and clang that is there
-            (on Windows, where nobody has tried it yet: of gcc, clang and cl).
+        compiler: its command, of what takes GCC's options; by default the environment's CC, else the first of cc, gcc
+            and clang that is there.
         variants: for which CPUs, of `VARIANTS`; less those that the compiler does not know.
 
     Returns:
@@ -89,26 +89,59 @@ def build(
         OSError: `directory` cannot be written; on Windows also while a process has the library loaded.
     """
     command = _compiler(compiler)
-    toolchain = _Msvc if Path(command[0]).stem.lower() in ("cl", "clang-cl") else _Gcc
     here = _HERE if sources is None else Path(sources).absolute()
     target = (_HERE if directory is None else Path(directory).absolute()) / LIBRARY
     # beside the target: a file is renamed in one step on one file system only
     with tempfile.TemporaryDirectory(prefix="_building", dir=target.parent) as folder:
-        tools = toolchain(command, Path(folder), tuple(extra))
-        known = {name: flags for name, flags in VARIANTS.items() if name in variants and tools.accepts(flags)}
+
+        def compiled(source: Path, name: str, flags: Sequence[str], defined: Sequence[str] = ()) -> str:
+            words = [*_FLAGS, *flags, *(f"-D{word}" for word in defined), *extra, "-c", str(source), "-o", f"{name}.o"]
+            _run([*command, *words], folder)
+            return f"{name}.o"
+
+        def accepts(flags: tuple[str, ...]) -> bool:
+            # a compiler may be older, or for another machine
+            probe = Path(folder, "probe.c")
+            probe.write_text("int probe(int x) { return x + 1; }\n")
+            try:
+                compiled(probe, "probe", flags)
+            except BuildError:
+                return not flags  # without any: the true reason comes with the sources
+            return True
+
+        known = {name: flags for name, flags in VARIANTS.items() if name in variants and accepts(flags)}
         has = [f"HAS_{name.upper()}" for name in known if name != "baseline"]
         has.append(f"SOURCES={checksum(here)}u")
-        units: list[tuple[str, str, tuple[str, ...], list[str]]] = [("dispatch.c", "dispatch", (), has)]
-        kernels = [name for name in _KERNELS if (here / name).exists()]
+        units: list[tuple[Path, str, tuple[str, ...], list[str]]] = [(here / "dispatch.c", "dispatch", (), has)]
+        kernels = [here / name for name in _KERNELS if (here / name).exists()]
         units += [
-            (kernel, f"{Path(kernel).stem}_{name}", flags, [f"VARIANT={name}"])
+            (kernel, f"{kernel.stem}_{name}", flags, [f"VARIANT={name}"])
             for kernel in kernels
             for name, flags in known.items()
         ]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            objects = list(pool.map(lambda unit: tools.compile(here / unit[0], *unit[1:]), units))
-        os.replace(tools.link(objects), target)
+            objects = list(pool.map(lambda unit: compiled(*unit), units))
+        libraries = [] if sys.platform == "win32" else ["-lm"]
+        _run([*command, "-shared", *extra, "-o", LIBRARY, *objects, *libraries], folder)
+        os.replace(Path(folder, LIBRARY), target)
     return target
+
+
+def _run(command: list[str], folder: str) -> None:
+    try:
+        done = subprocess.run(
+            command,
+            cwd=folder,
+            env=_ENVIRONMENT | os.environ | {"LC_ALL": "C"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+        )
+    except OSError as error:
+        raise BuildError(f"{error}\n(of {shlex.join(command)})") from error
+    if done.returncode:
+        raise BuildError(f"{(done.stderr + done.stdout).strip()}\n(of {shlex.join(command)})")
 
 
 def _compiler(named: str | None) -> list[str]:
@@ -119,78 +152,11 @@ def _compiler(named: str | None) -> list[str]:
         if shutil.which(words[0]) is None:
             raise BuildError(f"the C compiler {words[0]!r}, which CC or the caller names, is not there")
         return words
-    # Visual Studio's compiler is found in its own command prompt, where it is on the PATH; its registry is not searched
-    names = ("gcc", "clang", "cl") if sys.platform == "win32" else ("cc", "gcc", "clang")
+    names = ("gcc", "clang") if sys.platform == "win32" else ("cc", "gcc", "clang")
     for name in names:
         if shutil.which(name):
             return [name]
     raise BuildError(f"no C compiler: none of {', '.join(names)} is on the PATH, and CC names none")
-
-
-class _Gcc:
-    """GCC, clang, and what takes their options."""
-
-    def __init__(self, command: list[str], folder: Path, extra: tuple[str, ...]):
-        self.command, self.folder, self.extra = command, folder, extra
-
-    def accepts(self, flags: tuple[str, ...]) -> bool:
-        """Whether there is a variant by `flags`: a compiler may be older, or for another machine."""
-        probe = self.folder / "probe.c"
-        probe.write_text("int probe(int x) { return x + 1; }\n")
-        try:
-            self.compile(probe, "probe", flags, [])
-        except BuildError:
-            return not flags  # without any: the true reason comes with the sources
-        return True
-
-    def compile(self, source: Path, name: str, flags: Sequence[str], defined: Sequence[str]) -> Path:
-        """The path of the object `name` of `source`."""
-        target = self.folder / f"{name}.o"
-        options = [*_FLAGS, *flags, *(f"-D{word}" for word in defined), *self.extra]
-        self._run([*options, "-c", str(source), "-o", str(target)])
-        return target
-
-    def link(self, objects: Sequence[Path]) -> Path:
-        """The path of the library of `objects`."""
-        target = self.folder / LIBRARY
-        libraries = [] if sys.platform == "win32" else ["-lm"]
-        self._run(["-shared", *self.extra, "-o", str(target), *map(str, objects), *libraries])
-        return target
-
-    def _run(self, words: Sequence[str]) -> None:
-        command = [*self.command, *words]
-        try:
-            done = subprocess.run(
-                command,
-                cwd=self.folder,
-                env=_ENVIRONMENT | os.environ | {"LC_ALL": "C"},
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                errors="replace",
-            )
-        except OSError as error:
-            raise BuildError(f"{error}\n(of {shlex.join(command)})") from error
-        if done.returncode:
-            raise BuildError(f"{(done.stderr + done.stdout).strip()}\n(of {shlex.join(command)})")
-
-
-class _Msvc(_Gcc):
-    """Visual Studio's, which nobody has tried yet: it has no vectors of GCC's kind, and compiles plain loops."""
-
-    def accepts(self, flags: tuple[str, ...]) -> bool:
-        return not flags
-
-    def compile(self, source: Path, name: str, flags: Sequence[str], defined: Sequence[str]) -> Path:
-        target = self.folder / f"{name}.obj"
-        options = ["/nologo", "/O2", "/MD", "/std:c11", "/experimental:c11atomics", *(f"/D{word}" for word in defined)]
-        self._run([*options, *self.extra, "/c", str(source), f"/Fo{target}"])
-        return target
-
-    def link(self, objects: Sequence[Path]) -> Path:
-        target = self.folder / LIBRARY
-        self._run(["/nologo", "/LD", *self.extra, *map(str, objects), f"/Fe{target}"])
-        return target
 
 
 def _main() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Sequence
-from ctypes import byref, c_double, c_int32, c_int64, c_void_p
+from ctypes import addressof, byref, c_double, c_float, c_int32, c_int64, c_void_p
 from typing import NamedTuple
 
 import torch
@@ -123,28 +123,32 @@ def sample(
         exact: (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
     """
     native = library()
-    if native is None or not result.numel():
+    if native is None or 0 in result.shape:
         return
-    if _is_slow(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
+    steps, made_steps = images.stride(), result.stride()
+    count, channels, height, width = result.shape
+    together = mode == "bilinear" and channels in (3, 4) and made_steps[1::2] == (1, channels)
+    # pixels that lie neither in planes nor side by side would be interpolated one by one
+    quick = mode == "nearest" or steps[3] == made_steps[3] == 1 or (together and steps[1::2] == (1, channels))
+    if not quick and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
         where = {"grid": grid, "mapped": mapped, "nodes": nodes, "cells": cells, "exact": exact}
-        together = _is_together(result, mode)
-        fits = together or result.stride(3) == 1
+        fits = together or made_steps[3] == 1
         made = result if fits else torch.empty(result.shape, dtype=result.dtype, device="cpu")
-        source = images if images.stride(0) else images[:1]  # which all results show
+        source = images if steps[0] else images[:1]  # which all results show
         source = source.clone(memory_format=torch.channels_last if together else torch.contiguous_format)
         sample(source.expand(images.shape), made, mode, padding, fill, **where)
         if not fits:
             result.copy_(made)
         return
     job = _Job()
-    count, channels, height, width = result.shape
-    job.source, job.source_strides = images.data_ptr(), images.stride()
-    job.result, job.result_strides = result.data_ptr(), result.stride()
+    job.source, job.source_strides = images.data_ptr(), steps
+    job.result, job.result_strides = result.data_ptr(), made_steps
     job.count, job.channels, job.height, job.width = count, channels, height, width
     job.source_height, job.source_width = images.shape[-2:]
-    elements = _elements(fill, images.dtype)
-    values = torch.tensor(fill, dtype=torch.float32, device="cpu")
-    job.fill, job.fill_elements = values.data_ptr(), elements.data_ptr()
+    values = (c_float * channels)(*fill)
+    elements = None if images.dtype == torch.float32 else _elements(fill, images.dtype)
+    job.fill = addressof(values)
+    job.fill_elements = job.fill if elements is None else elements.data_ptr()
     if grid is not None:
         job.grid, job.grid_is_double = grid.data_ptr(), grid.dtype == torch.float64
         job.grid_strides = _shared(grid), *grid.stride()[1:]
@@ -155,26 +159,14 @@ def sample(
         job.nodes, job.node_strides = nodes.data_ptr(), (_shared(nodes), nodes.stride(1))
         job.cells, job.cell_stride = cells.data_ptr(), _shared(cells)
         job.rows, job.columns = cells.shape[1:]
-        job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
+        if exact.shape[1]:
+            job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
     job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
     job.mode, job.padding = _MODES[mode], _PADDINGS[padding]
     job.tile_rows = max(_TILE // width // 8, 1) * 8
     tiles = -(-height // job.tile_rows) * count
     pointer = byref(job)
     spread(lambda: native.camtorch_sample(pointer), min(thread_count(), tiles))
-
-
-def _is_slow(images: Tensor, result: Tensor, mode: str) -> bool:
-    """Whether pixels lie so that they are interpolated one by one: neither in planes nor together."""
-    if mode == "nearest" or images.stride(3) == result.stride(3) == 1:
-        return False
-    return not (_is_together(images, mode) and _is_together(result, mode))
-
-
-def _is_together(images: Tensor, mode: str) -> bool:
-    """Whether the channels of a pixel lie side by side and are interpolated together, three or four."""
-    channels = images.shape[1]
-    return mode == "bilinear" and channels in (3, 4) and images.stride()[1::2] == (1, channels)
 
 
 def _shared(tensor: Tensor) -> int:
@@ -194,7 +186,8 @@ def _elements(fill: Sequence[float], dtype: torch.dtype) -> Tensor:
 
 def layout(images: Tensor) -> torch.memory_format:
     """How images (B, C, H, W) lie in memory: their channels last, or plane by plane."""
-    last = images.shape[1] > 1 and 0 < images.stride(1) < images.stride(3)
+    strides = images.stride()
+    last = images.shape[1] > 1 and 0 < strides[1] < strides[3]
     return torch.channels_last if last else torch.contiguous_format
 
 
@@ -240,7 +233,7 @@ def classify(probed: Probed) -> tuple[Tensor, int] | None:
     if native is None:
         return None
     rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
-    cells = torch.empty(len(nodes), rows, columns, dtype=torch.int32, device="cpu")
+    cells = torch.empty(nodes.shape[0], rows, columns, dtype=torch.int32, device="cpu")
     scratch = torch.empty(25 * (columns + 8), dtype=torch.float32, device="cpu")
     given = _Classification(
         nodes.data_ptr(),
@@ -249,7 +242,7 @@ def classify(probed: Probed) -> tuple[Tensor, int] | None:
         mapped.stride(0),
         rim.data_ptr(),
         rim.stride(0),
-        len(nodes),
+        nodes.shape[0],
         rows,
         columns,
         *probed.size,

@@ -12,14 +12,12 @@ from torch import Tensor
 from camtorch._arguments import as_image_size, as_number, no_camera, shown
 from camtorch._editing import edited
 from camtorch._module import typed_as
-from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
-from camtorch.augment.sample import Named, Sample, SampleTransform, without_graph_in_workers
+from camtorch.augment.sample import Named, Sample, SampleTransform, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Listed, Mixed
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.warp.affine import AffineWarp
-from camtorch.warp.sampling import Options, as_options
 
 _LENGTHS = ("depth", "distance", "points", "tvec")
 
@@ -63,7 +61,6 @@ class CanonicalCamera(SampleTransform):
 
     focal: float
     image_size: tuple[int, int] | None
-    options: Options
 
     def __init__(
         self,
@@ -71,17 +68,10 @@ class CanonicalCamera(SampleTransform):
         *,
         scales: Literal["depth", "image"] = "depth",
         image_size: Sequence[int] | None = None,
-        camera: Camera | None = None,
-        mode: str = "bilinear",
-        padding_mode: str = "zeros",
-        fill: float | Sequence[float] = 0.0,
         antialias: bool | None = None,
-        tolerance: float = 0.001,
-        fields: Mapping[str, str] | None = None,
-        mask_fill: float = 0.0,
-        valid_mask: bool = False,
+        **options: Any,
     ):
-        super().__init__(camera, fields, mask_fill, valid_mask)
+        super().__init__(antialias=antialias, **options)
         focal = as_number(focal, "focal", self._name)
         if not 0 < focal < math.inf:
             raise ValueError(f"{self._name}: focal must be positive pixels; got {focal!r}")
@@ -91,8 +81,6 @@ class CanonicalCamera(SampleTransform):
             raise ValueError(f"{self._name}: images keep their size where depth is scaled; got image_size={image_size}")
         self.focal, self.scales = focal, scales
         self.image_size = as_image_size(image_size, self._name)
-        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
-        self.antialias = antialias
 
     def scale(self, camera: Camera) -> Tensor:
         """(*B,): s of cameras (*B), `focal` by their focal length. Its gradients go to fx and fy."""
@@ -105,8 +93,7 @@ class CanonicalCamera(SampleTransform):
         slopes = slopes_at_axis(camera.optics, k.reshape(batch.numel(), count)).view(*batch, 2)
         return self.focal / ((camera.fx * camera.fy).sqrt() * slopes.prod(-1).sqrt())
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Make a sample canonical, a dict or keyword arguments, single or a batch.
 
@@ -116,7 +103,7 @@ class CanonicalCamera(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
-        scale = self._scale_of_each(camera, count)
+        scale = self.scale(camera).expand(count)
         if self.scales == "depth":
             moved = self._scaled(sample, named, batched, scale)
         else:
@@ -126,8 +113,7 @@ class CanonicalCamera(SampleTransform):
         moved["scale"] = scale if batched else scale.squeeze(0)
         return moved
 
-    @on_one_thread
-    @without_graph_in_workers
+    @on_samples
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Undo it, of a sample as it came out, or of what was predicted of one.
 
@@ -140,7 +126,7 @@ class CanonicalCamera(SampleTransform):
         sample.pop("scale", None)
         if self.scales == "depth":
             named, batched, count, camera = self._batch(sample, predicted=True)
-            return self._scaled(sample, named, batched, 1 / self._scale_of_each(camera, count))
+            return self._scaled(sample, named, batched, 1 / self.scale(camera).expand(count))
         source = sample.pop("source_camera", None)
         if source is None:
             raise ValueError(f"{self._name}: to go back, the sample needs source_camera as it came out")
@@ -155,10 +141,6 @@ class CanonicalCamera(SampleTransform):
 
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
-
-    def _scale_of_each(self, camera: Camera, count: int) -> Tensor:
-        """(count,)."""
-        return self.scale(camera).expand(count)
 
     def _scaled(self, sample: Sample, named: Named, batched: bool, scale: Tensor) -> Sample:
         """The sample with every length of the camera's frame times a factor (B,)."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -29,19 +30,17 @@ _ROUNDS, _PARTS = 5, 8
 _STEP = 1e-6
 
 
-class Profile(NamedTuple):
-    """A lens from the axis outwards, at the nodes of a disc, (*C, nodes) each; what a model does not have is None."""
+Profile = dict[str, Tensor]
+"""A lens from the axis outwards, (*C, nodes) each at the nodes of a disc, of the names in `_MARGINS` that it has."""
 
-    turns: Tensor
-    """The angles from node to node."""
-    room: Tensor
-    """Positive where the chart has rays."""
-    slope: Tensor | None
-    """A lower bound of the slope of the lens in all directions."""
-    reach: Tensor | None
-    """An upper bound of how many times further out points come to lie."""
-    defined: Tensor | None
-    """Positive where the formula exists."""
+_MARGINS: dict[str, Callable[[Tensor], Tensor]] = {
+    "room": lambda ratio: ratio - _KEPT,  # positive where the chart has rays
+    "turns": lambda ratio: torch.minimum(ratio / _FLATTEST - 1, 1 - ratio / _STEEPEST),  # angles from node to node
+    "slope": lambda ratio: ratio - _LEAST,  # a lower bound in all directions
+    "reach": lambda ratio: 1 - ratio / _MOST,  # an upper bound of how many times further out points come to lie
+    "defined": lambda ratio: ratio - _KEPT,  # positive where the formula exists
+}
+"""Positive for a lens in the set, by the ratio of its profile to that of the lens given."""
 
 
 class Limits:
@@ -96,29 +95,19 @@ class Limits:
         angles = _angles(chart, radii)
         # what turns back needs no table to tell
         room = FURTHEST - radii if isinstance(chart, Inverted) else chart.on_plane(radii, torch.zeros_like(radii))
-        room = torch.minimum(room, math.pi - angles)
-        slope = reach = None
+        profile = {"room": torch.minimum(room, math.pi - angles)}
+        if self.bends:
+            profile["turns"] = angles.diff(dim=-1, prepend=torch.zeros_like(angles[..., :1]))
         if lens.stages:
-            slope, furthest = lens.lower_bound(radii)
-            reach = furthest / radii
+            profile["slope"], furthest = lens.lower_bound(radii)
+            profile["reach"] = furthest / radii
         defined = self.model.defined(k.unbind(-1))
-        turns = angles.diff(dim=-1, prepend=torch.zeros_like(angles[..., :1]))
-        return Profile(turns, room, slope, reach, None if defined is None else defined.unsqueeze(-1))
+        return profile if defined is None else {**profile, "defined": defined.unsqueeze(-1)}
 
     def _margin(self, k: Tensor, radius: Tensor, given: Profile) -> Tensor:
         """(*C): positive for coefficients in the set; given: the profile of the lens given."""
-        here = self._profile(k, radius)
-        ratios = [here.room / given.room - _KEPT]
-        if self.bends:
-            turns = here.turns / given.turns
-            ratios += [turns / _FLATTEST - 1, 1 - turns / _STEEPEST]
-        if here.slope is not None and given.slope is not None:
-            ratios.append(here.slope / given.slope - _LEAST)
-        if here.reach is not None and given.reach is not None:
-            ratios.append(1 - here.reach / given.reach / _MOST)
-        if here.defined is not None and given.defined is not None:
-            ratios.append(here.defined / given.defined - _KEPT)
-        least = [r.nan_to_num(nan=-1.0).amin(-1) for r in ratios]
+        here = self._profile(k, radius).items()
+        least = [_MARGINS[name](value / given[name]).nan_to_num(nan=-1.0).amin(-1) for name, value in here]
         return torch.stack(torch.broadcast_tensors(*least)).amin(0)
 
     def along(self, direction: Tensor, radius: Tensor) -> Tensor:

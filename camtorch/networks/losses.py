@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, overload
+from typing import TYPE_CHECKING, Literal, TypedDict, overload
 
 import torch
 from torch import Tensor
@@ -19,6 +19,9 @@ from camtorch._arguments import (
     shown,
 )
 from camtorch.camera import Camera
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 __all__ = ["angles", "rays", "reprojection"]
 
@@ -41,27 +44,24 @@ def angles(first: Tensor, second: Tensor) -> Tensor:
     return 2 * torch.atan2(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
 
 
+class _Points(TypedDict, total=False):
+    samples: int | tuple[int, int]
+    weights: Numbers | None
+
+
+class _Pixels(_Points, total=False):
+    pixels: Numbers | None
+
+
 @overload
 def rays(
-    predicted: Camera,
-    target: Camera,
-    *,
-    samples: int | tuple[int, int] = 16,
-    pixels: Numbers | None = None,
-    weights: Numbers | None = None,
-    reduction: Literal["mean"] = "mean",
+    predicted: Camera, target: Camera, *, reduction: Literal["mean"] = "mean", **options: Unpack[_Pixels]
 ) -> Tensor: ...
 
 
 @overload
 def rays(
-    predicted: Camera,
-    target: Camera,
-    *,
-    samples: int | tuple[int, int] = 16,
-    pixels: Numbers | None = None,
-    weights: Numbers | None = None,
-    reduction: Literal["none"],
+    predicted: Camera, target: Camera, *, reduction: Literal["none"], **options: Unpack[_Pixels]
 ) -> tuple[Tensor, Tensor]: ...
 
 
@@ -112,9 +112,8 @@ def reprojection(
     target: Camera | Tensor,
     points: Tensor | None = None,
     *,
-    samples: int | tuple[int, int] = 16,
-    weights: Numbers | None = None,
     reduction: Literal["mean"] = "mean",
+    **options: Unpack[_Points],
 ) -> Tensor: ...
 
 
@@ -124,9 +123,8 @@ def reprojection(
     target: Camera | Tensor,
     points: Tensor | None = None,
     *,
-    samples: int | tuple[int, int] = 16,
-    weights: Numbers | None = None,
     reduction: Literal["none"],
+    **options: Unpack[_Points],
 ) -> tuple[Tensor, Tensor]: ...
 
 

@@ -1,5 +1,5 @@
-"""Plots of cameras and calibrations, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes and
-returns them.
+"""Plots of cameras and calibrations, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes, `ax`,
+by default new ones, and returns them. Without matplotlib an ImportError says how to install it.
 """
 
 from camtorch.plot.calibrations import (

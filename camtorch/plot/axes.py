@@ -9,7 +9,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap, ListedColormap
+    from matplotlib.colors import ListedColormap
 
     from camtorch.camera import Camera
 
@@ -19,6 +19,7 @@ COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
 NO_RAYS = "#d9d4ca"
 """Of pixels without a value."""
 _LEVELS = {"counts": ("Blues", 0.2, 0.75), "residuals": ("viridis", 0.85, 0.05), "uncertainty": ("magma", 0.95, 0.2)}
+_LEVELS |= {"distortion": ("viridis_r", 0.15, 1)}
 """matplotlib's maps, and the part of each from the palest colour to the darkest."""
 
 
@@ -78,28 +79,15 @@ def magnification(most: float) -> int:
     return power * max(n for n in (1, 2, 5) if n * power <= most)
 
 
-def without_palest(name: str) -> Colormap:
-    """A colour map of matplotlib, but for what is hard to see on white."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
-
-    return ListedColormap(colormaps[name](np.linspace(0.15, 1, 256)))
-
-
 def printable(name: str) -> str:
     """A name without what fonts cannot draw: control characters, halves of characters in names of files."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
 
 
 def levels(name: str, count: int = 256) -> ListedColormap:
-    """Colours in order, from what is little to what is much, of "counts", "residuals" or "uncertainty"."""
+    """Colours in order, from what is little to what is much, of what `_LEVELS` names."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
     source, start, end = _LEVELS[name]
     return ListedColormap(colormaps[source](np.linspace(start, end, count)))
-
-
-def cycle(count: int) -> list[str]:
-    """As many colours."""
-    return [COLOURS[i % len(COLOURS)] for i in range(count)]

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from numpy.typing import ArrayLike
-    from torch import Tensor
 
     from camtorch.calibration.calibrate import Calibration
 
@@ -59,35 +58,35 @@ class Sightings(NamedTuple):
     @property
     def seen(self) -> np.ndarray:
         """(V, N) corners that have a residual."""
-        found: np.ndarray = np.isfinite(self.errors).all(-1)
-        return found
+        return np.asarray(np.isfinite(self.errors).all(-1))
+
+    @property
+    def used(self) -> np.ndarray:
+        """(V, N) those that are no outliers."""
+        return np.asarray(self.seen & self.inliers)
 
     @property
     def lengths(self) -> np.ndarray:
         """(V, N) px, of the residuals."""
-        found: np.ndarray = np.hypot(self.errors[..., 0], self.errors[..., 1])
-        return found
+        return np.asarray(np.hypot(self.errors[..., 0], self.errors[..., 1]))
 
     @property
     def angles(self) -> np.ndarray:
-        """(V, N) radians from the optical axis."""
-        x, y, z = np.moveaxis(self.points, -1, 0)
-        found: np.ndarray = np.where(self.seen, np.arctan2(np.hypot(x, y), z), np.nan)
-        return found
+        """(K,) radians from the optical axis, of the corners that are no outliers."""
+        x, y, z = self.points[self.used].T
+        return np.asarray(np.arctan2(np.hypot(x, y), z))
 
     @property
     def reach(self) -> float:
         """Radians from the axis of the furthest inlier, but for one in 200, which may be wrong; 0 without any."""
-        angles = np.sort(self.angles[self.seen & self.inliers])
+        angles = np.sort(self.angles)
         return float(angles[math.ceil(0.995 * len(angles)) - 1]) if len(angles) else 0.0
 
     @property
     def rms(self) -> np.ndarray:
         """(V,) px per point of the inliers of each view, NaN for a view without any."""
-        squares = np.where(self.inliers & self.seen, self.lengths**2, 0).sum(-1)
-        counts = (self.inliers & self.seen).sum(-1)
-        found: np.ndarray = np.sqrt(np.where(counts > 0, squares, np.nan) / np.maximum(counts, 1))
-        return found
+        squares, counts = np.where(self.used, self.lengths**2, 0).sum(-1), self.used.sum(-1)
+        return np.asarray(np.sqrt(np.where(counts > 0, squares, np.nan) / np.maximum(counts, 1)))
 
 
 @torch.no_grad()
@@ -113,27 +112,23 @@ def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """Where the image has corners: dots, on cells that are the darker the more corners they have; crosses are outliers.
 
     The title says in how many of the cells that have rays a corner was seen.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
-
-    Raises:
-        ImportError: no matplotlib.
     """
     from matplotlib.colors import PowerNorm
 
     ax, shots, (height, width) = _on_image(calibration, ax)
-    rows, columns = _cells(height, width)
-    pixels = shots.pixels[shots.seen & shots.inliers]
+    rows, columns = (max(3, round(_CELLS * side / max(height, width))) for side in (height, width))
+    pixels = shots.pixels[shots.used]
     edges = [np.linspace(-0.5, length - 0.5, count + 1) for length, count in ((height, rows), (width, columns))]
     counts = np.histogram2d(pixels[:, 1], pixels[:, 0], edges)[0]
     cells = np.ma.masked_equal(counts, 0)
     cmap, norm = levels("counts").with_extremes(bad=PALE), PowerNorm(0.5, 0, max(counts.max(), 1))
     ax.pcolormesh(edges[1], edges[0], cells, cmap=cmap, norm=norm, zorder=0.5, edgecolors="#ffffff", linewidth=0.6)
-    _dots(ax, pixels[_thinned(len(pixels))], INK, 0.9 if len(pixels) > _DENSE else 1.6)
+    _dots(ax, pixels[_evenly(len(pixels), _ARROWS)], INK, 0.9 if len(pixels) > _DENSE else 1.6)
     _crosses(ax, shots)
-    share = _covered(calibration, counts)
+    lattice = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
+    with torch.no_grad():
+        rays = calibration.camera.unproject(lattice)[1].numpy(force=True) | (counts > 0)
+    share = (counts > 0).sum() / max(rays.sum(), 1)
     ax.set_title(f"{len(pixels):,} corners in {100 * share:.0f} % of the image")
     return ax
 
@@ -141,24 +136,17 @@ def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
 def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """The residuals of all corners over the image, from where a corner was seen to where the model shows it.
 
-    They are drawn longer, by a factor that the title says. Crosses are outliers. Of more than 15,000 the longest and
-    an even choice of the others are drawn.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
-
-    Raises:
-        ImportError: no matplotlib.
+    They are drawn longer, by a factor that the title says. Crosses are outliers. Of more than 15,000 an even choice of
+    all lengths is drawn, with the longest.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm
     from matplotlib.ticker import MaxNLocator
 
     ax, shots, (height, width) = _on_image(calibration, ax)
-    use = shots.seen & shots.inliers
+    use = shots.used
     pixels, errors, lengths = shots.pixels[use], shots.errors[use], shots.lengths[use]
-    few = _thinned(len(lengths), lengths)
+    few = np.argsort(-lengths, kind="stable")[_evenly(len(lengths), _ARROWS)]
     pixels, errors, lengths = pixels[few], errors[few], lengths[few]
     usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 0.0
     bounds = MaxNLocator(5).tick_values(0, usual or 1.0)
@@ -181,17 +169,9 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
 
 
 def residual_histogram(calibration: Calibration, ax: Axes | None = None) -> Axes:
-    """How often residuals have a size, across (u) and down (v), beside the normal distribution of sigma.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
-
-    Raises:
-        ImportError: no matplotlib.
-    """
+    """How often residuals have a size, across (u) and down (v), beside the normal distribution of sigma."""
     ax, shots = axes_or_new(ax), sightings(calibration)
-    errors = shots.errors[shots.seen & shots.inliers]
+    errors = shots.errors[shots.used]
     sigma = float(calibration.sigma)
     reach = 4.5 * sigma if sigma > 0 else 1.0
     bins = np.linspace(-reach, reach, 46).tolist()
@@ -203,10 +183,8 @@ def residual_histogram(calibration: Calibration, ax: Axes | None = None) -> Axes
         normal = np.exp(-((x / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
         label = f"normal, {sigma:.3g} px"
         ax.plot(x, normal * len(errors) * (bins[1] - bins[0]), color=INK, linestyle="--", linewidth=1, label=label)
-    ax.set_xlim(-reach, reach)
-    ax.set_xlabel("residual, px")
-    ax.set_ylabel("corners")
-    ax.set_title("residuals across (u) and down (v)")
+    title = "residuals across (u) and down (v)"
+    ax.set(xlim=(-reach, reach), xlabel="residual, px", ylabel="corners", title=title)
     ax.legend(frameon=False, loc="upper right", handlelength=1.4)
     return ax
 
@@ -220,7 +198,7 @@ def views(calibration: Calibration, ax: Axes | None = None, *, names: Sequence[s
         names: of all views that were passed; by default their numbers from 0.
 
     Raises:
-        ValueError: not as many names as views. ImportError: no matplotlib.
+        ValueError: not as many names as views.
     """
     ax, shots = axes_or_new(ax), sightings(calibration)
     rms = shots.rms
@@ -234,10 +212,8 @@ def views(calibration: Calibration, ax: Axes | None = None, *, names: Sequence[s
     shown = np.arange(0, len(rms), step)
     turned = 0 if names is None else 90
     ax.set_xticks(shown, [labels[i] for i in shown], parse_math=False, rotation=turned)
-    ax.set_xlim(-0.6, len(rms) - 0.4)
-    ax.set_xlabel("view")
-    ax.set_ylabel("rms, px")
-    ax.set_title("rms of each view; dashed: of all")
+    title = "rms of each view; dashed: of all"
+    ax.set(xlim=(-0.6, len(rms) - 0.4), xlabel="view", ylabel="rms, px", title=title)
     return ax
 
 
@@ -251,7 +227,7 @@ def view(calibration: Calibration, number: int, ax: Axes | None = None, *, image
         image: (H, W) or (H, W, C), of the size of the camera's image.
 
     Raises:
-        ValueError: no such view, or one without corners; an image of another size. ImportError: no matplotlib.
+        ValueError: no such view, or one without corners; an image of another size.
     """
     ax, shots = axes_or_new(ax), sightings(calibration)
     height, width = size_of(calibration.camera)
@@ -269,7 +245,7 @@ def view(calibration: Calibration, number: int, ax: Axes | None = None, *, image
                 f"plot: image is {image.shape[:2]} (height, width), and the camera's image_size {(height, width)}"
             )
         ax.imshow(image, extent=edges, cmap="gray", zorder=0)
-    use = shots.seen[index] & shots.inliers[index]
+    use = shots.used[index]
     pixels, errors = shots.pixels[index][use], shots.errors[index][use]
     usual = float(np.quantile(shots.lengths[index][use], 0.9)) if use.any() else 1.0
     longer = magnification(0.03 * max(height, width) / max(usual, 1e-9))
@@ -289,9 +265,6 @@ def uncertainty(calibration: Calibration, ax: Axes | None = None, *, distance: f
         calibration: of a camera.
         ax: by default new ones.
         distance: of what is seen, in the unit of the boards.
-
-    Raises:
-        ImportError: no matplotlib.
     """
     ax, shots, (height, width) = _on_image(calibration, ax)
     rows, columns = (max(2, round(_LATTICE * side / max(height, width))) + 1 for side in (height, width))
@@ -308,7 +281,7 @@ def uncertainty(calibration: Calibration, ax: Axes | None = None, *, distance: f
         filled = ax.contourf(u, v, np.ma.maximum(values, bounds[0]), bounds, colors=colours, extend=extend, zorder=1)
         _bar(ax, filled, "px")
         ax.set_title(f"sigma of a projection {at}: median {np.median(values.compressed()):.2g} px")
-    outline = _hull(shots.pixels[shots.seen & shots.inliers])
+    outline = _hull(shots.pixels[shots.used])
     ax.plot(*outline.T, color=INK, linestyle=(0, (4, 3)), linewidth=1.1, zorder=4)
     return ax
 
@@ -320,13 +293,6 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     Shaded are the angles that the corners have but for one in 200, with the histogram of all at the bottom. The band is
     the uncertainty of a projection at infinity, drawn wider by the factor that the legend says. The curve ends with the
     image, or with the rays.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
-
-    Raises:
-        ImportError: no matplotlib.
     """
     ax, shots, camera = axes_or_new(ax), sightings(calibration), calibration.camera
     size_of(camera)
@@ -334,12 +300,14 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     pixels, valid = followed(camera, angles, _AZIMUTHS)
     inside = valid & camera.contains(pixels)
     radius = torch.linalg.vector_norm(pixels - camera.intrinsics[2:], dim=-1)
-    seen = np.degrees(shots.angles[shots.seen & shots.inliers])
+    seen = np.degrees(shots.angles)
     known = math.degrees(shots.reach)
     ax.axvspan(0, known, color=PALE, zorder=0)
     some = inside.any(-1)
     middle = torch.where(valid, radius, torch.nan).nanmean(-1)[some].double()
-    sigma = _worst(calibration, pixels, inside)[some.numpy(force=True)]
+    # the greatest among the azimuths that are inside
+    sigmas = torch.where(inside, calibration.uncertainty(pixels.double()), -1.0).nan_to_num(-1.0).amax(-1)[some]
+    sigma = torch.where(sigmas >= 0, sigmas, torch.nan).double().numpy(force=True)
     x, y = np.degrees(angles[some].double().numpy(force=True)), middle.numpy(force=True)
     top = 1.08 * float(np.nanmax(y)) if len(y) else 1.0
     within = sigma[x <= known]
@@ -355,21 +323,11 @@ def calibrated_radius(calibration: Calibration, ax: Axes | None = None) -> Axes:
     if len(seen):
         edges = np.arange(0, seen.max() + 2.5, 2.5)
         counts = np.histogram(seen, edges)[0]
-        ax.bar(
-            edges[:-1],
-            counts * (0.16 * top / counts.max()),
-            2.3,
-            align="edge",
-            color=GREY,
-            alpha=0.55,
-            zorder=1,
-            label="corners",
-        )
-    ax.set_xlim(0, 1.06 * max(float(x[-1]) if len(x) else 1.0, float(seen.max(initial=1e-3))))
-    ax.set_ylim(0, top)
-    ax.set_xlabel("angle from the axis, degrees")
-    ax.set_ylabel("distance from the principal point, px")
-    ax.set_title("radius over angle, within the image")
+        heights = counts * (0.16 * top / counts.max())
+        ax.bar(edges[:-1], heights, 2.3, align="edge", color=GREY, alpha=0.55, zorder=1, label="corners")
+    furthest = 1.06 * max(float(x[-1]) if len(x) else 1.0, float(seen.max(initial=1e-3)))
+    ax.set(xlim=(0, furthest), ylim=(0, top), title="radius over angle, within the image")
+    ax.set(xlabel="angle from the axis, degrees", ylabel="distance from the principal point, px")
     ax.legend(frameon=False, loc="upper left", handlelength=1.4)
     return ax
 
@@ -378,30 +336,20 @@ def boards(calibration: Calibration, ax: Axes | None = None) -> Axes:
     """The boards as they stood before the camera, seen from its upper right, each in the colour of its rms.
 
     Of more than 300 an even choice is drawn.
-
-    Args:
-        calibration: of a camera.
-        ax: by default new ones.
-
-    Raises:
-        ImportError: no matplotlib.
     """
     from matplotlib.collections import PolyCollection
 
     ax, shots = axes_or_new(ax), sightings(calibration)
-    rms = shots.rms
     outlines = [_hull(_oblique(points[np.isfinite(points).all(-1)])) for points in shots.points]
-    known = [i for i, outline in enumerate(outlines) if len(outline) > 2 and math.isfinite(rms[i])]
-    some = known if len(known) <= _BOARDS else [known[i] for i in np.linspace(0, len(known) - 1, _BOARDS).astype(int)]
-    extent = np.concatenate([outlines[i] for i in some]) if some else np.ones((1, 2))
-    size = float(np.abs(extent).max())
+    known = [i for i, outline in enumerate(outlines) if len(outline) > 2 and math.isfinite(shots.rms[i])]
+    some = [known[i] for i in _evenly(len(known), _BOARDS)]
+    size, few = 1.0, len(some) < 60
     if some:
-        shapes, cmap, few = [outlines[i] for i in some], levels("residuals"), len(some) < 60
-        faces = PolyCollection(shapes, array=rms[some], cmap=cmap, alpha=0.35 if few else 0.15, zorder=2)
-        rims = PolyCollection(
-            shapes, array=rms[some], cmap=cmap, facecolors="none", linewidths=1.0 if few else 0.5, zorder=3
-        )
-        ax.add_collection(faces)
+        shapes = [outlines[i] for i in some]
+        size = float(np.abs(np.concatenate(shapes)).max())
+        options: Any = {"array": shots.rms[some], "cmap": levels("residuals")}
+        ax.add_collection(PolyCollection(shapes, **options, alpha=0.35 if few else 0.15, zorder=2))
+        rims = PolyCollection(shapes, **options, facecolors="none", linewidths=1.0 if few else 0.5, zorder=3)
         ax.add_collection(rims)
         _bar(ax, rims, "rms, px")
     _draw_camera(ax, 0.12 * size)
@@ -423,28 +371,9 @@ def _bar(ax: Axes, mappable: ScalarMappable, label: str, **options: Any) -> None
     bar.ax.minorticks_off()
 
 
-def _cells(height: int, width: int) -> tuple[int, int]:
-    rows, columns = (max(3, round(_CELLS * side / max(height, width))) for side in (height, width))
-    return rows, columns
-
-
-@torch.no_grad()
-def _covered(calibration: Calibration, counts: np.ndarray) -> float:
-    """The part of the cells with rays that have a corner."""
-    rows, columns = counts.shape
-    lattice = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
-    rays = calibration.camera.unproject(lattice)[1].numpy(force=True) | (counts > 0)
-    return float((counts > 0).sum() / rays.sum()) if rays.any() else 0.0
-
-
-def _thinned(count: int, lengths: np.ndarray | None = None) -> np.ndarray:
-    """Indices of at most _ARROWS: the longest tenth of them, if there are lengths, and the others evenly."""
-    if count <= _ARROWS:
-        return np.arange(count)
-    order = np.arange(count) if lengths is None else np.argsort(-lengths)
-    longest, others = np.split(order, [0 if lengths is None else _ARROWS // 10])
-    evenly = np.linspace(0, len(others) - 1, _ARROWS - len(longest)).astype(int)
-    return np.concatenate((longest, np.sort(others)[evenly]))
+def _evenly(count: int, most: int) -> np.ndarray:
+    """Indices of all, or of an even choice with the first and the last one."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
 def _dots(ax: Axes, places: np.ndarray, colour: Any, size: float, zorder: float = 2.0) -> None:
@@ -456,20 +385,17 @@ def _strokes(ax: Axes, ends: np.ndarray, colour: Any, width: float, zorder: floa
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
-    codes = np.tile([Path.MOVETO, Path.LINETO], len(ends)).astype(np.uint8)
-    path = Path(ends.reshape(-1, 2), codes)
+    path = Path(ends.reshape(-1, 2), np.tile([Path.MOVETO, Path.LINETO], len(ends)).astype(np.uint8))
     path.should_simplify = False  # which would drop the dots
-    stroke = PathPatch(path, facecolor="none", edgecolor=colour, linewidth=width, capstyle="round", zorder=zorder)
-    ax.add_patch(stroke)
+    ax.add_patch(PathPatch(path, facecolor="none", edgecolor=colour, linewidth=width, capstyle="round", zorder=zorder))
 
 
 def _crosses(ax: Axes, shots: Sightings, index: int | None = None) -> None:
     """Outliers."""
-    out = shots.seen & ~shots.inliers
-    if index is not None:
-        out = out & (np.arange(len(out)) == index)[:, None]
+    rows = slice(None) if index is None else index
+    out = shots.seen[rows] & ~shots.inliers[rows]
     if out.any():
-        u, v = shots.pixels[out].T
+        u, v = shots.pixels[rows][out].T
         label = f"{len(u):,} outlier{'s' * (len(u) > 1)}"
         size, thick = (4, 1.0) if index is None else (7, 1.6)
         ax.plot(u, v, "x", color=COLOURS[1], markersize=size, markeredgewidth=thick, label=label, zorder=5)
@@ -485,35 +411,18 @@ def _bands(values: np.ndarray) -> list[float]:
     return ladder[first : last + 1]
 
 
-def _worst(calibration: Calibration, pixels: Tensor, inside: Tensor) -> np.ndarray:
-    """(K,) the greatest uncertainty at infinity among the azimuths (K, A) that are inside; NaN without any."""
-    values = torch.full(inside.shape, -math.inf, dtype=torch.float64)
-    if bool(inside.any()):
-        values[inside.cpu()] = calibration.uncertainty(pixels[inside].double(), math.inf).double().cpu().nan_to_num(-1)
-    most = values.amax(-1)
-    found: np.ndarray = torch.where(most >= 0, most, torch.nan).numpy()
-    return found
-
-
 def _hull(points: np.ndarray) -> np.ndarray:
     """(M, 2), closed: the convex hull of (N, 2), by Andrew's monotone chain."""
-    ordered = sorted(set(map(tuple, points.tolist())))
-    if len(ordered) < 3:
-        return np.array(ordered).reshape(-1, 2)
-
-    def half(along: Sequence[tuple[float, ...]]) -> list[tuple[float, ...]]:
-        kept: list[tuple[float, ...]] = []
+    ordered = np.unique(points, axis=0)
+    around: list[np.ndarray] = []
+    for along in (ordered, ordered[::-1]) if len(ordered) > 2 else ():
+        half: list[np.ndarray] = []
         for p in along:
-            while len(kept) > 1:
-                (ax, ay), (bx, by) = kept[-2], kept[-1]
-                if (bx - ax) * (p[1] - ay) - (by - ay) * (p[0] - ax) > 0:
-                    break
-                kept.pop()
-            kept.append(p)
-        return kept[:-1]
-
-    around = half(ordered) + half(ordered[::-1])
-    return np.array([*around, around[0]])
+            while len(half) > 1 and np.linalg.det((half[-1] - half[-2], p - half[-2])) <= 0:
+                half.pop()
+            half.append(p)
+        around += half[:-1]
+    return np.array([*around, around[0]]) if around else ordered
 
 
 _TURN, _TILT = math.radians(58), math.radians(24)
@@ -529,14 +438,12 @@ def _oblique(points: np.ndarray) -> np.ndarray:
 
 def _draw_camera(ax: Axes, size: float) -> None:
     """A frustum at the origin, and its axis."""
-    rim = size * np.array(
-        [(-0.6, -0.45, 1.0), (0.6, -0.45, 1.0), (0.6, 0.45, 1.0), (-0.6, 0.45, 1.0), (-0.6, -0.45, 1)]
+    around = _oblique(
+        size * np.array([(x, y, 1.0) for x, y in ((-0.6, -0.45), (0.6, -0.45), (0.6, 0.45), (-0.6, 0.45))])
     )
-    around = _oblique(rim)
     centre = _oblique(np.zeros(3))
-    ax.plot(*around.T, color=INK, linewidth=1.2, zorder=5)
-    for corner in around[:4]:
-        ax.plot(*np.stack((centre, corner)).T, color=INK, linewidth=1.2, zorder=5)
+    for corner, following in zip(around, np.roll(around, -1, 0), strict=True):
+        ax.plot(*np.stack((centre, corner, following)).T, color=INK, linewidth=1.2, zorder=5)
     ax.plot(*_oblique(np.array([(0, 0, 0), (0, 0, 2.2 * size)])).T, color=GREY, linewidth=0.9, linestyle="--", zorder=4)
 
 

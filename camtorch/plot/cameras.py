@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,13 +20,12 @@ from camtorch.plot.axes import (
     PALE,
     axes_or_new,
     check_single,
-    cycle,
     draw_frame,
+    levels,
     magnification,
     printable,
     require_matplotlib,
     size_of,
-    without_palest,
 )
 from camtorch.projection.rays import angles_from_axis, followed, ideal, image_lattice
 from camtorch.rotations import rotation_matrix
@@ -58,7 +58,7 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
         count: of arrows along the longer side.
 
     Raises:
-        ValueError: a batch, or a camera without image size. ImportError: no matplotlib.
+        ValueError: a batch, or a camera without image size.
     """
     height, width = size_of(camera)
     ax = axes_or_new(ax)
@@ -69,7 +69,10 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
     undistorted, covered = ideal(camera).project(rays)
     moved = (pixels - undistorted).double()
     draw_frame(ax, height, width)
-    _shade_without_rays(ax, camera)
+    dark = camera.unproject(image_lattice(camera, 200, 200))[1].numpy(force=True)
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    shade = np.ma.masked_array(np.ones((200, 200)), dark)
+    ax.imshow(shade, extent=edges, cmap="Greys", vmin=0, vmax=5, interpolation="nearest", zorder=0)
     both, lost = valid & covered, valid & ~covered
     if bool(lost.any()):
         u, v = pixels[lost].double().T.tolist()
@@ -90,11 +93,10 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
             width=0.0024,
             headwidth=4,
             headlength=5,
-            cmap=without_palest("viridis_r"),
+            cmap=levels("distortion"),
             zorder=3,
         )
-        extend = _limit(arrows, length)
-        ax.figure.colorbar(arrows, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
+        _bar(ax, arrows, length)
     cx, cy = camera.intrinsics[2:].tolist()
     ax.plot([cx], [cy], "+", color=COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
     times = f", {longer} times as long" if longer > 1 else ""
@@ -116,7 +118,7 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
         labels: of the cameras; by default their models.
 
     Raises:
-        ValueError: a batch, or not as many labels as cameras. ImportError: no matplotlib.
+        ValueError: a batch, or not as many labels as cameras.
     """
     cameras = cameras if isinstance(cameras, Sequence) else [cameras]
     labels = labels or [camera.key for camera in cameras]
@@ -124,15 +126,13 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
         raise ValueError(f"plot: {len(cameras)} cameras, and labels for {len(labels)}")
     ax = axes_or_new(ax)
     shown = seen = 0.0
-    for i, (camera, label, colour) in enumerate(zip(cameras, labels, cycle(len(cameras)), strict=True)):
+    for i, (camera, label, colour) in enumerate(zip(cameras, labels, cycle(COLOURS), strict=False)):
         check_single(camera)
         angles, low, high = _radii(camera)
         ax.fill_between(np.degrees(angles), low, high, color=colour, alpha=0.25, linewidth=0, zorder=2)
         middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        # the later ones thinner, to show what they cover
-        ax.plot(
-            np.degrees(angles), middle, color=colour, label=label, linewidth=3.2 if i == 0 < len(cameras) - 1 else 1.5
-        )
+        wide = 3.2 if i == 0 < len(cameras) - 1 else 1.5  # the later ones thinner, to show what they cover
+        ax.plot(np.degrees(angles), middle, color=colour, label=label, linewidth=wide)
         ax.plot(np.degrees(angles[-1:]), middle[-1:], "o", color=colour, markersize=5, zorder=3)
         if i == 0 and camera.distortion_names:
             angles, low, _ = _radii(ideal(camera))
@@ -145,13 +145,9 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
                 ax.axvspan(0, seen, color=PALE, zorder=0)
             corners = image_lattice(camera, 2, 2).flatten(0, 1) - camera.intrinsics[2:]
             shown = max(shown, float(torch.linalg.vector_norm(corners, dim=-1).max()))
-    if shown:
-        # tangents grow without end
-        ax.set_ylim(0, 1.15 * shown)
-    ax.set_xlim(0, 1.15 * seen if seen else None)
-    ax.set_ylim(bottom=0)
-    ax.set_xlabel("angle from the axis, degrees")
-    ax.set_ylabel("distance from the principal point, px")
+    ax.set_xlim(0, 1.15 * seen or None)
+    ax.set_ylim(0, 1.15 * shown or None)  # tangents grow without end
+    ax.set(xlabel="angle from the axis, degrees", ylabel="distance from the principal point, px")
     ax.set_title("radius over angle, as far as valid")
     ax.legend(frameon=False, loc="lower right")
     return ax
@@ -169,7 +165,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
             closest: two calibrations of one camera may differ by where they look.
 
     Raises:
-        ValueError: a batch, no image size, or two different ones. ImportError: no matplotlib.
+        ValueError: a batch, no image size, or two different ones.
     """
     compared = differences.difference(a, b, remove_rotation=remove_rotation)
     height, width = a.size_for("a difference")
@@ -179,8 +175,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     ax.set_facecolor(NO_RAYS)
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
     image = ax.imshow(values, extent=edges, cmap="magma_r", interpolation="nearest")
-    extend = _limit(image, compared.apart[compared.both])
-    ax.figure.colorbar(image, ax=ax, label="px", shrink=0.8, pad=0.02, extend=extend)
+    _bar(ax, image, compared.apart[compared.both])
     turned = ""
     if remove_rotation:
         turned = f", turned by {math.degrees(differences.angle(compared.rotation)):.3g} degrees"
@@ -200,7 +195,7 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
         ax: by default new ones.
 
     Raises:
-        ValueError: no camera has a pose. ImportError: no matplotlib.
+        ValueError: no camera has a pose.
     """
     ax = axes_or_new(ax)
     names = [name for name in rig.cameras if name in rig.extrinsics]
@@ -211,7 +206,7 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
     above = spread[1] <= max(spread[0], spread[2])
     across, up = (0, 2) if above else (2, 1)
     size = float(spread.max()) or 1.0
-    for name, place, colour in zip(names, places, cycle(len(names)), strict=True):
+    for name, place, colour in zip(names, places, cycle(COLOURS), strict=False):
         camera = rig.cameras[name]
         wide, tall = (1.0, 1.0) if camera.image_size is None else camera.field_of_view[:2].tolist()
         half = min(math.pi, (wide if above else tall) / 2)
@@ -223,23 +218,14 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
         ax.fill(wedge[:, across], wedge[:, up], color=colour, alpha=0.16, linewidth=0, zorder=1)
         ax.plot(wedge[:, across], wedge[:, up], color=colour, linewidth=0.9, zorder=2)
         ax.plot(place[across], place[up], "o", color=colour, markersize=6, zorder=3)
-        label = ax.annotate(
-            printable(name),
-            place[[across, up]],
-            xytext=(0, -7),
-            textcoords="offset points",
-            color=INK,
-            ha="center",
-            va="top",
-        )
-        label.set_parse_math(False)
+        options: Any = {"textcoords": "offset points", "color": INK, "ha": "center", "va": "top"}
+        ax.annotate(printable(name), place[[across, up]], (0, -7), **options).set_parse_math(False)
     ax.set_aspect("equal")
     ax.margins(0.15)
     if not above:
         ax.invert_yaxis()
-    ax.set_xlabel("xyz"[across])
-    ax.set_ylabel("xyz"[up])
-    ax.set_title(f"{len(names)} cameras from {'above' if above else 'the right'}")
+    title = f"{len(names)} cameras from {'above' if above else 'the right'}"
+    ax.set(xlabel="xyz"[across], ylabel="xyz"[up], title=title)
     return ax
 
 
@@ -258,32 +244,20 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
     radius_curve([camera] if other is None else [camera, other], axes[1], labels=labels)
     if other is not None:
         difference(camera, other, axes[2])
-    figure.suptitle(
-        title or f"{type_before_parametrizations(camera).__name__}, {width} x {height}", color=INK, fontsize=15
-    )
+    title = title or f"{type_before_parametrizations(camera).__name__}, {width} x {height}"
+    figure.suptitle(title, color=INK, fontsize=15)
     return figure
 
 
 # -- parts of plots
 
 
-def _shade_without_rays(ax: Axes, camera: Camera) -> None:
-    height, width = camera.size_for("a plot")
-    valid = camera.unproject(image_lattice(camera, 200, 200))[1]
-    shade = np.ma.masked_array(np.ones((200, 200)), valid.numpy(force=True))
-    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
-    ax.imshow(shade, extent=edges, cmap="Greys", vmin=0, vmax=5, interpolation="nearest", zorder=0)
-
-
-def _limit(mappable: ScalarMappable, values: Tensor) -> str:
-    """Give what is coloured its range, without the few largest values if they are far from the others."""
+def _bar(ax: Axes, mappable: ScalarMappable, values: Tensor) -> None:
+    """Colours for the range of values, without the few largest if they are far from the others."""
     most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)
     cut = most > 4 * many > _FAINT
-    if most < _NOTHING:
-        mappable.set_clim(0, _NOTHING)
-        return "neither"
-    mappable.set_clim(0, 1.5 * many if cut else most)
-    return "max" if cut else "neither"
+    mappable.set_clim(0, 1.5 * many if cut else max(most, _NOTHING))
+    ax.figure.colorbar(mappable, ax=ax, label="px", shrink=0.8, pad=0.02, extend="max" if cut else "neither")
 
 
 def _radii(camera: Camera) -> tuple[np.ndarray, list[float], list[float]]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
 
 KINDS = ("z", "distance")
 
@@ -47,3 +52,16 @@ def depth_scale(depth: Tensor, rays: Tensor, valid: Tensor, kind: str) -> tuple[
     good = ahead & torch.isfinite(depth) & (depth > 0)
     length = torch.where(good, depth, 0.0)
     return (length / torch.where(ahead, z, 1.0) if kind == "z" else length), good
+
+
+def backproject(camera: Camera, depth: Numbers, kind: str) -> tuple[Tensor, Tensor]:
+    """Points (*B, H, W, 3), and valid (*B, H, W); see `Camera.backproject`."""
+    owner, batch = f"{type(camera).__name__}.backproject", camera.batch_shape
+    depth = as_depth(depth, kind, camera.size_for("backproject"), owner, camera.intrinsics.device)
+    fits = not batch or (depth.ndim == 4 and len(batch) == 1 and len(depth) in (1, *batch))
+    if not fits or (depth.ndim == 4 and depth.shape[1] != 1):
+        of = f" for cameras {tuple(batch)}" if batch else ""
+        raise ValueError(f"{owner}: depth must be (B, 1, H, W){of}; got shape {tuple(depth.shape)}")
+    rays, valid = camera.rays()
+    scale, good = depth_scale(depth[:, 0] if depth.ndim == 4 else depth, rays, valid, kind)
+    return rays * scale[..., None], good

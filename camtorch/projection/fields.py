@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole, broadcast_shapes, check_devices, working_dtype
+from camtorch._arguments import (
+    Numbers,
+    as_points,
+    as_vectors,
+    as_whole,
+    broadcast_shapes,
+    check_devices,
+    fails,
+    working_dtype,
+)
 from camtorch.extrinsics import Extrinsics
 from camtorch.optics.derivatives import goes_forward
 from camtorch.rotations import rotate_planes, rotation_matrix
 
 if TYPE_CHECKING:
+    from camtorch._module import Memo
     from camtorch.camera import Camera
 
+_MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray goes straight up or down
 
 
@@ -50,6 +62,30 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
     rows, columns = (torch.arange(side // step, dtype=like.dtype, device=like.device) * step + middle for side in size)
     v, u = torch.meshgrid(rows, columns, indexing="ij")
     return torch.stack((u, v), -1)
+
+
+def over_image(
+    camera: Camera,
+    memo: Memo,
+    inputs: Sequence[Tensor],
+    stride: int,
+    function: Callable[[Tensor], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """What a function makes of all pixels or patches (*B, H, W, 2) of a camera, kept where nothing of `inputs` learns.
+
+    Not of more than half a million pixels or patches.
+    """
+
+    def compute() -> tuple[Tensor, ...]:
+        grid = camera.pixel_grid(stride)
+        return function(grid.expand(*camera.batch_shape, *grid.shape))
+
+    if torch.compiler.is_compiling():  # nothing is kept then, and a comparison would bound sizes that are left open
+        return compute()
+    step = max(as_whole(stride, "stride", "pixel_grid"), 1)
+    if math.prod((*camera.batch_shape, *camera.size_for("pixel_grid"))) // step**2 > _MOST_KEPT:
+        return compute()
+    return memo.copies(inputs, (camera.form, stride), compute)
 
 
 def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: str) -> tuple[Tensor, Tensor]:
@@ -136,8 +172,10 @@ def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack((x, y, z), -2), per_unit, valid
 
 
-def local_pinhole(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def local_pinhole(camera: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
     """Rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
+    owner = f"{type(camera).__name__}.local_pinhole"
+    pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera.tensors, owner)
     rotation, per_unit, valid = local_frames(tangents(camera, pixels))
     centre = torch.where(valid[..., None], pixels.to(per_unit.dtype), 0.0)
     top = torch.cat((per_unit, centre[..., None]), -1)
@@ -145,15 +183,22 @@ def local_pinhole(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
     return rotation, torch.cat((top, bottom), -2)
 
 
-def perspective_field(camera: Camera, gravity: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Latitude (*B, H, W), up (*B, H, W, 2) and valid (*B, H, W); see `Camera.perspective_field`.
+def perspective_field(camera: Camera, gravity: Numbers, stride: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Latitude (*B, H, W), up (*B, H, W, 2) and valid (*B, H, W); see `Camera.perspective_field`."""
+    owner = f"{type(camera).__name__}.perspective_field"
+    down = as_vectors(gravity, "gravity", owner)
+    if fails((down != 0).any(-1)):
+        raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
+    down = down.to(camera.intrinsics.device)
+    _broadcast(camera.batch_shape, down.shape[:-1], "gravity", owner)
+    inputs = *camera.tensors, down
+    latitude, up, valid = over_image(
+        camera, camera._fields, inputs, stride, lambda pixels: _field(camera, down, pixels)
+    )
+    return latitude, up, valid
 
-    Args:
-        camera: it knows all of the pixels.
-        gravity: (*B, 3), of any length but zero.
-        pixels: (*B, H, W, 2).
-    """
-    _broadcast(camera.batch_shape, gravity.shape[:-1], "gravity", f"{type(camera).__name__}.perspective_field")
+
+def _field(camera: Camera, gravity: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     frame, per_unit, valid = local_frames(tangents(camera, pixels))
     upward = -gravity / gravity.square().sum(-1, keepdim=True).sqrt()
     seen = (frame * upward[..., None, None, None, :].to(frame.dtype)).sum(-1)  # x, y, z of the local frame

@@ -9,7 +9,6 @@ import base64
 import io
 import math
 import os
-import re
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence, Sized
@@ -18,19 +17,22 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import camtorch.plot as plot
 from camtorch._arguments import check_path
+from camtorch._photographs import load_stored, stored_size
 from camtorch.calibration.calibrate import Calibration
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.verdict import ROUGH, Survey
 from camtorch.io.writing import replacing
-from camtorch.plot.axes import require_matplotlib
-from camtorch.plot.calibrations import Sightings, sightings
+from camtorch.plot.axes import printable, require_matplotlib
+from camtorch.plot.calibrations import sightings
 from camtorch.projection.rays import image_lattice
-from camtorch.report.photographs import as_jpeg
 
 if TYPE_CHECKING:
+    from PIL import Image
+
     Images: TypeAlias = Sequence[Any] | None
     Names: TypeAlias = Sequence[str] | None
 
@@ -43,6 +45,7 @@ _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "svg.fonttype": "none",  # the browser has fonts for names in all scripts
 }
+_SIDE, _QUALITY = 760, 80  # px of the longer side of a photograph, and of its JPEG file
 
 
 @torch.no_grad()
@@ -69,8 +72,9 @@ def write_report(
 
     Raises:
         ImportError: no matplotlib or no Jinja2 (`pip install 'camtorch[plot]'`). ValueError: not as many images or
-            names as views, an image of another size than the camera's, a name that no camera has. TypeError: images of
-            a rig that are no mapping. OSError: the file cannot be written.
+            names as views, an image of another size than the camera's, a name that no camera has. TypeError: images or
+            names that are no list, images of a rig that are no mapping. OSError: the file cannot be written, an image
+            file is not there.
     """
     if not isinstance(calibration, (Calibration, RigCalibration)):
         raise TypeError(f"write_report: calibration must be what calibrate returns; got {type(calibration).__name__}")
@@ -88,12 +92,9 @@ def write_report(
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
         resources.files("camtorch.report").joinpath("report.html").read_text("utf-8")
     )
-    text = template.render(
-        title=_printable(title or found),
-        today=time.strftime("%d %B %Y").lstrip("0"),
-        rig=rig,
-        cameras=[_camera(one) for one in shots],
-    )
+    today = time.strftime("%d %B %Y").lstrip("0")
+    cameras = [_camera(one) for one in shots]
+    text = template.render(title=printable(str(title or found)), today=today, rig=rig, cameras=cameras)
     with replacing(path) as (file,):
         file.write(text.encode())
 
@@ -117,32 +118,33 @@ def _rig_shots(calibration: RigCalibration, images: Any, names: Any) -> list[_Sh
         if stray:
             there = ", ".join(map(repr, calibration.cameras))
             raise ValueError(f"write_report: {what} of {', '.join(map(repr, stray))}; the rig has {there}")
-    return [
-        _Shots(
-            camera,
-            None if images is None else images.get(name),
-            names.get(name) if isinstance(names, Mapping) else names,
-            name,
-            f"camera-{i}-",
-        )
-        for i, (name, camera) in enumerate(calibration.cameras.items())
-    ]
+    shots = []
+    for i, (name, camera) in enumerate(calibration.cameras.items()):
+        own = names.get(name) if isinstance(names, Mapping) else names
+        shots.append(_Shots(camera, (images or {}).get(name), own, name, f"camera-{i}-"))
+    return shots
 
 
 class _Shots:
     """A camera's calibration, its views by name, and their photographs."""
 
     def __init__(self, calibration: Calibration, images: Any, names: Any, camera: str = "", prefix: str = ""):
-        self.calibration, self.camera, self.prefix = calibration, _printable(camera), prefix
+        self.calibration, self.camera, self.prefix = calibration, printable(camera), prefix
         count = len(calibration.image_points)
         for what, given in (("images", images), ("names", names)):
-            if given is not None and not isinstance(given, Sized):
-                raise TypeError(f"write_report: {what} must be a list, one for each view; got {type(given).__name__}")
+            if given is not None and (not isinstance(given, Sized) or isinstance(given, (str, bytes))):
+                raise TypeError(f"write_report: {what} must be a list, one for each view; got {given!r:.60}")
             if given is not None and len(given) != count:
                 raise ValueError(f"write_report: {len(given)} {what} for {count} views; give one of each, or None")
         self.images: list[Any] = [None] * count if images is None else list(images)
-        self.names = [_name(i, image) for i, image in enumerate(self.images)] if names is None else list(names)
-        self.seen: Sightings = sightings(calibration)
+        paths = {i: os.fsdecode(image) for i, image in enumerate(self.images) if _is_path(image)}
+        for i, path in paths.items():
+            if not os.path.exists(path):
+                raise FileNotFoundError(f"write_report: images[{i}] is no file: {path!r}")
+        usual = [os.path.basename(paths[i]) if i in paths else f"view {i}" for i in range(count)]
+        self.names = [printable(str(name)) for name in (usual if names is None else names)]
+        self.seen = sightings(calibration)
+        self.corners, self.outliers = int(self.seen.seen.sum()), int((self.seen.seen & ~self.seen.inliers).sum())
 
     @property
     def tone(self) -> str:
@@ -151,33 +153,21 @@ class _Shots:
             return "bad"
         return "care" if self.calibration.warnings else "good"
 
-    @property
-    def corners(self) -> tuple[int, int]:
-        """How many were seen, and how many of them are outliers."""
-        return int(self.seen.seen.sum()), int((self.seen.seen & ~self.seen.inliers).sum())
+
+def _is_path(image: Any) -> bool:
+    return isinstance(image, (str, bytes, os.PathLike))
 
 
-def _name(number: int, image: Any) -> str:
-    return os.path.basename(os.fsdecode(image)) if isinstance(image, (str, bytes, os.PathLike)) else f"view {number}"
+def _tiles(calibration: Calibration | RigCalibration, note: str) -> list[tuple[str, str, str]]:
+    """Numbers that the page begins with: label, value and note."""
+    return [
+        ("Reprojection rms", f"{calibration.rms:.3g} px", note),
+        ("Noise (sigma)", f"{calibration.sigma:.3g} px", "of a coordinate of a corner"),
+    ]
 
 
-def _printable(text: object) -> str:
-    """A text that a file can hold, whatever it is: names of files come from outside."""
-    plain = str(text).encode("utf-8", "replace").decode()
-    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "\N{REPLACEMENT CHARACTER}", plain)
-
-
-class _Tile(NamedTuple):
-    """A number that the page begins with."""
-
-    label: str
-    value: str
-    unit: str
-    note: str
-
-
-def _views_tile(count: int, corners: int, outliers: int) -> _Tile:
-    return _Tile("Views", f"{count}", "", f"{corners:,} corners, {outliers:,} outlier{'s' * (outliers != 1)}")
+def _views_tile(count: int, corners: int, outliers: int) -> tuple[str, str, str]:
+    return "Views", f"{count}", f"{corners:,} corners, {outliers:,} outlier{'s' * (outliers != 1)}"
 
 
 def _camera(shots: _Shots) -> dict[str, Any]:
@@ -197,7 +187,19 @@ def _camera(shots: _Shots) -> dict[str, Any]:
         uncertainty.append(figure(plot.uncertainty, over_image, distance=near))
     squares = np.nan_to_num(seen.lengths**2).sum(-1) / np.maximum(seen.seen.sum(-1), 1)
     ranked: list[int] = np.argsort(-squares, kind="stable").tolist()
-    numbers = [str(camera.intrinsics.tolist()), *([str(camera.distortion.tolist())] if count else [])]
+    most = float(np.nan_to_num(seen.rms).max(initial=0.0)) or 1.0
+    intrinsics, distortion = camera.intrinsics.tolist(), camera.distortion.tolist()
+    numbers = [str(intrinsics), *[str(distortion)] * (count > 0), f"image_size={calibration.image_size}"]
+    code = ",\n    ".join(numbers)
+    values = zip(calibration.parameter_names, intrinsics + distortion, calibration.std.tolist(), strict=True)
+    parameters = [(name, _rounded(value, std), f"{std:.2g}" if std > 0 else "held") for name, value, std in values]
+    if any(calibration.bend):
+        parameters.append(("bend along x, y", "{:.3g}, {:.3g}".format(*calibration.bend), ""))
+    wide, tall, _ = camera.fov.numpy(force=True)
+    sigmas = calibration.uncertainty(image_lattice(camera, 25, 33).double())
+    median = f"{float(sigmas.nanmedian()):.2g}".replace("nan", "-")
+    clean = np.sqrt((seen.lengths[seen.used] ** 2).mean()) if shots.corners > shots.outliers else math.nan
+    reach = f"{math.degrees(seen.reach):.1f}°"
     return {
         "name": shots.camera,
         "prefix": shots.prefix,
@@ -206,62 +208,39 @@ def _camera(shots: _Shots) -> dict[str, Any]:
         "tone": shots.tone,
         "verdict": calibration.verdict,
         "warnings": calibration.warnings,
-        "tiles": _tiles(shots),
-        "reach": f"{math.degrees(seen.reach):.1f}°",
+        "tiles": [
+            *_tiles(calibration, f"{clean:.3g} without outliers" if shots.outliers else "per corner"),
+            ("Uncertainty", f"{median} px", "median over the image, at infinity"),
+            _views_tile(len(seen.numbers), shots.corners, shots.outliers),
+            ("Corners reach", reach, "from the axis, but for one in 200"),
+            ("Field of view", f"{wide:.0f} x {tall:.0f}°", "of the image, across and down"),
+        ],
+        "reach": reach,
         "coverage": figure(plot.coverage, over_image),
         "radius": figure(plot.calibrated_radius, beside),
         "residuals": figure(plot.residuals, over_image),
         "histogram": figure(plot.residual_histogram, beside),
         "uncertainty": uncertainty,
         "boards": figure(plot.boards, beside),
-        "views": _views(shots, ranked),
-        "worst": [_photograph(shots, row) for row in ranked[:_WORST]],
-        "parameters": _parameters(calibration),
-        "code": f"import camtorch as ct\n\ncamera = ct.{type(camera).__name__}(\n    "
-        + ",\n    ".join((*numbers, f"image_size={calibration.image_size}"))
-        + ",\n)",
+        "views": [
+            {
+                "name": shots.names[seen.numbers[row]],
+                "id": f"{shots.prefix}view-{seen.numbers[row]}" if place < _WORST else "",
+                "percent": f"{100 * np.nan_to_num(seen.rms[row]) / most:.1f}",
+                "rms": f"{seen.rms[row]:.3g}",
+                "corners": int(seen.seen[row].sum()),
+                "outliers": int((seen.seen[row] & ~seen.inliers[row]).sum()),
+            }
+            for place, row in enumerate(ranked)
+        ],
+        "worst": [_photograph(shots, seen.numbers[row]) for row in ranked[:_WORST]],
+        "parameters": parameters,
+        "code": f"import camtorch as ct\n\ncamera = ct.{type(camera).__name__}(\n    {code},\n)",
     }
 
 
-def _tiles(shots: _Shots) -> list[_Tile]:
-    calibration, seen = shots.calibration, shots.seen
-    corners, outliers = shots.corners
-    wide, tall, _ = calibration.camera.fov.numpy(force=True)
-    values = calibration.uncertainty(image_lattice(calibration.camera, 25, 33).double(), math.inf).numpy(force=True)
-    values = values[np.isfinite(values)]
-    clean = float(np.sqrt((seen.lengths[seen.seen & seen.inliers] ** 2).mean())) if corners > outliers else math.nan
-    rms_note = f"{clean:.3g} without outliers" if outliers else "per corner"
-    median = f"{np.median(values):.2g}" if len(values) else "-"
-    return [
-        _Tile("Reprojection rms", f"{calibration.rms:.3g}", "px", rms_note),
-        _Tile("Noise (sigma)", f"{calibration.sigma:.3g}", "px", "of a coordinate of a corner"),
-        _Tile("Uncertainty", median, "px", "median over the image, at infinity"),
-        _views_tile(len(seen.numbers), corners, outliers),
-        _Tile("Corners reach", f"{math.degrees(seen.reach):.1f}°", "", "from the axis, but for one in 200"),
-        _Tile("Field of view", f"{wide:.0f} x {tall:.0f}°", "", "of the image, across and down"),
-    ]
-
-
-def _views(shots: _Shots, ranked: Sequence[int]) -> list[dict[str, Any]]:
-    """Rows of the table of views, the worst first."""
-    seen, rms = shots.seen, shots.seen.rms
-    most = float(np.nan_to_num(rms).max(initial=0.0)) or 1.0
-    return [
-        {
-            "name": _printable(shots.names[seen.numbers[row]]),
-            "id": f"{shots.prefix}view-{seen.numbers[row]}" if place < _WORST else "",
-            "percent": f"{100 * np.nan_to_num(rms[row]) / most:.1f}",
-            "rms": f"{rms[row]:.3g}",
-            "corners": int(seen.seen[row].sum()),
-            "outliers": int((seen.seen[row] & ~seen.inliers[row]).sum()),
-        }
-        for place, row in enumerate(ranked)
-    ]
-
-
-def _photograph(shots: _Shots, row: int) -> dict[str, str]:
+def _photograph(shots: _Shots, number: int) -> dict[str, str]:
     """A view's photograph, if there is one, and the marks to lay over it."""
-    number = shots.seen.numbers[row]
     height, width = shots.calibration.image_size
 
     def draw(ax: Any) -> None:
@@ -271,37 +250,22 @@ def _photograph(shots: _Shots, row: int) -> dict[str, str]:
         ax.lines[0].remove()  # the frame, which is the edge of the image here
 
     marks = _drawn(draw, height / width, bare=True)
-    image, note = "", marks.title.split(", ", 1)[1]
+    image, name, note = "", shots.names[number], marks.title.split(", ", 1)[1]
     if shots.images[number] is not None:
         try:
-            image = _as_url("image/jpeg", as_jpeg(shots.images[number], (height, width), shots.names[number]))
+            image = _as_url("image/jpeg", _as_jpeg(shots.images[number], (height, width), name))
         except OSError as error:
             note += f"; no photograph: {error.strerror or error}"
-    name = _printable(shots.names[number])
     return {"id": f"{shots.prefix}view-{number}", "name": name, "note": note, "image": image, "marks": marks.url}
-
-
-def _parameters(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Name, value and standard deviation of each."""
-    camera = calibration.camera
-    values = [*camera.intrinsics.tolist(), *camera.distortion.tolist()]
-    rows = [
-        (name, _rounded(value, std), f"{std:.2g}" if std > 0 else "held")
-        for name, value, std in zip(calibration.parameter_names, values, calibration.std.tolist(), strict=True)
-    ]
-    if any(calibration.bend):
-        rows.append(("bend along x, y", "{:.3g}, {:.3g}".format(*calibration.bend), ""))
-    return rows
 
 
 def _rig(calibration: RigCalibration, cameras: Sequence[_Shots]) -> dict[str, Any]:
     """What the template shows of a rig as a whole."""
     tones = [shots.tone for shots in cameras] + ["good" if calibration.converged else "bad"]
-    corners, outliers = (sum(counts) for counts in zip(*(shots.corners for shots in cameras), strict=True))
     poses = calibration.rig.extrinsics
     positions = {name: pose.position.tolist() for name, pose in poses.items()}
     size = max(math.hypot(*position) for position in positions.values())
-    mounts = []
+    mounts, between = [], []
     for name, pose in poses.items():
         std = calibration.mount_std[name].tolist()
         cells = [_rounded(value, size / 100) for value in positions[name]]
@@ -310,16 +274,10 @@ def _rig(calibration: RigCalibration, cameras: Sequence[_Shots]) -> dict[str, An
             (math.degrees(float(pose.rotation.norm())), math.degrees(math.hypot(*std[:3]))),
         ):
             cells += [_rounded(value, spread), f"{spread:.2g}"]
-        mounts.append((_printable(name), cells))
-    between = []
-    if 2 < len(poses) <= _PAIRS:
-        for name, a in poses.items():
-            apart = [None if b is a else b.compose(a.inverse()) for b in poses.values()]
-            shown = [
-                p and (f"{float(p.translation.norm()):.4g}", f"{math.degrees(float(p.rotation.norm())):.3g}°")
-                for p in apart
-            ]
-            between.append((_printable(name), shown))
+        mounts.append((printable(name), cells))
+        apart = [None if other is pose else other.compose(pose.inverse()) for other in poses.values()]
+        lengths = [p and (f"{p.translation.norm():.4g}", f"{p.rotation.norm().rad2deg():.3g}°") for p in apart]
+        between.append((printable(name), lengths))
     return {
         "tone": min(tones, key=("bad", "care", "good").index),
         # of each camera's verdict the first sentence; all of it is in the camera's own part
@@ -327,14 +285,13 @@ def _rig(calibration: RigCalibration, cameras: Sequence[_Shots]) -> dict[str, An
             (shots.camera, shots.calibration.verdict.partition(". ")[0].removesuffix(".") + ".") for shots in cameras
         ],
         "tiles": [
-            _Tile("Reprojection rms", f"{calibration.rms:.3g}", "px", "per corner, all cameras"),
-            _Tile("Noise (sigma)", f"{calibration.sigma:.3g}", "px", "of a coordinate of a corner"),
-            _Tile("Cameras", f"{len(cameras)}", "", "that see the same boards"),
-            _views_tile(len(calibration.views), corners, outliers),
+            *_tiles(calibration, "per corner, all cameras"),
+            ("Cameras", f"{len(cameras)}", "that see the same boards"),
+            _views_tile(len(calibration.views), sum(s.corners for s in cameras), sum(s.outliers for s in cameras)),
         ],
         "figure": _drawn(lambda ax: plot.rig(calibration.rig, ax), 0.72),
         "mounts": mounts,
-        "between": between,
+        "between": between if 2 < len(poses) <= _PAIRS else [],
     }
 
 
@@ -346,7 +303,7 @@ def _rounded(value: float, std: float) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
-# -- figures
+# -- figures and photographs
 
 
 class _Figure(NamedTuple):
@@ -357,13 +314,7 @@ class _Figure(NamedTuple):
 
 
 def _drawn(draw: Callable[[Any], object], ratio: float, *, bare: bool = False) -> _Figure:
-    """A plot.
-
-    Args:
-        draw: on the Axes that it gets.
-        ratio: of height to width.
-        bare: whether the Axes are all of the figure, without labels.
-    """
+    """A plot on Axes of a ratio of height to width, which are all of the figure, without labels, if it is bare."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -383,3 +334,47 @@ def _drawn(draw: Callable[[Any], object], ratio: float, *, bare: bool = False) -
 
 def _as_url(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _as_jpeg(image: Any, size: tuple[int, int], name: str) -> bytes:
+    """A small JPEG file of an image of any kind that users pass.
+
+    Raises:
+        ValueError: its (height, width) is not `size`. OSError: it cannot be read.
+    """
+    from PIL import Image
+
+    def check(height: int, width: int) -> None:
+        if (height, width) != size:
+            raise ValueError(
+                f"write_report: the image {name!r} has {width} x {height} pixels, and those of the camera have "
+                f"{size[1]} x {size[0]}"
+            )
+
+    if _is_path(image):
+        with Image.open(os.fsdecode(image)) as opened:
+            check(*stored_size(opened))
+            opened.draft(None, (_SIDE, _SIDE))
+            image = load_stored(opened)
+    else:
+        image = image if isinstance(image, Image.Image) else _from_array(image)
+        check(image.height, image.width)
+    if image.mode.startswith(("I", "F")):  # deep grey
+        values = np.asarray(image, np.float64)
+        image = Image.fromarray((255 * values / max(values.max(), 1e-9)).clip(0, 255).astype(np.uint8))
+    image = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
+    image.thumbnail((_SIDE, _SIDE), reducing_gap=2.0)
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=_QUALITY, optimize=True)
+    return file.getvalue()
+
+
+def _from_array(image: Any) -> Image.Image:
+    from PIL import Image
+
+    if isinstance(image, Tensor):
+        image = (image if image.ndim == 2 else image.movedim(0, -1)).numpy(force=True)
+    values = np.asarray(image)
+    if values.dtype.kind == "f":
+        values = (255 * values).clip(0, 255).astype(np.uint8)
+    return Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)

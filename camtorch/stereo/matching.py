@@ -20,11 +20,7 @@ _ROUNDING = 1e-6  # px, by which a disparity may be off zero
 
 
 def opencv() -> Any:
-    """The module `cv2`.
-
-    Raises:
-        ImportError: it is not installed.
-    """
+    """The module `cv2`, or an ImportError that says how to install it."""
     try:
         import cv2
     except ImportError:
@@ -35,7 +31,7 @@ def opencv() -> Any:
 def match(
     rectification: Rectification, left: Tensor, right: Tensor, least: float, most: float
 ) -> tuple[Tensor, Tensor]:
-    """Disparities of the rectified left image.
+    """Disparities (H, W) of the rectified left image, NaN where none is known, and where both cameras see the place.
 
     Args:
         rectification: of one pair; where its columns correspond, disparities lie along them.
@@ -43,12 +39,6 @@ def match(
         right: likewise.
         least: the least disparity to look for, in pixels, negative where the right camera stands to the left.
         most: the greatest.
-
-    Returns:
-        (H, W) float32 disparities, NaN where none is known, and where one is: both cameras see what is there.
-
-    Raises:
-        ImportError: no OpenCV.
     """
     cv2 = opencv()
     images = [_arranged(image, rectification.vertical) for image in _of_bytes(left, right)]

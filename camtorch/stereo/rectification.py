@@ -100,7 +100,7 @@ class Rectification(GeometryModule):
         self.source_left, self.source_right, self.extrinsics = source_left, source_right, extrinsics
         self.camera_left = self.camera_right = camera
         self.projection, self.vertical, self.align = projection, vertical, align
-        self._memo = Memo()
+        self._axis, self._memo = int(vertical), Memo()
 
     @property
     def frame(self) -> Frame:
@@ -143,10 +143,11 @@ class Rectification(GeometryModule):
 
     def _made(self) -> tuple[Warp, Warp]:
         frame = self.frame
-        return (
-            Warp(self.source_left, self.camera_left, frame.left.to(self.source_left.intrinsics.dtype)),
-            Warp(self.source_right, self.camera_right, frame.right.to(self.source_right.intrinsics.dtype)),
+        of_left, of_right = (
+            Warp(source, self.camera_left, rotation.to(source.intrinsics.dtype))
+            for source, rotation in ((self.source_left, frame.left), (self.source_right, frame.right))
         )
+        return of_left, of_right
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """Both images, (B, C, H, W) each, rectified."""
@@ -180,8 +181,7 @@ class Rectification(GeometryModule):
         Raises:
             ValueError: another shape.
         """
-        owner = "disparity_to_points"
-        camera = self.camera_left
+        owner, camera = "disparity_to_points", self.camera_left
         size = camera.size_for(owner)
         d = as_values(disparity, "disparity", owner, camera.intrinsics.device)
         shape, count = tuple(d.shape), self.extrinsics.batch_shape.numel()
@@ -196,17 +196,14 @@ class Rectification(GeometryModule):
         if batched and (d.ndim != 4 or len(d) not in (1, count, camera.batch_shape.numel())):
             raise ValueError(f"{owner}: disparity must be (B, 1, H, W) for {count} pairs; got {shape}")
         try:
-            known = None if valid is None else torch.as_tensor(valid, device=d.device)
+            known = torch.as_tensor(True if valid is None else valid, device=d.device).to(torch.bool)
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(f"{owner}: valid must be a mask in the shape of disparity; got {shown(valid)}") from None
-        if known is not None and tuple(known.shape) != shape:
+        if valid is not None and tuple(known.shape) != shape:
             raise ValueError(f"{owner}: valid must have the shape of disparity, {shape}; got {tuple(known.shape)}")
-        rows = d.reshape(-1, *size)
-        points, good = self._points(self._pixels(), rows)
-        good = good.reshape(*(shape if not batched else (len(good), 1, *size)))
-        points = points.reshape(*good.shape, 3)
-        if known is not None:
-            good = good & known.to(torch.bool)
+        points, good = self._points(self._pixels(), d.reshape(-1, *size))
+        good = good.reshape((len(good), 1, *size) if batched else shape)
+        points, good = points.reshape(*good.shape, 3), good & known
         return torch.where(good[..., None], points, 0.0), good
 
     def _pixels(self) -> Tensor:
@@ -217,40 +214,34 @@ class Rectification(GeometryModule):
     def _points(self, pixels: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Of pixels (*B, H, W, 2) and disparities (B, H, W)."""
         camera, baseline = self.camera_left, self.baseline.to(d.dtype)[..., None, None]
-        focal = camera.intrinsics.to(d.dtype)[..., 1 if self.vertical else 0, None, None]
+        focal = camera.intrinsics.to(d.dtype)[..., self._axis, None, None]
         rays, has_ray = camera.unproject(pixels.to(camera.intrinsics.dtype))
-        x, y, z = rays.to(d.dtype).unbind(-1)
-        along = y if self.vertical else x
-        across = torch.hypot(x if self.vertical else y, z)
+        rays = rays.to(d.dtype)
+        along, z = rays[..., self._axis], rays[..., 2]
+        across = torch.hypot(rays[..., 1 - self._axis], z)
         good = torch.isfinite(d) & has_ray & (d * baseline > 0)
         d = torch.where(good, d, torch.where(baseline < 0, -1.0, 1.0).to(d.dtype))
-        if self.projection == "perspective":
-            distance, unit = focal * baseline / d, z
-        elif self.projection == "cylindrical":
-            distance, unit = focal * baseline / d, across
+        unit = z if self.projection == "perspective" else across
+        if self.projection != "latlon":
+            distance = focal * baseline / d
         else:
             # by the angles from the plane across the baseline: tan a - tan b = sin(a - b) / (cos a cos b)
             angle, turn = torch.atan2(along, across), d / focal
             other = angle - turn
             good = good & (turn.abs() < math.pi) & (other.abs() < math.pi / 2)
             distance = baseline * torch.cos(angle) * torch.cos(other) / torch.sin(torch.where(good, turn, 1.0))
-            unit = across
         good = good & (distance > 0) & torch.isfinite(distance) & (unit > 0)
         scale = torch.where(good, distance, 0.0) / torch.where(unit > 0, unit, 1.0)
-        return torch.stack((x * scale, y * scale, z * scale), -1), good
+        return rays * scale[..., None], good
 
     def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The disparity of points (*B, *N, 3) of the frame of the rectified left camera, and whether both see them."""
         numbers, baseline = self.camera_left.intrinsics, self.baseline  # float64, which points need not become
         points, _ = as_points(points, "points", 3, baseline.shape, (numbers,), "Rectification.disparity")
-        baseline = baseline.to(points.dtype)
-        axis = 1 if self.vertical else 0
-        shift = torch.nn.functional.one_hot(torch.tensor(axis, device=points.device), 3).to(points.dtype)
-        shift = baseline[..., None] * shift
-        lead = points.ndim - 1 - baseline.ndim
-        moved = points - shift.reshape(*baseline.shape, *[1] * lead, 3)
+        shift = baseline.to(points.dtype)[..., None] * _unit(self._axis, points)
+        moved = points - shift.reshape(*baseline.shape, *[1] * (points.ndim - 1 - baseline.ndim), 3)
         (left, one), (right, other) = self.camera_left.project(points), self.camera_right.project(moved)
-        return (left - right)[..., axis], one & other
+        return (left - right)[..., self._axis], one & other
 
     def disparity_range(self, near: float, far: float = math.inf) -> tuple[float, float]:
         """The least and the greatest disparity that points of a range of depths have, over all pixels and pairs.
@@ -271,32 +262,29 @@ class Rectification(GeometryModule):
         if not least < most:
             raise ValueError(f"depth_range: disparities must be least < most; got least={least}, most={most}")
         with torch.no_grad():
-            camera = self.camera_left
-            depths = []
-            for d in (least, most):
-                like = camera.intrinsics.new_full((1, *camera.size_for("depth_range")), float(d))
-                points, good = self._points(self._pixels(), like)
-                depth = points[..., 2] if self.projection == "perspective" else self.distance(points)
-                depths.append(depth[good])
-        found = torch.cat(depths)
-        ends = [float(found.min()), float(found.max())] if len(found) else [math.inf, math.inf]
-        crosses = least <= 0 <= most
-        return ends[0], math.inf if crosses else ends[1]
+            ends = self.camera_left.intrinsics.new_tensor([least, most])[:, None, None]
+            size = self.camera_left.size_for("depth_range")
+            parts = [self._points(self._pixels(), end.expand(1, *size)) for end in ends]
+            found = torch.cat([points[good] for points, good in parts])
+            found = found[..., 2] if self.projection == "perspective" else self.distance(found)
+        if not len(found):
+            return math.inf, math.inf
+        return float(found.min()), math.inf if least <= 0 <= most else float(found.max())
 
     def distance(self, points: Tensor) -> Tensor:
         """Of points (..., 3) of the frame of the rectified left camera, from the baseline: depth in a panorama."""
         points = as_coordinates(points, "points", 3, "Rectification.distance")
-        return torch.hypot(points[..., 0 if self.vertical else 1], points[..., 2])
+        return torch.hypot(points[..., 1 - self._axis], points[..., 2])
 
     @torch.no_grad()
     def _at(self, depth: float) -> Tensor:
         """The disparities of all pixels at a depth."""
         camera, baseline = self.camera_left, self.baseline[..., None, None]
-        focal = camera.intrinsics[..., 1 if self.vertical else 0, None, None]
+        focal = camera.intrinsics[..., self._axis, None, None]
         if self.projection != "latlon":
             return focal * baseline / depth
         rays, has_ray = camera.unproject(self._pixels())
-        along, across = rays[..., 1 if self.vertical else 0], self.distance(rays)
+        along, across = rays[..., self._axis], self.distance(rays)
         angle = torch.atan2(along, across)
         return (focal * (angle - torch.atan(torch.tan(angle) - baseline / depth)))[has_ray.expand(angle.shape)]
 
@@ -308,21 +296,15 @@ class Rectification(GeometryModule):
         """
         if self.projection != "perspective" or self.extrinsics.batch_shape or self.camera_left.batch_shape:
             raise ValueError(f"Rectification.opencv: of one perspective pair alone; this is {self.projection}")
-        frame, (fx, fy, cx, cy) = self.frame, self.camera_left.intrinsics.unbind(-1)
-        zero = torch.zeros_like(fx)
-        first = torch.stack((fx, zero, cx, zero, zero, fy, cy, zero, zero, zero, zero + 1, zero)).view(3, 4)
+        frame, first = self.frame, torch.nn.functional.pad(self.camera_left.K, (0, 1))
+        fx, fy, cx, cy = self.camera_left.intrinsics.unbind(-1)
+        focal, zero = (fx, fy)[self._axis], torch.zeros_like(fx)
         shift = torch.zeros_like(first)
-        axis = 1 if self.vertical else 0
-        shift[axis, 3] = -(fy if self.vertical else fx) * frame.baseline
+        shift[self._axis, 3] = -focal * frame.baseline
         # d = f b / z, and rows of Q are x, y, f and 1 / b times it
-        q = torch.stack(
-            (
-                *(zero + 1, zero, zero, -cx),
-                *(zero, fx / fy, zero, -cy * fx / fy),
-                *(zero, zero, zero, fx),
-                *(zero, zero, (fx / fy if self.vertical else 1.0) / frame.baseline.to(fx.dtype), zero),
-            )
-        ).view(4, 4)
+        q = torch.stack((zero + 1, fx / fy, zero, zero)).diag()
+        q[:2, 3], q[2, 3] = -torch.stack((cx, cy * fx / fy)), fx
+        q[3, 2] = fx / focal / frame.baseline.to(fx.dtype)
         return {"R1": frame.left, "R2": frame.right, "P1": first, "P2": first + shift, "Q": q}
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -342,10 +324,9 @@ class Rectification(GeometryModule):
 
     def extra_repr(self) -> str:
         """How the images lie."""
-        lines = "columns" if self.vertical else "rows"
         baseline = self.baseline.detach()
-        far = f"{float(baseline):.6g}" if not baseline.ndim else f"of {baseline.numel()} pairs"
-        return f"{self.projection}, {lines} correspond, baseline {far}"
+        far = f"of {baseline.numel()} pairs" if baseline.ndim else f"{float(baseline):.6g}"
+        return f"{self.projection}, {'columns' if self.vertical else 'rows'} correspond, baseline {far}"
 
 
 def rectify(
@@ -393,23 +374,18 @@ def rectify(
             raise ValueError(f"{owner}: {name} must be one of {known}; got {shown(value)}")
     size, vertical = as_image_size(image_size, owner), as_flag(vertical, "vertical", owner)
     check_devices(owner, left=left.intrinsics, right=right.intrinsics, extrinsics=extrinsics.rotation)
-    batch = as_batch(
-        owner,
-        left=(*left.batch_shape, 1),
-        right=(*right.batch_shape, 1),
-        extrinsics=(*extrinsics.batch_shape, 1),
-    )
+    parts = {"left": left, "right": right, "extrinsics": extrinsics}
+    batch = as_batch(owner, **{name: (*part.batch_shape, 1) for name, part in parts.items()})
     if len(batch) > 1:
         raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
     with torch.no_grad():
         frame = frame_of(extrinsics, vertical, align)
-        kind = _KINDS[projection]
-        model = kind.columns if vertical else kind.rows
-        views = [_View(left, frame.left), _View(right, frame.right)]
-        low, high, focal = _extent(views, model, kind, vertical, owner)
+        model = _KINDS[projection].columns if vertical else _KINDS[projection].rows
+        views = [(left, frame.left), (right, frame.right)]
+        low, high, focal = _extent(views, model, _KINDS[projection], vertical, owner)
         if fov is not None:
-            half = _half(fov, kind, projection, vertical, (high - low) / 2, owner)
-            low, high = -half, half
+            high = _half(fov, projection, vertical, (high - low) / 2, owner)
+            low = -high
         camera = _target(model, low, high, focal, size, fov)
     dtype = torch.promote_types(left.intrinsics.dtype, right.intrinsics.dtype)
     return Rectification(left, right, extrinsics, camera.to(dtype), projection, vertical, align)
@@ -427,13 +403,13 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
     length = torch.linalg.vector_norm(translation, dim=-1)
     if fails(length > 0):
         raise ValueError(f"{owner}: the cameras stand at one place; extrinsics.translation is {translation.tolist()}")
-    axis = 1 if vertical else 0
+    axis = int(vertical)
     if align == "opencv":
         half = rotation_matrix(-extrinsics.rotation.double() / 2)
         across = (half @ translation[..., None])[..., 0]
         # the shortest turn that brings the baseline to its axis
         sign = torch.where(across[..., axis] > 0, 1.0, -1.0).to(across)
-        aim = sign[..., None] * torch.nn.functional.one_hot(torch.tensor(axis), 3).to(across)
+        aim = sign[..., None] * _unit(axis, across)
         normal = torch.linalg.cross(across, aim, dim=-1)
         sine = torch.linalg.vector_norm(normal, dim=-1)
         angle = torch.atan2(sine, (across * aim).sum(-1))
@@ -442,8 +418,7 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
         turn = rotation_matrix(normal * factor[..., None])
         return Frame(turn @ half.mT, turn @ half, -sign * length)
     toward = -(rotation.mT @ translation[..., None])[..., 0] / length[..., None]  # of the right camera, from the left
-    view = rotation[..., 2, :] + rotation.new_tensor([0.0, 0.0, 1.0])
-    upright = rotation[..., axis, :] + torch.nn.functional.one_hot(torch.tensor(axis), 3).to(rotation)
+    view, upright = rotation[..., 2, :] + _unit(2, rotation), rotation[..., axis, :] + _unit(axis, rotation)
     sign = torch.where((toward * upright).sum(-1) < 0, -1.0, 1.0).to(toward)
     along = toward * sign[..., None]
     ahead = view - (view * along).sum(-1, keepdim=True) * along
@@ -459,63 +434,53 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
     return Frame(turned, turned @ rotation.mT, sign * length)
 
 
-class _View(NamedTuple):
-    """A camera and how it is turned."""
-
-    camera: Camera
-    rotation: Tensor
-
-
-def _seen(view: _View, plane: Camera, limit: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and greatest (*B, 2) of what the middle row and column of an image show, on the plane of a projection."""
-    lines = middle_lines(view.camera, view.rotation, plane, limit, _LINE)
-    across, down = ((points[..., axis], valid) for axis, (points, valid) in enumerate(lines))
-    low = torch.stack([torch.where(valid, p, torch.inf).amin(-1) for p, valid in (across, down)], -1)
-    high = torch.stack([torch.where(valid, p, -torch.inf).amax(-1) for p, valid in (across, down)], -1)
-    return low, high
+def _unit(axis: int, like: Tensor) -> Tensor:
+    """(3,)."""
+    return like.new_tensor([float(i == axis) for i in range(3)])
 
 
 def _extent(
-    views: list[_View], model: type[Camera], kind: _Kind, vertical: bool, owner: str
+    views: list[tuple[Camera, Tensor]], model: type[Camera], kind: _Kind, vertical: bool, owner: str
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Lows and highs (*B, 2) on the plane of a projection, and (*B,) the focal length that loses nothing in the middle.
 
     Raises:
         ValueError: nothing that both see.
     """
-    plane = model(torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64, device=views[0].rotation.device))
-    limit = torch.tensor([kind.across, kind.along] if vertical else [kind.along, kind.across]).to(views[0].rotation)
-    (low_left, high_left), (low_right, high_right) = (_seen(view, plane, limit) for view in views)
-    low, high = torch.minimum(low_left, low_right), torch.maximum(high_left, high_right)
-    across = 0 if vertical else 1
-    low[..., across] = torch.maximum(low_left, low_right)[..., across]
-    high[..., across] = torch.minimum(high_left, high_right)[..., across]
+    plane = model(torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64, device=views[0][1].device))
+    limit = torch.tensor([kind.across, kind.along] if vertical else [kind.along, kind.across]).to(views[0][1])
+    ends = []
+    for camera, rotation in views:  # what the middle row and column of the image show
+        lines = middle_lines(camera, rotation, plane, limit, _LINE)
+        for end in (torch.inf, -torch.inf):
+            one, other = (torch.where(valid, p[..., i], end) for i, (p, valid) in enumerate(lines))
+            ends.append(torch.stack([w.amin(-1) if end > 0 else w.amax(-1) for w in (one, other)], -1))
+    low_left, high_left, low_right, high_right = ends
+    is_across = torch.tensor([vertical, not vertical], device=limit.device)
+    low = torch.where(is_across, torch.maximum(low_left, low_right), torch.minimum(low_left, low_right))
+    high = torch.where(is_across, torch.minimum(high_left, high_right), torch.maximum(high_left, high_right))
     if not bool((low < high).all()):
-        lines = "columns" if vertical else "rows"
-        raise ValueError(f"{owner}: no {lines} show what both cameras see; are the extrinsics right from left?")
+        raise ValueError(
+            f"{owner}: no {'columns' if vertical else 'rows'} show what both cameras see; are the extrinsics right "
+            "from left?"
+        )
     middle = (low + high) / 2
-    focal = torch.stack([_scale(view, plane, middle) for view in views]).amax(0)
+    focal = torch.stack([_scale(*view, plane, middle) for view in views]).amax(0)
     if not bool((focal > 0).all()):
         raise ValueError(f"{owner}: neither camera sees the middle of the rectified images; give fov and image_size")
     return low, high, focal
 
 
-def _scale(view: _View, plane: Camera, middle: Tensor) -> Tensor:
+def _scale(camera: Camera, rotation: Tensor, plane: Camera, middle: Tensor) -> Tensor:
     """(*B,) pixels of a camera per unit of the plane of a projection, at a point of it; 0 where it does not see it."""
     offsets = _STEP * middle.new_tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
     rays, _ = plane.unproject(middle[..., None, :] + offsets)
-    back = rays @ view.rotation
-    camera = view.camera
-    pixels, valid = camera.project(back.to(camera.intrinsics.dtype))
-    pixels = pixels.double()
-    sides = (pixels[..., 1, :] - pixels[..., 0, :], pixels[..., 3, :] - pixels[..., 2, :])
-    area = (sides[0][..., 0] * sides[1][..., 1] - sides[0][..., 1] * sides[1][..., 0]).abs()
-    return torch.where(valid.all(-1), area.sqrt() / (2 * _STEP), 0.0)
+    pixels, valid = camera.project((rays @ rotation).to(camera.intrinsics.dtype))
+    (a, b), (c, d) = (side.unbind(-1) for side in pixels.double()[..., 1::2, :].sub(pixels[..., ::2, :]).unbind(-2))
+    return torch.where(valid.all(-1), (a * d - b * c).abs().sqrt() / (2 * _STEP), 0.0)
 
 
-def _half(
-    fov: float | tuple[float, float], kind: _Kind, projection: str, vertical: bool, usual: Tensor, owner: str
-) -> Tensor:
+def _half(fov: float | tuple[float, float], projection: str, vertical: bool, usual: Tensor, owner: str) -> Tensor:
     """(*B, 2): half the width and the height of the plane of a projection.
 
     Raises:
@@ -535,12 +500,7 @@ def _half(
 
 
 def _target(
-    model: type[Camera],
-    low: Tensor,
-    high: Tensor,
-    focal: Tensor,
-    size: tuple[int, int] | None,
-    fov: Any,
+    model: type[Camera], low: Tensor, high: Tensor, focal: Tensor, size: tuple[int, int] | None, fov: Any
 ) -> Camera:
     """The camera of both images: square pixels, unless two angles and a size say otherwise."""
     extent = high - low

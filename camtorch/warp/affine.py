@@ -15,8 +15,9 @@ from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, joined, render
-from camtorch.warp.warp import Warp
+from camtorch.warp.routes import positions, route_of
+from camtorch.warp.sampling import Fill, Mode, Options, PaddingMode, Sampler, joined, render
+from camtorch.warp.warp import Warp, checked
 
 SHRINKS = 1.5
 """From this many pixels of the image to one of the result on, edits antialias by themselves."""
@@ -62,16 +63,16 @@ class MirrorWarp(Warp):
         fill: Fill | None = None,
     ) -> Tensor:
         """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
-        if self._decides and not self._moments() and not torch.compiler.is_compiling() and not in_transform():
-            sampled = self._checked(images, mode, padding_mode, fill)
-            inputs = self._inputs()
-            smooth = sampled[0] != "nearest" and images.dtype != torch.bool
-            if smooth and not self._is_long() and not self._learns(inputs) and is_concrete(self.target.intrinsics):
-                where = self._kept(inputs, sampled[1])
+        plain = not (torch.compiler.is_compiling() or in_transform()) and is_concrete(self.target.intrinsics)
+        if self._decides and plain:
+            sampler, inputs = checked(self, images, mode, padding_mode, fill), self._inputs()
+            smooth = sampler.mode != "nearest" and images.dtype != torch.bool
+            if smooth and route_of(self, inputs, images, sampler.mode) == "kept":
+                where = positions(self, inputs, "kept", sampler.padding_mode)
                 if self._halvings is None:
                     self._halvings = _halvings(where, self.source.size_for("Warp"))
                 if any(self._halvings):
-                    return self._smoothed(images, where, self._halvings, *sampled)
+                    return self._smoothed(images, where, self._halvings, sampler)
         return super().forward(images, mode=mode, padding_mode=padding_mode, fill=fill)
 
     def _smoothed(
@@ -79,12 +80,10 @@ class MirrorWarp(Warp):
         images: Tensor,
         where: Sampling | Lattice,
         halvings: list[int],
-        mode: Mode,
-        padding_mode: PaddingMode,
-        fill: tuple[float, ...],
+        sampler: Sampler,
     ) -> Tensor:
         """Sampled from images that torch's antialiased interpolation halved so many times, for each camera."""
-        result = self._empty(images, self._count(images))
+        result = self._empty(images)
         if where.seam is not None:
             images, where = joined(images, where, 4 << max(halvings))
         images = images.expand(len(result), -1, -1, -1)
@@ -99,17 +98,24 @@ class MirrorWarp(Warp):
                 small = F.interpolate(here if plain else widen(here), size, mode="bilinear", antialias=True)
                 here = small if plain else narrow(small, images.dtype)
             part = where if every else where.cameras(rows)
-            made = render(here, part, mode, padding_mode, fill)
+            made = render(here, part, *sampler)
             if every:
                 return made
             result[rows] = made
         return result
 
-    def _empty(self, images: Tensor, count: int) -> Tensor:
-        size = self.target.size_for("Warp")
+    def _empty(self, images: Tensor) -> Tensor:
+        cameras, size = self.batch_shape.numel(), self.target.size_for("Warp")
+        count = len(images) if cameras == 1 else cameras
         if images.requires_grad or not images.is_cpu:
             return images.new_empty(count, images.shape[1], *size)
         return sampler.empty(images, count, size)
+
+    @property
+    def options(self) -> Options:
+        """See `Warp.options`; an antialias of None stays one."""
+        options = super().options
+        return {**options, "antialias": None} if self._decides else options  # type: ignore[typeddict-item]
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """See `Warp.between`."""
@@ -156,7 +162,7 @@ class AffineWarp(MirrorWarp):
         fill: Fill | None = None,
     ) -> Tensor:
         """Edited images, as of `Warp.forward`."""
-        mode, padding_mode, values = self._checked(images, mode, padding_mode, fill)
+        mode, padding_mode, values = checked(self, images, mode, padding_mode, fill)
         if images.ndim == 4 and may_look(self.matrix) and not in_transform():
             made = self._copied(images, values) if padding_mode == "zeros" else None
             made = self._shrunk(images, mode) if made is None else made
@@ -190,9 +196,9 @@ class AffineWarp(MirrorWarp):
         height, width = self.target.size_for("Warp")
         moves = [[tuple(map(round, row)) for row in matrix] for matrix in matrices.tolist()]
         if all(move == moves[0] for move in moves):
-            result, rows = self._empty(images, len(images)), [(slice(None), moves[0])]
+            result, rows = self._empty(images), [(slice(None), moves[0])]
         else:
-            result = self._empty(images, self._count(images))
+            result = self._empty(images)
             rows = [(slice(i, i + 1), move) for i, move in enumerate(moves)]
         images = images.expand(len(result), -1, -1, -1)
         for row, ((a, b, left), (c, d, top)) in rows:
@@ -256,17 +262,14 @@ class AffineWarp(MirrorWarp):
     def _inputs(self) -> list[Tensor]:
         return [self.matrix]
 
-    def _whole(self, padding: PaddingMode) -> Sampling | Lattice:
-        return self._strip(range(self.target.size_for("Warp")[0]), padding)
-
-    def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
+    def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         width = self.target.size_for("Warp")[1]
         back = inverted(self._maps)
         side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
         # pixels to positions: (2 u + 1) / W - 1
         back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)
         dtype = torch.promote_types(self.source.intrinsics.dtype, torch.float32)
-        if self.tolerance and not self.antialias and back.is_cpu and is_concrete(back) and not in_transform():
+        if tolerance and not self.antialias and back.is_cpu and is_concrete(back) and not in_transform():
             return straight_lattice(back, rows, width, dtype)
         v, u = (torch.arange(n, dtype=back.dtype, device=back.device) for n in (len(rows), width))
         v = v + rows.start

@@ -219,7 +219,8 @@ def tabulate(
 
 def _like(target: Camera) -> Tensor:
     """A tensor of the dtype and on the device to compute positions in."""
-    return target.intrinsics.new_empty(0, dtype=torch.promote_types(target.intrinsics.dtype, torch.float32))
+    like = target.intrinsics
+    return like if like.dtype.itemsize >= 4 else like.float()
 
 
 def _pixels(rows: range, width: int, like: Tensor) -> Tensor:
@@ -236,7 +237,7 @@ def pixels_of_rows(target: Camera, rows: range) -> Tensor:
 
 def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `Exact`."""
-    if pixels.ndim == 3:
+    if pixels.ndim == 3 and target.batch_shape:
         pixels = pixels.expand(*target.batch_shape, *pixels.shape)
     rays, has_ray = rays_of(target, pixels)
     if rays.ndim == 3:
@@ -254,7 +255,8 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
     """
     if may_look(seen) and is_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
-            plane.mul_(2 / side).add_(1 / side - 1).clamp_(-_FAR, _FAR)
+            plane.mul_(2 / side).add_(1 / side - 1)
+        seen.clamp_(-_FAR, _FAR)
         if not bool(mapped.all()):
             seen.masked_fill_(~mapped.unsqueeze(-1), OUTSIDE)
         return seen
@@ -312,16 +314,16 @@ def on_lattice(
     if min(n, m) < _FEWEST:
         return None
     keeps = in_memory(like) and (n + 5) * (m + 5) <= _MOST_KEPT
-    pixels = _kept_looks(rows, width, like.dtype) if keeps else _looks(rows, width, like)
+    pixels = _kept_probes(rows, width, like.dtype) if keeps else _probes(rows, width, like)
     exact = partial(_positions, source, target, rotation)
-    positions, mapped = exact(pixels[None])  # (B, 1, N, 2)
-    counts = (n + 5) * (m + 5), len(pixels) - (n + 5) * (m + 5)
-    at_nodes, mapped_nodes = (t[:, 0].split(counts, 1)[0].unflatten(1, (n + 5, m + 5)) for t in (positions, mapped))
-    lattice, rim = at_nodes.movedim(-1, 1), mapped[:, 0].split(counts, 1)[1]
+    positions, mapped = exact(pixels)  # (B, 1, N, 2)
+    count, shape = (n + 5) * (m + 5), (n + 5, m + 5)
+    lattice = positions[:, 0, :count].movedim(-1, 1).unflatten(2, shape)
+    mapped_nodes, rim = mapped[:, 0, :count].unflatten(1, shape), mapped[:, 0, count:]
     size = source.size_for("Warp")
     probed, classes = Probed(lattice, mapped_nodes, rim, (height, width), size, tolerance, padding), None
     if in_memory(lattice) and not is_recorded():
-        classes = classify(probed._replace(nodes=lattice.float()))
+        classes = classify(probed._replace(nodes=lattice if lattice.dtype == torch.float32 else lattice.float()))
     cells, most = classes or _classified(probed)
     if not most:
         return Lattice(lattice, cells, like.new_empty(2, 0, STEP, STEP), (height, width), seam_of(source))
@@ -358,21 +360,21 @@ def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype
     return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), (len(rows), width))
 
 
-def _looks(rows: range, width: int, like: Tensor) -> Tensor:
-    """(N, 2): the nodes of a lattice, and the pixels at the rim of the target, which may tell what nodes do not."""
+def _probes(rows: range, width: int, like: Tensor) -> Tensor:
+    """(1, N, 2): the nodes of a lattice, and the pixels at the rim of the target, which may tell what nodes do not."""
     # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
     v, u = (
         (torch.arange(math.ceil(side / STEP) + 5, dtype=like.dtype, device=like.device) - 2) * STEP
         for side in (len(rows), width)
     )
     nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
-    return torch.cat((nodes.flatten(1), _rim(rows, width, like).mT), 1).mT
+    return torch.cat((nodes.flatten(1), _rim(rows, width, like).mT), 1).mT[None]
 
 
 @lru_cache(maxsize=8)
-def _kept_looks(rows: range, width: int, dtype: torch.dtype) -> Tensor:
+def _kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):
-        return _looks(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
+        return _probes(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
 
 
 def _rim(rows: range, width: int, like: Tensor) -> Tensor:

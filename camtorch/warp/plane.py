@@ -24,14 +24,14 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.models import Pinhole
 from camtorch.rotations import rotation_matrix
+from camtorch.warp.proxy import ProxyWarp, turned
 from camtorch.warp.sampling import Fill, Mode, PaddingMode
-from camtorch.warp.surface import SurfaceWarp, turned
 from camtorch.warp.warp import Warp
 
 _GRAZING = 1e-9  # the cosine of a ray to the plane's normal from which on it does not meet the plane
 
 
-class PlaneWarp(SurfaceWarp):
+class PlaneWarp(ProxyWarp):
     """The image that `target` would see of a plane, made from the image of `source`, which stands elsewhere.
 
     What lies on the plane is where it should be; what rises above it is smeared, as in every image of that kind. For
@@ -126,7 +126,7 @@ class PlaneWarp(SurfaceWarp):
     def _inputs(self) -> list[Tensor]:
         return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation, self.normal, self.distance]
 
-    # -- the surface
+    # -- the plane
 
     def _to_source(self, rays: Tensor) -> tuple[Tensor, Tensor]:
         return _carried(rays, *self.plane), _ahead(rays, *self.plane[2:])

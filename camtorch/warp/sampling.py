@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import Any, Literal, TypedDict, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, get_args
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -26,13 +26,18 @@ Name = TypeVar("Name", bound=str)
 MODES: tuple[Mode, ...] = get_args(Mode)
 PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
-# Between two pixel centres the interpolation is a polynomial; as many nodes determine it
-_NODES = {"nearest": (), "bilinear": (0.0, 1.0), "bicubic": (0.0, 1 / 3, 2 / 3, 1.0)}
 _REACH = {"nearest": 1, "bilinear": 1, "bicubic": 2}  # pixels to either side of a position that have a part in it
 _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
 _TILE = 512  # pixels along the sides of what is then sampled at a time
 _TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth
-_FLOATING = {4: torch.float32, 8: torch.float64}
+
+
+class Sampler(NamedTuple):
+    """How the images of one call are sampled."""
+
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: tuple[float, ...]
 
 
 def render(
@@ -72,9 +77,10 @@ def render(
     if not dtype.is_floating_point:
         images = images.detach()
         where = where._replace(grid=where.grid.detach()) if isinstance(where, Sampling) else where
-    result = _natively(images, where, mode, padding_mode, fill, out)
+    how = Sampler(mode, padding_mode, fill)
+    result = _natively(images, where, how, out)
     if result is None:
-        result = _by_torch(images, where, mode, padding_mode, fill, kept)
+        result = _by_torch(images, where, how, kept)
         result = _laid_as(images, result) if out is None else out.copy_(result)
     return result
 
@@ -109,14 +115,7 @@ def _laid_as(images: Tensor, result: Tensor) -> Tensor:
     return result.contiguous(memory_format=torch.channels_last)
 
 
-def _natively(
-    images: Tensor,
-    where: Sampling | Lattice,
-    mode: Mode,
-    padding_mode: PaddingMode,
-    fill: tuple[float, ...],
-    out: Tensor | None = None,
-) -> Tensor | None:
+def _natively(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tensor | None = None) -> Tensor | None:
     """What compiled code makes, or None: here is decided whether it does.
 
     It wants the library, memory of the CPU, no graph and no transform, nobody who records what torch does, a dtype that
@@ -124,6 +123,7 @@ def _natively(
     """
     if torch.compiler.is_compiling() or is_recorded() or in_transform():
         return None
+    mode, padding_mode, fill = how
     positions = where.nodes if isinstance(where, Lattice) else where.grid
     if not (native_available() and sampler.takes(images.dtype, mode) and all(map(in_memory, (images, positions)))):
         return None
@@ -131,13 +131,13 @@ def _natively(
         return None
     values = fill * images.shape[1] if len(fill) == 1 else fill
     if isinstance(where, Lattice):
-        result = sampler.empty(images, len(images), where.size) if out is None else out
+        result = sampler.empty(images, images.shape[0], where.size) if out is None else out
         at = where.single
         sampler.sample(images, result, mode, padding_mode, values, nodes=at.nodes, cells=at.cells, exact=at.exact)
         return result
     if positions.dtype not in (torch.float32, torch.float64):
         return None
-    result = sampler.empty(images, len(images), (positions.shape[1], positions.shape[2])) if out is None else out
+    result = sampler.empty(images, images.shape[0], (positions.shape[1], positions.shape[2])) if out is None else out
     # in "zeros" positions far outside say that there is none
     mapped = None if padding_mode == "zeros" else where.mapped
     sampler.sample(images, result, mode, padding_mode, values, grid=positions, mapped=mapped)
@@ -171,22 +171,15 @@ def blended(parts: Iterable[Tensor], weights: Iterable[Tensor], mode: Mode) -> T
     return result
 
 
-def _by_torch(
-    images: Tensor,
-    where: Sampling | Lattice,
-    mode: Mode,
-    padding_mode: PaddingMode,
-    fill: tuple[float, ...],
-    kept: dict[int, Pyramid] | None,
-) -> Tensor:
+def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
     """What `grid_sample` makes of B images."""
     count, dtype = images.shape[0], images.dtype
     plain = is_plain(images)
     wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
     if isinstance(where, Lattice):
         where = where.pixels
-    if mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
-        return _pick(images, where, padding_mode, fill)
+    if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
+        return _pick(images, where, how)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
     plain = plain and is_plain(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
@@ -194,16 +187,16 @@ def _by_torch(
     step = count if wide or not plain else 1 if large else thread_count()
     if not large and count <= step:
         levels = _levels(kept, 0, widen(images), finite)
-        return narrow(_render(levels.images, where.grid, where, levels, mode, padding_mode, fill), dtype)
+        return narrow(_render(levels.images, where.grid, where, levels, how), dtype)
     result = images.new_empty(*images.shape[:2], *where.grid.shape[1:3])
     for i in range(0, count, step):
         part = slice(i, i + step)
         levels = _levels(kept, i, images[part], finite)
         here = where if where.grid.shape[0] == 1 else where.cameras(part)
         if large:
-            _render_tiles(result[part], levels, here, mode, padding_mode, fill)
+            _render_tiles(result[part], levels, here, how)
         else:
-            made = _render(widen(images[part]), here.grid, here, levels, mode, padding_mode, fill)
+            made = _render(widen(images[part]), here.grid, here, levels, how)
             result[part] = narrow(made, dtype)
     return result
 
@@ -213,63 +206,47 @@ def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor, finite: boo
     return Pyramid(images, finite) if kept is None else kept.setdefault(i, Pyramid(images, finite))
 
 
-def _render_tiles(
-    result: Tensor,
-    levels: Pyramid,
-    where: Sampling,
-    mode: Mode,
-    padding_mode: PaddingMode,
-    fill: tuple[float, ...],
-) -> None:
+def _render_tiles(result: Tensor, levels: Pyramid, where: Sampling, how: Sampler) -> None:
     """One image in tiles of the target, each from a copy of what it reads."""
     for top in range(0, result.shape[2], _TILE):
         for left in range(0, result.shape[3], _TILE):
             down, across = slice(top, top + _TILE), slice(left, left + _TILE)
             here = where.part(down, across)
-            images, grid = _read(levels.images, here, mode, padding_mode)
-            result[:, :, down, across] = narrow(
-                _render(images, grid, here, levels, mode, padding_mode, fill), result.dtype
-            )
+            images, grid = _read(levels.images, here, how)
+            result[:, :, down, across] = narrow(_render(images, grid, here, levels, how), result.dtype)
 
 
-def _read(images: Tensor, where: Sampling, mode: Mode, padding_mode: PaddingMode) -> tuple[Tensor, Tensor]:
+def _read(images: Tensor, where: Sampling, how: Sampler) -> tuple[Tensor, Tensor]:
     """The part of the images that is read, as of `widen`, and the positions on it.
 
     What is cut off at the image's own edges alone, or has no part in the result, leaves the padding as it is.
     """
-    slices, axes = [], []
+    reach, slices, axes = _REACH[how.mode], [], []
     sides, planes = images.shape[:-3:-1], where.grid.unbind(-1)
     ranges = [[float(end) for end in torch.aminmax(plane)] for plane in planes]
     if any(low < -1 or high > 1 for low, high in ranges):
         read = where.mapped
-        if padding_mode == "zeros":
-            margins = (1 + 2 * _REACH[mode] / side for side in sides)
+        if how.padding_mode == "zeros":
+            margins = (1 + 2 * reach / side for side in sides)
             across, down = (plane.abs() < margin for plane, margin in zip(planes, margins, strict=True))
             read = across & down
         bounds = (torch.inf, torch.amin), (-torch.inf, torch.amax)
         ranges = [[float(pick(torch.where(read, plane, none))) for none, pick in bounds] for plane in planes]
     for plane, side, ends in zip(planes, sides, ranges, strict=True):
         first, last = ((end + 1) * side / 2 - 0.5 for end in ends)
-        if padding_mode == "reflection" and (first < 0 or last > side - 1):
+        if how.padding_mode == "reflection" and (first < 0 or last > side - 1):
             first, last = 0.0, side - 1.0
         # one more pixel for what is lost in rounding
-        start = int(min(max(first - _REACH[mode], 0), side - 1))
-        stop = int(min(max(last + _REACH[mode] + 2, start + 1), side))
+        start = int(min(max(first - reach, 0), side - 1))
+        stop = int(min(max(last + reach + 2, start + 1), side))
         slices.append(slice(start, stop))
         axes.append(((plane + 1) * side - 2 * start) / (stop - start) - 1)
     return widen(images[:, :, slices[1], slices[0]]), torch.stack(axes, -1)
 
 
-def _render(
-    images: Tensor,
-    grid: Tensor,
-    where: Sampling,
-    levels: Pyramid,
-    mode: Mode,
-    padding_mode: PaddingMode,
-    fill: tuple[float, ...],
-) -> Tensor:
+def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how: Sampler) -> Tensor:
     """Images of a dtype to compute in, or a part of them, at positions `grid` on it, filled and antialiased."""
+    mode, padding_mode, fill = how
     minifies = where.scale is not None
     # what lies beyond the rim is left out by coverage: at small levels the rim's pixels are wide
     beyond: PaddingMode = "border" if minifies and padding_mode == "zeros" else padding_mode
@@ -372,7 +349,10 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
 def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
     """On a CPU, with work for every thread, of which grid_sample gives one to each image."""
     where = Sampling(grid[:1] if grid.stride(0) == 0 else grid, images.new_empty(0), None)
-    if padding_mode == "zeros" and (native := _natively(images, where, mode, padding_mode, (0.0,))) is not None:
+    if (
+        padding_mode == "zeros"
+        and (native := _natively(images, where, Sampler(mode, padding_mode, (0.0,)))) is not None
+    ):
         return native
     threads = torch.get_num_threads()
     if len(images) >= threads:
@@ -452,36 +432,17 @@ def _padded(u: Tensor, side: int, padding_mode: PaddingMode) -> Tensor:
     return u.clamp(0, side - 1)
 
 
-def _pick(images: Tensor, where: Sampling, padding_mode: PaddingMode, fill: tuple[float, ...]) -> Tensor:
+def _pick(images: Tensor, where: Sampling, how: Sampler) -> Tensor:
     """The nearest of integers (B, C, H, W), moved and not computed with: no float holds every id."""
     limits = torch.iinfo(images.dtype)
-    values = [min(max(round(value), limits.min), limits.max) for value in fill]
+    values = [min(max(round(value), limits.min), limits.max) for value in how.fill]
     value = torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None]
-    if is_plain(images, where.grid):
-        picked = _pick_bits(images, where.grid, padding_mode)
-        if padding_mode == "zeros" and not any(values):
-            return picked
-        seen = _nearest(where.grid, images.shape[-2:], padding_mode)[2] if padding_mode == "zeros" else where.mapped
-        return torch.where(seen.unsqueeze(1), picked, value)
-    u, v, inside = _nearest(where.grid, images.shape[-2:], padding_mode)
-    seen = inside if padding_mode == "zeros" else where.mapped
+    u, v, inside = _nearest(where.grid, images.shape[-2:], how.padding_mode)
+    seen = inside if how.padding_mode == "zeros" else where.mapped
     index = torch.where(inside, v.long() * images.shape[-1] + u.long(), 0).flatten(1).unsqueeze(1)
     pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
     picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
     return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
-
-
-def _pick_bits(images: Tensor, grid: Tensor, padding_mode: PaddingMode) -> Tensor:
-    """The nearest integers, 0 where there are none: grid_sample moves bits as they are (on a CPU, not compiled)."""
-    wide = _FLOATING[images.dtype.itemsize]
-    grid = grid.expand(len(images), -1, -1, -1)
-    result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
-    step = torch.get_num_threads()
-    for parts in zip(result.split(step), images.split(step), grid.split(step), strict=True):
-        # a copy of what is read next: from a cache that is three times as fast
-        bits = parts[1].view(wide).clone()
-        parts[0].view(wide).copy_(sample(bits, parts[2], "nearest", padding_mode, finite=True))
-    return result
 
 
 def _nearest(grid: Tensor, size: torch.Size, padding_mode: PaddingMode) -> tuple[Tensor, Tensor, Tensor]:
@@ -565,49 +526,24 @@ class _Sample(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         images, grid = ctx.saved_tensors
-        by_images, by_grid = torch.ops.aten.grid_sampler_2d_backward(
-            gradient,
-            images,
-            grid,
-            {"bilinear": 0, "nearest": 1, "bicubic": 2}[ctx.mode],
-            PADDINGS.index(ctx.padding_mode),
-            False,
-            (True, True) if in_transform() else ctx.needs_input_grad[:2],  # torch 2.10 maps over both alone
-        )
-        return by_images, by_grid, None, None
+        wanted = (True, True) if in_transform() else ctx.needs_input_grad[:2]  # torch 2.10 maps over both alone
+        return *_backward(gradient, images, grid, ctx, wanted), None, None
 
     @staticmethod
     def jvp(ctx: Any, images_tangent: Tensor, grid_tangent: Tensor, *_: Any) -> Tensor:
         images, grid = ctx.saved_tensors
+        count, channels = images.shape[:2]
         tangent = F.grid_sample(images_tangent, grid, ctx.mode, ctx.padding_mode, align_corners=False)
-        nodes = _NODES[ctx.mode]
-        for axis in (0, 1):
-            size = images.shape[3 - axis]
-            position = ((grid[..., axis] + 1) * size - 1) / 2
-            cell = position.floor()
-            weights = _derivative_weights(nodes, position - cell)
-            for node, weight in zip(nodes, weights, strict=True):
-                moved = (2 * (cell + node) + 1) / size - 1
-                at_node = torch.stack((moved, grid[..., 1]) if axis == 0 else (grid[..., 0], moved), -1)
-                value = F.grid_sample(images, at_node, ctx.mode, ctx.padding_mode, align_corners=False)
-                tangent = tangent + value * (weight * grid_tangent[..., axis] * (size / 2)).unsqueeze(1)
-        return tangent
+        # a channel alone, so that its gradient by the positions is not added to that of others
+        alone, at = images.flatten(0, 1).unsqueeze(1), grid.repeat_interleave(channels, 0)
+        _, slopes = _backward(torch.ones_like(tangent).flatten(0, 1).unsqueeze(1), alone, at, ctx, (True, True))
+        return tangent + (slopes.unflatten(0, (count, channels)) * grid_tangent.unsqueeze(1)).sum(-1)
 
 
-def _derivative_weights(nodes: tuple[float, ...], t: Tensor) -> list[Tensor]:
-    """The derivative at t of the Lagrange polynomial of each node."""
-    weights = []
-    for i, node in enumerate(nodes):
-        others = [n for j, n in enumerate(nodes) if j != i]
-        scale = 1.0
-        for n in others:
-            scale *= node - n
-        total = torch.zeros_like(t)
-        for left_out in range(len(others)):
-            term = torch.ones_like(t)
-            for j, n in enumerate(others):
-                if j != left_out:
-                    term = term * (t - n)
-            total = total + term
-        weights.append(total / scale)
-    return weights
+def _backward(gradient: Tensor, images: Tensor, grid: Tensor, ctx: Any, wanted: tuple[bool, ...]) -> tuple[Tensor, ...]:
+    """The derivatives of grid_sample by images and positions."""
+    mode, padding = {"bilinear": 0, "nearest": 1, "bicubic": 2}[ctx.mode], PADDINGS.index(ctx.padding_mode)
+    derivatives: tuple[Tensor, ...] = torch.ops.aten.grid_sampler_2d_backward(
+        gradient, images, grid, mode, padding, False, wanted
+    )
+    return derivatives

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, Literal, TypedDict, cast, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 import torch
 from torch import Tensor, nn
@@ -163,11 +163,15 @@ class RollingShutter(GeometryModule):
         made._moment = moment
         return made
 
-    def moments(self) -> list[RollingShutter]:
-        """The shutter at moments of its exposure, spread evenly; none if it blurs nothing, or is at one."""
-        blurs = bool((self.exposure.detach() > 0).any()) if is_concrete(self.exposure) else self._blurs
-        if self._moment is not None or not blurs:
-            return []
+    @property
+    def blurs(self) -> bool:
+        """Whether the exposure takes time; a shutter at one moment of it does not blur."""
+        if self._moment is not None:
+            return False
+        return bool((self.exposure.detach() > 0).any()) if is_concrete(self.exposure) else self._blurs
+
+    def exposed(self) -> list[RollingShutter]:
+        """The shutter at `samples` moments of its exposure, spread evenly."""
         parts = ((i + 0.5) / self.samples - 0.5 for i in range(self.samples))
         return [self._with(self.readout, self.rates, self.exposure, part) for part in parts]
 
@@ -221,7 +225,7 @@ def _lead(value: Tensor, ndim: int, inner: int = 0) -> Tensor:
     return value if value.ndim == inner else value.reshape(len(value), *[1] * (ndim - 1), *value.shape[1:])
 
 
-class _InMotion:
+class InMotion:
     """A camera behind a rolling shutter, as a warp sees one: rays are those of the middle of the readout."""
 
     def __init__(self, camera: Camera, shutter: RollingShutter):
@@ -298,17 +302,12 @@ def averaged(
         padding_mode: likewise.
         fill: likewise.
     """
-    light = widen(images)
+    linear = widen(images)
     if gamma != 1:
-        light, fill = light.clamp(min=0) ** gamma, tuple(max(value, 0.0) ** gamma for value in fill)
+        linear, fill = linear.clamp(min=0) ** gamma, tuple(max(value, 0.0) ** gamma for value in fill)
     options = {"mode": mode, "padding_mode": padding_mode, "fill": fill}
-    mean = reduce(torch.add, (warp(light, **options) for warp in warps)) / len(warps)
+    mean = reduce(torch.add, (warp(linear, **options) for warp in warps)) / len(warps)
     if gamma != 1:  # the root has no derivative at zero
         some = mean > 0
         mean = torch.where(some, torch.where(some, mean, 1.0) ** (1 / gamma), 0.0)
     return narrow(mean, images.dtype)
-
-
-def in_motion(camera: Camera, shutter: RollingShutter | None) -> Camera:
-    """The camera, behind its shutter if it has one."""
-    return camera if shutter is None else cast("Camera", _InMotion(camera, shutter))

@@ -18,15 +18,15 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
 from camtorch.rotations import rotation_matrix
 from camtorch.warp.plane import BirdsEye
+from camtorch.warp.proxy import ProxyWarp, turned
 from camtorch.warp.sampling import Mode, blended
-from camtorch.warp.surface import SurfaceWarp, turned
 from camtorch.warp.warp import Warp, as_sized
 
 _BLEND = 1 / 8  # of the shorter side: how far from where a camera ends it begins to fade
 _LEAST = 1e-6  # the weight of a pixel that a camera only just sees, beside none
 
 
-class _SphereWarp(SurfaceWarp):
+class _SphereWarp(ProxyWarp):
     """What a target at a rig's origin sees of a sphere about it, by a camera of the rig within it."""
 
     def __init__(self, source: Camera, target: Camera, extrinsics: Extrinsics, radius: float, mode: Mode):

@@ -11,9 +11,8 @@ from scenes import cabin, portrait
 
 import camtorch as ct
 from camtorch._drawing import INK, PAPER, Marks, font, shown
-from camtorch.cli.labelled_image import LabelledImage
 from camtorch.cli.labels import Labels
-from camtorch.cli.sheet import arrows
+from camtorch.cli.sheet import LabelledImage, arrows
 from drawings.pages import IMAGES, code, sections
 from drawings.sheets import GAP, TILE, WIDTH, pair, put
 

@@ -18,9 +18,9 @@ from scenes.portrait import driver
 import camtorch as ct
 from camtorch._drawing import INK, PAPER, shown
 from camtorch.boards.boards import Chessboard
-from camtorch.cli import labelled_image, sheet
-from camtorch.cli.labelled_image import LabelledImage
+from camtorch.cli import sheet
 from camtorch.cli.labels import Labels
+from camtorch.cli.sheet import LabelledImage
 from camtorch.rotations import mount_rotation
 from drawings.pages import EXAMPLES, IMAGES
 from drawings.sheets import drawn, in_rows, tiles
@@ -33,7 +33,7 @@ def rendered(lens: ct.Camera | None = None) -> LabelledImage:
     """A driver with labels, behind a lens."""
     found = driver(lens)
     labels = Labels(found.keypoints, found.boxes, found.eyes, found.gaze)
-    return labelled_image.photograph(found.image, found.camera, labels, "a rendered driver")
+    return sheet.photograph(found.image, found.camera, labels, "a rendered driver")
 
 
 def moved(before: LabelledImage, warp: ct.Warp) -> LabelledImage:
@@ -149,8 +149,8 @@ def fields() -> Image.Image:
 def augment() -> Image.Image:
     """What `camtorch augment` makes of a rendered driver."""
     before = rendered()
-    after = labelled_image.augmented(before, "dms130", 5, 0, min_filled=0.95, fov="source")
-    title, origin = "One image, five other cameras", labelled_image.origin("dms130", before)
+    after = sheet.augmented(before, "dms130", 5, 0, min_filled=0.95, fov="source")
+    title, origin = "One image, five other cameras", sheet.origin("dms130", before)
     page = sheet.drawing([before, *after], title, origin)
     page.thumbnail((960, 2000), Image.Resampling.LANCZOS)
     return page

@@ -68,9 +68,9 @@ def likes():
 
 
 # Every preset with some models, and some pairs of models: all would take minutes
-WITH_PRESETS = [(i, KEYS[(5 * i + j) % len(KEYS)]) for j in range(2) for i in range(len(PRESETS))]
-WITH_MODELS = [(len(PRESETS) + KEYS.index(like), key) for like, key in PAIRS[::3]]
-FEW = {WITH_PRESETS[0], WITH_PRESETS[2], WITH_MODELS[8]}
+WITH_PRESETS = [(i, KEYS[(5 * i + j) % len(KEYS)]) for j in range(2) for i in range(0, len(PRESETS), 2)]
+WITH_MODELS = [(len(PRESETS) + KEYS.index(like), key) for like, key in PAIRS[::6]]
+FEW = {WITH_PRESETS[0], WITH_PRESETS[2], WITH_MODELS[4]}
 
 
 @pytest.mark.parametrize(("which", "key"), slow_unless(FEW.__contains__, WITH_PRESETS + WITH_MODELS))
@@ -156,17 +156,6 @@ def test_signs_of_the_angles(angle, moves):
         turned = torch.tensor([math.cos(math.radians(10)), -math.sin(math.radians(10))]) * 100
         expected = turned - torch.tensor([100.0, 0.0])
     torch.testing.assert_close(shift, expected.float(), atol=1e-3, rtol=0)
-
-
-@pytest.mark.parametrize("angle", ["yaw", "pitch", "roll"])
-def test_angles_may_be_left_out(angle):
-    camera, pixels = pinhole(), lattice()
-    turned = {angle: (10, 10)}
-    none, zero = (
-        RandomMount(camera=camera, **{**dict.fromkeys(("yaw", "pitch", "roll"), v), **turned}) for v in (None, (0, 0))
-    )
-    torch.testing.assert_close(none(keypoints=pixels)["keypoints"], zero(keypoints=pixels)["keypoints"], rtol=0, atol=0)
-    assert (none(keypoints=pixels)["keypoints"] - pixels).abs().max() > 10
 
 
 def sample(count=3, camera=None):
@@ -299,13 +288,6 @@ def test_skipped_samples_stay_bit_identical(name):
         assert [c.key for c in out["camera"]] == ["kannala_brandt" if a else "pinhole" for a in draw["apply"]]
     else:
         assert torch.equal(out["camera"].intrinsics[skipped][0], batch["camera"].intrinsics)
-
-
-def test_p_of_zero_changes_nothing():
-    out = RandomMount(p=0)(sample())
-    for field, value in sample().items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(out[field], value)
 
 
 def test_every_sample_may_have_its_own_camera():

@@ -95,14 +95,6 @@ def test_a_gate_of_numbers_is_a_gate(camera):
         mount.draw(-1)
 
 
-@pytest.mark.parametrize("p", [0, 1])
-def test_labels_of_whole_numbers_and_of_none(camera, p):
-    mount = RandomMount(camera=camera, p=p)
-    boxes = torch.tensor([[[math.nan, 1.0, 5.0, 5.0], [1.0, 1.0, math.inf, 5.0], [1.0, 1.0, 5.0, 5.0]]])
-    assert mount(boxes=boxes)["boxes_valid"].tolist()[0][:2] == [False, False]
-    assert mount(keypoints=torch.tensor([[[3, 4]]]))["keypoints"].dtype == torch.float32
-
-
 def test_a_camera_in_a_batch_of_one_serves_all(camera):
     one = ct.Pinhole(torch.tensor([[60.0, 60, 39.5, 29.5]]), image_size=SIZE).requires_grad_(False)
     mount, points = RandomMount(p=0.5), torch.rand(6, 4, 2) * 50

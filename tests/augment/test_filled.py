@@ -3,9 +3,7 @@
 import copy
 import pickle
 import re
-import warnings
 
-import kornia.augmentation as K  # noqa: N812
 import pytest
 import torch
 
@@ -58,10 +56,6 @@ def test_mostly_empty_images_are_told_once_with_the_number():
 )
 def test_what_is_full_or_meant_so_is_not_told(augmentation):
     augmentation(image=torch.rand(2, 3, *SIZE))
-
-
-def test_labels_alone_are_not_told():
-    RandomCamera("dms130", camera=pinhole())(keypoints=torch.rand(2, 5, 2) * 100)
 
 
 def test_front_ends_tell_it_too():
@@ -125,18 +119,6 @@ def test_a_batch_is_its_samples_and_replays_are_identical(name):
             torch.testing.assert_close(alone["keypoints"], out["keypoints"][i], atol=1e-2, rtol=0)
 
 
-def test_kornia_replays_it_bit_by_bit():
-    aug = K.AugmentationSequential(
-        ct.augment.kornia.RandomCamera(pinhole(), "dms130", min_filled=0.9), data_keys=["input", "keypoints"]
-    )
-    data = torch.ones(4, 1, *SIZE), torch.rand(4, 5, 2) * 100
-    first, params = aug(*data), aug._params
-    aug(*data)
-    again = aug(*data, params=params)
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    assert (first[0] > 0).flatten(1).float().mean(1).min() > 0.9
-
-
 @pytest.mark.slow
 def test_compiled_it_is_the_same():
     augmentation = RandomCamera("dms130", camera=pinhole(), fov="source", min_filled=0.9)
@@ -197,12 +179,6 @@ def test_a_field_of_view_that_is_not_made_is_told_once(untold, name):
     ASKED[name](**options)(keypoints=torch.rand(8, 5, 2))  # warnings are errors here
 
 
-def test_front_ends_tell_of_it_too(untold):
-    aug = ct.augment.kornia.RandomLens(pinhole(60), "kannala_brandt", fov=120, min_filled=0.9)
-    with pytest.warns(UserWarning, match="asked for fov=120"):
-        aug(torch.rand(2, 3, *SIZE))
-
-
 @pytest.mark.parametrize(
     "augmentation",
     [
@@ -257,16 +233,3 @@ def test_every_source_has_its_own_fov():
     assert found.min() > 0.95
     focal = augmentation.change(cameras, augmentation.draw(2)).target.intrinsics[:, 0]
     assert focal[0] > 1.5 * focal[1]
-
-
-def test_a_first_example_has_full_images():
-    augmentation = RandomCamera("dms130", fov="source", min_filled=0.95, yaw=15, pitch=10, roll=20, camera=pinhole())
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        out = augmentation(image=torch.ones(16, 1, *SIZE))
-    assert (out["image"] > 0).flatten(1).float().mean(1).min() > 0.95
-
-
-def test_words_that_are_no_fov():
-    with pytest.raises(TypeError, match=r"fov must be a range \(low, high\) or a number; got 'sauce'"):
-        RandomCamera("dms130", fov="sauce")

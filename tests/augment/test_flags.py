@@ -7,7 +7,6 @@ import pickle
 import kornia.augmentation as K  # noqa: N812
 import pytest
 import torch
-from torch.utils.data import DataLoader
 from torchvision_stand_in import torchvision_of
 
 import camtorch as ct
@@ -111,15 +110,3 @@ def test_torchvision_s_flags_go_on_through_chains(vision):
     assert lost["boxes"].as_subclass(torch.Tensor)[0].tolist() == [-1, -1, -1, -1]
     assert not lost["keypoints_valid"].any()
     assert not lost["boxes_valid"].any()
-
-
-def test_torchvision_s_flags_survive_a_loader(vision):
-    front_end, tv = vision
-    transform = front_end.Transform(narrow(), fisheye(), valid=True)
-    targets = [transform(*sample(tv))[1] for _ in range(4)]
-    plain = [
-        {k: v.as_subclass(torch.Tensor) if isinstance(v, tv.TVTensor) else v for k, v in t.items()} for t in targets
-    ]
-    for batch in DataLoader(plain, batch_size=2):
-        assert batch["keypoints"].shape == (2, 4, 2)
-        assert batch["keypoints_valid"].tolist() == [[True, False, True, False]] * 2

@@ -5,7 +5,7 @@ import torch
 
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens
-from camtorch.warp.warp import along_edges
+from camtorch.warp.boxes import along_edges
 
 WHOLE = [name for name in PRESETS if name != "aria"]
 """Of Aria's, the calibrated polynomial folds before the corners: they lie beyond what the lens lights."""
@@ -51,11 +51,3 @@ def test_a_drawn_lens_loses_no_pixel_that_its_like_has(amount):
         assert lost.max() <= 1e-4 * after[0].numel(), name  # a line of them may be hit by less than a tenth of a pixel
         lenses = drawn.change(None, draw).target.distortion
         assert (lenses != lenses[:1]).any(-1).sum() > 12, name
-
-
-def test_the_typical_wide_lens_is_as_wide_as_its_name_says():
-    camera = PRESETS["dms130"].camera()
-    width, cy = camera.image_size[1], float(camera.intrinsics[3])
-    left, right = camera.unproject(torch.tensor([[-0.5, cy], [width - 0.5, cy]]))[0]
-    across = torch.atan2(right[0], right[2]) - torch.atan2(left[0], left[2])
-    assert abs(float(across.rad2deg()) - 130) < 0.5

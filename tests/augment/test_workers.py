@@ -1,13 +1,10 @@
 """Augmentations in the workers of a DataLoader, and a learnable camera in DistributedDataParallel."""
 
-import os
 import pickle
-import sys
 
 import numpy as np
 import pytest
 import torch
-from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader, Dataset
 
 import camtorch as ct
@@ -100,50 +97,3 @@ def test_an_augmentation_pickles_with_its_options():
     # without a graph positions are rounded otherwise, by 1e-6 px or so
     again = copy(image=image[0].numpy(), draw=draw)["image"]
     np.testing.assert_allclose(again, before["image"][0].detach().numpy(), rtol=0, atol=1e-5)
-
-
-class Learner(torch.nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.camera, self.augmentation = camera(torch.float64), augmentation()
-
-    def forward(self, images, keypoints, draw):
-        moved = self.augmentation(image=images, keypoints=keypoints, camera=self.camera, draw=draw)
-        return moved["image"], moved["keypoints"]
-
-
-def gradients(learner, rows):
-    """Those of all parameters, of a loss of the means over these rows of one batch."""
-    generator = torch.Generator().manual_seed(1)
-    images = torch.rand(COUNT, 1, *SIZE, dtype=torch.float64, generator=generator)
-    weights = torch.rand(COUNT, 1, *SIZE, dtype=torch.float64, generator=generator)
-    points = torch.tensor([7.0, 5.0]) + 4 * torch.rand(COUNT, 3, 2, dtype=torch.float64, generator=generator)
-    draw = augmentation().draw(COUNT, generator)
-    moved, keypoints = learner(images[rows], points[rows], {name: value[rows] for name, value in draw.items()})
-    ((moved * weights[rows]).sum((1, 2, 3)).mean() + keypoints.square().sum((1, 2)).mean()).backward()
-    return {name: parameter.grad for name, parameter in learner.named_parameters()}
-
-
-def work(rank, folder):
-    torch.set_num_threads(1)
-    if sys.platform == "linux":
-        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
-    torch.distributed.init_process_group("gloo", init_method=(folder / "meeting").as_uri(), rank=rank, world_size=2)
-    found = gradients(DistributedDataParallel(Learner()), slice(rank, None, 2))
-    torch.save(found, folder / f"gradients{rank}.pt")
-    torch.distributed.destroy_process_group()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    not (torch.distributed.is_available() and torch.distributed.is_gloo_available()), reason="this torch has no gloo"
-)
-def test_two_processes_have_the_gradient_of_one(tmp_path):
-    torch.multiprocessing.spawn(work, (tmp_path,), nprocs=2)
-    whole = gradients(Learner(), slice(None))
-    assert set(whole) == {"camera.intrinsics", "camera.distortion"}
-    assert all(gradient.abs().min() > 1e-6 for gradient in whole.values())
-    for rank in (0, 1):
-        found = torch.load(tmp_path / f"gradients{rank}.pt", weights_only=True)
-        for name, gradient in whole.items():
-            torch.testing.assert_close(found[f"module.{name}"], gradient, rtol=1e-10, atol=1e-10)

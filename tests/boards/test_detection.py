@@ -49,7 +49,7 @@ def test_a_part_of_a_board_with_markers_is_enough(board):
 def test_chessboards_keep_their_order_however_they_are_turned():
     board = BOARDS[0]
     assert board.symmetries == 1
-    for roll in np.arange(0.3, 2 * np.pi, np.pi / 2):
+    for roll in (0.3, 0.3 + np.pi):
         middle = 0.12 * np.array([np.cos(roll), np.sin(roll)]) - 0.075 * np.array([-np.sin(roll), np.cos(roll)])
         image, truth = photograph(board, fisheye(), (0.0, 0, roll), (*-middle, 0.3))
         assert np.abs(detect(board, image).pixels - truth).max() < 0.6
@@ -101,23 +101,17 @@ def test_noisy_and_blurred_chessboards_are_found_no_worse_than_by_their_sectors(
     assert np.sqrt(((detect(board, noisy).pixels - truth) ** 2).sum(-1).mean()) < 0.35
 
 
-def test_corners_that_opencv_puts_beside_their_rows_are_mended():
-    board, rng = BOARDS[0], np.random.default_rng(0)
+def test_corners_that_opencv_puts_beside_their_rows_are_mended(monkeypatch):
+    board, rng, found_by = BOARDS[0], np.random.default_rng(0), cv2.findChessboardCornersSB
     image, truth = photograph(board, fisheye(), (0.1, -0.3, 0.1), (-0.12, -0.1, 0.25))
 
-    class OffBoard:
-        """OpenCV, three of whose corners are off."""
+    def off(*arguments, **options):
+        found, corners = found_by(*arguments, **options)
+        corners.reshape(-1, 2)[[0, 30, 53]] += 9 * rng.choice((-1, 1), (3, 2))
+        return found, corners
 
-        def __getattr__(self, name):
-            return getattr(cv2, name)
-
-        def findChessboardCornersSB(self, *arguments, **options):  # noqa: N802
-            found, corners = cv2.findChessboardCornersSB(*arguments, **options)
-            for index in (0, 30, 53):
-                corners[index] += 9 * rng.choice((-1, 1), 2)
-            return found, corners
-
-    pixels = detection._chessboard(OffBoard(), board, image)
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", off)
+    pixels = detect(board, image).pixels
     seen = np.isfinite(pixels[:, 0])
     assert seen.sum() >= 53
     assert np.abs(pixels - truth)[seen].max() < 0.2
@@ -170,16 +164,13 @@ def test_tags_that_are_no_part_of_the_board_are_left_out():
 def test_boards_are_made_again_of_their_options(board):
     assert board_of(board.options()) == board
     assert len(board.points()) == board.grid[0] * board.grid[1]
+    if board.kind == "charuco":
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        theirs = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
+        assert np.allclose(theirs.getChessboardCorners(), board.points(), atol=1e-7)
     rows = board.points().reshape(*board.grid, 3)
     assert (np.diff(rows[..., 0], axis=1) > 0).all()
     assert (np.diff(rows[..., 1], axis=0) > 0).all()
-
-
-def test_points_of_charuco_are_opencvs():
-    board = BOARDS[1]
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    theirs = cv2.aruco.CharucoBoard((9, 7), 0.03, 0.022, dictionary).getChessboardCorners()
-    assert np.allclose(theirs, board.points(), atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,11 @@
 """What must hold of calibrations: the optimum from nothing, the same for all forms and orders, outliers named."""
 
 import copy
-import itertools
 import math
 
 import pytest
 import torch
-from boards import chessboard, opencv_left, ov_plane, seen_by
+from boards import opencv_left, ov_plane, seen_by
 from cameras import KEYS, one, slow_unless
 from torch.testing import assert_close
 
@@ -63,12 +62,47 @@ def test_numbers_agree_with_the_residuals(left):
     assert left.inliers.all()
 
 
-def test_uncertainty_is_that_of_mrcal(left):
+@pytest.mark.parametrize(
+    ("bend", "infinity", "near"),
+    [
+        # drcal 0.0.0 (mrcal) on the same corners: LENSMODEL_OPENCV5, without regularisation, mean-pcam
+        (None, (0.13531484, 5.85650548, 2.64013932), (0.04614336, 5.88096998, 2.65341868)),
+        pytest.param(
+            (2.92625783e-05, -1.75310142e-04),
+            (0.13034116, 5.24030511, 2.44796354),
+            (0.04433168, 5.25551759, 2.4513902),
+            marks=slow,
+        ),
+    ],
+)
+def test_uncertainty_is_that_of_mrcal(bend, infinity, near, left):
     """Whose noise is the root of the mean square, which does not count the parameters."""
-    pixels, share = torch.tensor([(320.0, 240), (20, 20), (620, 460)]).double(), left.rms / math.sqrt(2) / left.sigma
-    for distance, expected in ((math.inf, (0.1353, 5.857, 2.640)), (0.5, (0.0462, 5.878, 2.651))):
-        found = share * left.uncertainty(pixels, distance)
-        assert_close(found, torch.tensor(expected).double(), rtol=1e-2, atol=0)
+    found = left if bend is None else calibrate(LEFT, bend=True)
+    assert found.bend == pytest.approx(bend or (0.0, 0.0), rel=1e-4)
+    pixels, share = torch.tensor([(320.0, 240), (20, 20), (620, 460)]).double(), found.rms / math.sqrt(2) / found.sigma
+    for distance, expected in ((math.inf, infinity), (0.5, near)):
+        assert_close(share * found.uncertainty(pixels, distance), torch.tensor(expected).double(), rtol=1e-4, atol=0)
+
+
+def test_uncertainty_takes_any_shape_of_pixels(left):
+    grid = torch.stack(torch.meshgrid(torch.arange(0, 640, 40), torch.arange(0, 480, 40), indexing="xy"), -1)
+    whole, distances = left.uncertainty(grid), torch.full((12, 16), math.inf)
+    assert whole.shape == (12, 16)
+    assert torch.equal(whole[3, 5], left.uncertainty((200, 120)))
+    assert left.uncertainty(torch.zeros(0, 2)).shape == (0,)
+    distances[3, 5] = 0.3
+    mixed = left.uncertainty(grid.float(), distances)
+    assert mixed[3, 5] == left.uncertainty((200, 120), 0.3) != whole[3, 5]
+    assert mixed[0, 0] == whole[0, 0]
+    assert torch.equal(whole.isnan(), ~left.camera.unproject(grid.double())[1])
+    for pixels, distance, words in (
+        ((1.0, 2.0, 3.0), 1.0, r"pixels must be \(\.\.\., 2\); got shape \(3,\)"),
+        ((1.0, 2.0), 0.0, "distance must be positive"),
+        ((1.0, 2.0), math.nan, "distance must be positive"),
+        ([(1.0, 2.0)], (1.0, 2.0), r"one for each pixel \(1,\); got shape \(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            left.uncertainty(pixels, distance)
 
 
 def test_results_are_without_a_graph_but_go_on_learning(left):
@@ -86,54 +120,32 @@ def test_results_are_without_a_graph_but_go_on_learning(left):
 
 
 @slow
-@torch.inference_mode()
-def test_the_same_bit_for_bit_and_without_autograd(left):
-    again = calibrate(LEFT)
-    assert_close(values(again), values(left), **exactly)
-    assert_close(again.residuals, left.residuals, **exactly)
-    assert_close(again.covariance, left.covariance, **exactly)
-
-
-@slow
-@pytest.mark.parametrize("form", ["list", "OpenCV", "float32"])
-def test_every_form_gives_the_same(form, left):
+@pytest.mark.parametrize("form", ["list", "OpenCV", "float32", "views", "corners"])
+def test_forms_orders_and_frames_do_not_matter(form, left):
+    """The corners of the file are rounded to float32's nine digits."""
     points, pixels = LEFT.object_points, LEFT.image_points
+    views, corners = torch.arange(13), torch.arange(54)
     if form == "list":
-        found = ct.calibrate("brown_conrady", [points] * 13, list(pixels), image_size=LEFT.image_size)
-        assert [tuple(t.shape) for t in found.residuals] == [(54, 2)] * 13
-        assert [tuple(t.shape) for t in found.inliers] == [(54,)] * 13
+        given = [points] * 13, list(pixels)
     elif form == "OpenCV":
-        boards = [points.float().numpy()[:, None]] * 13
-        corners = [view.float().numpy()[:, None] for view in pixels]
-        found = ct.calibrate("brown_conrady", boards, corners, image_size=LEFT.image_size)
-        assert [tuple(t.shape) for t in found.residuals] == [(54, 1, 2)] * 13
-    else:
-        found = ct.calibrate("brown_conrady", points.float(), pixels.float(), image_size=LEFT.image_size)
-        assert tuple(found.residuals.shape) == (13, 54, 2)
-    # the corners of the file are rounded to float32's nine digits
+        given = [points.float().numpy()[:, None]] * 13, [view.float().numpy()[:, None] for view in pixels]
+    elif form == "float32":
+        given = points.float(), pixels.float()
+    elif form == "views":
+        views = torch.randperm(13, generator=torch.Generator().manual_seed(1))
+        given = points, pixels[views]
+    else:  # in millimetres, turned, and far from the origin
+        corners = torch.randperm(54, generator=torch.Generator().manual_seed(2))
+        turn = rotation_matrix(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
+        given = (1000 * points @ turn.mT + torch.tensor([2000.0, -500.0, 900.0]))[corners], pixels[:, corners]
+    found = ct.calibrate("brown_conrady", *given, image_size=LEFT.image_size)
     assert bool(((values(found) - values(left)).abs() < 1e-4 * left.std).all())
     assert found.camera.intrinsics.dtype == torch.float64
-    assert not isinstance(found.rms, torch.Tensor) or found.rms.ndim == 0
-
-
-@slow
-def test_the_order_of_views_does_not_matter(left):
-    order = torch.randperm(13, generator=torch.Generator().manual_seed(1))
-    found = ct.calibrate("brown_conrady", LEFT.object_points, LEFT.image_points[order], image_size=LEFT.image_size)
-    assert bool(((values(found) - values(left)).abs() < 1e-6 * left.std).all())
-    assert_close(found.residuals, left.residuals[order], rtol=0, atol=1e-6)
-
-
-@slow
-def test_the_order_of_corners_and_the_frame_of_the_board_do_not_matter(left):
-    order = torch.randperm(54, generator=torch.Generator().manual_seed(2))
-    turn = rotation_matrix(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
-    # in millimetres, and far from the origin
-    points = (1000 * LEFT.object_points @ turn.mT + torch.tensor([2000.0, -500.0, 900.0]))[order]
-    found = ct.calibrate("brown_conrady", points, LEFT.image_points[:, order], image_size=LEFT.image_size)
-    assert bool(((values(found) - values(left)).abs() < 1e-5 * left.std).all())
-    assert_close(found.residuals, left.residuals[:, order], rtol=0, atol=1e-5)
-    assert found.rms == pytest.approx(left.rms, abs=1e-9)
+    if form in ("list", "OpenCV"):
+        assert [t.shape for t in found.residuals] == [t.shape for t in given[1]]
+        assert [t.shape for t in found.inliers] == [t.shape[:-1] for t in given[1]]
+    else:
+        assert_close(found.residuals, left.residuals[views][:, corners], rtol=0, atol=1e-4)
 
 
 @slow
@@ -163,7 +175,6 @@ def test_a_view_without_corners_is_left_out(left):
     assert_close(values(found), values(left), **exactly)
     assert len(found.residuals) == 14
     assert found.residuals[5].isnan().all()
-    assert found.extrinsics.batch_shape == (13,)
 
 
 def test_fixed_coefficients():
@@ -228,8 +239,8 @@ def test_a_fisheye_past_its_plane():
 @slow
 @pytest.mark.parametrize(
     ("model", "best"),
-    # double sphere and EUCM have two coefficients, and their optimum is 2 % above
-    [("fisheye624", 0.4816), ("fisheye62", 0.4816), ("mei", 0.4816), ("double_sphere", 0.49138), ("eucm", 0.49141)],
+    # EUCM has two coefficients, and its optimum is 2 % above
+    [("fisheye624", 0.4816), ("eucm", 0.49141)],
 )
 def test_every_fisheye_model_starts_from_nothing(model, best):
     train, test = ov_plane("train"), ov_plane("test")
@@ -247,7 +258,7 @@ FREE_TO_TURN = {"cylindrical", "equirectangular", "latlon", "transverse_cylindri
     ("key", "form"),
     slow_unless(
         ("kannala_brandt", "float32 poses").__eq__,
-        list(itertools.product(KEYS, ("float64", "float32", "float32 poses"))),
+        [*((key, "float32") for key in KEYS), ("kannala_brandt", "float64"), ("kannala_brandt", "float32 poses")],
     ),
 )
 def test_corners_without_noise_have_an_optimum(key, form):
@@ -276,51 +287,32 @@ def test_corners_without_noise_have_an_optimum(key, form):
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "error", "words"),
     [
-        ({"model": "brown"}, "brown_conrady"),
-        ({"count": 3}, "count=3"),
-        ({"fixed": ("k9",)}, "k9"),
-        ({"fixed": ("fx",)}, "start"),
-        ({"loss": "tukey"}, "tukey"),
-        ({"loss": "huber", "loss_scale": 0.0}, "loss_scale"),
-        ({"start": ct.KannalaBrandt([500.0, 500.0, 320.0, 240.0])}, "KannalaBrandt"),
-        ({"image_size": (640, 480)}, "height"),
-        ({"image_size": None}, "image_size"),
-        ({"image_points": LEFT.image_points.mT}, r"got shape \(13, 2, 54\)"),
-        ({"object_points": chessboard(8, 6, 0.025)}, "48"),
-        ({"image_points": LEFT.image_points * math.nan}, "NaN"),
-        ({"image_points": LEFT.image_points[:, :3], "object_points": LEFT.object_points[:3]}, "3"),
+        ({"model": "brown"}, ValueError, "brown_conrady"),
+        ({"model": ct.Camera}, TypeError, "model must be a camera model"),
+        ({"count": 3}, ValueError, "count=3"),
+        ({"model": "kannala_brandt", "count": 10**9}, ValueError, "here 100 at most; got count=1000000000"),
+        ({"fixed": ("k9",)}, ValueError, "k9"),
+        ({"fixed": ("fx",)}, ValueError, "start"),
+        ({"fixed": None}, TypeError, "fixed must be names"),
+        ({"fixed": {"cx": 320.0}}, TypeError, "fixed must be names"),
+        ({"loss": "tukey"}, ValueError, "tukey"),
+        ({"loss": "huber", "loss_scale": 0.0}, ValueError, "loss_scale"),
+        ({"loss": "huber", "loss_scale": "1"}, TypeError, "loss_scale must be a number"),
+        ({"bend": "no"}, TypeError, "bend must be True or False"),
+        ({"progress": "bar"}, TypeError, "progress must be a function"),
+        ({"start": ct.KannalaBrandt([500.0, 500.0, 320.0, 240.0])}, ValueError, "start must be one BrownConrady.*Kan"),
+        ({"start": "camera.yml"}, TypeError, "start must be a camera; got str"),
+        ({"model": ct.Pinhole(torch.ones(2, 4))}, ValueError, r"start must be one Pinhole.*batch_shape=\(2,\)"),
+        ({"object_points": LEFT.object_points[:48]}, ValueError, "48"),
     ],
 )
-def test_bad_arguments(changes, words):
+def test_bad_arguments(changes, error, words):
     given = {"model": "brown_conrady", "object_points": LEFT.object_points, "image_points": LEFT.image_points}
     given |= {"image_size": LEFT.image_size, **changes}
-    with pytest.raises(ValueError, match=words) as caught:
+    with pytest.raises(error, match=rf"^calibrate:? .*{words}"):
         ct.calibrate(given.pop("model"), given.pop("object_points"), given.pop("image_points"), **given)
-    assert "calibrate" in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"fixed": None}, "fixed must be names"),
-        ({"fixed": {"cx": 320.0}}, "fixed must be names"),
-        ({"loss": "huber", "loss_scale": "1"}, "loss_scale must be a number"),
-        ({"bend": "no"}, "bend must be True or False"),
-        ({"progress": "bar"}, "progress must be a function"),
-        ({"model": ct.Camera}, "model must be a camera model"),
-    ],
-)
-def test_arguments_of_other_types(changes, words):
-    given = {"model": "pinhole", "image_size": LEFT.image_size, **changes}
-    with pytest.raises(TypeError, match=f"^calibrate:? {words}"):
-        ct.calibrate(given.pop("model"), LEFT.object_points, LEFT.image_points, **given)
-
-
-def test_a_million_coefficients():
-    with pytest.raises(ValueError, match="here 100 at most; got count=1000000000"):
-        calibrate(LEFT, model="kannala_brandt", count=10**9)
 
 
 @slow

@@ -27,22 +27,20 @@ def the_rig():
     return {name: camera.double().requires_grad_(False) for name, camera in cameras.items()}, turns, shifts
 
 
-def seen(views=24, seed=0, noise=NOISE, board=BOARD):
+def seen(views=24, noise=NOISE):
     """Corners by the name of a camera, NaN where one does not see the board, and the poses of the boards."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
         return torch.rand(*shape, generator=generator, dtype=torch.float64) - 0.5
 
     cameras, turns, shifts = the_rig()
     rotations = rotation_matrix(1.2 * draw(views, 3))
-    away = torch.cat((1.6 * draw(views, 1) + 0.1, 0.5 * draw(views, 1), torch.ones(views, 1)), -1) * (
-        1 + draw(views, 1)
-    )
-    translations = away - rotations @ board.mean(0)
+    away = torch.cat((1.6 * draw(views, 1) + 0.1, 0.5 * draw(views, 1), torch.ones(views, 1)), -1)
+    translations = away * (1 + draw(views, 1)) - rotations @ BOARD.mean(0)
     pixels = {}
     for i, (name, camera) in enumerate(cameras.items()):
-        points = (board @ rotations.mT + translations[:, None]) @ rotation_matrix(turns[i]).mT + shifts[i]
+        points = (BOARD @ rotations.mT + translations[:, None]) @ rotation_matrix(turns[i]).mT + shifts[i]
         found, valid = camera.project(points)
         valid = valid & camera.contains(found)
         valid = valid & (valid.sum(-1, keepdim=True) >= 12)
@@ -75,6 +73,10 @@ def test_cameras_and_poses_are_found_within_their_sigma():
     off = torch.cat(off)
     assert float(off.abs().max()) < 4
     assert 0.5 < float(off.square().mean().sqrt()) < 1.5
+    for name, camera in found.cameras.items():  # each sees its corners through its own poses
+        projected, _ = camera.camera.project(camera.extrinsics(BOARD.expand(24, -1, -1)))
+        off = torch.where(torch.isnan(pixels[name]), torch.nan, projected - pixels[name]).detach()
+        torch.testing.assert_close(off, found.residuals[name], equal_nan=True, atol=1e-8, rtol=0)
     # a board far away is tilted by a fifth of a pixel more or less
     torch.testing.assert_close(rotation_matrix(found.boards.rotation.detach()), rotations, atol=0.02, rtol=0)
     torch.testing.assert_close(found.boards.translation.detach(), translations, atol=0.01, rtol=0)
@@ -94,44 +96,28 @@ def test_exact_corners_give_the_exact_rig(noise):
 
 
 @pytest.mark.slow
-def test_a_camera_of_a_result_sees_its_corners_through_its_own_poses():
-    pixels, _, _ = seen(views=12)
-    found = calibrated(pixels)
-    for name, camera in found.cameras.items():
-        projected, valid = camera.camera.project(camera.extrinsics(BOARD.expand(12, -1, -1)))
-        assert valid[~torch.isnan(pixels[name][..., 0])].all()
-        torch.testing.assert_close(
-            torch.where(torch.isnan(pixels[name]), torch.nan, projected - pixels[name]).detach(),
-            found.residuals[name],
-            equal_nan=True,
-            atol=1e-8,
-            rtol=0,
-        )
-
-
-@pytest.mark.slow
 def test_views_of_different_moments_are_asked_about():
-    pixels = seen()[0]
+    pixels = seen(views=10)[0]
     with pytest.warns(UserWarning, match="by all cameras at the same moment"):
-        assert not calibrated(pixels | {"right": pixels["right"].roll(1, 0)}).converged
+        assert not calibrated(pixels | {"right": pixels["right"].roll(1, 0)}, PAIR).converged
 
 
 @pytest.mark.slow
 def test_cameras_that_are_linked_by_a_third_one():
-    pixels, _, _ = seen(views=30)
-    pixels["right"][:15] = math.nan
-    pixels["side"][15:] = math.nan
+    pixels, _, _ = seen(views=20)
+    pixels["right"][:10] = math.nan
+    pixels["side"][10:] = math.nan
     found = calibrated(pixels)
     assert found.converged
     _, _, shifts = the_rig()
-    torch.testing.assert_close(found.rig.extrinsics["side"].translation.detach(), shifts[2], atol=3e-3, rtol=0)
+    torch.testing.assert_close(found.rig.extrinsics["side"].translation.detach(), shifts[2], atol=5e-3, rtol=0)
 
 
 @pytest.mark.slow
 def test_a_camera_that_is_held_stays_as_it_is():
     pixels, _, _ = seen(views=12)
     known = the_rig()[0]["left"]
-    found = calibrated(pixels, {**MODELS, "left": known}, fixed={"left": "all", "right": ("cx",)})
+    found = calibrated(pixels, {**PAIR, "left": known}, fixed={"left": "all", "right": ("cx",)})
     torch.testing.assert_close(found.rig["left"].intrinsics.detach(), known.intrinsics, rtol=0, atol=0)
     assert float(found.std["left"].abs().max()) == 0
     assert found.rig["right"].cx.item() == 399.5  # the middle
@@ -143,48 +129,27 @@ def test_one_camera_is_a_rig_as_well():
     pixels, _, _ = seen(views=8)
     alone = ct.calibrate("kannala_brandt", BOARD, pixels["left"], image_size=(480, 640))
     found = calibrated(pixels, {"left": "kannala_brandt"})
-    torch.testing.assert_close(
-        found.rig["left"].intrinsics.detach(), alone.camera.intrinsics.detach(), rtol=1e-9, atol=0
-    )
+    torch.testing.assert_close(found.rig["left"].intrinsics, alone.camera.intrinsics, rtol=1e-9, atol=0)
     torch.testing.assert_close(found.std["left"], alone.std, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda p: {**p, "right": p["right"][:5]}, "same views"),
-        (lambda p: {k: v for k, v in p.items() if k != "right"}, "right"),
-        (lambda p: {**p, "right": torch.full_like(p["right"], math.nan)}, "right"),
-    ],
+    ("changes", "words"),
+    [({"fixed": {"middle": "all"}}, "no camera is called 'middle'"), ({"image_sizes": {}}, "name the same cameras")],
 )
-def test_what_makes_no_rig_is_said(change, words):
-    pixels, _, _ = seen(views=10)
-    sizes = {name: camera.image_size for name, camera in the_rig()[0].items()}
-    with pytest.raises(ValueError, match=words):
-        ct.calibrate_rig(MODELS, BOARD, change(pixels), image_sizes=sizes)
-
-
-def test_cameras_that_no_board_links_are_named():
-    pixels, _, _ = seen(views=20)
-    pixels["left"][10:], pixels["right"][:10], pixels["side"][:10] = math.nan, math.nan, math.nan
-    with pytest.raises(ValueError, match=r"right.*side|no board"):
-        calibrated(pixels)
-
-
-def test_names_that_no_camera_has_are_refused():
-    pixels, _, _ = seen(views=10)
-    with pytest.raises(ValueError, match="middle"):
-        calibrated(pixels, fixed={"middle": "all"})
+def test_what_makes_no_rig_is_said(changes, words):
+    sizes = {name: the_rig()[0][name].image_size for name in PAIR}
+    points = {name: pixels for name, pixels in seen(views=6)[0].items() if name in PAIR}
+    with pytest.raises(ValueError, match=f"^calibrate_rig: .*{words}"):
+        ct.calibrate_rig(PAIR, BOARD, points, **{"image_sizes": sizes, **changes})
 
 
 @pytest.mark.slow
 def test_views_are_copies_where_all_cameras_saw_the_same():
     pixels, *_ = seen(views=6)
-    some = list(PAIR)
     again = {name: torch.cat((p, p[:3])) for name, p in pixels.items()}
-    again[some[1]][7] += 0.3 * torch.randn(
-        again[some[1]][7].shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
+    noise = torch.randn(54, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    again["right"][7] += 0.3 * noise
     with pytest.warns(UserWarning, match="those of another view in views 6, 8"):
         found = calibrated(again, PAIR)
     assert found.views == (*range(6), 7)
@@ -195,18 +160,10 @@ def test_views_are_copies_where_all_cameras_saw_the_same():
 @pytest.mark.slow
 def test_double_spheres_of_a_rig_have_twins():
     lens = ct.DoubleSphere([200.0, 200, 320, 240], [-0.18, 0.59], image_size=(480, 640))
-    corners, rotations, translations = seen_by(lens, 10, noise=0.2)
-    with torch.no_grad():
-        moved = corners.object_points @ rotations.mT + translations[:, None] - torch.tensor([0.02, 0, 0]).double()
-        pixels, valid = lens.double().project(moved)
-    pixels = pixels + 0.2 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    pixels[~(valid & lens.contains(pixels))] = torch.nan
-    found = ct.calibrate_rig(
-        {"left": "double_sphere", "right": "double_sphere"},
-        corners.object_points,
-        {"left": corners.image_points, "right": pixels},
-        image_sizes=dict.fromkeys(("left", "right"), (480, 640)),
-    )
+    corners, *_ = seen_by(lens, 8, noise=0.2)
+    points = {"left": corners.image_points, "right": seen_by(lens, 8, noise=0.2, seed=0)[0].image_points + 0.01}
+    models, sizes = dict.fromkeys(points, "double_sphere"), dict.fromkeys(points, (480, 640))
+    found = ct.calibrate_rig(models, corners.object_points, points, image_sizes=sizes)
     named = [text.split(":")[0] for text in found.warnings if "The parameters are not known, though" in text]
     assert named == ["left", "right"]
 

@@ -101,15 +101,17 @@ def test_noisy_pixels_are_explained_better_than_by_the_truth(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["planar", "space"])
-@pytest.mark.parametrize("fov", [10, 90, 190])
-def test_thousands_of_poses_end_in_the_optimum(fov, kind):
-    good = [
-        attempts(lens(fov), fov, 100, points, kind, noise, points)
-        for points in (4, 5, 8, 50)
-        for noise in (0.0, 0.1, 1.0)
-    ]
+@pytest.mark.parametrize(("fov", "kind"), [(10, "space"), (190, "planar")])
+def test_poses_end_in_the_optimum(fov, kind):
+    cases = product((4, 5, 8, 50), (0.0, 0.1, 1.0))
+    good = [attempts(lens(fov), fov, 100, points, kind, noise, points) for points, noise in cases]
     assert torch.cat(good).double().mean() > 0.998
+
+
+def opencvs_rms(points, seen, matrix, k, *start):
+    """What OpenCV's local search makes of a start."""
+    r, t = cv2.solvePnPRefineLM(points, seen, matrix, k, *start)
+    return np.sqrt(np.mean(np.sum((cv2.projectPoints(points, r, t, matrix, k)[0][:, 0] - seen) ** 2, -1)))
 
 
 @pytest.mark.parametrize("kind", ["planar", "space"])
@@ -119,13 +121,11 @@ def test_the_cost_is_opencvs_or_less(kind):
     pixels = pixels + 0.5 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
     _, rms, valid = ct.solve_pnp(camera, target, pixels)
     assert valid.all()
-    matrix, k = camera.K.numpy(), camera.distortion.numpy()
     for row in range(len(target)):
         points, seen = target[row].numpy(), pixels[row].numpy()
-        _, r, t = cv2.solvePnP(points, seen, matrix, k, flags=cv2.SOLVEPNP_SQPNP)
-        r, t = cv2.solvePnPRefineLM(points, seen, matrix, k, r, t)
-        theirs = np.sqrt(np.mean(np.sum((cv2.projectPoints(points, r, t, matrix, k)[0][:, 0] - seen) ** 2, -1)))
-        assert rms[row] <= theirs * (1 + 1e-6)
+        lens_of = camera.K.numpy(), camera.distortion.numpy()
+        start = cv2.solvePnP(points, seen, *lens_of, flags=cv2.SOLVEPNP_SQPNP)[1:]
+        assert rms[row] <= opencvs_rms(points, seen, *lens_of, *start) * (1 + 1e-6)
 
 
 def test_both_minima_of_a_plane_are_compared():
@@ -145,12 +145,9 @@ def test_both_minima_of_a_plane_are_compared():
         flip = torch.eye(3) - 2 * sight[:, :, None] * sight[:, None]
         other = flip @ found.matrix()[:, :3, :3].detach() @ torch.diag(torch.tensor([1.0, 1, -1])).double()
         for row in range(len(pixels)):
-            r, _ = cv2.Rodrigues(other[row].numpy())
-            matrix, k = camera.K.numpy(), camera.distortion.numpy()
-            start = r, found.translation[row].detach().numpy()[:, None].copy()
-            r, t_ = cv2.solvePnPRefineLM(target.numpy(), pixels[row].numpy(), matrix, k, *start)
-            error = cv2.projectPoints(target.numpy(), r, t_, matrix, k)[0][:, 0] - pixels[row].numpy()
-            theirs = np.sqrt(np.mean(np.sum(error**2, -1)))
+            start = cv2.Rodrigues(other[row].numpy())[0], found.translation[row].detach().numpy()[:, None].copy()
+            given = target.numpy(), pixels[row].numpy(), camera.K.numpy(), camera.distortion.numpy()
+            theirs = opencvs_rms(*given, *start)
             assert rms[row] <= theirs * (1 + 1e-6)
             better += bool(rms[row] < theirs * 0.999)
     assert better > 60
@@ -173,33 +170,21 @@ def test_gradients_are_those_of_the_optimum():
 
 
 def test_what_is_unseen_does_not_matter():
-    camera = lens(60)
-    target, _, _, pixels = scenes(camera, 60, 5, 9, "space")
+    camera = lens(190)
+    target, _, _, pixels = scenes(camera, 190, 5, 9, "space")
     pixels = pixels + 0.5 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
     expected = ct.solve_pnp(camera, target[:, :6], pixels[:, :6])
-    hidden = pixels.clone()
-    hidden[:, 6:] = torch.nan
-    weights = torch.ones(5, 9)
-    weights[:, 6:] = 0
-    hidden_points = target.clone()
-    hidden_points[:, 6:] = torch.inf
+    hidden = torch.arange(9) >= 6
+    blind = torch.tensor([1e5, 1e5]).double()
+    assert not camera.unproject(blind)[1]
     for found in (
-        ct.solve_pnp(camera, target, hidden),
-        ct.solve_pnp(camera, target, pixels, weights=weights),
-        ct.solve_pnp(camera, hidden_points, pixels),
+        ct.solve_pnp(camera, target, torch.where(hidden[:, None], torch.nan, pixels)),
+        ct.solve_pnp(camera, target, torch.where(hidden[:, None], blind, pixels)),
+        ct.solve_pnp(camera, target, pixels, weights=1.0 - hidden.double()),
+        ct.solve_pnp(camera, torch.where(hidden[:, None], torch.inf, target), pixels),
     ):
         torch.testing.assert_close(found.extrinsics.matrix(), expected.extrinsics.matrix())
         torch.testing.assert_close(found.rms, expected.rms)
-
-
-def test_pixels_without_a_ray_are_unseen():
-    camera = lens(190)
-    target, _, _, pixels = scenes(camera, 190, 4, 8, "space")
-    blind = torch.tensor([1e5, 1e5]).double()
-    assert not camera.unproject(blind)[1]
-    changed = torch.cat((pixels[:, :7], blind.expand(4, 1, 2)), 1)
-    expected = ct.solve_pnp(camera, target[:, :7], pixels[:, :7])
-    torch.testing.assert_close(ct.solve_pnp(camera, target, changed).extrinsics.matrix(), expected.extrinsics.matrix())
 
 
 def test_bad_rows_are_invalid_and_leave_the_others_alone():
@@ -242,56 +227,47 @@ def test_shapes():
     camera = lens(60)
     target, _, _, pixels = scenes(camera, 60, 3, 6, "space")
     one = ct.solve_pnp(camera, target[0], pixels[0])
-    assert one.extrinsics.batch_shape == ()
-    assert one.rms.shape == ()
-    assert one.valid.shape == ()
-    same = [
-        (target[0].numpy(), pixels[0].numpy()[:, None]),
-        (target[0].numpy()[:, None], pixels[0].numpy()[:, None]),
-        (target[0].numpy()[None], pixels[0].numpy()[:, None]),
-        (target[0].tolist(), pixels[0].tolist()),
-    ]
-    for points, seen in same:
-        found = ct.solve_pnp(camera, points, seen)
-        torch.testing.assert_close(found.extrinsics.matrix().reshape(4, 4), one.extrinsics.matrix(), rtol=0, atol=1e-4)
+    assert one.extrinsics.batch_shape == one.rms.shape == one.valid.shape == ()
+    assert isinstance(one.extrinsics.rotation, torch.nn.Parameter)
+    columns = pixels[0].numpy()[:, None]
+    for points in (target[0].numpy(), target[0].numpy()[:, None], target[0].numpy()[None], target[0].tolist()):
+        for seen in (columns, pixels[0].tolist()):
+            found = ct.solve_pnp(camera, points, seen).extrinsics.matrix().reshape(4, 4)
+            torch.testing.assert_close(found, one.extrinsics.matrix(), rtol=0, atol=1e-4)
     several = ct.solve_pnp(camera, [x.numpy() for x in target], [p.numpy()[:, None] for p in pixels])
     assert several.extrinsics.batch_shape == (3,)
     torch.testing.assert_close(several.extrinsics[0].matrix(), one.extrinsics.matrix())
     shared = ct.solve_pnp(camera, target[0], pixels[:1].expand(2, 5, 6, 2))
     assert shared.extrinsics.batch_shape == (2, 5)
-    assert shared.valid.all()
     cameras = ct.BrownConrady(camera.intrinsics.repeat(3, 1), camera.distortion.repeat(3, 1))
-    torch.testing.assert_close(
-        ct.solve_pnp(cameras, target, pixels).extrinsics.matrix(), several.extrinsics.matrix(), rtol=1e-6, atol=1e-6
-    )
+    found = ct.solve_pnp(cameras, target, pixels).extrinsics.matrix()
+    torch.testing.assert_close(found, several.extrinsics.matrix(), rtol=1e-6, atol=1e-6)
     empty = ct.solve_pnp(camera, target[:0], pixels[:0])
     assert empty.extrinsics.batch_shape == empty.rms.shape == (0,)
     assert not ct.solve_pnp(camera, target, pixels * torch.nan).valid.any()
     single = ct.solve_pnp(camera.float(), target.float(), pixels.float())
     assert single.rms.dtype == single.extrinsics.translation.dtype == torch.float32
-    assert isinstance(one.extrinsics.rotation, torch.nn.Parameter)
+
+
+SIX, SEEN = torch.rand(6, 3), torch.rand(6, 2)
 
 
 @pytest.mark.parametrize(
     ("arguments", "error", "says"),
     [
-        ((None, torch.rand(6, 3), torch.rand(6, 2)), TypeError, "camera must be a camera"),
-        ((lens(60), torch.rand(6, 3), torch.rand(6, 3)), ValueError, "pixels must be"),
-        ((lens(60), torch.rand(6, 2), torch.rand(6, 2)), ValueError, "object_points must be"),
-        ((lens(60), torch.rand(6, 3), torch.rand(5, 2)), ValueError, "not the same number"),
-        ((lens(60), torch.rand(3, 3), torch.rand(3, 2)), ValueError, "4 points at least"),
-        ((lens(60), torch.rand(2, 6, 3), torch.rand(3, 6, 2)), ValueError, "do not fit"),
-        ((lens(60), [torch.rand(6, 3), torch.rand(5, 3)], torch.rand(2, 6, 2)), ValueError, "one shape"),
-        ((lens(60), "points", torch.rand(2, 6, 2)), TypeError, "object_points must be"),
+        ((None, SIX, SEEN), TypeError, "camera must be a camera"),
+        ((lens(60), SIX, SIX), ValueError, "pixels must be"),
+        ((lens(60), SEEN, SEEN), ValueError, "object_points must be"),
+        ((lens(60), SIX, SEEN[:5]), ValueError, "not the same number"),
+        ((lens(60), SIX[:3], SEEN[:3]), ValueError, "4 points at least"),
+        ((lens(60), SIX.expand(2, 6, 3), SEEN.expand(3, 6, 2)), ValueError, "do not fit"),
+        ((lens(60), [SIX, SIX[:5]], SEEN), ValueError, "one shape"),
+        ((lens(60), "points", SEEN), TypeError, "object_points must be"),
+        ((lens(60), SIX, SEEN, -torch.ones(6)), ValueError, "weights must not be negative"),
+        ((lens(60), SIX, SEEN, torch.ones(5)), ValueError, "weights must be"),
     ],
 )
 def test_bad_arguments(arguments, error, says):
+    weights = arguments[3] if len(arguments) > 3 else None
     with pytest.raises(error, match=rf"solve_pnp: .*{says}"):
-        ct.solve_pnp(*arguments)
-
-
-def test_bad_weights():
-    with pytest.raises(ValueError, match="weights must not be negative"):
-        ct.solve_pnp(lens(60), torch.rand(6, 3), torch.rand(6, 2), weights=-torch.ones(6))
-    with pytest.raises(ValueError, match="weights must be"):
-        ct.solve_pnp(lens(60), torch.rand(6, 3), torch.rand(6, 2), weights=torch.ones(5))
+        ct.solve_pnp(*arguments[:3], weights=weights)

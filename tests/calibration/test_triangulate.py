@@ -20,12 +20,8 @@ def rig(seed=0):
     """Three cameras of different models, their poses, points, and the pixels of those that each sees."""
     g = torch.Generator().manual_seed(seed)
     cameras = [camera.requires_grad_(False) for camera in CAMERAS]
-    extrinsics = [
-        ct.Extrinsics(0.2 * torch.randn(3, generator=g).double(), torch.randn(3, generator=g).double()).requires_grad_(
-            False
-        )
-        for _ in cameras
-    ]
+    poses = [(0.2 * torch.randn(3, generator=g).double(), torch.randn(3, generator=g).double()) for _ in cameras]
+    extrinsics = [ct.Extrinsics(*pose).requires_grad_(False) for pose in poses]
     points = torch.randn(400, 3, generator=g).double() * 3 + torch.tensor([0.0, 0.0, 3.0])
     pixels = []
     for camera, pose in zip(cameras, extrinsics, strict=True):
@@ -35,13 +31,9 @@ def rig(seed=0):
 
 
 def rms_of(cameras, extrinsics, points, pixels):
-    squares = torch.stack(
-        [
-            (camera.project(pose(points))[0] - seen).square().sum(-1)
-            for camera, pose, seen in zip(cameras, extrinsics, pixels, strict=True)
-        ]
-    )
-    return squares.nanmean(0).sqrt()
+    each = zip(cameras, extrinsics, pixels, strict=True)
+    squares = [(camera.project(pose(points))[0] - seen).square().sum(-1) for camera, pose, seen in each]
+    return torch.stack(squares).nanmean(0).sqrt()
 
 
 def test_exact_pixels_give_the_points():

@@ -10,9 +10,8 @@ from PIL import Image
 
 import camtorch as ct
 from camtorch._drawing import BOX, GAZE, POINT
-from camtorch.cli import labelled_image, labels, sheet
+from camtorch.cli import labels, sheet
 from camtorch.cli.main import main
-from camtorch.rotations import mount_rotation
 
 CAMERA = (
     "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
@@ -30,7 +29,7 @@ LABELS = {
 def folder(tmp_path, monkeypatch):
     """The current folder, with an image, its camera and labels; all images are small."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(labelled_image, "NEW_SIZE", (96, 128))
+    monkeypatch.setattr(sheet, "NEW_SIZE", (96, 128))
     Path("camera.yml").write_text(CAMERA)
     Path("labels.json").write_text(json.dumps(LABELS))
     grey = np.full((64, 96, 3), 128, np.uint8)
@@ -56,9 +55,14 @@ def camera():
     )
 
 
+def known_labels():
+    path = Path("labels.json")
+    return labels.labels_of(labels.read_json(path), path, camera())
+
+
 def photograph(known=None, image=None):
     image = torch.full((3, 64, 96), 128, dtype=torch.uint8) if image is None else image
-    return labelled_image.photograph(image, camera(), known, "in.png")
+    return sheet.photograph(image, camera(), known, "in.png")
 
 
 def near(image, x, y, colour):
@@ -88,18 +92,14 @@ def test_seeds_decide(folder, capsys):
     assert lines[0] == lines[2] == lines[6] != lines[4]
 
 
-def test_options_reach_the_cameras(folder, capsys):
-    words = ["--yaw=12,12", "--pitch=0,0", "--roll=-5,-5", "--zoom", 0, "--fov", 100, "--preset", "surround190"]
+@pytest.mark.parametrize("angles", [(12, 0, -5), (-70, 60, -150), (170, 5, 90)])
+def test_options_reach_the_cameras(folder, capsys, angles):
+    mount = [f"--{name}={v},{v}" for name, v in zip(("yaw", "pitch", "roll"), angles, strict=True)]
+    words = [*mount, "--zoom", 0, "--fov", 100, "--preset", "surround190"]
     augment(*PHOTO, *words, "--size", "80x80", "-n", 1)
     line = capsys.readouterr().out.splitlines()[0]
-    assert "yaw +12.0 degrees, pitch +0.0 degrees, roll -5.0 degrees, surround190" in line
+    assert "yaw {:+.1f} degrees, pitch {:+.1f} degrees, roll {:+.1f} degrees, surround190".format(*angles) in line
     assert 85 < float(line.split("surround190, ")[1].split()[0]) < 115
-
-
-@pytest.mark.parametrize("angles", [(0, 0, 0), (12, -7, 30), (-70, 60, -150), (170, 5, 90)])
-def test_captions_tell_the_mount(angles):
-    rotation = mount_rotation(*torch.tensor(angles, dtype=torch.float64))
-    assert labelled_image._mount_angles(rotation) == pytest.approx(angles, abs=1e-9)
 
 
 @pytest.mark.slow
@@ -135,7 +135,7 @@ def test_the_list_of_presets(folder, capsys):
 
 
 def test_marks_lie_where_labels_say(folder):
-    view = photograph(labels.read(Path("labels.json"), camera()))
+    view = photograph(known_labels())
     assert view.keypoints_valid.tolist() == [True, True, False]
     image = np.array(sheet.marked(view, 640, 960)).astype(int)
     assert image.shape == (640, 960, 3)
@@ -156,14 +156,14 @@ def test_marks_lie_where_labels_say(folder):
 )
 def test_labels_move_with_the_image(folder, preset):
     # a keypoint at each end of the arrow, and a spot of light at one
-    plain = photograph(labels.read(Path("labels.json"), camera()))
+    plain = photograph(known_labels())
     ((start, end),) = sheet.arrows(plain)
     y, x = torch.meshgrid(torch.arange(64), torch.arange(96), indexing="ij")
     spot = 250 * torch.exp(-((x - start[0]) ** 2 + (y - start[1]) ** 2) / 8)
-    known = labels.read(Path("labels.json"), camera())
+    known = known_labels()
     known.keypoints = torch.tensor([start, end], dtype=torch.float64)
     before = photograph(known, spot.byte().expand(3, -1, -1).contiguous())
-    for view in labelled_image.augmented(before, labelled_image.lens(preset), 2, 0):
+    for view in sheet.augmented(before, sheet.lens(preset), 2, 0):
         ((start, end),) = sheet.arrows(view)
         torch.testing.assert_close(view.labels.keypoints.tolist(), [start, end], rtol=0, atol=1e-2)
         weight = (view.image[0].double() - 128).clamp(min=0) * (view.image[0] == view.image[2])
@@ -196,20 +196,15 @@ def test_long_and_narrow_images(folder):
 BAD = [
     ("", "no JSON"),
     ('{"keypoints": [[1, 2], [3', "no JSON"),
-    (b"\xff\xfe\x00\xd8", "no JSON"),
     ("[" * 100_000, "no JSON"),
     ("[[1, 2]]", "must be an object"),
-    ("null", "must be an object"),
+    ('{"keypoints": [[1, NaN]]}', "no JSON: NaN is none; null is, or leave it out"),
     *(
         (f'{{"keypoints": {entry}}}', f"keypoints: must be [[x, y], ...], numbers between -1e6 and 1e6; got {got}")
         for entry, got in (
             ("3", "3"),
-            ('{"a": 1}', '{"a": 1}'),
-            ("[[1, 2], 3]", "3"),
             ("[[1, 2], [3, 4, 5]]", "[3, 4, 5]"),
             ('[[1, "2"]]', '[1, "2"]'),
-            ("[[1, true]]", "[1, true]"),
-            ("[[1, NaN]]", "[1, NaN]"),
             ("[[1, 1" + 999 * "0" + "]]", "[1, 1000"),
         )
     ),
@@ -219,13 +214,12 @@ BAD = [
     ('{"camera": {"model": "none"}}', "labels.json: states the camera, and so does --camera"),
     ('{"gaze": [0, 0, 0], "gaze_from": [3, 4]}', "gaze: a direction has a length"),
     ('{"gaze": [0, 0, 1], "gaze_from": [9000, 4]}', "gaze_from: the camera has no ray at [9000, 4]"),
-    (" " * (1 << 21), "larger than 1 MiB"),
 ]
 
 
 def test_bad_labels_are_named(folder, capsys):
     for content, text in BAD:
-        Path("labels.json").write_bytes(content if isinstance(content, bytes) else content.encode())
+        Path("labels.json").write_text(content)
         error = refused(capsys, "augment", *PHOTO)
         assert "labels.json" in error
         assert text in error

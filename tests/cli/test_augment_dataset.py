@@ -2,10 +2,8 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ import torch
 from PIL import Image, ImageDraw
 
 import camtorch as ct
-from camtorch.cli import coco, rle
+from camtorch.cli import coco
 from camtorch.cli.main import main
 
 SIZE = (72, 96)
@@ -48,8 +46,8 @@ def moved(annotations, change, told=None):
     def move(labels):
         return samples({"json": labels})["json"]
 
-    labels = coco.labels_of(annotations, SIZE, (told if told is not None else []).append)
-    return coco.moved(annotations, labels, move({"points": np.zeros(3), **coco.packed(labels)}), move, SIZE)
+    moving = coco.Annotations(annotations, SIZE, (told if told is not None else []).append)
+    return moving.moved(move({"points": np.zeros(3), **moving.labels}), move)
 
 
 def drawn(polygon):
@@ -66,14 +64,14 @@ def test_runs_are_those_of_coco():
     mask = np.zeros((6, 8), bool)
     mask[1:4, 2:7] = mask[5, 0] = True
     # as pycocotools 2.0.11 writes it
-    assert rle.encode(mask, as_text=True) == "5172L00000005"
-    assert rle.encode(mask, as_text=False) == [5, 1, 7, 3, 3, 3, 3, 3, 3, 3, 3, 3, 8]
+    assert coco.encoded(mask, as_text=True) == "5172L00000005"
+    assert coco.encoded(mask, as_text=False) == [5, 1, 7, 3, 3, 3, 3, 3, 3, 3, 3, 3, 8]
     rng = np.random.default_rng(0)
     for part in (0.0, 0.02, 0.5, 1.0):
         mask = rng.random((37, 53)) < part
         mask[:, 20:40] ^= True
         for as_text in (True, False):
-            assert np.array_equal(rle.decode(rle.encode(mask, as_text=as_text), mask.shape), mask)
+            assert np.array_equal(coco.decoded(coco.encoded(mask, as_text=as_text), mask.shape), mask)
     for counts, message in (
         ([5, 1], "counts are of 6 pixels, and the size says 8x6"),
         ([49, -1], "counts are no runs"),
@@ -83,7 +81,7 @@ def test_runs_are_those_of_coco():
         (None, "no runs"),
     ):
         with pytest.raises(ValueError, match=message):
-            rle.decode(counts, (6, 8))
+            coco.decoded(counts, (6, 8))
 
 
 # -- annotations
@@ -101,7 +99,7 @@ def test_annotations_move_with_the_image(source, target, angles):
     truth = change[0]({"mask.npy": mask.astype(np.uint8), "json": {}})["mask.npy"] > 0
     annotations = [
         {"id": 1, "image_id": 1, "segmentation": [POLYGON], "bbox": [20, 12, 50, 43], "area": 1, "category_id": 3},
-        {"id": 2, "area": 1, "segmentation": {"counts": rle.encode(mask, as_text=True), "size": list(SIZE)}},
+        {"id": 2, "area": 1, "segmentation": {"counts": coco.encoded(mask, as_text=True), "size": list(SIZE)}},
         {"id": 3, "image_id": 1, "bbox": [20.0, 12.0, 50.0, 43.0], "area": 1000.0},
         {"id": 4, "image_id": 1, "keypoints": [30, 20, 2, 60, 18, 1, 45, 28, 0], "num_keypoints": 2},
         {"id": 5, "image_id": 1, "caption": "a cat", "gaze": [0.0, 0.0, -1.0]},
@@ -124,7 +122,7 @@ def test_annotations_move_with_the_image(source, target, angles):
         assert outline["category_id"] == 3
     assert (runs is None) == (not truth.any())
     if runs is not None:
-        assert np.array_equal(rle.decode(runs["segmentation"]["counts"], SIZE), truth)
+        assert np.array_equal(coco.decoded(runs["segmentation"]["counts"], SIZE), truth)
         assert runs["area"] == truth.sum()
     if box is not None:
         x, y, w, h = box["bbox"]
@@ -333,7 +331,7 @@ def test_labels_in_files_of_their_own(folder, capsys):
     told = capsys.readouterr()
     assert "images/2.json: No such file or directory" in told.err
     assert "error: images/0.jpg: images/0.json: no JSON" in told.err
-    assert "error: images/b/1.png: its labels hold NaN or infinity" in told.err
+    assert "error: images/b/1.png: images/b/1.json: no JSON: NaN is none; null is, or leave it out" in told.err
     assert "broken: 0 of 3 files made; 3 failed" in told.out
 
 
@@ -356,8 +354,7 @@ def test_wrong_words_and_files_are_told(folder, capsys):
         ({"annotations": [{"image_id": 99}]}, "no image has the id 99"),
         ({"images": []}, "no image has the id 10"),
         ({"images": [{"id": 1, "file_name": "0.jpg", "width": "96"}]}, "width must be a number; got '96'"),
-        ({"info": {"year": float("inf")}}, "NaN and infinity are no JSON"),
-        ({"annotations": [{"image_id": 10, "score": float("nan")}]}, "images[0] and its annotations: NaN and infinity"),
+        ({"info": {"year": float("inf")}}, "labels.json: no JSON: Infinity is none"),
     ):
         Path("labels.json").write_text(json.dumps(content | change))
         assert message in refused()
@@ -370,37 +367,32 @@ def test_wrong_words_and_files_are_told(folder, capsys):
     assert "error: images/0.jpg: annotation 100: bbox must be" in told.err
     assert "error: images/lost.png: No such file or directory" in told.err
     assert "error: images/2.jpg: it is 96x72, and its labels are for 640x72" in told.err
-    assert "new/labels.json: 0 images, 0 annotations, of 0 of the 3 images so far" in told.out
+    assert not Path("new/labels.json").exists()  # as there is nothing to stand in it
+
+
+def test_what_is_wrong_with_all_images_is_said_once_and_nothing_is_written(folder, capsys):
+    half = ct.load("camera.json").camera.resize(SIZE[0] // 2, SIZE[1] // 2)
+    ct.save(half, "half.json")
+    for words, text in (
+        ((*WORDS, "--zoom", "1"), "zoom must"),
+        ((*WORDS[:4], "--zoom", "1"), "zoom must"),
+        ((*WORDS, "--fov", "2"), "seems to be radians"),
+        ((*WORDS[:5], "half.json"), "images/0.jpg is 96x72, but the camera in half.json is for 48x36; --rescale"),
+    ):
+        augment("-o", "new", start=words, expect=2)
+        error = capsys.readouterr().err
+        assert text in error
+        assert error.count("\n") == 1
+        assert not Path("new").exists()
+    augment("-o", "new", "--rescale", start=(*WORDS[:5], "half.json"))
+    assert "3 of 3 files made" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_ranks_and_killed_runs_of_several_processes_end_as_one_process_does(tmp_path):
-    make(tmp_path, 24)
+def test_ranks_and_processes_make_what_one_process_makes(folder):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-
-    def start(*words):
-        command = [sys.executable, "-m", "camtorch", *WORDS, *words]
-        return subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
-
-    assert start("-o", "whole", "--jobs", "1").wait(120) == 0
-    whole = files(tmp_path / "whole")
+    augment("-o", "whole")
+    augment("-o", "two", jobs=2)
     ranks = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "camtorch"]
-    subprocess.run([*ranks, *WORDS, "-o", "ranks"], cwd=tmp_path, env=environment, check=True, capture_output=True)
-    assert files(tmp_path / "ranks") == whole
-    rng = np.random.default_rng(0)
-    killed = 0
-    for _ in range(3):
-        process = start("-o", "new", "--jobs", "2", "--resume")
-        deadline = time.monotonic() + 60
-        there = len(files(tmp_path / "new"))
-        while process.poll() is None and len(files(tmp_path / "new")) <= there and time.monotonic() < deadline:
-            time.sleep(0.002)
-        time.sleep(rng.uniform(0, 0.05))
-        if process.poll() is None:
-            process.send_signal(signal.SIGKILL)
-            killed += 1
-        process.wait()
-        time.sleep(0.3)  # its processes follow
-    assert killed >= 2
-    assert start("-o", "new", "--jobs", "2", "--resume").wait(120) == 0
-    assert files(tmp_path / "new") == whole
+    subprocess.run([*ranks, *WORDS, "-o", "ranks"], env=environment, check=True, capture_output=True)
+    assert files("ranks") == files("two") == files("whole")

@@ -51,21 +51,13 @@ def folder(seen, tmp_path, monkeypatch):
     return tmp_path
 
 
+def birdseye(*words):
+    command("birdseye", "floor.png", *words)
+
+
 def test_squares_of_the_floor_are_squares_of_its_size(folder, capsys):
-    command("birdseye", "floor.png", "--camera", "posed.json", *RANGES, "-o", "above.png")
-    command(
-        "birdseye",
-        "floor.png",
-        "--camera",
-        "camera.json",
-        "--height",
-        HEIGHT,
-        "--pitch",
-        PITCH,
-        *RANGES,
-        "-o",
-        "same.png",
-    )
+    birdseye("--camera", "posed.json", *RANGES, "-o", "above.png")
+    birdseye("--camera", "camera.json", "--height", HEIGHT, "--pitch", PITCH, *RANGES, "-o", "same.png")
     out = capsys.readouterr().out.splitlines()
     assert out[0] == (
         "above.png: the ground from above, x -2 to 2 and y 0.5 to 4.5 at 0.02 a pixel, 200x200, by kannala_brandt, "
@@ -85,12 +77,8 @@ def test_squares_of_the_floor_are_squares_of_its_size(folder, capsys):
 
 
 def test_a_pitch_is_down(folder):
-    command("birdseye", "floor.png", "--camera", "camera.json", "--height", 1, "--pitch", 90, *RANGES, "-o", "down.png")
-    command("birdseye", "floor.png", "--camera", "camera.json", "--height", 1, *RANGES, "-o", "level.png")
     # straight down: the middle of the image is the origin, which lies below the camera
     small = ["--x", "-0.1", "0.1", "--y", "-0.1", "0.1", "--resolution", "0.2"]
-    command(
-        "birdseye", "floor.png", "--camera", "camera.json", "--height", 1, "--pitch", 90, *small, "-o", "origin.png"
-    )
+    birdseye("--camera", "camera.json", "--height", 1, "--pitch", 90, *small, "-o", "origin.png")
     middle = np.array(Image.open("floor.png")).astype(float)[89:91, 119:121].mean()
     assert np.array(Image.open("origin.png"))[0, 0] == pytest.approx(middle, abs=1)

@@ -110,48 +110,6 @@ def test_without_a_square_it_fills_the_paper(capsys):
     assert "squares of 52 mm, markers of 39 mm" in capsys.readouterr().out
 
 
-def test_outlines_are_borders_and_holes():
-    black = np.array([[1, 1, 1, 0], [1, 0, 1, 0], [1, 1, 1, 1]], bool)
-    found = printing.outlines(black)
-    assert sorted(map(len, found)) == [4, 6]
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        black = rng.random((7, 9)) < 0.5
-        doubled = [area(line) for line in printing.outlines(black)]
-        assert sum(doubled) == 2 * black.sum()  # holes run the other way
-
-
-def area(line):
-    return sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(line, [*line[1:], line[0]], strict=True))
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        ("-o b.pdf", "which board? --board COLUMNSxROWS"),
-        ("--board 9 -o b.pdf", "'9' is not COLUMNSxROWS"),
-        ("--board 9x6 -o b.png", "b.png: a board is drawn as .pdf or .svg"),
-        ("--board 9x6 --square 50mm -o b.pdf", "500 x 350 mm does not fit on paper of 297 x 210 mm"),
-        ("--board 9x6 --square 3ft -o b.pdf", "'3ft' is no length above 0"),
-        ("--board 9x6 --square=-3 -o b.pdf", "'-3' is no length above 0"),
-        ("--board 9x6 --square 24 -o b.pdf", "'24' would be metres: 24mm, or 24m if it is that large"),
-        ("--board 9x6 --paper a9 -o b.pdf", "'a9' is no paper: a4, a3"),
-        ("--board 9x6 --paper 20x20mm -o b.pdf", "a square would be less than a millimetre"),
-        ("--board 9x6 --spacing 0.3 -o b.pdf", "--spacing is for --type aprilgrid; this is a chessboard"),
-        ("--board 9x6 --dictionary x -o b.pdf", "--dictionary is for --type charuco or --type aprilgrid"),
-        ("--type charuco --board 9x6 --dictionary x -o b.pdf", "no dictionary of markers is called 'x'; OpenCV has"),
-        ("--type charuco --board 20x20 --dictionary 4X4_50 -o b.pdf", "has 50 markers, and the board needs more"),
-        ("--type charuco --board 9x6 --square 2cm --marker 3cm -o b.pdf", "a marker must be smaller than its square"),
-    ],
-)
-def test_what_cannot_be_drawn(capsys, words, text):
-    board(words, expect=2)
-    error = capsys.readouterr().err
-    assert text in error
-    assert error.count("\n") == 1
-    assert not Path("b.pdf").exists()
-
-
 def test_a_file_is_overwritten_when_that_is_said():
     board("--board 9x6 -o b.svg")
     board("--board 9x6 -o b.svg", expect=2)

@@ -11,7 +11,7 @@ from test_calibrate_cli import BOARD, assert_near, poses
 
 import camtorch as ct
 from camtorch.boards.corners import read_corners
-from camtorch.cli import frames, videos
+from camtorch.cli import searching, videos
 from camtorch.cli.main import main
 
 av = pytest.importorskip("av")
@@ -55,7 +55,7 @@ def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatc
     for image, pixels in zip(corners, truth, strict=True):
         assert np.nanmax(np.linalg.norm(image.pixels - pixels, axis=1)) < 0.5
     # what was found is not searched for again
-    monkeypatch.setattr(frames, "detect", None)
+    monkeypatch.setattr(searching, "detect", None)
     assert main([*words, "-o", "again.yml"]) == 0
     assert (ct.load("again.yml").camera.intrinsics == ct.load("camera.yml").camera.intrinsics).all()
     # but the frames are shown in a report, for which they are read before the work
@@ -69,7 +69,7 @@ def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatc
 def test_frames_are_read_for_the_report(filmed):
     path, _ = filmed
     there, gone = path.with_name("board.mp4#t=0.250"), path.with_name("other.mp4#t=0.250")
-    images = frames.read([there, gone, path, None])
+    images = searching.read_frames([there, gone, path, None])
     assert list(images) == [there]
     assert images[there].shape == (480, 640)
 

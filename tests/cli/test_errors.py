@@ -8,8 +8,10 @@ import pytest
 import torch
 from command_line import FILES, LEVEL, opened, refused, write_photograph
 from PIL import Image
+from test_calibrate_cli import corners_of
 
 import camtorch as ct
+from camtorch.boards.corners import write_corners
 
 PHOTO = "in.png --camera camera.yml"
 PAIR = "rectify in.png in.png"
@@ -137,6 +139,58 @@ CASES = {
         ("rectify in.png grey.png --camera rig.json", "are images of different kinds"),
         ("rectify half.png half.png --camera rig.json", "half.png is 48x32, but the camera in rig.json is for 96x64"),
     ],
+    "board": [
+        ("board -o b.pdf", "which board? --board COLUMNSxROWS"),
+        ("board --board 9 -o b.pdf", "'9' is not COLUMNSxROWS"),
+        ("board --board 9x6 -o b.png", "b.png: a board is drawn as .pdf or .svg"),
+        ("board --board 9x6 --square 50mm -o b.pdf", "500 x 350 mm does not fit on paper of 297 x 210 mm"),
+        ("board --board 9x6 --square 3ft -o b.pdf", "'3ft' is no length above 0"),
+        ("board --board 9x6 --square=-3 -o b.pdf", "'-3' is no length above 0"),
+        ("board --board 9x6 --square 24 -o b.pdf", "'24' would be metres: 24mm, or 24m if it is that large"),
+        ("board --board 9x6 --paper a9 -o b.pdf", "'a9' is no paper: a4, a3"),
+        ("board --board 9x6 --paper 20x20mm -o b.pdf", "a square would be less than a millimetre"),
+        ("board --board 9x6 --spacing 0.3 -o b.pdf", "--spacing is for --type aprilgrid; this is a chessboard"),
+        ("board --board 9x6 --dictionary x -o b.pdf", "--dictionary is for --type charuco or --type aprilgrid"),
+        (
+            "board --type charuco --board 9x6 --dictionary x -o b.pdf",
+            "no dictionary of markers is called 'x'; OpenCV has",
+        ),
+        ("board --type charuco --board 20x20 --dictionary 4X4_50 -o b.pdf", "has 50 markers, and the board needs more"),
+        (
+            "board --type charuco --board 9x6 --square 2cm --marker 3cm -o b.pdf",
+            "a marker must be smaller than its square",
+        ),
+    ],
+    "calibrate": [
+        ("calibrate", "which images? Files, quoted patterns or folders"),
+        ("calibrate in.png", "which board? --board COLUMNSxROWS"),
+        ("calibrate none*.png --board 9x6", "none*.png: no file has such a name"),
+        ("calibrate empty --board 9x6", "empty: a folder without images"),
+        ("calibrate in.png --board 9", "'9' is not COLUMNSxROWS"),
+        ("calibrate in.png --board 9x6 --left b.png", "one of these says what to calibrate"),
+        ("calibrate --left b.png --board 9x6", "--left is one of a pair: --left and --right are both needed"),
+        ("calibrate --rig in.png --board 9x6", "--rig takes NAME=IMAGE, as in cam0=folder"),
+        ("calibrate --rig cam0=in.png --board 9x6", "--rig takes several cameras"),
+        ("calibrate --left in.png --right in.png --board 9x6", "in.png: is given as an image of two cameras"),
+        ("calibrate in.png --board 9x6 --match name", "--match is for --left and --right, or --rig"),
+        (
+            "calibrate in.png --board 9x6 --model lens",
+            "--model: there is no camera model 'lens'; known are brown_conrady",
+        ),
+        ("calibrate in.png --board 9x6 --model fisheye", "did you mean 'kannala_brandt'?"),
+        ("calibrate in.png --board 9x6 --model fisheye62 -o new.yml", "-o camera.json holds every model"),
+        ("calibrate in.png --board 9x6 --model fisheye62 --count 3", "--count: fisheye62 takes n = 8"),
+        ("calibrate in.png --board 9x6 --count 3", "--count is for a --model"),
+        ("calibrate in.png --board 9x6 -o camera.foo", "camera.foo: the name does not say the format"),
+        ("calibrate in.png --board 9x6 -o in.png --force", "would overwrite in.png, which is read"),
+        ("calibrate in.png --board 9x6 -o exists.json", "exists.json: exists already; --force"),
+        ("calibrate in.png --board 9x6 -o new.json --report exists.json", "exists.json: exists already; --force"),
+        ("calibrate in.png --board 9x6 -o new.json --report new.json", "must be different files"),
+        ("calibrate in.png --board 9x6 -o new.json --corners new.json", "must be different files"),
+        ("calibrate in.png --board 9x6 --corners exists.json", "exists.json: no file of corners"),
+        ("calibrate in.png --board 8x6 --corners corners.json", "holds corners of chessboard, 9x6 inner corners"),
+        ("calibrate --board 8x6 --corners corners.json --force", "no images are given to find this one in"),
+    ],
 }
 
 
@@ -149,6 +203,9 @@ def files(tmp_path_factory):
     (folder / "labels.json").write_text(json.dumps({"keypoints": [[20, 30]]}))
     (folder / "cut.png").write_bytes((folder / "in.png").read_bytes()[:3000])
     (folder / "images").mkdir()
+    (folder / "empty").mkdir()
+    (folder / "exists.json").write_text("{}")
+    write_corners(corners_of(count=3), folder / "corners.json")
     shutil.copy(folder / "in.png", folder / "images")
     for name, kind in (("alpha", "RGBA"), ("grey", "L")):
         opened(folder / "in.png").convert(kind).save(folder / f"{name}.png")

@@ -1,5 +1,6 @@
-"""Many files at once: what is found, what is kept, what is made anew, and processes that die."""
+"""Many files at once: which are meant, which part is whose, and processes that die."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -14,65 +15,64 @@ from camtorch.io.writing import all_left_over
 from camtorch.jobs import inputs
 from camtorch.jobs.items import Item, Shard
 from camtorch.jobs.manifest import Manifest
-from camtorch.jobs.run import pending, run
+from camtorch.jobs.run import run
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """The current folder, with files in folders."""
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("in/10.jpg", "in/2.JPG", "in/deep/1.png", "in/deep/notes.txt", "in/.hidden.jpg", "in/.git/3.jpg"):
-        Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).write_text(name)
-    return tmp_path
-
-
-def found(*words, output="out"):
-    files, faults = inputs.find(words, inputs.IMAGES, Path(output))
-    return {str(one.path): str(one.place) for one in files}, dict(faults)
 
 
 # -- inputs
 
 
-def test_files_are_found_with_their_places(folder):
+@pytest.fixture
+def tree():
+    """Files in folders, and a function that says which of them are found, and their places."""
+    for name in ("in/10.jpg", "in/2.JPG", "in/deep/1.png", "in/deep/notes.txt", "in/.hidden.jpg", "in/.git/3.jpg"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(name)
+
+    def found(*words, output="out"):
+        files, faults = inputs.find(words, inputs.IMAGES, Path(output))
+        assert not faults
+        return {str(one.path): str(one.place) for one in files}
+
+    return found
+
+
+def test_files_are_found_with_their_places(tree):
+    everything = {"in/2.JPG": "2.JPG", "in/10.jpg": "10.jpg", "in/deep/1.png": "deep/1.png"}  # 2 before 10
     for words, expected in (
-        (["in"], {"in/2.JPG": "2.JPG", "in/10.jpg": "10.jpg", "in/deep/1.png": "deep/1.png"}),  # 2 before 10
+        (["in"], everything),
         (["in/deep", "in/2.JPG", "in/2.JPG"], {"in/2.JPG": "2.JPG", "in/deep/1.png": "deep/1.png"}),
-        (["in/**/*"], {"in/2.JPG": "2.JPG", "in/10.jpg": "10.jpg", "in/deep/1.png": "deep/1.png"}),
+        (["in/**/*"], everything),
         (["in/d*/*"], {"in/deep/1.png": "deep/1.png"}),
     ):
-        files, faults = found(*words)
-        assert (list(files.items()), faults) == (list(expected.items()), {})
+        assert list(tree(*words).items()) == list(expected.items())
     Path("in/[1].jpg").write_text("the name of a file, not a pattern")
-    assert found("in/[1].jpg")[0] == {"in/[1].jpg": "[1].jpg"}
+    assert tree("in/[1].jpg") == {"in/[1].jpg": "[1].jpg"}
     Path("in/empty").mkdir()
-    for word, text in (("in/.*gif", "no file of a known type"), ("in/empty", "nothing in there ends in .bmp")):
+    for word, text in (("in/*gif", "no file of a known type"), ("in/empty", "nothing in there ends in .bmp")):
         with pytest.raises(ValueError, match=text):
-            found(word.replace(".*", "*"))
-
-
-def test_outputs_are_not_read_again(folder):
+            tree(word)
     Path("in/out").mkdir()
     Path("in/out/2.JPG").write_text("made")
     for word in ("in", "in/**/*", "."):
-        assert not any("out" in name for name in found(word, output="in/out")[0])
-    assert found("in/out", output="in/out")[0] == {"in/out/2.JPG": "2.JPG"}  # and is refused by `items.check`
+        assert not any("out" in name for name in tree(word, output="in/out"))
+    assert tree("in/out", output="in/out") == {"in/out/2.JPG": "2.JPG"}  # and is refused by `items.check`
 
 
-def test_links(folder):
+def test_links(tree):
     Path("elsewhere").mkdir()
     Path("elsewhere/5.jpg").touch()
-    Path("in/there").symlink_to("../elsewhere")
-    Path("in/deep/up").symlink_to("..")
-    Path("in/me.jpg").symlink_to("me.jpg")
-    Path("in/gone.jpg").symlink_to("nowhere.jpg")
-    Path("in/gone.txt").symlink_to("nowhere.txt")
+    for name, target in (("there", "../elsewhere"), ("deep/up", ".."), ("me.jpg", "me.jpg"), ("gone.jpg", "no.jpg")):
+        Path("in", name).symlink_to(target)
     os.mkfifo("in/pipe.jpg")
     # a link to nothing is taken, so that it is told of; a circle shows nothing new
     lost = {"in/gone.jpg", "in/me.jpg"}
-    assert found("in")[0].keys() == {"in/2.JPG", "in/10.jpg", "in/deep/1.png", "in/there/5.jpg", *lost}
-    assert found("in/**/*.jpg")[0].keys() == {"in/10.jpg", "in/there/5.jpg", *lost}
+    assert tree("in").keys() == {"in/2.JPG", "in/10.jpg", "in/deep/1.png", "in/there/5.jpg", *lost}
+    assert tree("in/**/*.jpg").keys() == {"in/10.jpg", "in/there/5.jpg", *lost}
 
 
 # -- shards
@@ -81,7 +81,7 @@ TORCHRUN, SRUN = {"TORCHELASTIC_RUN_ID": "none"}, {"SLURM_JOB_ID": "7", "SLURM_S
 
 
 @pytest.mark.parametrize(
-    ("environment", "shard", "left_over"),
+    ("values", "shard", "left_over"),
     [
         ({}, Shard(), ""),
         ({"RANK": "0", "WORLD_SIZE": "1"}, Shard(), ""),
@@ -91,19 +91,25 @@ TORCHRUN, SRUN = {"TORCHELASTIC_RUN_ID": "none"}, {"SLURM_JOB_ID": "7", "SLURM_S
         ({"SLURM_JOB_ID": "7", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, Shard(), ""),  # a script that sbatch runs
         (SRUN | {"SLURM_PROCID": "2", "SLURM_NTASKS": "4", "RANK": "0", "WORLD_SIZE": "2"}, Shard(2, 4), ""),
         (TORCHRUN | SRUN | {"RANK": "0", "WORLD_SIZE": "2", "SLURM_PROCID": "3", "SLURM_NTASKS": "4"}, Shard(0, 2), ""),
+        *((TORCHRUN | numbers, None, "") for numbers in (
+            {}, {"WORLD_SIZE": "2"}, {"RANK": "2", "WORLD_SIZE": "2"}, {"RANK": "-1", "WORLD_SIZE": "2"},
+        )),
     ],
-)
-def test_shards(environment, shard, left_over):
-    assert Shard.of_environment(environment) == shard
-    assert Shard.unmarked(environment) == left_over
+)  # fmt: skip
+def test_shards(monkeypatch, values, shard, left_over):
+    for name in os.environ:
+        if name.startswith(("SLURM", "TORCHELASTIC")) or name.endswith(("RANK", "WORLD_SIZE")):
+            monkeypatch.delenv(name)
+    for name, value in values.items():
+        monkeypatch.setenv(name, value)
+    if shard is None:
+        with pytest.raises(ValueError, match="which shard"):
+            Shard.of_environment()
+        return
+    with pytest.warns(UserWarning, match=left_over) if left_over else contextlib.nullcontext():
+        assert Shard.of_environment() == shard
     parts = [Shard(rank, shard.count).of(range(5)) for rank in range(shard.count)]
     assert sorted(number for part in parts for number in part) == list(range(5))
-
-
-def test_shards_that_are_none():
-    for numbers in ({}, {"WORLD_SIZE": "2"}, {"RANK": "2", "WORLD_SIZE": "2"}, {"RANK": "-1", "WORLD_SIZE": "2"}):
-        with pytest.raises(ValueError, match="which shard"):
-            Shard.of_environment(TORCHRUN | numbers)
 
 
 # -- jobs
@@ -119,8 +125,8 @@ def jobs_of(texts):
     return made
 
 
-def carried_out(todo, *, settings=0, shard=None, **options):
-    with Manifest(Path("out"), "doubling", settings, shard) as manifest:
+def carried_out(todo, **options):
+    with Manifest(Path("out"), "doubling", 0) as manifest:
         return run(todo, Doubling(), manifest, **options)
 
 
@@ -130,41 +136,35 @@ def contents():
     return {str(path.relative_to("out")): path.read_text() for path in files}
 
 
-@pytest.fixture
-def empty(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def left_over(todo):
+    return all_left_over([os.path.realpath(path) for item in todo for path in item.outputs])
 
 
-@pytest.mark.parametrize("change", ["input", "settings", "variant", "output", "gone", "account"])
-def test_what_has_changed_is_made_anew(empty, change):
-    todo = jobs_of({"a": "1", "b": "2"})
-    carried_out(todo)
-    settings = 0
-    if change == "input":
-        Path("in/a").write_text("9")
-    elif change == "settings":
-        settings = {"other": 1.5}
-    elif change == "variant":
-        todo[0] = Item(todo[0].inputs, todo[0].outputs, variant="seed 7")
-    elif change == "output":
-        Path("out/more/a").write_text("1?")
-    elif change == "gone":
-        Path("out/a").unlink()
-    else:  # cut off in the middle of what it says of b, as by a crash
-        (account,) = Path("out").glob(".camtorch*")
-        account.write_bytes(account.read_bytes()[:-40])
-    with Manifest(Path("out"), "doubling", settings) as manifest:
-        again = [item.name for item in pending(todo, manifest, resume=True)]
-    assert again == {"settings": ["in/a", "in/b"], "account": ["in/b"]}.get(change, ["in/a"])
-    report = carried_out(todo, settings=settings, resume=True)
-    assert (report.made, report.kept) == (len(again), 2 - len(again))
-    first = {"input": "99", "variant": "11seed 7"}.get(change, "11")
-    assert contents() == {"a": first, "more/a": first, "b": "22", "more/b": "22"}
-    assert carried_out(todo, settings=settings, resume=True).kept == 2
+def started(texts, **options):
+    """A process of its own that works on them, when it has come to one that says "wait"."""
+    code = (
+        "from copying import *; from test_jobs import *; import signal; "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "  # what runs in the background ignores it
+        f"carried_out(jobs_of({texts}), **{options})"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE, text=True,
+                               start_new_session=True)  # fmt: skip
+    while not Path("out/waiting").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    return process
 
 
-def test_what_is_not_of_the_job_is_not_overwritten(empty):
+def test_nobody_does_the_same_at_the_same_time():
+    with Manifest(Path("out"), "doubling", 0):
+        with pytest.raises(BlockingIOError, match="another process does this right now"):
+            carried_out([])
+        with Manifest(Path("out"), "doubling", 0, Shard(0, 2)), Manifest(Path("out"), "other", 0):
+            pass
+
+
+def test_what_is_not_of_the_job_is_not_overwritten():
     todo = jobs_of({"a": "1", "b": "2"})
     Path("out").mkdir()
     Path("out/a").write_text("mine")
@@ -176,98 +176,49 @@ def test_what_is_not_of_the_job_is_not_overwritten(empty):
     assert Path("out/a").read_text() == "11"
 
 
-def test_nobody_does_the_same_at_the_same_time(empty):
-    with Manifest(Path("out"), "doubling", 0):
-        with pytest.raises(BlockingIOError, match="another process does this right now"):
-            carried_out([])
-        with Manifest(Path("out"), "doubling", 0, Shard(0, 2)), Manifest(Path("out"), "other", 0):
-            pass
-
-
 @pytest.mark.slow
-def test_what_a_crash_left_is_removed(empty):
-    todo = jobs_of({"a" * 30 + "1": "1", "a" * 30 + "2": "wait"})
-    code = (
-        "from copying import *; from test_jobs import *; "
-        "carried_out(jobs_of({'a' * 30 + '1': '1', 'a' * 30 + '2': 'wait'}))"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)})
-    try:
-        while not Path("out/waiting").exists():
-            assert process.poll() is None
-            time.sleep(0.01)
-    finally:
-        process.kill()
-        process.wait()
+def test_what_a_crash_left_is_removed():
+    texts = {"a" * 30 + "1": "1", "a" * 30 + "2": "wait"}
+    process = started(texts)
+    process.kill()
+    process.communicate()
     Path("out/waiting").unlink()
-    outputs = [os.path.realpath(path) for item in todo for path in item.outputs]
-    assert len(all_left_over(outputs)) == 1
-    assert all_left_over(outputs[:2]) == []  # another name that begins alike
-    Path("in", "a" * 30 + "2").write_text("2")
+    todo = jobs_of(texts | {"a" * 30 + "2": "2"})
+    assert len(left_over(todo)) == 1
+    assert left_over(todo[:1]) == []  # another name that begins alike
     report = carried_out(todo, resume=True)
-    assert (report.made, report.kept) == (1, 1)
-    assert all_left_over(outputs) == []
-    assert len(contents()) == 4
+    assert (report.made, report.kept, left_over(todo), len(contents())) == (1, 1, [], 4)
 
 
 @pytest.mark.slow
-def test_processes_make_what_one_makes(empty):
-    texts = {f"{i:02}": "1" for i in range(20)} | {"04": "fail", "05": "note"}
+def test_processes_make_what_one_makes_and_go_on_where_one_was_killed():
+    texts = {f"{i:02}": "1" for i in range(20)} | {"04": "fail", "05": "note", "03": "die"}
     todo = jobs_of(texts)
-    seen = []
-    report = carried_out(todo, processes=2, watch=lambda done, kept: seen.append(done))
-    assert report.failed == [("in/04", "it says so")]
-    assert report.made == 19
-    assert report.notes == {"is a note": ["in/05"]}
-    assert (seen == sorted(seen), seen[-1]) == (True, 20)
-    expected = {f"{place}{name}" for name, text in texts.items() if text != "fail" for place in ("", "more/")}
-    assert contents().keys() == expected
-
-
-@pytest.mark.slow
-def test_a_process_that_is_killed_ends_the_job_which_goes_on_later(empty):
-    todo = jobs_of({f"{i:02}": "1" for i in range(20)} | {"03": "die"})
     with pytest.raises(ChildProcessError, match=r"a process was killed, .*; at work were .*in/03"):
         carried_out(todo, processes=2)
-    outputs = [os.path.realpath(path) for item in todo for path in item.outputs]
-    assert all_left_over(outputs) == []
+    assert left_over(todo) == []
     Path("in/03").write_text("1")
-    report = carried_out(todo, processes=2, resume=True)
-    assert (report.failed, report.made + report.kept) == ([], 20)
-    assert len(contents()) == 40
+    parts = []
+    report = carried_out(todo, processes=2, resume=True, add=parts.append)
+    assert (report.failed, report.made + report.kept) == ([("in/04", "it says so")], 19)
+    assert report.notes in ({"is a note": ["in/05"]}, {})  # where it was made before
+    assert (min(parts) >= 0, sum(parts)) == (True, 20)
+    assert contents().keys() == {f"{place}{name}" for name in texts if name != "04" for place in ("", "more/")}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_processes_end_with_who_started_them(empty, number):
-    code = (
-        "from copying import *; from test_jobs import *; import multiprocessing as m, signal; "
-        "signal.signal(signal.SIGINT, signal.default_int_handler); "  # what runs in the background ignores it
-        "carried_out(jobs_of({'a': 'wait', 'b': 'wait', 'c': '3'}), processes=2)"
-    )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE, text=True,
-                               start_new_session=True)  # fmt: skip
-    try:
-        while not Path("out/waiting").exists():
-            assert process.poll() is None
-            time.sleep(0.01)
-        time.sleep(0.5)
-        process.send_signal(number)
-        process.wait(15)
-    finally:
-        process.kill()
-    begin = time.monotonic()
-    while time.monotonic() < begin + 15:  # until nobody of them is there
-        try:
+def test_processes_end_with_who_started_them(number):
+    process = started({"a": "wait", "b": "wait", "c": "3"}, processes=2)
+    time.sleep(0.5)
+    process.send_signal(number)
+    _, error = process.communicate(timeout=15)
+    with contextlib.suppress(ProcessLookupError):
+        for _ in range(300):  # until nobody of them is there
             os.killpg(process.pid, 0)
-        except ProcessLookupError:
-            break
-        time.sleep(0.05)
-    else:
+            time.sleep(0.05)
         os.killpg(process.pid, signal.SIGKILL)
         pytest.fail("processes that stay")
-    assert contents() == {"waiting": ""} or number == signal.SIGKILL  # what an interrupt leaves is in order
-    if number == signal.SIGINT:
-        assert "KeyboardInterrupt" in process.stderr.read()
-    process.stderr.close()
+    if number == signal.SIGINT:  # what an interrupt leaves is in order
+        assert contents() == {"waiting": ""}
+        assert "KeyboardInterrupt" in error

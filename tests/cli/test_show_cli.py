@@ -7,18 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 from cameras import KEYS, one
-from command_line import FILES, FISHEYE, MATRIX, command, opened, refused, write_photograph
+from command_line import FILES, FISHEYE, MATRIX, command, opened, refused
 
 import camtorch as ct
 from camtorch.analysis.summary import summarise
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """The current folder, with a camera."""
-    monkeypatch.chdir(tmp_path)
-    write_photograph(tmp_path)
-    return tmp_path
 
 
 def batch():
@@ -82,9 +74,8 @@ def test_convert_says_how_good_it_is(folder, capsys):
 
 
 def test_convert_keeps_poses(folder, capsys):
-    command(
-        "convert", FILES / "opencv_stereo.yml", "out.json", "--from-model", "kannala_brandt", "--model", "fisheye62"
-    )
+    words = "out.json --from-model kannala_brandt --model fisheye62"
+    command("convert", FILES / "opencv_stereo.yml", *words.split())
     before, after = ct.load(FILES / "opencv_stereo.yml"), ct.load("out.json")
     assert [type(camera) for camera in after.cameras.values()] == [ct.Fisheye62] * 2
     for name, pose in before.extrinsics.items():
@@ -178,19 +169,8 @@ def test_show_says_how_much_is_alike_where_the_rim_is_not(folder, capsys):
 
 
 def test_a_size_that_the_file_does_not_say(folder, capsys):
-    command(
-        "convert",
-        FILES / "opencv_stereo.yml",
-        "chain.yaml",
-        "--model",
-        "kannala_brandt",
-        "--format",
-        "kalibr",
-        "--size",
-        "1280x800",
-        "--count",
-        "4",
-    )
+    words = "chain.yaml --model kannala_brandt --format kalibr --size 1280x800 --count 4"
+    command("convert", FILES / "opencv_stereo.yml", *words.split())
     assert [camera.image_size for camera in ct.load("chain.yaml").cameras.values()] == [(800, 1280)] * 2
 
 

@@ -35,11 +35,8 @@ def test_work_of_more_than_a_moment_shows_how_far_it_is_and_leaves_nothing(monke
     assert not told.split("\r")[-1]
 
 
-def test_messages_are_one_line(capsys):
+def test_messages_are_one_line_and_do_not_steer_the_terminal(capsys):
     terminal.note("what\n  pillow said")
     assert capsys.readouterr().err == "camtorch: note: what pillow said\n"
-
-
-def test_names_do_not_steer_the_terminal(capsys):
     terminal.say("error: \x1b[2J\u202egone\n.jpg: späce 日本")
     assert capsys.readouterr().err == r"camtorch: error: \x1b[2J\u202egone .jpg: späce 日本" + "\n"

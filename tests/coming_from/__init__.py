@@ -1,6 +1,6 @@
 """What the checks of the rows of the pages "Coming from" have in common; beside this is one file a library."""
 
-import importlib
+import inspect
 
 import cv2
 import numpy as np
@@ -23,19 +23,24 @@ def row(*keys, slow=False):
     return register
 
 
+def equal(table):
+    """Register rows where the same numbers come out of both: names -> what gives pairs (ours, theirs), and an atol."""
+    for keys, pairs in table.items():
+
+        def check(pairs=pairs):
+            *found, atol = pairs()
+            for ours, theirs in found:
+                close(ours, theirs, atol)
+
+        check.__signature__ = inspect.Signature()
+        row(*keys.split(" "))(check)
+
+
 def trap(check, slow=False):
     """Register the check of what a page says under "Traps"."""
     name = f"{check.__module__.split('.')[-1]}: {check.__name__}"
     TRAPS.append(pytest.param(check, id=name, marks=[pytest.mark.slow] if slow else []))
     return check
-
-
-def optional(name):
-    """The module, or None where it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        return None
 
 
 def close(ours, theirs, atol=1e-9):

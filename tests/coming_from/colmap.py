@@ -3,15 +3,14 @@
 import functools
 
 import numpy as np
-import pytest
+import pycolmap
 import torch
 from torch.nn.utils import parametrize
 
 import camtorch as ct
 
-from . import SIZE, close, optional, photograph, pixels, points, row, same_images, trap
+from . import SIZE, close, equal, photograph, pixels, points, row, same_images, trap
 
-pycolmap = optional("pycolmap")
 HEIGHT, WIDTH = SIZE
 FISHEYE = [75.0, 77.5, 80.0, 60.0, 0.02, -0.01, 0.003, -0.001]
 OPENCV = [75.0, 77.5, 80.0, 60.0, -0.28, 0.1, 1e-3, -5e-4]
@@ -46,11 +45,6 @@ CLASSES = {
 }
 
 
-def needed():
-    if pycolmap is None:
-        pytest.skip("pycolmap is not installed")
-
-
 def theirs(name="OPENCV", params=OPENCV):
     return pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
 
@@ -81,7 +75,6 @@ def plane(rays):
 
 @row("pycolmap.Reconstruction", "pycolmap.Reconstruction.cameras", "pycolmap.Reconstruction.images")
 def read(tmp_path):
-    needed()
     reconstruction(theirs()).write(tmp_path)
     rig = ct.load(tmp_path)
     assert list(rig.cameras) == ["1"]
@@ -93,7 +86,6 @@ def read(tmp_path):
 
 @row("pycolmap.Reconstruction.write")
 def write(tmp_path):
-    needed()
     rig = ct.Rig({"1": lens()}, {"a.jpg": pose()}, images={"a.jpg": "1"})
     (tmp_path / "binary").mkdir()
     for path in (tmp_path / "text", tmp_path / "binary" / "cameras.bin"):
@@ -104,57 +96,57 @@ def write(tmp_path):
         close(image.cam_from_world().matrix(), moved().matrix())
 
 
-@row("pycolmap.Camera.img_from_cam")
-def project():
-    needed()
-    close(lens().project(torch.from_numpy(points()))[0] + 0.5, theirs().img_from_cam(points()))
+HALF = torch.tensor([0, 0, 0.5, 0.5])
+IN_K = torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+POINT = torch.from_numpy(points()[0])
 
 
-@row("pycolmap.Camera.cam_ray_from_img", "pycolmap.Camera.cam_from_img")
-def unproject():
-    needed()
-    rays, valid = lens().unproject(torch.from_numpy(pixels() - 0.5))
-    assert valid.all()
-    close(rays, theirs().cam_ray_from_img(pixels()), 1e-7)
-    close(plane(rays), theirs().cam_from_img(pixels()), 1e-7)
+def turned():
+    """Another pose, theirs and ours."""
+    turn, shift = np.array([0.0, 0.3, 0.0]), np.array([1.0, 0.0, 0.0])
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(turn), shift), ct.Extrinsics(turn, shift).requires_grad_(False)
 
 
-@row("pycolmap.Camera.calibration_matrix")
-def matrix():
-    needed()
-    close(lens().K + torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), theirs().calibration_matrix())
-
-
-@row("pycolmap.Camera.rescale")
-def rescale():
-    needed()
+def rescaled():
     camera = theirs()
     camera.rescale(80, 60)
-    close(lens().resize(60, 80).intrinsics + torch.tensor([0, 0, 0.5, 0.5]), camera.params[:4])
+    return camera.params[:4]
 
 
-@row(
-    "pycolmap.Image.cam_from_world",
-    "pycolmap.Image.projection_center",
-    "pycolmap.Image.project_point",
-    "pycolmap.Rigid3d.matrix",
-    "pycolmap.Rigid3d.inverse",
-)
-def poses():
-    needed()
-    image = reconstruction(theirs()).images[7]
-    close(pose().matrix()[:3], image.cam_from_world().matrix())
-    close(pose().position, image.projection_center())
-    close(lens()(pose()(torch.from_numpy(points()[0])))[0] + 0.5, image.project_point(points()[0]))
-    close(pose().inverse().matrix()[:3], moved().inverse().matrix())
-    other = ct.Extrinsics(np.array([0.0, 0.3, 0.0]), np.array([1.0, 0.0, 0.0])).requires_grad_(False)
-    turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.3, 0.0])), np.array([1.0, 0.0, 0.0]))
-    close(pose().compose(other).matrix()[:3], (moved() * turned).matrix())
+def image():
+    return reconstruction(theirs()).images[7]
+
+
+def rays():
+    return lens().unproject(torch.from_numpy(pixels() - 0.5))[0]
+
+
+_of = "pycolmap.Image"
+equal({
+    "pycolmap.Camera.img_from_cam": lambda: (
+        (lens().project(torch.from_numpy(points()))[0] + 0.5, theirs().img_from_cam(points())), 1e-9
+    ),
+    "pycolmap.Camera.cam_ray_from_img pycolmap.Camera.cam_from_img": lambda: (
+        (rays(), theirs().cam_ray_from_img(pixels())), (plane(rays()), theirs().cam_from_img(pixels())), 1e-7
+    ),
+    "pycolmap.Camera.calibration_matrix": lambda: ((lens().K + IN_K, theirs().calibration_matrix()), 1e-9),
+    "pycolmap.Camera.rescale": lambda: ((lens().resize(60, 80).intrinsics + HALF, rescaled()), 1e-9),
+    f"{_of}.cam_from_world {_of}.projection_center {_of}.project_point": lambda: (
+        (pose().matrix()[:3], image().cam_from_world().matrix()),
+        (pose().position, image().projection_center()),
+        (lens()(pose()(POINT))[0] + 0.5, image().project_point(points()[0])),
+        1e-9,
+    ),
+    "pycolmap.Rigid3d.matrix pycolmap.Rigid3d.inverse": lambda: (
+        (pose().inverse().matrix()[:3], moved().inverse().matrix()),
+        (pose().compose(turned()[1]).matrix()[:3], (moved() * turned()[0]).matrix()),
+        1e-9,
+    ),
+})  # fmt: skip
 
 
 @row("pycolmap.undistort_camera")
 def undistort():
-    needed()
     bitmap = pycolmap.Bitmap.from_array(photograph())
     flat, camera = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, theirs())
     fx, fy, cx, cy = camera.params
@@ -166,7 +158,6 @@ def undistort():
 
 @row("pycolmap.estimate_and_refine_absolute_pose")
 def absolute_pose():
-    needed()
     seen = lens()(pose()(torch.from_numpy(points())))[0]
     found = pycolmap.estimate_and_refine_absolute_pose(seen.numpy() + 0.5, points(), theirs())
     ours, _, valid = ct.solve_pnp(lens(), points(), seen)
@@ -176,7 +167,6 @@ def absolute_pose():
 
 @row("pycolmap.triangulate_point", "pycolmap.estimate_triangulation", slow=True)
 def triangulate():
-    needed()
     here = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False)
     world = torch.from_numpy(points(20))
     seen = torch.stack([lens()(pose)[0] for pose in (here(world), pose()(world))])
@@ -191,7 +181,6 @@ def triangulate():
 
 def model(first):
     def check(tmp_path):
-        needed()
         kind, names = CLASSES[first]
         for name in names:
             focal = [75.0] if name.startswith(("SIMPLE", "RADIAL")) else [75.0, 77.5]
@@ -212,7 +201,6 @@ for _first in CLASSES:
 
 @trap
 def quaternions(tmp_path):
-    needed()
     reconstruction(theirs()).write_text(tmp_path)
     line = next(line for line in (tmp_path / "images.txt").read_text().splitlines() if line.endswith("a.jpg"))
     w, x, y, z = map(float, line.split()[1:5])
@@ -235,7 +223,6 @@ def one_focal_length(tmp_path):
 
 @trap
 def past_ninety_degrees():
-    needed()
     angle = 1.7
     beside = np.array([[np.sin(angle), 0.0, np.cos(angle)]])
     camera, ours = theirs("OPENCV_FISHEYE", FISHEYE), lens(ct.KannalaBrandt, FISHEYE)

@@ -13,7 +13,7 @@ from kornia.image import ImageSize
 import camtorch as ct
 import camtorch.augment.kornia as front_end
 
-from . import SIZE, as_images, close, photograph, pixels, points, row, trap
+from . import SIZE, as_images, close, equal, photograph, pixels, points, row, trap
 
 MATRIX = torch.tensor([[75.0, 0, 79.5], [0, 77.5, 59.5], [0, 0, 1]], dtype=torch.float64)
 OTHER = torch.tensor([[60.0, 0, 75.0], [0, 62.0, 58.0], [0, 0, 1]], dtype=torch.float64)
@@ -50,58 +50,128 @@ def depth():
     return 2 + torch.rand(1, 1, *SIZE, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-@row("kornia.geometry.camera.PinholeCamera")
-def pinhole_camera():
-    close(pinhole(theirs().camera_matrix[0]).intrinsics, NUMBERS)
-    close(ct.Extrinsics.from_matrix(theirs().extrinsics).rotation, POSE.rotation[None])
+def lifted(camera=None, depth=2.5):
+    """Points at a depth of the pixels."""
+    rays, _ = (camera or pinhole()).unproject(PIXELS)
+    return rays / rays[..., 2:] * depth
 
 
-@row("kornia.geometry.camera.PinholeCamera.project")
-def project():
-    close(pinhole()(POSE(POINTS))[0], theirs().project(POINTS[None])[0])
+def flat(points=POINTS):
+    return points[:, :2] / points[:, 2:]
 
 
-@row("kornia.geometry.camera.PinholeCamera.unproject")
-def unproject():
-    rays, _ = pinhole().unproject(PIXELS)
-    world = POSE.inverse()(rays / rays[..., 2:] * 2.5)
-    close(world, theirs().unproject(PIXELS[None], torch.full((1, 50, 1), 2.5, dtype=torch.float64))[0])
+def shown(warp, theirs):
+    """The largest difference of the images where ours is valid."""
+    return (warp(image()) - theirs).abs()[warp.valid_mask().expand_as(theirs)].max()
 
 
-@row("kornia.geometry.camera.PinholeCamera.scale")
-def scale():
-    half = theirs().scale(torch.tensor([0.5], dtype=torch.float64)).camera_matrix[0]
-    ours = pinhole().resize(60, 80)
-    close(half[[0, 1], [0, 1]], ours.intrinsics[:2])
-    close(half[:2, 2] - 0.25, ours.intrinsics[2:])
+NUMBERS_AND_D4, ONE = torch.cat([NUMBERS, D4]), torch.full((50, 1), 2.5, dtype=torch.float64)
+SECOND = ct.Extrinsics(np.array([0.3, 0.1, -0.2]), np.array([1.0, 2.0, 3.0])).requires_grad_(False)
+NOWHERE = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False)
+UNIT, GRAPHICS = torch.tensor([1.0, 1, 0, 0]).double(), torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())
+TILTED = torch.cat([D5, torch.zeros(7), torch.tensor([0.02, -0.01])]).double()
+calibration, camera, K3 = geometry.calibration, geometry.camera, sensors.KannalaBrandtK3
+of_rig = "kornia.geometry.linalg"
+
+equal({
+    "kornia.geometry.camera.PinholeCamera": lambda: (
+        (pinhole(theirs().camera_matrix[0]).intrinsics, NUMBERS),
+        (ct.Extrinsics.from_matrix(theirs().extrinsics).rotation, POSE.rotation[None]),
+        1e-9,
+    ),
+    "kornia.geometry.camera.PinholeCamera.project": lambda: (
+        (pinhole()(POSE(POINTS))[0], theirs().project(POINTS[None])[0]), 1e-9
+    ),
+    "kornia.geometry.camera.PinholeCamera.unproject": lambda: (
+        (POSE.inverse()(lifted()), theirs().unproject(PIXELS[None], ONE[None])[0]), 1e-9
+    ),
+    "kornia.geometry.camera.PinholeCamera.scale": lambda: (
+        (
+            theirs().scale(torch.tensor([0.5]).double()).camera_matrix[0][[0, 1, 0, 1], [0, 1, 2, 2]],
+            pinhole().resize(60, 80).intrinsics + torch.tensor([0, 0, 0.25, 0.25]),
+        ),
+        1e-9,
+    ),
+    "kornia.geometry.camera.project_points": lambda: (
+        (pinhole().project(POINTS)[0], geometry.project_points(POINTS, MATRIX)), 1e-9
+    ),
+    "kornia.geometry.camera.unproject_points": lambda: (
+        (lifted(), geometry.unproject_points(PIXELS, ONE, MATRIX)),
+        (pinhole().unproject(PIXELS)[0] * ONE, geometry.unproject_points(PIXELS, ONE, MATRIX, normalize=True)),
+        1e-9,
+    ),
+    "kornia.geometry.camera.distort_points_kannala_brandt": lambda: (
+        (fisheye().project(POINTS)[0], camera.distort_points_kannala_brandt(flat(), NUMBERS_AND_D4)), 1e-9
+    ),
+    "kornia.geometry.camera.undistort_points_kannala_brandt": lambda: (
+        (flat(lifted(fisheye())), camera.undistort_points_kannala_brandt(PIXELS, NUMBERS_AND_D4)), 1e-6
+    ),
+    "kornia.geometry.calibration.distort_points": lambda: (
+        (ct.Warp(pinhole(), lens()).transform_points(PIXELS)[0], calibration.distort_points(PIXELS, MATRIX, D5)), 1e-9
+    ),
+    "kornia.geometry.calibration.tilt_projection": lambda: (
+        (
+            ct.BrownConrady(NUMBERS, TILTED).project(POINTS)[0],
+            geometry.transform_points(
+                calibration.tilt_projection(*TILTED[-2:])[None], ct.BrownConrady(UNIT, D5).project(POINTS)[0][None]
+            )[0] * NUMBERS[:2] + NUMBERS[2:],
+        ),
+        1e-9,
+    ),
+    "kornia.geometry.conversions.axis_angle_to_rotation_matrix": lambda: (
+        (POSE.matrix()[:3, :3], geometry.axis_angle_to_rotation_matrix(POSE.rotation[None])[0]), 1e-6
+    ),
+    "kornia.geometry.conversions.normalize_pixel_coordinates": lambda: (
+        (geometry.normalize_pixel_coordinates(torch.tensor([[0.0, 0], [159, 119]]), *SIZE), [[-1.0, -1], [1, 1]]),
+        (ct.Warp(pinhole(), pinhole()).grid()[0, 0, 0], [1 / SIZE[1] - 1, 1 / SIZE[0] - 1]),
+        1e-5,
+    ),
+    "kornia.geometry.conversions.camtoworld_graphics_to_vision_4x4": lambda: (  # y up, z back
+        (
+            geometry.camtoworld_graphics_to_vision_4x4((POSE.inverse().matrix() @ GRAPHICS)[None])[0],
+            POSE.inverse().matrix(),
+        ),
+        1e-9,
+    ),
+    f"{of_rig}.compose_transformations {of_rig}.relative_transformation": lambda: (
+        (POSE.compose(SECOND).matrix(), geometry.compose_transformations(*matrices(POSE, SECOND))[0]),
+        (POSE.inverse().compose(SECOND).matrix(), geometry.relative_transformation(*matrices(POSE, SECOND))[0]),
+        1e-9,
+    ),
+    "kornia.sensors.camera.CameraModel": lambda: (
+        (
+            ct.BrownConrady(NUMBERS, TILTED[:8]).project(POINTS)[0],
+            sensors.CameraModel(
+                ImageSize(*SIZE), sensors.CameraModelType.BROWN_CONRADY, torch.cat([NUMBERS, TILTED[:8]])
+            ).project(Vector3(POINTS)).data,
+        ),
+        1e-9,
+    ),
+    "kornia.sensors.camera.KannalaBrandtK3": lambda: (
+        (fisheye().project(POINTS)[0], K3(ImageSize(*SIZE), NUMBERS_AND_D4).project(Vector3(POINTS)).data), 1e-9
+    ),
+    "kornia.sensors.camera.PinholeModel": lambda: (
+        (pinhole().project(POINTS)[0], sensors.PinholeModel(ImageSize(*SIZE), NUMBERS).project(Vector3(POINTS)).data),
+        1e-9,
+    ),
+    "kornia.augmentation.RandomHorizontalFlip": lambda: (
+        (ours(ct.augment.HorizontalFlip(p=1.0))[0], kornias(K.RandomHorizontalFlip(p=1.0))[0]),
+        (ours(ct.augment.VerticalFlip(p=1.0))[0], kornias(K.RandomVerticalFlip(p=1.0))[0]),
+        1e-9,
+    ),
+    "kornia.augmentation.RandomRotation": lambda: (
+        (ours(leaning(20.0))[0], kornias(K.RandomRotation((20.0, 20.0), p=1.0))[0]), 1e-3
+    ),
+})  # fmt: skip
 
 
-@row("kornia.geometry.camera.project_points")
-def project_points():
-    close(pinhole().project(POINTS)[0], geometry.project_points(POINTS, MATRIX))
+def matrices(*poses):
+    return [pose.matrix()[None] for pose in poses]
 
 
-@row("kornia.geometry.camera.unproject_points")
-def unproject_points():
-    rays, _ = pinhole().unproject(PIXELS)
-    one = torch.full((50, 1), 2.5, dtype=torch.float64)
-    close(rays / rays[..., 2:] * one, geometry.unproject_points(PIXELS, one, MATRIX))
-    close(rays * one, geometry.unproject_points(PIXELS, one, MATRIX, normalize=True))
-
-
-@row("kornia.geometry.camera.distort_points_kannala_brandt")
-def distort_kannala_brandt():
-    params = torch.cat([NUMBERS, D4])
-    flat = POINTS[:, :2] / POINTS[:, 2:]
-    theirs = geometry.camera.distort_points_kannala_brandt(flat, params)
-    close(ct.KannalaBrandt(params[:4], params[4:]).project(POINTS)[0], theirs)
-
-
-@row("kornia.geometry.camera.undistort_points_kannala_brandt")
-def undistort_kannala_brandt():
-    rays, _ = fisheye().unproject(PIXELS)
-    found = geometry.camera.undistort_points_kannala_brandt(PIXELS, torch.cat([NUMBERS, D4]))
-    close(rays[:, :2] / rays[:, 2:], found, 1e-6)
+def leaning(roll):
+    camera = ct.Pinhole([75.0, 75.0, 79.5, 59.5], image_size=SIZE).requires_grad_(False)
+    return ct.augment.RandomMount(yaw=None, pitch=None, roll=(roll, roll), camera=camera, min_filled=0)
 
 
 @row("kornia.geometry.camera.StereoCamera", "kornia.geometry.depth.depth_from_disparity")
@@ -119,35 +189,20 @@ def stereo_camera():
     close(points[..., 2], geometry.depth.depth_from_disparity(disparity, 0.12, focal), 1e-6)
 
 
-@row("kornia.geometry.calibration.distort_points")
-def distort_points():
-    found, _ = ct.Warp(pinhole(), lens()).transform_points(PIXELS)
-    close(found, geometry.calibration.distort_points(PIXELS, MATRIX, D5))
-
-
 @row("kornia.geometry.calibration.undistort_points")
 def undistort_points():
     found, _ = ct.Warp(lens(), pinhole(OTHER)).transform_points(PIXELS)
-    close(found, geometry.calibration.undistort_points(PIXELS, MATRIX, D5, OTHER, num_iters=200), 1e-6)
-    assert (found - geometry.calibration.undistort_points(PIXELS, MATRIX, D5, OTHER)).abs().max() > 1e-3
+    close(found, calibration.undistort_points(PIXELS, MATRIX, D5, OTHER, num_iters=200), 1e-6)
+    assert (found - calibration.undistort_points(PIXELS, MATRIX, D5, OTHER)).abs().max() > 1e-3
 
 
-@row("kornia.geometry.calibration.undistort_image")
+@row("kornia.geometry.calibration.undistort_image", "kornia.geometry.transform.remap")
 def undistort_image():
     warp = ct.Warp(lens(), pinhole())
-    same = (warp(image()) - geometry.calibration.undistort_image(image(), MATRIX[None], D5[None])).abs()
-    assert same[warp.valid_mask().expand_as(same)].max() < 1e-9
+    assert shown(warp, calibration.undistort_image(image(), MATRIX[None], D5[None])) < 1e-9
     assert warp(as_images(photograph())).dtype == torch.uint8
-
-
-@row("kornia.geometry.calibration.tilt_projection")
-def tilt():
-    tilted = torch.cat([D5, torch.zeros(7), torch.tensor([0.02, -0.01])]).double()
-    found, _ = ct.BrownConrady(NUMBERS, tilted).project(POINTS)
-    matrix = geometry.calibration.tilt_projection(tilted[-2], tilted[-1])
-    flat, _ = ct.BrownConrady(torch.tensor([1.0, 1, 0, 0]).double(), D5).project(POINTS)
-    moved = geometry.transform_points(matrix[None], flat[None])[0]
-    close(found, moved * NUMBERS[:2] + NUMBERS[2:])
+    maps = (((warp.grid().double()[..., i] + 1) * size - 1) / 2 for i, size in enumerate(SIZE[::-1]))
+    assert shown(warp, geometry.remap(image(), *maps, align_corners=True)) < 1e-3
 
 
 @row("kornia.geometry.calibration.solve_pnp_dlt", slow=True)
@@ -162,25 +217,12 @@ def solve_pnp():
     close(found.matrix(), POSE.matrix(), 1e-6)
 
 
-def maps():
-    """(1, H, W) each: where `undistort_image` looks."""
-    grid = ct.Warp(lens(), pinhole()).grid().double()
-    return (((grid[..., i] + 1) * size - 1) / 2 for i, size in enumerate(SIZE[::-1]))
-
-
-@row("kornia.geometry.transform.remap")
-def remap():
-    warp = ct.Warp(lens(), pinhole())
-    same = (warp(image()) - geometry.remap(image(), *maps(), align_corners=True)).abs()
-    assert same[warp.valid_mask().expand_as(same)].max() < 1e-3
-
-
 @row("kornia.geometry.transform.warp_perspective")
 def warp_perspective():
     turn = POSE.matrix()[:3, :3]
     warp = ct.Warp(pinhole(), pinhole(OTHER), turn)
     theirs = geometry.warp_perspective(image(), (OTHER @ turn @ MATRIX.inverse())[None], SIZE)
-    assert (warp(image()) - theirs).abs()[warp.valid_mask().expand_as(theirs)].max() < 1e-3
+    assert shown(warp, theirs) < 1e-3
 
 
 @row("kornia.geometry.transform.resize")
@@ -206,9 +248,9 @@ def edits():
 def depth_to_3d():
     for kind in ("z", "distance"):
         found, _ = pinhole().backproject(depth(), kind=kind)
-        theirs = geometry.depth.depth_to_3d_v2(depth()[:, 0], MATRIX[None], normalize_points=kind == "distance")
-        close(found, theirs)
-        channels = geometry.depth.depth_to_3d(depth(), MATRIX[None], normalize_points=kind == "distance")
+        by_distance = kind == "distance"
+        close(found, geometry.depth.depth_to_3d_v2(depth()[:, 0], MATRIX[None], normalize_points=by_distance))
+        channels = geometry.depth.depth_to_3d(depth(), MATRIX[None], normalize_points=by_distance)
         close(found.permute(0, 3, 1, 2), channels)
 
 
@@ -216,72 +258,20 @@ def depth_to_3d():
 def reproject():
     found, valid = ct.Reproject(pinhole(), pinhole(), POSE)(image(), depth())
     assert valid.float().mean() > 0.3
-    nothing = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False)
     for same in (
         geometry.depth.warp_frame_depth(image(), depth(), POSE.matrix()[None], MATRIX[None]),
-        geometry.depth.depth_warp(theirs(POSE), theirs(nothing), depth(), image(), *SIZE),
+        geometry.depth.depth_warp(theirs(POSE), theirs(NOWHERE), depth(), image(), *SIZE),
     ):
         assert (found - same).abs()[valid.expand_as(found)].max() < 1e-6
 
 
-@row("kornia.geometry.conversions.axis_angle_to_rotation_matrix")
-def rotations():
-    close(POSE.matrix()[:3, :3], geometry.axis_angle_to_rotation_matrix(POSE.rotation[None])[0], 1e-6)
-
-
-@row("kornia.geometry.conversions.normalize_pixel_coordinates")
-def normalised():
-    corners = torch.tensor([[0.0, 0.0], [SIZE[1] - 1, SIZE[0] - 1]])
-    close(geometry.normalize_pixel_coordinates(corners, *SIZE), [[-1.0, -1.0], [1.0, 1.0]], 1e-6)
-    grid = ct.Warp(pinhole(), pinhole()).grid()[0]
-    close(grid[0, 0], [1 / SIZE[1] - 1, 1 / SIZE[0] - 1], 1e-5)
-
-
-@row("kornia.geometry.conversions.camtoworld_graphics_to_vision_4x4")
-def graphics():
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    world_from_graphics = POSE.inverse().matrix() @ flip  # y up, z back
-    found = ct.Extrinsics.from_matrix(geometry.camtoworld_graphics_to_vision_4x4(world_from_graphics[None])[0])
-    close(found.inverse().matrix(), POSE.matrix())
-
-
-@row("kornia.geometry.linalg.compose_transformations", "kornia.geometry.linalg.relative_transformation")
-def compositions():
-    second = ct.Extrinsics(np.array([0.3, 0.1, -0.2]), np.array([1.0, 2.0, 3.0])).requires_grad_(False)
-    one, two = POSE.matrix()[None], second.matrix()[None]
-    close(POSE.compose(second).matrix(), geometry.compose_transformations(one, two)[0])
-    close(POSE.inverse().compose(second).matrix(), geometry.relative_transformation(one, two)[0])
-
-
 @row("kornia.geometry.epipolar.triangulate_points", slow=True)
 def triangulate():
-    here = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False)
-    seen = torch.stack([pinhole()(pose(POINTS))[0] for pose in (here, POSE)])
-    found, _, valid = ct.triangulate([pinhole(), pinhole()], [here, POSE], seen)
+    seen = torch.stack([pinhole()(pose(POINTS))[0] for pose in (NOWHERE, POSE)])
+    found, _, valid = ct.triangulate([pinhole(), pinhole()], [NOWHERE, POSE], seen)
     assert valid.all()
-    projections = [(MATRIX @ pose.matrix()[:3])[None] for pose in (here, POSE)]
+    projections = [(MATRIX @ pose.matrix()[:3])[None] for pose in (NOWHERE, POSE)]
     close(found, geometry.epipolar.triangulate_points(*projections, *seen[:, None])[0], 1e-6)
-
-
-@row("kornia.sensors.camera.CameraModel")
-def camera_model():
-    params = torch.cat([NUMBERS, D5, torch.zeros(3)]).double()
-    model = sensors.CameraModel(ImageSize(*SIZE), sensors.CameraModelType.BROWN_CONRADY, params)
-    close(
-        ct.BrownConrady(params[:4], params[4:], image_size=SIZE).project(POINTS)[0], model.project(Vector3(POINTS)).data
-    )
-
-
-@row("kornia.sensors.camera.KannalaBrandtK3")
-def kannala_brandt_k3():
-    model = sensors.KannalaBrandtK3(ImageSize(*SIZE), torch.cat([NUMBERS, D4]))
-    close(fisheye().project(POINTS)[0], model.project(Vector3(POINTS)).data)
-
-
-@row("kornia.sensors.camera.PinholeModel")
-def pinhole_model():
-    model = sensors.PinholeModel(ImageSize(*SIZE), NUMBERS)
-    close(ct.Pinhole(NUMBERS, image_size=SIZE).project(POINTS)[0], model.project(Vector3(POINTS)).data)
 
 
 SPOT = torch.tensor([[[100.0, 30.0]]])
@@ -315,7 +305,6 @@ def sequential():
     drawn = alone.draw(1)
     sample = ct.augment.Compose([alone], camera=camera)(image=image, keypoints=SPOT)
     close(sample["keypoints"], spot, 1e-3)
-    close(alone(image=image, draw=drawn)["image"], alone(image=image, draw=drawn)["image"], 0)
     close(alone.inverse(alone(image=image, keypoints=SPOT, draw=drawn))["keypoints"], SPOT, 1e-3)
 
 
@@ -326,25 +315,12 @@ def random_fisheye():
     assert (sample["keypoints"] - SPOT).abs().max() > 0.1
 
 
-@row("kornia.augmentation.RandomRotation")
-def random_rotation():
-    camera = ct.Pinhole([75.0, 75.0, 79.5, 59.5], image_size=SIZE).requires_grad_(False)
-    turned = ct.augment.RandomMount(yaw=None, pitch=None, roll=(20.0, 20.0), camera=camera, min_filled=0)
-    close(ours(turned)[0], kornias(K.RandomRotation((20.0, 20.0), p=1.0))[0], 1e-3)
-
-
 @row("kornia.augmentation.RandomPerspective")
 def random_perspective():
     camera = pinhole()
     sample = ct.augment.RandomMount(camera=camera)(image=image(), keypoints=SPOT.double())
     homography = sample["camera"].K[0] @ sample["rotation"][0] @ MATRIX.inverse()
     close(sample["keypoints"], geometry.transform_points(homography[None], SPOT.double()), 1e-6)
-
-
-@row("kornia.augmentation.RandomHorizontalFlip")
-def flips():
-    for name in ("HorizontalFlip", "VerticalFlip"):
-        close(ours(getattr(ct.augment, name)(p=1.0))[0], kornias(getattr(K, f"Random{name}")(p=1.0))[0])
 
 
 @row("kornia.augmentation.RandomRotation90")
@@ -372,29 +348,6 @@ def resize():
     close(kornias(K.Resize((60, 80)))[0][0, 0, 0], torch.tensor(100 * 79 / 159), 1e-3)
     found = cv2.resize(np.arange(160, dtype=np.float32)[None], (80, 1), interpolation=cv2.INTER_LINEAR)[0]
     np.testing.assert_allclose(np.interp(100.0, found, np.arange(80.0)), 49.75, atol=1e-4)
-
-
-@trap
-def labels_that_stay():
-    zero, one = torch.zeros(2), torch.ones(2)
-    for augmentation in (
-        K.RandomFisheye(zero, zero, one, p=1.0),
-        K.RandomThinPlateSpline(p=1.0, align_corners=False),
-        K.RandomElasticTransform(p=1.0, align_corners=False),
-    ):
-        close(kornias(augmentation)[0], SPOT, 0)
-    masked = K.AugmentationSequential(K.RandomFisheye(zero, zero, one, p=1.0), data_keys=["input", "mask"])
-    with pytest.raises(NotImplementedError, match=r"^$"):
-        masked(torch.zeros(1, 1, *SIZE), torch.zeros(1, 1, *SIZE))
-
-
-@trap
-def remap_without_corners():
-    columns = torch.arange(160.0).expand(1, 1, 120, 160).contiguous()
-    rows, same = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
-    shifted = geometry.remap(columns, same[None], rows[None])[0, 0, 60]
-    close(shifted[1:-1] - columns[0, 0, 60, 1:-1], torch.arange(1.0, 159.0) / 159 - 0.5, 1e-4)
-    close(geometry.remap(columns, same[None], rows[None], align_corners=True), columns, 1e-4)
 
 
 @trap

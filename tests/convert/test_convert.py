@@ -137,7 +137,7 @@ def test_close_conversions(make_source, target, options, limit):
     assert float(result.valid_fraction) > 0.999 or "max_angle" in options
 
 
-@pytest.mark.parametrize("p", slow_unless({1e-6}.__contains__, [0.0, 1e-6, 1e-4, 1e-3]))
+@pytest.mark.parametrize("p", slow_unless({1e-6}.__contains__, [1e-6, 1e-3]))
 def test_a_table_of_a_lens_that_is_nearly_radial(p):
     """The fewer pixels determine a node, the less may what is not radial pull at it."""
     lens = torch.tensor([-0.1, 0, p, -p, 0], **F64)
@@ -146,18 +146,6 @@ def test_a_table_of_a_lens_that_is_nearly_radial(p):
     check(source, result)
     assert float(result.max_error) < 1e-4 + 1500 * p
     assert float(result.valid_fraction) == 1
-
-
-@pytest.mark.slow
-def test_rows_of_a_batch_take_as_many_coefficients_as_alone():
-    omega = torch.linspace(0.6, 1.3, 8, **F64)[:, None]
-    source = ct.FOV(torch.tensor([300.0, 300, 320, 240], **F64).expand(8, 4), omega, image_size=SIZE)
-    together = source.convert("kannala_brandt")
-    for i in (0, 3, 7):
-        alone = ct.FOV(source.intrinsics[i].detach(), omega[i], image_size=SIZE).convert("kannala_brandt")
-        count = alone.camera.distortion.shape[-1]
-        assert not bool(together.camera.distortion[i, count:].any())
-        torch.testing.assert_close(together.max_error[i], alone.max_error, rtol=1e-5, atol=1e-9)
 
 
 # -- related models
@@ -439,7 +427,7 @@ def test_nothing_between_the_nodes_is_worse(key, target, intrinsics, distortion)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", KEYS)
+@each_kind
 @given(data=st.data())
 @settings(max_examples=4)
 def test_nothing_between_the_nodes_of_drawn_cameras_is_worse(key, data):
@@ -461,8 +449,11 @@ def test_wild_cameras_become_something_finite(key, data):
     check(source, result)
 
 
-def test_conversion_in_inference_mode():
+@pytest.mark.parametrize("key", slow_unless({"brown_conrady"}.__contains__, ["brown_conrady", "division"]))
+def test_conversion_in_inference_mode(key):
+    """Derivatives of the one go backward, of the other forward."""
     camera = ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640))
-    known = camera.convert("double_sphere")
+    options = {"count": 4, "max_angle": 0.8}
+    known = camera.convert(key, **options)
     with torch.inference_mode():
-        assert torch.equal(camera.convert("double_sphere").camera.distortion, known.camera.distortion)
+        torch.testing.assert_close(camera.convert(key, **options).camera.distortion, known.camera.distortion)

@@ -223,8 +223,6 @@ def test_a_warp_of_one_camera_for_all_rows():
     np.testing.assert_allclose(turned, dewarp.rotation, atol=1e-6)
     assert (moved["camera_model"] == "pinhole").all()
 
-
-def test_a_warp_with_a_shutter_undoes_it_for_all_rows():
     shutter = ct.RollingShutter(0.03, torch.tensor([0.5, 6.0, 1.0], requires_grad=True) * 1)
     target = ct.Pinhole([18.0, 18.0, 15.5, 11.5], image_size=SIZE)
     warp = ct.Warp(camera(), target, shutter=shutter)

@@ -18,9 +18,10 @@ import camtorch.augment.kornia
 import camtorch.augment.numpy
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "coming-from").glob("*.md"))
-for _library in ("opencv", "kornia", "colmap", "albumentations", "pytorch3d", "nvtorchcam"):
-    importlib.import_module(f"coming_from.{_library}")  # which registers its checks
-LIBRARIES = ["albumentations", "cv2", "kornia", "nvtorchcam", "pycolmap", "pytorch3d"]
+LIBRARIES = [name for name in ("albumentations", "cv2", "kornia", "pycolmap") if importlib.util.find_spec(name)]
+UNCHECKED = "albumentations." if "albumentations" not in LIBRARIES else "none"
+for _page in ("opencv", "kornia", "colmap", "pytorch3d", "nvtorchcam", *({"albumentations"} & {*LIBRARIES})):
+    importlib.import_module(f"coming_from.{_page}")  # which registers its checks
 INSTANCES = {
     "augment": ct.augment.Augmentation,
     "calibration": ct.Calibration,
@@ -59,7 +60,6 @@ def resolved(name):
 
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_their_names_exist(library):
-    pytest.importorskip(library, reason=f"{library} is not installed")
     names = [name for names, _ in rows() for name in names if name.split(".")[0] == library]
     if not hasattr(cv2, "omnidir"):  # of opencv-contrib-python
         names = [name for name in names if not name.startswith("cv2.omnidir")]
@@ -85,7 +85,8 @@ def test_our_names_exist(page):
 
 def test_every_row_has_a_check():
     """But for those that have no counterpart."""
-    assert sorted({names[0] for names, ours in rows() if ours != "none"} - set(CHECKS)) == []
+    asked = {names[0] for names, ours in rows() if ours != "none"} - set(CHECKS)
+    assert sorted(name for name in asked if not name.startswith(UNCHECKED)) == []
     assert sorted(set(CHECKS) - {names[0] for names, _ in rows()}) == []
 
 

@@ -1,7 +1,6 @@
 """The scripts: what they measure can fail, what they learn from is labelled truly, and each writes its figure."""
 
 import math
-import statistics
 
 import birds_eye
 import dewarp_room
@@ -83,13 +82,6 @@ def test_the_car_park_comes_back(tmp_path):
 # -- predict_camera
 
 
-def test_lenses_are_drawn_within_their_field_of_view():
-    cameras = predict_camera.lenses(200, torch.Generator().manual_seed(0))
-    assert 54 < cameras.fov[:, 0].min() < 60
-    assert 120 < cameras.fov[:, 0].max() < 126
-    assert bool(cameras.rays()[1].all())
-
-
 def test_photographs_are_what_their_cameras_see():
     # of a panorama whose red is the height of the ray, in the frame in which it was taken
     focal = 128 / math.pi
@@ -110,19 +102,14 @@ def test_photographs_are_what_their_cameras_see():
 @pytest.mark.slow
 def test_a_small_network_learns_focal_length_and_distortion_from_single_images(tmp_path):
     # of lenses and places that it has not seen. After 700 steps chance decides much, and another processor is like
-    # another seed: of four 10 to 18 % and 4.3 to 7.7 degrees were measured. So the median of three is asked to be
-    # better than any prior, of which the least were 23 % and 8.9 degrees
-    results = [predict_camera.run(seed=seed) for seed in range(3)]
-    for result in results:
-        assert bool(result.found.rays()[1].all())
+    # another seed: of four 10 to 18 % and 4.3 to 7.7 degrees were measured. So it is asked to be better than any prior,
+    # of which the least were 23 % and 8.9 degrees
+    result = predict_camera.run()
+    assert bool(result.found.rays()[1].all())
     for measure, least in ((predict_camera.Result.focal, 0.23), (predict_camera.Result.corners, 8)):
-        before, after = (
-            [float(measure(result, cameras).median()) for result, cameras in pairs]
-            for pairs in ([(r, r.prior) for r in results], [(r, r.found) for r in results])
-        )
-        assert min(before) > least
-        assert statistics.median(after) < least
-    predict_camera.draw(results[0], str(tmp_path / "camera.png"))
+        before, after = (float(measure(result, cameras).median()) for cameras in (result.prior, result.found))
+        assert after < least < before
+    predict_camera.draw(result, str(tmp_path / "camera.png"))
     assert is_a_figure(tmp_path / "camera.png")
 
 
@@ -192,47 +179,14 @@ def test_faces_before_a_rolling_shutter_are_those_that_a_warp_makes(drivers):
     assert off < 0.2 * before
 
 
-def test_affine_turns_gaze_with_the_image(seen):
-    plain, turned = (learned_from(name, seen) for name in ("plain", "affine"))
-    torch.testing.assert_close(turned.gaze.norm(dim=-1), torch.ones(len(turned.gaze)))
-    torch.testing.assert_close(turned.gaze[:, 2], plain.gaze[:, 2])
-    assert (turned.gaze - plain.gaze).abs().max() > 0.05
-    # a line through the face and the projection of gaze turn by the same angle, but for shear
-    lines = [s.keypoints[:, 7] - s.keypoints[:, :4].mean(1) for s in (plain, turned)]
-    before, after = (torch.atan2(line[:, 1], line[:, 0]) for line in lines)
-    gaze = [torch.atan2(s.gaze[:, 1], s.gaze[:, 0]) for s in (plain, turned)]
-    apart = torch.remainder((after - before) - (gaze[1] - gaze[0]) + torch.pi, 2 * torch.pi) - torch.pi
-    assert apart.abs().max() < 0.25
-
-
 @pytest.mark.slow
 def test_a_small_run_is_reproducible(tmp_path):
-    first, again = (train_faces.run(images=8, count=10, steps=3, seed=2) for _ in range(2))
+    first, again = (train_faces.run(images=4, count=6, steps=2, seed=2) for _ in range(2))
     assert list(first[0]) == list(train_faces.TRAINING_SETS)
     for name, result in first[0].items():
         assert result.curves == again[0][name].curves
     train_faces.draw(*first, str(tmp_path / "faces.png"))
     assert is_a_figure(tmp_path / "faces.png")
-
-
-@pytest.mark.slow
-def test_learning_lowers_the_loss(seen):
-    test = learned_from("plain", seen)
-    network = train_faces.Network()
-
-    def loss():
-        with torch.no_grad():
-            return float(train_faces.loss_of(network(test), test))
-
-    before = loss()
-    train_faces.train("plain", network, seen, {"shutter": test}, 30, 0)
-    assert loss() < 0.7 * before
-
-
-def test_lenses_of_tests_are_of_several_models():
-    cameras = [faces.lens(name) for name in faces.LENSES]
-    assert {camera.image_size for camera in cameras} == {SIZE}
-    assert len({camera.key for camera in cameras}) == 3
 
 
 # -- the scenes and OpenCV

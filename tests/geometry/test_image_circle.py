@@ -9,7 +9,6 @@ from cameras import DISTINCT, KEYS, _limits, _summed, axis_slope, fan, make, one
 import camtorch as ct
 from camtorch._evaluation import rows_of
 from camtorch._module import Memo
-from camtorch.augment.presets import PRESETS
 from camtorch.optics import Equidistant, Lens, Planar, Polynomial, Tilt
 from camtorch.projection import domain, unproject
 from camtorch.projection.unproject import invert
@@ -17,7 +16,6 @@ from camtorch.projection.unproject import invert
 LENSES = [key for key in KEYS if one(key).distortion_names]
 # What rounding keeps the search of single pixels from, at steep places of a chart that is solved for itself
 MISSED = {"ocamcalib": 0.02}
-BY_STAGES = [key for key in LENSES if one(key).optics(one(key).distortion.unbind(-1))[1].rest is not None]
 
 
 class Leaning(ct.KannalaBrandt):
@@ -98,46 +96,12 @@ def check(camera, monkeypatch):
     assert more.double().mean() <= MISSED.get(camera.key, 0.0)
 
 
-@pytest.mark.parametrize("key", BY_STAGES)
-def test_most_lenses_of_stages_have_a_circle(key):
-    """And a batch of them is answered as each alone."""
-    camera = lenses(key, "mild")
-    stagewise = rows_of(camera, camera.intrinsics, camera.distortion).domain.stagewise
-    assert stagewise.double().mean() > 0.3
-    pixels = around(camera)
-    rays, valid = camera.unproject(pixels)
-    for i, single in enumerate(camera):
-        alone, known = single.unproject(pixels[i])
-        assert torch.equal(known, valid[i])
-        torch.testing.assert_close(alone, rays[i], rtol=0, atol=1e-7)
-
-
 def test_a_tilted_sensor_behind_a_radial_lens(monkeypatch):
     intrinsics = torch.tensor([[210.0, 212.0, 322.0, 236.0]], dtype=torch.float64)
     distortion = torch.tensor([[-0.1, -0.02, 0.02, -0.03]], dtype=torch.float64)
     camera = Leaning(intrinsics, distortion, image_size=(480, 640)).requires_grad_(False)
     assert rows_of(camera, camera.intrinsics, camera.distortion).domain.all_stagewise
     check(camera, monkeypatch)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_corners_without_a_ray_are_searched_for_once(dtype, monkeypatch):
-    """A real lens whose image circle lies inside the image: no azimuth is followed, and no corner pixel is searched."""
-    searched, search = [], unproject.search
-
-    def counted(lenses, camera, u, v):
-        searched.append(len(camera))
-        return search(lenses, camera, u, v)
-
-    monkeypatch.setattr(unproject, "search", counted)
-    camera = PRESETS["aria"].camera().to(dtype)
-    camera.intrinsics[:2] *= 0.7
-    rays, valid = camera.rays()
-    assert 0.3 < valid.double().mean() < 0.9
-    assert sum(searched) < 0.001 * valid.numel()
-    lens = rows_of(camera, camera.intrinsics[None], camera.distortion[None]).domain
-    assert "azimuths" not in lens.__dict__
-    assert torch.isfinite(rays).all()
 
 
 @pytest.mark.parametrize("key", LENSES)

@@ -5,16 +5,15 @@ import signal
 import threading
 import time
 from collections import deque
-from itertools import pairwise
 
 import pytest
 import torch
 from cameras import RARE_ARE_SLOW, one
+from test_blocks import everything
 
 import camtorch as ct
 from camtorch import _threads
 from camtorch._threads import spread
-from camtorch.projection import rows
 
 
 class Pieces:
@@ -46,34 +45,12 @@ def test_all_threads_share_the_work(threads):
     assert len(pieces.by) == threads
 
 
-def test_one_thread_starts_no_other(monkeypatch):
-    monkeypatch.setattr(_threads, "_pool", None)
-    spread(Pieces(3, 0), 1)
-
-
 def test_workers_are_kept():
     spread(Pieces(10), 3)
     before = threading.active_count()
     for _ in range(5):
         spread(Pieces(10), 3)
     assert threading.active_count() == before
-
-
-def test_a_worker_that_finds_no_core_is_not_waited_for():
-    busy, calls = threading.Event(), []
-    pool = _threads._Pool()
-    begun = threading.Event()
-    blocked = _threads._Call(lambda: begun.set() or busy.wait())
-    pool.send(blocked, 1)
-    assert begun.wait(10)
-    call = _threads._Call(lambda: calls.append(1))
-    pool.send(call, 1)
-    call.end()  # its only worker is at the other call
-    busy.set()
-    blocked.end()
-    pool.send(_threads._Call((through := threading.Event()).set), 1)  # behind it in the queue
-    assert through.wait(10)
-    assert not calls
 
 
 def test_what_has_begun_is_waited_for():
@@ -212,44 +189,23 @@ def test_this_thread_alone_is_limited_and_to_the_end_of_the_function():
     assert seen == 2 * [(1, 3), (1, 3), (3, 3), (3, 3)]
 
 
-def everything(camera, method, values, weights):
-    values = values.clone().requires_grad_()
-    result, valid = getattr(camera, method)(values)
-    leaves = [values, *(p for p in camera.parameters() if p.numel())]
-    return result.detach(), valid, *torch.autograd.grad((result * weights).sum(), leaves)
-
-
 @can_limit
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)
 @pytest.mark.parametrize("method", ["project", "unproject"])
 def test_results_do_not_depend_on_threads(key, method):
     camera, generator, count = one(key).float(), torch.Generator().manual_seed(0), 70_001
     values = torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0, 1.5])
-    weights = torch.rand(count, 2 if method == "project" else 3, generator=generator)
     if method == "unproject":
         values = camera.project(values)[0].detach()
     found, before = [], torch.get_num_threads()
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            found.append(everything(camera, method, values, weights))
+            found.append(everything(camera, method, values))
     finally:
         torch.set_num_threads(before)
     for result, expected in zip(*found, strict=True):
         assert torch.equal(result, expected)
-
-
-@pytest.mark.parametrize("length", [1, 1000, 65_537, 131_073, 150_001, 500_000, 1_000_000, 1_111_111])
-def test_blocks_are_split_evenly(length):
-    camera = one("kannala_brandt")
-    cameras = rows.Cameras.of(type(camera), camera.intrinsics[None].detach(), camera.distortion[None].detach())
-    edges = [block.points for block in rows.blocks(cameras, torch.empty(1, length, 3))]
-    assert (edges[0].start, edges[-1].stop) == (0, length)
-    assert all(before.stop == after.start for before, after in pairwise(edges))
-    sizes = [points.stop - points.start for points in edges]
-    assert max(sizes) <= 2**16
-    assert max(sizes) <= 1.1 * min(sizes)
-    assert all(size % _threads.EVEN == 0 for size in sizes[:-1])
 
 
 def test_several_threads_use_one_camera():

@@ -49,7 +49,7 @@ def test_a_warm_call_is_a_short_way(key, method, dtype):
 
 
 # of all of camtorch: what a warp between two such cameras enters, and the augmentation's own
-AUGMENTED = {"webcam": 29, "dms130": 30, None: 22}
+AUGMENTED = {"webcam": 30, "dms130": 31, None: 22}
 OWN = 4
 
 
@@ -95,7 +95,7 @@ needs_the_native_sampler = pytest.mark.skipif(not ct.native_available(), reason=
 @needs_the_native_sampler
 def test_a_new_camera_and_its_warp_take_few_calls_of_torch():
     image = torch.rand(1, 3, 480, 640)
-    assert median_of_calls(lambda: warped(image)) <= 275
+    assert median_of_calls(lambda: warped(image)) <= 240
 
 
 @needs_the_native_sampler
@@ -104,4 +104,4 @@ def test_an_augmentation_takes_few_calls_of_torch():
     augmentation = ct.augment.RandomCamera("kannala_brandt", fov=(60, 70), camera=camera)
     image = torch.zeros(8, 1, 480, 640, dtype=torch.uint8)
     sample = {"image": image, "mask": image, "keypoints": torch.rand(8, 68, 2) * 400}
-    assert median_of_calls(lambda: augmentation(sample)) <= 980
+    assert median_of_calls(lambda: augmentation(sample)) <= 900

@@ -16,14 +16,6 @@ T += [[0.005392633690220337, 0.9999227207198279, -0.011201432503970198, 0.0004]]
 T += [[-0.016440254133497537, 0.011288733433323263, 0.9998011214944192, -0.0008]]
 
 
-def test_opencv_stereo():
-    rig = load("opencv_stereo.yml")
-    assert list(rig.cameras) == list(rig.extrinsics) == ["1", "2"]
-    assert rig.extrinsics["1"](float64(POINT)).tolist() == list(POINT)
-    second = float64([row[:3] for row in T]) @ float64(POINT) + float64([-0.0832, 0.0009, 0.0004])
-    assert torch.allclose(rig.extrinsics["2"](float64(POINT)), second, rtol=0, atol=1e-15)
-
-
 def camchain(**extra):
     lines = []
     for i, name in enumerate(("cam0", "cam1", "cam2")):
@@ -33,21 +25,18 @@ def camchain(**extra):
     return "\n".join(lines)
 
 
-def test_kalibr_chain(tmp_path):
+@pytest.mark.parametrize("key", ["T_cn_cnm1", "T_cam_imu", "T_imu_cam"])
+def test_poses_of_kalibr(key, tmp_path):
+    """From one camera to the next, or each from the IMU, or the other way round."""
     path, rows = tmp_path / "chain.yaml", [*T, [0, 0, 0, 1]]
-    path.write_text(camchain(cam1={"T_cn_cnm1": rows}, cam2={"T_cn_cnm1": rows}))
+    first = {} if key == "T_cn_cnm1" else {key: rows}
+    path.write_text(camchain(cam0=first, cam1={key: rows}, cam2={key: rows}))
     rig = ct.load(path)
     step, point = float64(rows), float64([*POINT, 1])
-    for i, name in enumerate(rig.cameras):
-        expected = torch.linalg.matrix_power(step, i) @ point
+    powers = {"T_cn_cnm1": (0, 1, 2), "T_cam_imu": (1, 1, 1), "T_imu_cam": (-1, -1, -1)}[key]
+    for name, power in zip(rig.cameras, powers, strict=True):
+        expected = torch.linalg.matrix_power(step, power) @ point
         assert torch.allclose(rig.extrinsics[name](point[:3]), expected[:3], rtol=0, atol=1e-14)
-
-
-def test_kalibr_imu(tmp_path):
-    path, rows = tmp_path / "chain.yaml", [*T, [0, 0, 0, 1]]
-    path.write_text(camchain(**{f"cam{i}": {"T_cam_imu": rows} for i in range(3)}))
-    rig = ct.load(path)
-    assert torch.allclose(rig.extrinsics["cam2"].matrix(), float64(rows), rtol=0, atol=1e-15)
 
 
 def test_kalibr_models(tmp_path):
@@ -98,19 +87,8 @@ def test_nerfstudio_axes():
 
 def test_nerfstudio_camera_of_each_frame(tmp_path):
     path, rows = tmp_path / "transforms.json", [*T, [0, 0, 0, 1]]
-    frames = [
-        {
-            "file_path": f"{i}.png",
-            "transform_matrix": rows,
-            "fl_x": 500 + i,
-            "fl_y": 501,
-            "cx": 320,
-            "cy": 240,
-            "w": 640,
-        }
-        | {"h": 480, "k1": 0.1, "k2": 0, "p1": 0, "p2": 0.01}
-        for i in range(2)
-    ]
+    size = {"fl_y": 501, "cx": 320, "cy": 240, "w": 640, "h": 480, "k1": 0.1, "k2": 0, "p1": 0, "p2": 0.01}
+    frames = [{"file_path": f"{i}.png", "transform_matrix": rows, "fl_x": 500 + i, **size} for i in range(2)]
     path.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}))
     rig = ct.load(path)
     assert {name: camera.intrinsics[0].item() for name, camera in rig.cameras.items()} == {"0.png": 500, "1.png": 501}
@@ -121,13 +99,11 @@ def test_nerfstudio_camera_of_each_frame(tmp_path):
         ct.load(path)
 
 
-def test_nerfstudio_of_instant_ngp(tmp_path):
+def test_models_of_instant_ngp(tmp_path):
     path = tmp_path / "transforms.json"
     text = {"camera_angle_x": 1.2, "w": 640, "h": 480, "frames": []}
-    path.write_text(json.dumps(text))
-    focal = 320 / math.tan(0.6)
-    assert ct.load(path).camera.intrinsics.tolist() == [focal, focal, 319.5, 239.5]
     for more, kind in (
+        ({}, ct.Pinhole),
         ({"camera_model": "PINHOLE", "k1": 0, "p2": 0}, ct.Pinhole),
         ({"camera_model": "PINHOLE", "k1": 0.1}, ct.BrownConrady),
         ({"k1": 0.1}, ct.BrownConrady),
@@ -196,6 +172,7 @@ def test_poses_of_colmap_stay_together(tmp_path):
 
 @pytest.mark.parametrize(("keys", "focal"), [
     ({"camera_angle_x": 1.0, "camera_angle_y": 0.5}, (320 / math.tan(0.5), 240 / math.tan(0.25))),
+    ({"camera_angle_x": 1.2}, (320 / math.tan(0.6), 320 / math.tan(0.6))),
     ({"camera_angle_y": 0.5}, (240 / math.tan(0.25), 240 / math.tan(0.25))),
     ({"fl_x": 500, "camera_angle_y": 0.5}, (500.0, 240 / math.tan(0.25))),
     ({"x_fov": 57.29577951308232, "y_fov": 28.64788975654116}, (320 / math.tan(0.5), 240 / math.tan(0.25))),
@@ -203,14 +180,12 @@ def test_poses_of_colmap_stay_together(tmp_path):
 def test_angles_of_nerfstudio(keys, focal, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"w": 640, "h": 480, "frames": [], **keys}))
     camera = ct.load(tmp_path / "transforms.json").camera
-    assert camera.intrinsics[:2].tolist() == pytest.approx(focal, rel=1e-12)
-
-
-rotations = st.lists(st.floats(-3, 3), min_size=3, max_size=3) | st.permutations([0.0, 0.0, math.pi])
+    assert camera.intrinsics.tolist() == pytest.approx([*focal, 319.5, 239.5], rel=1e-12)
 
 
 HOLDING = {"camtorch", "kalibr", "colmap", "nerfstudio", "aria", "basalt"}
 """Formats of several cameras at any places."""
+rotations = st.lists(st.floats(-3, 3), min_size=3, max_size=3) | st.permutations([0.0, 0.0, math.pi])
 vectors = st.tuples(rotations, st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3))
 
 

@@ -51,61 +51,26 @@ def test_what_was_loaded_is_written_as_any_format_that_holds_it(name, format, tm
 # -- the values of the manifest
 
 
-def cases():
-    """File, camera, model, intrinsics in the file's convention, distortion, size (width, height)."""
-    for name, entry in MANIFEST.items():
-        expected = entry["expected"]
-        if name.startswith(("opencv_camera", "ros")):
-            core = [expected[k] for k in ("fx", "fy", "cx", "cy")] if "fx" in expected else None
-            core = core or [expected["K"][0][0], expected["K"][1][1], expected["K"][0][2], expected["K"][1][2]]
-            model = "kannala_brandt" if expected.get("distortion_model") == "equidistant" else "brown_conrady"
-            yield name, None, model, core, expected["D"], (expected["width"], expected["height"])
-        elif name == "opencv_fisheye.yml":
-            values = expected["params"]
-            yield name, None, "kannala_brandt", values[:4], values[4:], (expected["width"], expected["height"])
-        elif name.startswith("nerfstudio"):
-            core = [expected[k] for k in ("fl_x", "fl_y", "cx", "cy")]
-            fisheye = expected["camera_model"] == "OPENCV_FISHEYE"
-            names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-            model = "kannala_brandt" if fisheye else "brown_conrady"
-            yield name, None, model, core, [expected[k] for k in names], (expected["w"], expected["h"])
-        elif name.startswith("kalibr"):
-            for key, model in (("cam0", "brown_conrady"), ("cam1", "kannala_brandt")):
-                size = (1280, 800) if key == "cam0" else (1920, 1280)
-                yield name, key, model, expected[key]["intrinsics"], expected[key]["D"], size
-        elif name.startswith("basalt"):
-            for i, (model, camera) in enumerate(zip(("double_sphere", "kannala_brandt"), expected, strict=True)):
-                values = list(camera["intrinsics"].values())
-                yield name, f"cam{i}", model, values[:4], values[4:], tuple(MANIFEST[name]["resolution"][i])
-        elif name.startswith("mrcal"):
-            values = expected["intrinsics"]
-            model = "brown_conrady" if values[4:] else "pinhole"
-            yield name, None, model, values[:4], values[4:], tuple(expected["imagersize"])
-        elif name.startswith("aria"):
-            models = {"FisheyeRadTanThinPrism": "fisheye624", "Fisheye62": "fisheye62"}
-            for label, camera in expected.items():
-                values = camera["params"]
-                if camera["name"] in models:
-                    values = values[:1] + values
-                model = models.get(camera["name"], "kannala_brandt")
-                yield name, label, model, values[:4], values[4:], tuple(camera["image_size"])
-        elif "cameras" in expected:
-            for label, camera in expected["cameras"].items():
-                yield name, label, *(camera[key] for key in ("model", "intrinsics", "distortion", "image_size"))
+CASES = [
+    (name, label, camera)
+    for name, entry in MANIFEST.items()
+    if "cameras" in entry["expected"]
+    for label, camera in entry["expected"]["cameras"].items()
+]
 
 
-@pytest.mark.parametrize(("name", "camera", "model", "core", "distortion", "size"), list(cases()))
-def test_values_of_the_manifest(name, camera, model, core, distortion, size):
-    rig = load(name)
-    found = rig.cameras[camera] if camera else rig.camera
-    assert found.key == model
-    shift = MANIFEST[name]["pixel_centre"]
-    assert found.intrinsics.tolist() == [core[0], core[1], core[2] - shift, core[3] - shift]
-    assert found.distortion.tolist() == distortion
-    assert found.image_size == (size[1], size[0])
+@pytest.mark.parametrize(("name", "label", "expected"), CASES)
+def test_values_of_the_manifest(name, label, expected):
+    """Intrinsics in the file's convention, and the size as width and height."""
+    found, shift = load(name).cameras[label], MANIFEST[name]["pixel_centre"]
+    fx, fy, cx, cy = expected["intrinsics"]
+    assert found.key == expected["model"]
+    assert found.intrinsics.tolist() == [fx, fy, cx - shift, cy - shift]
+    assert found.distortion.tolist() == expected["distortion"]
+    assert found.image_size == tuple(expected["image_size"][::-1])
     pixel = found.project(float64(POINT))[0] + shift
-    reference = MANIFEST[name].get("check_pixel_of_point_0p1_m0p2_1", {}).get(camera)
-    reference = reference or pixel_of(model, core, distortion)
+    reference = MANIFEST[name].get("check_pixel_of_point_0p1_m0p2_1", {}).get(label)
+    reference = reference or pixel_of(expected["model"], expected["intrinsics"], expected["distortion"])
     assert torch.allclose(pixel, float64(reference), rtol=0, atol=1e-9)
 
 

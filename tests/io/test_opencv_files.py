@@ -30,16 +30,6 @@ def test_old_header_other_names_and_what_is_not_asked_for_may_be_nan():
     assert camera.image_size == (480, 640)
 
 
-@pytest.mark.parametrize(
-    ("flag", "model"),
-    [(flag, ct.KannalaBrandt) for flag in ("1", "true", "1.")]
-    + [(flag, ct.BrownConrady) for flag in ("0", "No", "0.0")],
-)
-def test_flag_values(path, flag, model):
-    written(path, f"K: {K}\nD: [0.1, 0.01, 0.001, 0.0001]\nfisheye_model: {flag}\n")
-    assert type(opencv.read(path)) is model
-
-
 @pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
 @pytest.mark.parametrize("xi", ["1.25", "[1.25]", "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1.25]}"])
 def test_omnidir(tmp_path, suffix, xi):
@@ -97,6 +87,7 @@ avg_reprojection_error: 0.2
     camera = ct.load(written(path, text)).camera
     assert camera.distortion.tolist() == [0.3, 0.1, 0, 0, 0]
     assert camera.image_size == (480, 640)
+    assert ct.load(written(path, f"camera_matrix: [{K[:3]}, {K[3:6]}, {K[6:]}]\n")).camera.image_size is None
     without = f"K: {K}\nundistorted_points: [1]\ndist_std_dev: [1]\ndistortion_names: [k1]\n"
     assert type(ct.load(written(path, without)).camera) is ct.Pinhole
     for orphan in ("xi_1", "xi_left"):
@@ -129,12 +120,6 @@ def test_model_argument_decides(path):
         opencv.read(path, "fish")
 
 
-def test_without_distortion_or_size(path):
-    camera = opencv.read(written(path, f"camera_matrix: [{K[:3]}, {K[3:6]}, {K[6:]}]\n"))
-    assert type(camera) is ct.Pinhole
-    assert camera.image_size is None
-
-
 def test_stereo_file_asks_for_a_name():
     with pytest.raises(CameraFileError, match=r"opencv_stereo.yml: M1, M2: several cameras; choose one by its name"):
         opencv.read(FILES / "opencv_stereo.yml")
@@ -150,7 +135,7 @@ def test_stereo_file_asks_for_a_name():
         ("- 1", "content", "not keys and values"),
         ("a: [1", r"line \d", "expected"),
         ("{'K': 1}", "K", "neither"),
-        ("{'K': [1}", "line 1", "Expecting ',' delimiter"),
+        ("{'K': [1}", "line 1", "does not match"),
         ("{K': 1}", "line 1", "double quotes"),
         ("x: 1", "camera_matrix", "missing"),
         ("K: !!opencv-matrix 3", "line 1", "keys and values"),
@@ -184,13 +169,16 @@ def test_every_fault_has_a_place_and_a_reason(path, text, place, reason):
     assert pickle.loads(pickle.dumps(caught.value)).args == caught.value.args
 
 
+D4 = "D: [0.1, 0.01, 0.001, 0.0001]\n"
+
+
 @pytest.mark.parametrize(
     ("text", "stated", "other"),
     [
-        ("fisheye_model: 1\nD: [0.1, 0.01, 0.001, 0.0001]\n", "kannala_brandt", "brown_conrady"),
-        ("fisheye_model: 0\nD: [0.1, 0.01, 0.001, 0.0001]\n", "brown_conrady", "kannala_brandt"),
+        *((f"fisheye_model: {yes}\n{D4}", "kannala_brandt", "brown_conrady") for yes in ("1", "true", "1.")),
+        *((f"fisheye_model: {no}\n{D4}", "brown_conrady", "kannala_brandt") for no in ("0", "No", "0.0")),
         ("fisheye_model: 0\n", "pinhole", "kannala_brandt"),
-        ("xi: 1.2\nD: [0.1, 0.01, 0.001, 0.0001]\n", "mei", "ucm"),
+        (f"xi: 1.2\n{D4}", "mei", "ucm"),
     ],
 )
 def test_a_file_that_states_its_model_is_not_overruled(path, text, stated, other):

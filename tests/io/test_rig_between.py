@@ -10,33 +10,22 @@ from rigs import float64, load
 
 import camtorch as ct
 
-LENSES = {
-    "opencv": ct.BrownConrady([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0], image_size=(480, 640)),
-    "kalibr": ct.KannalaBrandt([200.0, 201, 320, 240], [0.01, 0.0, 0.0, 0.0], image_size=(480, 640)),
-    "basalt": ct.DoubleSphere([300.0, 301, 320, 240], [-0.2, 0.59], image_size=(480, 640)),
-    "aria": ct.KannalaBrandt([200.0, 201, 320, 240], [0.01, 0.0, 0.0, 0.0], image_size=(480, 640)),
-    "camtorch": ct.LatLon([200.0, 201, 320, 240], image_size=(480, 640)),
-}
-SUFFIXES = {"opencv": ".yml", "kalibr": ".yaml"}
+LENS = ct.BrownConrady([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0], image_size=(480, 640))
 
 
-def pair(camera, first=([0.0] * 3, [0.0] * 3)):
+def pair(first=([0.0] * 3, [0.0] * 3)):
     poses = {"left": ct.Extrinsics(*first), "right": ct.Extrinsics([0.02, -0.05, 0.01], [-0.12, 0.005, 0.004])}
-    return ct.Rig({"left": camera, "right": camera}, poses).double().requires_grad_(False)
+    return ct.Rig({"left": LENS, "right": LENS}, poses).double().requires_grad_(False)
 
 
-@pytest.mark.parametrize("format", LENSES)
-def test_every_format_with_two_cameras_gives_a_pair_to_rectify(format, tmp_path):
-    first = ([0.0] * 3, [0.0] * 3) if format == "opencv" else ([0.3, 0.1, -0.2], [0.5, -0.4, 0.1])
-    rig = pair(LENSES[format], first)
-    path = tmp_path / f"rig{SUFFIXES.get(format, '.json')}"
-    ct.save(rig, path, format)
-    again = ct.load(path)
+def test_a_file_with_two_cameras_gives_a_pair_to_rectify(tmp_path):
+    rig = pair(([0.3, 0.1, -0.2], [0.5, -0.4, 0.1]))
+    ct.save(rig, tmp_path / "rig.json")
+    again = ct.load(tmp_path / "rig.json")
     left, right = again
     found = again.between(left, right)
     first, second = (rig.extrinsics[name].matrix() for name in rig)
     torch.testing.assert_close(found.matrix(), second @ first.inverse(), rtol=0, atol=1e-14)
-    assert not found.rotation.requires_grad
     rectified = ct.rectify(again[left], again[right], found)
     assert rectified.baseline.item() == pytest.approx(found.translation.norm().item(), rel=1e-14)
 
@@ -70,7 +59,7 @@ def test_opencv_pairs_are_posed_by_matrices_and_by_vectors(keys, tmp_path):
 
 
 def test_gradients_reach_the_poses_of_the_rig():
-    rig = pair(LENSES["camtorch"], ([0.3, 0.1, -0.2], [0.5, -0.4, 0.1])).requires_grad_(True)
+    rig = pair(([0.3, 0.1, -0.2], [0.5, -0.4, 0.1])).requires_grad_(True)
     rectification = ct.rectify(rig["left"], rig["right"], rig.between("left", "right"))
     rectification.baseline.backward()
     for pose in rig.extrinsics.values():
@@ -86,7 +75,7 @@ def test_gradients_reach_the_poses_of_the_rig():
     ],
 )
 def test_what_is_missing_is_said(names, text):
-    rig = pair(LENSES["camtorch"])
+    rig = pair()
     del rig.extrinsics["right"]
     with pytest.raises(ValueError, match=text):
         rig.between(*names)
@@ -95,7 +84,7 @@ def test_what_is_missing_is_said(names, text):
 @pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
 def test_opencv_reads_the_matrices_of_a_rectified_pair(suffix, tmp_path):
     cv2 = pytest.importorskip("cv2")
-    rig = pair(LENSES["opencv"])
+    rig = pair()
     found = ct.rectify(rig["left"], rig["right"], rig.between("left", "right"), image_size=(400, 600))
     path = tmp_path / f"pair{suffix}"
     found.save(path)
@@ -111,7 +100,7 @@ def test_opencv_reads_the_matrices_of_a_rectified_pair(suffix, tmp_path):
 
 
 def test_matrices_of_opencv_are_of_perspective_pairs(tmp_path):
-    rig = pair(LENSES["opencv"])
+    rig = pair()
     found = ct.rectify(rig["left"], rig["right"], rig.between("left", "right"), projection="latlon")
     with pytest.raises(ValueError, match=r"Rectification.opencv: .* this is latlon"):
         found.save(tmp_path / "pair.yml")

@@ -32,7 +32,7 @@ LOST = [
     ("kalibr", camera(distortion=[0.1, 0, 0, 0, 0.2]), "Kalibr has 4 for brown_conrady, so k3 would be lost"),
     ("kalibr", camera("fisheye624"), "Kalibr has no name for fisheye624"),
     ("kalibr", camera(image_size=None), "no image_size, which Kalibr needs"),
-    ("colmap", camera(distortion=[0.1] * 12), "s1 s2 s3 s4 would be lost; COLMAP has 8 coefficients"),
+    ("colmap", camera(distortion=[0.1] * 12), "COLMAP has 8 for brown_conrady, so s1 s2 s3 s4 would"),
     ("colmap", camera("fisheye62"), "COLMAP has no name for fisheye62"),
     ("colmap", camera("equirectangular"), "a part of a panorama"),
     ("nerfstudio", camera(distortion=[0.1] * 8), "Nerfstudio has 5 for brown_conrady, so k4 k5 k6 would be lost"),

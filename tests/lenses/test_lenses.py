@@ -14,7 +14,7 @@ import camtorch as ct
 from camtorch.cli.main import main
 from camtorch.lenses.collection import columns
 from camtorch.lenses.drawing import lenses_for
-from camtorch.warp.warp import along_edges
+from camtorch.warp.boxes import along_edges
 
 SAMPLE = Path(__file__).parents[1] / "files" / "lenses.csv"
 """Some rows of the collection, as they were published, with their numbers."""
@@ -63,17 +63,6 @@ def test_an_entry_says_what_the_collection_says(row):
 
 
 @pytest.mark.parametrize(
-    "words",
-    ["GoPro HERO9 wide", "gopro hero 9 black wide", "HERO9-black  WIDE", "wide hero9", "GoPro HERO9 wide 3840x2160"],
-)
-def test_words_find_a_lens_as_people_write_them(words):
-    row = next(row for row in rows() if row["camera"] == "HERO9 Black")
-    camera = ct.lenses.find(words)
-    assert camera.intrinsics.tolist() == [float(row[name]) for name in ("fx", "fy", "cx", "cy")]
-    assert camera.image_size == (2160, 3840)
-
-
-@pytest.mark.parametrize(
     ("body", "written"),
     [
         ("Sony a7sIII", ["Sony A7S III", "A7S3", "A7S Mark III", "a 7s iii", "ILCE-7SM3"]),
@@ -84,6 +73,7 @@ def test_words_find_a_lens_as_people_write_them(words):
         ("Nikon z62", ["nikon z6ii", "NIKON Z 6_2"]),
         ("Fujifilm X-T4", ["xt4", "X T4"]),
         ("GoPro HERO9 Black", ["go pro hero 9", "gopro9"]),
+        ("GoPro HERO9 Black Wide", ["GoPro HERO9 wide", "gopro hero 9 black wide", "HERO9-black  WIDE", "wide hero9"]),
         ("GoPro HERO11 Black", ["gopro11", "gopro hero11black"]),
         ("DJI OsmoPocket3", ["osmo-pocket 3"]),
     ],
@@ -176,7 +166,7 @@ def rim(height, width):
 @pytest.mark.parametrize(
     ("augmentation", "size", "fov", "count"),
     [
-        (ct.augment.RandomLens, (480, 640), (100, 150), 200),
+        (ct.augment.RandomLens, (480, 640), (100, 150), 64),
         pytest.param(ct.augment.RandomCamera, (1080, 1920), (150, 190), 400, marks=pytest.mark.slow),
         pytest.param(ct.augment.RandomLens, (640, 480), None, 400, marks=pytest.mark.slow),
     ],
@@ -185,7 +175,8 @@ def test_real_lenses_see_with_every_pixel_in_the_range(augmentation, size, fov, 
     augment = augmentation("real", fov=fov, camera=source(size))
     target = augment.change(None, augment.draw(count, torch.Generator().manual_seed(1))).target
     edge = rim(*size)
-    assert all(bool(target[i : i + 200].unproject(edge.expand(200, -1, -1))[1].all()) for i in range(0, count, 200))
+    step = min(count, 200)
+    assert all(bool(target[i : i + step].unproject(edge.expand(step, -1, -1))[1].all()) for i in range(0, count, step))
     wide = torch.cat([target[i : i + 50].field_of_view[:, 0] for i in range(0, count, 250)])  # some of them: it is slow
     low, high = fov or (0, 360)
     assert wide.min() >= math.radians(low)
@@ -232,15 +223,6 @@ def test_draws_are_compiled(fov):
     compiled = torch.compile(step, fullgraph=True, backend="aot_eager")(image)
     for now, then in zip(compiled, step(image), strict=True):
         torch.testing.assert_close(now, then, atol=1e-3, rtol=0)
-
-
-@pytest.mark.slow
-def test_a_sample_comes_with_a_real_lens():
-    augment = ct.augment.RandomCamera("real", fov=(60, 90), camera=source(), image_size=(240, 320), min_filled=0.9)
-    sample = augment(image=torch.rand(4, 3, 480, 640), generator=torch.Generator().manual_seed(0))
-    assert isinstance(sample["camera"], ct.KannalaBrandt)
-    assert sample["camera"].image_size == (240, 320)
-    assert (sample["image"] > 0).double().mean() > 0.85
 
 
 def test_the_command_line_knows_them(tmp_path, monkeypatch, capsys):

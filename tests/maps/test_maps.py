@@ -549,7 +549,7 @@ def test_models_of_images_of_any_size_are_read_if_somebody_says_the_size(tmp_pat
     assert float(ct.load_map(path, source_size=(200, 320)).error(small()).max()) < 1e-3
     with pytest.raises(ct.CameraFileError, match="say source_size="):
         ct.load_map(path)
-    with pytest.raises(ValueError, match=r"models of ONNX are called \.onnx"):  # as load_map would not find it
+    with pytest.raises(ValueError, match=r"files of onnx are called \.onnx"):  # as load_map would not find it
         small().save(tmp_path / "map.bin", "onnx")
 
 

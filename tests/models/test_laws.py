@@ -535,7 +535,7 @@ def test_fold_of_drawn_cameras(key, wild, data):
 
 @pytest.mark.slow
 @drawn_models
-@settings(max_examples=8)
+@settings(max_examples=3)
 @given(data=st.data())
 def test_fold_of_more_drawn_cameras(key, wild, data):
     check_no_shared_pixels(*check_fold(data.draw(drawn(key, wild)), azimuths=6))

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from cameras import KEYS, RANGES, fan, one, pixel_lattice, real, spread
@@ -204,61 +203,6 @@ def test_powers_that_overflow_are_not_valid(dtype):
 
 def test_a_camera_made_without_coefficients_is_an_ideal_one():
     torch.testing.assert_close(ct.EUCM(INTRINSICS).project(fan(80))[0], ct.Pinhole(INTRINSICS).project(fan(80))[0])
-
-
-def spline(nodes, values):
-    """The cubics (pieces, 4) through (0, 0) and a table: all conditions of an odd spline, not-a-knot at the end."""
-    nodes, values = np.concatenate(([0], nodes)), np.concatenate(([0], values))
-    pieces = len(nodes) - 1
-    rows, right = [], []
-
-    def row(*terms, equals=0.0):
-        made = np.zeros((pieces, 4))
-        for piece, powers, sign in terms:
-            made[piece] += sign * np.array(powers)
-        rows.append(made.ravel())
-        right.append(equals)
-
-    for i, h in enumerate(np.diff(nodes)):
-        row((i, (1, 0, 0, 0), 1), equals=values[i])
-        row((i, (1, h, h**2, h**3), 1), equals=values[i + 1])
-        if i < pieces - 1:
-            row((i, (0, 1, 2 * h, 3 * h**2), 1), (i + 1, (0, 1, 0, 0), -1))
-            row((i, (0, 0, 2, 6 * h), 1), (i + 1, (0, 0, 2, 0), -1))
-    row((0, (0, 0, 1, 0), 1))
-    row((pieces - 2, (0, 0, 0, 1), 1), (pieces - 1, (0, 0, 0, 1), -1))
-    return np.linalg.solve(np.stack(rows), right).reshape(pieces, 4)
-
-
-def test_a_table_of_millimetres():
-    degrees = torch.arange(0, 100, 10, dtype=torch.float64)
-    heights = torch.tensor([0, 0.52, 1.03, 1.55, 2.08, 2.6, 3.1, 3.57, 3.97, 4.26], dtype=torch.float64)
-    made = ct.Tabulated.from_table(INTRINSICS[2:], degrees.deg2rad(), heights, pixels_per_unit=1 / 0.003)
-    theta = torch.tensor([10.0, 40, 80, 3, 15, 47, 89], dtype=torch.float64)
-    sight = theta.deg2rad()
-    pixels, valid = made.project(torch.stack((0 * sight, sight.sin(), sight.cos()), -1))
-    assert valid.all()
-    r = (pixels[:, 1] - INTRINSICS[3]) * 0.003
-    torch.testing.assert_close(r[:3], heights[[1, 4, 8]])
-    cubics = spline(degrees[1:].numpy(), heights[1:].numpy())
-    expected = [np.polyval(cubics[int(t // 10)][::-1], t % 10) for t in theta.tolist()]
-    torch.testing.assert_close(r, torch.tensor(expected), rtol=1e-12, atol=0)
-    beyond = torch.tensor([1.58, 2.0], dtype=torch.float64)
-    assert not made.project(torch.stack((0 * beyond, beyond.sin(), beyond.cos()), -1))[1].any()
-
-
-def test_a_table_stays_monotone():
-    """A spline through a step would swing; and a table that turns back is valid up to there."""
-    angles = torch.linspace(0.2, 1.4, 7, dtype=torch.float64)
-    step = torch.tensor([0.2, 0.21, 0.22, 0.6, 0.98, 0.99, 1.0], dtype=torch.float64)
-    theta = torch.linspace(0.001, 1.399, 500, dtype=torch.float64)
-    rays = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1)
-    pixels, valid = ct.Tabulated.from_table([0.0, 0], angles, step).project(rays)
-    assert valid.all()
-    assert (pixels[:, 0].diff() > 0).all()
-    back = torch.tensor([0.2, 0.4, 0.6, 0.8, 0.7, 0.6, 0.5], dtype=torch.float64)
-    valid = ct.Tabulated.from_table([0.0, 0], angles, back).project(rays)[1]
-    assert torch.equal(valid, theta < 0.8)
 
 
 def test_the_angles_of_a_table_do_not_learn():

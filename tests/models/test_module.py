@@ -62,7 +62,7 @@ BOTH_WAYS = [(key, method) for key in sorted(DISTINCT) for method in ("project",
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("key", "method"), BOTH_WAYS)
+@pytest.mark.parametrize(("key", "method"), BOTH_WAYS[::3])
 def test_compile_without_graph_breaks(key, method):
     module, values = module_and_input(key, method)
     compiled = torch.compile(module, fullgraph=True, backend="aot_eager")
@@ -88,7 +88,7 @@ def test_compile_to_machine_code():
     ("key", "method"),
     slow_unless(
         ("kannala_brandt", "project").__eq__,
-        [case for case in BOTH_WAYS if case[0] in ("fisheye624", "kannala_brandt", "f_theta_backward")],
+        [("kannala_brandt", "project"), ("kannala_brandt", "unproject"), ("fisheye624", "project")],
     ),
 )
 def test_export(key, method):

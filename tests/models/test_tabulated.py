@@ -133,12 +133,12 @@ def test_a_data_sheet_in_float32_has_the_rays_of_float64():
     assert counts[1] > 0.7 * 1024 * 1024
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_pixel_of_a_table_is_valid_alone_as_in_a_batch(dtype):
-    made, reference = both(data_sheet(), dtype)
-    edge = float(reference.radius(reference.end)) * float(made.intrinsics[0])
-    radius = torch.cat((torch.linspace(0, 1.1 * edge, 40), edge * (1 + torch.linspace(-1e-5, 1e-5, 21)))).to(dtype)
-    pixels = made.intrinsics[2:] + torch.stack((radius * 0.6, radius * 0.8), -1)
-    alone = torch.stack([made.unproject(pixel)[1] for pixel in pixels])
-    assert torch.equal(made.unproject(pixels)[1], alone)
-    assert 0 < int(alone.sum()) < len(alone)
+def test_a_table_of_millimetres():
+    degrees = torch.arange(0, 100, 10, dtype=torch.float64)
+    heights = torch.tensor([0, 0.52, 1.03, 1.55, 2.08, 2.6, 3.1, 3.57, 3.97, 4.26], dtype=torch.float64)
+    made = ct.Tabulated.from_table(CENTRE, degrees.deg2rad(), heights, pixels_per_unit=1 / 0.003)
+    theta = torch.tensor([10.0, 40, 80, 3, 15, 47, 89, 90.5, 120], dtype=torch.float64).deg2rad()
+    pixels, valid = made.project(torch.stack((0 * theta, theta.sin(), theta.cos()), -1))
+    assert valid.tolist() == [True] * 7 + [False] * 2
+    expected = Reference(degrees[1:].deg2rad().numpy(), heights[1:].numpy()).radius(theta[:7].numpy())
+    np.testing.assert_allclose((pixels[:7, 1].detach() - CENTRE[1]) * 0.003, expected, rtol=1e-9)

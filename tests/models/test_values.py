@@ -1,5 +1,6 @@
 """Cameras are values: replaced, detached, cloned, indexed, expanded, put together, for every model."""
 
+import numpy as np
 import pytest
 import torch
 from cameras import KEYS, each_kind, one
@@ -136,6 +137,10 @@ CAMERA = camera_of("kannala_brandt")
         (lambda: CAMERA.replace(intrinsics="f"), TypeError, "intrinsics must be numbers"),
         (lambda: CAMERA.expand(2).expand(3), ValueError, r"batch dims \(2,\) do not expand to \(3,\)"),
         (lambda: ct.cat([]), ValueError, "cat: an empty list"),
+        (lambda: ct.cat(CAMERA, CAMERA), TypeError, r"cat: the cameras go in as one list, cat\(\[a, b\]\)"),
+        (lambda: CAMERA.expand(2)[::-1], TypeError, "slices that go forwards.*got slice"),
+        (lambda: ct.Mixed([CAMERA] * 2)[::-1], TypeError, "slices that go forwards.*got slice"),
+        (lambda: ct.Mixed([CAMERA]).replace(image_size="a"), TypeError, "Mixed: image_size must be two integers"),
         (lambda: ct.cat([CAMERA, 3]), TypeError, r"cat: cameras\[1\] must be a Camera; got int"),
         (
             lambda: ct.cat([CAMERA, CAMERA.crop(0, 0, 5, 5)]),
@@ -153,6 +158,27 @@ CAMERA = camera_of("kannala_brandt")
 def test_errors_name_what_is_wrong(call, error, said):
     with pytest.raises(error, match=said):
         call()
+
+
+def test_numbers_in_another_order_are_told_wherever_they_come_in():
+    with pytest.warns(UserWarning, match="both focal lengths come first"):
+        CAMERA.replace([50.0, 39.5, 51.0, 29.5])
+
+
+@pytest.mark.parametrize("count", [4, np.int64(4), torch.tensor(4)])
+@pytest.mark.parametrize("batch", [CAMERA, ct.Mixed([CAMERA])], ids=["single", "mixed"])
+def test_batches_expand_to_whole_numbers_of_any_kind(batch, count):
+    assert batch.expand(count).batch_shape == batch.expand((count,)).batch_shape == (4,)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, ct.Mixed([CAMERA])], ids=["single", "mixed"])
+def test_a_clone_made_at_inference_can_join_a_graph(camera):
+    with torch.inference_mode():
+        clone = camera.clone()
+    points = torch.tensor([[0.1, 0.2, 1.0]]).requires_grad_()
+    clone.project(points)[0].sum().backward()
+    assert points.grad.any()
+    assert not clone.intrinsics.requires_grad
 
 
 def test_numbers_of_narrow_dtypes_are_widened():

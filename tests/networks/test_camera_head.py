@@ -1,6 +1,7 @@
 """`CameraHead`: whatever its numbers are, every point of the image has a ray; and they learn."""
 
 import copy
+import functools
 import math
 import pickle
 
@@ -19,8 +20,12 @@ QUICK = [key if key in DISTINCT else pytest.param(key, marks=pytest.mark.slow) f
 
 
 def head(key, features=16, **options):
-    options = {"image_size": SIZE, "fov": FOV.get(key), **options}
-    return ct.CameraHead(features, key, **options)
+    return copy.deepcopy(made(key, features, **options))
+
+
+@functools.cache
+def made(key, features, **options):
+    return ct.CameraHead(features, key, **{"image_size": SIZE, "fov": FOV.get(key), **options})
 
 
 def random(layer, scale, generator):
@@ -56,13 +61,6 @@ def test_random_weights_give_cameras_with_a_ray_for_every_point_of_the_image(key
     for camera in valid_cameras(key, 80):
         assert bool(all_have_rays(camera).all())
         assert bool((camera.intrinsics[..., :2] > 0).all())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("key", ["brown_conrady", "fisheye624", "double_sphere"])
-def test_thousands_of_random_features(key):
-    for camera in valid_cameras(key, 4_000):
-        assert bool(all_have_rays(camera, 5, 7).all())
 
 
 @pytest.mark.parametrize("count", [5, 8, 14])
@@ -173,7 +171,7 @@ def test_gradients_do_not_vanish_far_out():
 @pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, sorted(USUAL - PANORAMAS - {"pinhole"})))
 def test_all_numbers_make_finite_cameras_and_gradients(key):
     layer = head(key)
-    count = 1000 if key in ("double_sphere", "mei") else 100
+    count = 300 if key in ("double_sphere", "mei") else 100
     ordinary = torch.randn(count, len(layer.names), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     large = [size * ordinary[:128] for size in (1e4, 1e6)]
     large += [size * ordinary[:16].sign() for size in (1e3, 1e4, 1e5, 1e6, 1e9, 1e30)]

@@ -10,18 +10,15 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from benchmarks import page
-from benchmarks.tables import Record
-from benchmarks.timing import threads
-from benchmarks.verdict import Requirement, figures, times_faster, verdict
+from benchmarks.verdict import Requirement, verdict
 
 ROOT = Path(__file__).resolve().parents[2]
 linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in Linux's /proc")
 
 
-SUBJECTS = ("images", "augment", "calibration", "stereo", "folders", "points", "load", "scaling")
+SUBJECTS = ("images", "stereo", "folders", "points")
 
 
 @pytest.mark.slow
@@ -32,26 +29,13 @@ def test_a_quick_run_measures_everyone_and_writes_every_figure(tmp_path):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "failed" not in done.stderr
-    assert done.stdout.count("### What is required") == len(SUBJECTS) - 3  # points, scaling and calibration have none
+    assert done.stdout.count("### What is required") == len(SUBJECTS) - 1  # points have none
     peers = {"images": "OpenCV, float map", "stereo": "OpenCV, float map", "folders": "read + warp + write"}
     for subject, found in json.loads(path.read_text())["results"].items():
         times = [figure["value"] for figure in found if figure["quantity"] == "seconds"]
         assert times, subject
         assert all(math.isfinite(value) and value > 0 for value in times)
         assert {"camtorch", peers.get(subject, "OpenCV")} <= {f["contestant"] for f in found}, subject
-
-
-def test_threads_are_as_before_after_an_error():
-    before = torch.get_num_threads()
-
-    def fail():
-        with threads(before + 1):
-            assert torch.get_num_threads() == before + 1
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert torch.get_num_threads() == before
 
 
 def test_the_verdict_names_the_worst_row():
@@ -64,12 +48,6 @@ def test_the_verdict_names_the_worst_row():
     assert judgements == ["NOT in 1", "NOT in 2", "NOT in 1"]
     assert "of nothing" not in "\n".join(lines)
     assert verdict([Requirement("holds", 2.0, {"a": 2.0})]).splitlines()[-1].endswith("ok |")
-
-
-def test_times_faster_is_beside_the_fastest_of_the_others():
-    records = [Record("case", who, "op", "fastest", value) for who, value in (("us", 2.0), ("a", 6.0), ("b", 3.0))]
-    records.append(Record("case", "us", "other", "fastest", 1.0))
-    assert times_faster(figures(records, "fastest"), "us", ["a", "b"]) == {"case, op": 1.5}
 
 
 @linux

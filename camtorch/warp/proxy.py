@@ -1,4 +1,4 @@
-"""Warps between cameras that stand at different places, by a surface that both see."""
+"""Warps between cameras that stand at different places, by a proxy of the scene: a plane, a sphere, a depth map."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers
 from camtorch.rotations import rotate_planes
-from camtorch.warp.grid import Lattice, Sampling, pixels_of_rows, to_positions
-from camtorch.warp.panorama import rays_of, seen_by
+from camtorch.warp.grid import Sampling, pixels_of_rows, scaled, to_positions
+from camtorch.warp.panorama import rays_of, seam_of, seen_by
 from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp
 
 
-class SurfaceWarp(Warp):
-    """A `Warp` whose cameras see the same points of a surface, which says where rays of one meet those of the other.
+class ProxyWarp(Warp):
+    """A `Warp` whose cameras see the same points of a proxy, which says where rays of one meet those of the other.
 
     Positions are exact, and full-size: no lattice.
     """
@@ -29,20 +29,15 @@ class SurfaceWarp(Warp):
         """The other way."""
         raise NotImplementedError
 
-    def _learned(self) -> Sampling:
-        return self._of_rows(range(self.target.size_for("Warp")[0]))
-
-    def _whole(self, padding: PaddingMode) -> Sampling:
-        return self._learned()
-
-    def _strip(self, rows: range, padding: PaddingMode | None = None) -> Sampling | Lattice:
+    def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
-            return self._of_rows(rows)
+            return Sampling(*self._of_rows(rows), None, seam_of(self.source))
         # the scale is that between neighbours
         around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target.size_for("Warp")[0]))
-        return self._of_rows(around).part(slice(rows.start - around.start, rows.stop - around.start))
+        where = scaled(self.source, *self._of_rows(around))
+        return where.part(slice(rows.start - around.start, rows.stop - around.start))
 
-    def _of_rows(self, rows: range) -> Sampling:
+    def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)
         rays, has_ray = rays_of(self.target, pixels.expand(*self.target.batch_shape, *pixels.shape))
         if rays.ndim == 3:
@@ -53,8 +48,7 @@ class SurfaceWarp(Warp):
             directions = directions.expand(count, *directions.shape[1:])
         seen, mapped = seen_by(self.source, directions)
         mapped = mapped & has_ray & met
-        grid = to_positions(seen, mapped, self.source.size_for("Warp"))
-        return self._with_scale(grid, mapped)
+        return to_positions(seen, mapped, self.source.size_for("Warp")), mapped
 
     def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
         source, target, carried = self.source, self.target, self._to_target

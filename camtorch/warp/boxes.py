@@ -1,0 +1,125 @@
+"""Boxes and polygons that a warp moves: enough points along their edges to follow them where a lens bends them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes, is_predicted
+from camtorch._tracing import may_look
+from camtorch.warp.panorama import PANORAMAS
+
+if TYPE_CHECKING:
+    from camtorch.warp.warp import Warp
+
+_EDGE_SAMPLES = 64  # per edge: one of 500 px bent to a radius of 300 px is then enclosed to 0.03 px
+_LATTICE = 16  # steps across and down the target, between points that are looked for in what a polygon encloses
+
+
+def moved_boxes(warp: Warp, boxes: Numbers) -> tuple[Tensor, Tensor]:
+    """See `Warp.transform_boxes`."""
+    boxes = as_values(boxes, "boxes", "Warp", warp.source.intrinsics.device)
+    if boxes.ndim == 0 or boxes.shape[-1] != 4:
+        raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
+    if not boxes.dtype.is_floating_point:
+        boxes = boxes.to(warp.source.intrinsics.dtype)
+    if not is_predicted(boxes):
+        check_boxes(boxes, "boxes", "Warp")
+    enclosing, valid = enclosed(warp, corners_of(boxes))
+    ordered = in_order(boxes)
+    return torch.where(ordered.unsqueeze(-1), enclosing, -1.0), valid & ordered
+
+
+def enclosed(warp: Warp, corners: Tensor) -> tuple[Tensor, Tensor]:
+    """See `Warp.enclose`."""
+    corners = as_coordinates(corners, "corners", 2, "Warp", warp.source.intrinsics.device, "B, *N, K")
+    if corners.ndim < 2:
+        raise ValueError(f"Warp: corners must be (B, *N, K, 2); got shape {tuple(corners.shape)}")
+    finite = torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
+    moved, mapped = warp._move(along_edges(corners, _EDGE_SAMPLES))
+    mapped = mapped & finite
+    low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
+    high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)
+    some, valid = mapped.any(-1), (mapped & warp.target.contains(moved)).any(-1)
+    # a polygon about a direction that the target does not map is turned inside out
+    plain = valid & mapped.all(-1) & (_area(corners) * _area(moved) > 0)
+    if not may_look(valid) or isinstance(warp.target, PANORAMAS) or not bool(plain.all()):
+        lattice, inside = _inside(warp, corners, moved)
+        inside = inside & finite
+        some, valid = some | inside.any(-1), valid | inside.any(-1)
+        inside = inside.unsqueeze(-1)
+        low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
+        high = torch.maximum(high, torch.where(inside, lattice, -torch.inf).amax(-2))
+    return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
+
+
+def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (N, 2) of a lattice from edge to edge of the target, and (B, *M, N): which show what polygons enclose.
+
+    They find what encloses the whole image, or such parts of it as show the source, and has no edge there.
+    """
+    height, width = warp.target.size_for("Warp")
+    share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
+    lattice = torch.cartesian_prod(share * width, share * height) - 0.5
+    with torch.no_grad():
+        shown, seen = warp._move(lattice.expand(*warp.batch_shape, *lattice.shape), back=True)
+        if warp.batch_shape:
+            lead = len(shown), *[1] * (corners.ndim - 3), len(lattice)
+            shown, seen = shown.reshape(*lead, 2), seen.reshape(lead)
+        return lattice, _within(corners, shown) & seen
+
+
+def corners_of(boxes: Tensor) -> Tensor:
+    """(..., 4, 2): the corners of boxes (..., 4) of x1 y1 x2 y2, clockwise from (x1, y1)."""
+    x1, y1, x2, y2 = boxes.unbind(-1)
+    corners: Tensor = torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2))
+    return corners
+
+
+def in_order(boxes: Tensor) -> Tensor:
+    """(...) bool: whether boxes (..., 4) have x1 <= x2 and y1 <= y2; those of x, y, width, height seldom do."""
+    ordered: Tensor = (boxes[..., :2] <= boxes[..., 2:]).all(-1)
+    return ordered
+
+
+def along_edges(corners: Tensor, samples: int) -> Tensor:
+    """(..., samples * K, 2): even steps along the edges of closed polygons (..., K, 2), the corners among them."""
+    share = torch.linspace(0, 1, samples + 1, dtype=corners.dtype, device=corners.device)[:-1, None]
+    start, end = corners.unsqueeze(-2), corners.roll(-1, -2).unsqueeze(-2)
+    return (start + (end - start) * share).flatten(-3, -2)
+
+
+def _area(corners: Tensor) -> Tensor:
+    """(...): of polygons (..., K, 2), negative for those that go round the other way."""
+    (x, y), (next_x, next_y) = corners.unbind(-1), corners.roll(-1, -2).unbind(-1)
+    return (x * next_y - next_x * y).sum(-1) / 2
+
+
+def _within(corners: Tensor, points: Tensor) -> Tensor:
+    """(..., N) bool: whether points (..., N, 2) are inside closed polygons (..., K, 2), by the edges to their right."""
+    x, y = points.unsqueeze(-2).unbind(-1)
+    x1, y1 = corners.unsqueeze(-3).unbind(-1)
+    across, down = x1.roll(-1, -1) - x1, y1.roll(-1, -1) - y1
+    above = y1 <= y
+    crossed = above != above.roll(-1, -1)
+    to_the_right = ((x - x1) * down < across * (y - y1)) == (down > 0)
+    inside: Tensor = (crossed & to_the_right).sum(-1) % 2 == 1
+    return inside
+
+
+def outlines(boxes: Tensor, samples: int = 16) -> Tensor:
+    """The outlines of boxes, as polygons that an augmentation moves point by point.
+
+    At the rim of a fisheye a box that encloses its warped outline is mostly background; the outline is not.
+
+    Args:
+        boxes: (..., 4) of x1 y1 x2 y2.
+        samples: points on each edge.
+
+    Returns:
+        (..., 4 * samples, 2).
+    """
+    boxes = as_coordinates(boxes, "boxes", 4, "outlines", means=" = x1, y1, x2, y2")
+    return along_edges(corners_of(boxes), as_whole(samples, "samples", "outlines", least=1))

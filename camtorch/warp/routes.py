@@ -1,0 +1,219 @@
+"""By which route a warp finds its sampling positions and makes its images: all of them, and where one is chosen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from camtorch._module import is_constant, with_values
+from camtorch._tracing import (
+    in_graph,
+    in_jit_trace,
+    in_transform,
+    is_concrete,
+    is_exporting,
+    is_for_here,
+    keeps_graph,
+    set_aside,
+)
+from camtorch.native.sampler import empty
+from camtorch.warp import compiled
+from camtorch.warp.grid import Lattice, Sampling, scaled
+from camtorch.warp.panorama import seam_of
+from camtorch.warp.sampling import PADDINGS, Mode, PaddingMode, Pyramid, Sampler, render
+from camtorch.warp.shutter import averaged
+
+if TYPE_CHECKING:
+    from camtorch.warp.warp import Warp
+
+Route = Literal["exposure", "operator", "strips", "graph", "kept"]
+
+_MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
+_STRIP = 1 << 21  # pixels of such a strip
+
+
+def route_of(warp: Warp, inputs: Sequence[Tensor], images: Tensor | None = None, mode: Mode = "nearest") -> Route:
+    """The route of a call; the lattice and the native sampler are chosen below, by `locate` and `render`.
+
+    * "exposure": the target's shutter blurs, so that the images are the mean of warps at several moments;
+    * "operator": compiled code calls one operator, and traces nothing of it;
+    * "strips": the grid would be too long for memory, and is made part by part;
+    * "graph": something learns, so that positions are computed anew with their graph;
+    * "kept": positions without a graph, pinned or kept until an input changes.
+
+    Args:
+        warp: the warp that is called.
+        inputs: all tensors that its positions depend on.
+        images: to be warped; None where positions alone are asked for.
+        mode: in which they are sampled.
+    """
+    learns = warp._pinned is None and keeps_graph(*inputs)
+    if images is not None:
+        shutter = warp.target_shutter
+        if mode != "nearest" and shutter is not None and shutter.blurs:
+            return "exposure"
+        learns = learns and images.dtype.is_floating_point
+        if not learns and _is_operator(warp) and compiled.takes(images, inputs):
+            return "operator"
+    if not learns and _is_long(warp, inputs) and (images is None or not in_graph(images)):
+        return "strips"
+    return "graph" if learns else "kept"
+
+
+def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
+    """The images of a warp; those given are checked."""
+    inputs = warp._inputs()
+    route = route_of(warp, inputs, images, sampler.mode)
+    if route == "exposure":
+        assert warp.target_shutter is not None
+        shutters = warp.target_shutter.exposed()
+        given = warp.source, warp.target, warp.rotation
+        parts = [
+            warp.between(*given, **warp.options, shutter=warp.shutter, target_shutter=shutter) for shutter in shutters
+        ]
+        return averaged(images, parts, warp.target_shutter.gamma, *sampler)
+    if route == "operator":
+        options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), *sampler
+        return compiled.warped(images, warp.source, warp.target, warp.rotation, *options)
+    if route == "strips":
+        cameras = math.prod(warp.batch_shape)
+        result = empty(images, len(images) if cameras == 1 else cameras, warp.target.size_for("Warp"))
+        kept: dict[int, Pyramid] = {}
+        for rows, where in strips(warp, sampler.padding_mode):
+            with torch.no_grad():
+                render(images, where, *sampler, kept, result[:, :, rows])
+        return result
+    return render(images, positions(warp, inputs, route, sampler.padding_mode), *sampler)
+
+
+def positions(warp: Warp, inputs: list[Tensor], route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
+    """Where all pixels of the target sample the source's image, by the route "graph" or "kept"."""
+    every = range(warp.target.size_for("Warp")[0])
+    if route == "graph":
+        if in_jit_trace():
+            raise RuntimeError(
+                "Warp: torch.jit.trace and torch.onnx.export(dynamo=False) cannot record cameras that learn; "
+                "torch.onnx.export(dynamo=True) and torch.export can. Or warp.requires_grad_(False), and one call "
+                "before, make its map a constant"
+            )
+        return warp._locate(every, padding, 0.0)
+    if is_exporting() and not torch.compiler.is_dynamo_compiling() and (constant := _constant(warp, padding)):
+        return constant
+    reach = _reach(warp, padding)
+    if warp._pinned is not None and (reach == warp.padding_mode or isinstance(warp._pinned, Sampling)):
+        return warp._pinned
+
+    def computed() -> Sampling | Lattice:
+        if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
+            return warp._locate(every, reach, warp.tolerance)
+        grid, mapped = compiled.positions(warp.source, warp.target, warp.rotation, warp.tolerance, reach)
+        if warp.antialias:
+            return scaled(warp.source, grid, mapped)
+        return Sampling(grid, mapped, None, seam_of(warp.source))
+
+    forms = [None if shutter is None else shutter.form for shutter in (warp.shutter, warp.target_shutter)]
+    options = warp.source.form, warp.target.form, *forms, warp.rotation is None, warp.antialias, warp.tolerance
+    kept: Sampling | Lattice
+    kept = warp._memos[reach if warp.tolerance else "zeros"](inputs, options, computed)  # what is exact serves all
+    return kept
+
+
+def strips(
+    warp: Warp, padding: PaddingMode = "zeros", count: int | None = None
+) -> Iterator[tuple[slice, Sampling | Lattice]]:
+    """Rows of the target, `count` at a time, and where they sample the source's image."""
+    height, width = warp.target.size_for("Warp")
+    step = count or max(_STRIP // (max(math.prod(warp.batch_shape), 1) * width), 1)
+    for top in range(0, height, step):
+        rows = range(top, min(top + step, height))
+        with torch.no_grad():
+            where = warp._locate(rows, _reach(warp, padding), warp.tolerance)
+        yield slice(rows.start, rows.stop), where
+
+
+def in_strips(
+    warp: Warp, images: Tensor, count: int | None, sampler: Sampler
+) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """See `Warp.strips`."""
+    kept: dict[int, Pyramid] = {}
+    for rows, where in strips(warp, sampler.padding_mode, count):
+        with torch.no_grad():
+            part, valid = render(images, where, *sampler, kept), _on_image(warp, where)
+        yield rows, part, valid
+
+
+@torch.no_grad()
+def valid_mask(warp: Warp) -> Tensor:
+    """See `Warp.valid_mask`."""
+    inputs = warp._inputs()
+    if route_of(warp, inputs) == "strips":
+        return torch.cat([_on_image(warp, where) for _, where in strips(warp)], 2)
+    return _on_image(warp, positions(warp, inputs, "kept"))
+
+
+def _on_image(warp: Warp, where: Sampling | Lattice) -> Tensor:
+    """(B or 1, 1, h, W') bool: whether the source maps pixels onto its image."""
+    where = where.pixels if isinstance(where, Lattice) else where
+    grid = where.grid.detach()
+    grid = grid if where.seam is None else where.seam.drawn_in(grid)
+    pixels = (grid + 1) * grid.new_tensor(warp.source.size_for("Warp")[::-1]) / 2 - 0.5
+    return (where.mapped & warp.source.contains(pixels)).unsqueeze(1)
+
+
+def pinned(warp: Warp) -> Sampling | Lattice | None:
+    """The positions that a warp keeps from now on, with their graph; None where they are not to be kept."""
+    # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the operator
+    # of compiled code keeps its own
+    inputs = warp._inputs()
+    if in_transform() or torch.is_inference_mode_enabled():
+        return warp._pinned
+    if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), inputs):
+        return warp._pinned
+    return positions(warp, inputs, "graph" if warp._pinned is None and keeps_graph(*inputs) else "kept")
+
+
+def _reach(warp: Warp, padding: PaddingMode) -> PaddingMode:
+    """The padding that positions are for which serve the warp's own, and this one."""
+    return max(warp.padding_mode, padding, key=PADDINGS.index)
+
+
+def _is_operator(warp: Warp) -> bool:
+    """Whether code is compiled that calls this warp as one; it knows cameras of one model, and no shutters."""
+    if not (is_for_here() and warp.is_an_operator):
+        return False
+    plain = warp.shutter is None and warp.target_shutter is None
+    return plain and not (warp.source.is_mixed or warp.target.is_mixed)
+
+
+def _is_long(warp: Warp, inputs: Sequence[Tensor]) -> bool:
+    """Whether the grid is not to be made at once, nor kept."""
+    # compared first, sizes that a program leaves open would be bounded in it
+    if warp._pinned is not None or torch.compiler.is_compiling():
+        return False
+    if math.prod((*warp.batch_shape, *warp.target.size_for("Warp"))) <= _MOST_KEPT:
+        return False
+    return not in_transform() and all(t.is_cpu and is_concrete(t) for t in inputs)
+
+
+def _constant(warp: Warp, padding: PaddingMode) -> Sampling | None:
+    """The positions as a constant of an exported program, unless they depend on what it is given."""
+    is_pinned = warp._pinned is not None
+    if not is_pinned and not is_constant(warp):
+        return None
+    with set_aside() if is_pinned else with_values(warp):
+        inputs = warp._inputs()
+
+        def own() -> Sampling:
+            where = positions(warp, inputs, "kept", padding)
+            where = where.pixels if isinstance(where, Lattice) else where
+            grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
+            return where._replace(grid=grid, mapped=mapped)
+
+        if is_pinned:
+            return own()
+        constant: Sampling = warp._constants(inputs, (_reach(warp, padding), warp.antialias, warp.tolerance), own)
+        return constant
