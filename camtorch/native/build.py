@@ -27,6 +27,9 @@ _SUFFIX = {"win32": "dll", "darwin": "dylib"}.get(sys.platform, "so")
 # two dots in its name: what walks a package's modules would take _sampler.so for one, and import it
 LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
 
+# what is compiled for each kind of CPU
+_KERNELS = ("kernel.c", "geometry.c")
+
 # where installation says in one line why it built no library
 REASON = "_sampler.reason.txt"
 
@@ -110,7 +113,12 @@ def build(
         has = [f"HAS_{name.upper()}" for name in known if name != "baseline"]
         has.append(f"SOURCES={checksum(here)}u")
         units: list[tuple[Path, str, tuple[str, ...], list[str]]] = [(here / "dispatch.c", "dispatch", (), has)]
-        units += [(here / "kernel.c", name, flags, [f"VARIANT={name}"]) for name, flags in known.items()]
+        kernels = [here / name for name in _KERNELS if (here / name).exists()]
+        units += [
+            (kernel, f"{kernel.stem}_{name}", flags, [f"VARIANT={name}"])
+            for kernel in kernels
+            for name, flags in known.items()
+        ]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(lambda unit: compiled(*unit), units))
         libraries = [] if sys.platform == "win32" else ["-lm"]

@@ -1,9 +1,11 @@
 /* The entry points: each is that of the best variant that this CPU can run. */
+#include "geometry.h"
 #include "sampler.h"
 
 #define DECLARED(variant)                                                                                              \
     int32_t sample_##variant(Job *);                                                                                      \
-    int32_t classify_##variant(const Classification *);
+    int32_t classify_##variant(const Classification *);                                                                \
+    int64_t geometry_##variant(Rows *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
 DECLARED(avx2)
@@ -56,3 +58,5 @@ EXPORTED const char *camtorch_variant(void) {
 EXPORTED int32_t camtorch_sample(Job *job) { CALLED(sample, job) }
 
 EXPORTED int32_t camtorch_classify(const Classification *given) { CALLED(classify, given) }
+
+EXPORTED int64_t camtorch_geometry(Rows *rows) { CALLED(geometry, rows) }

@@ -1,0 +1,85 @@
+/* Camera geometry: one variant, for the instructions that it is compiled for.
+ *
+ * Rows go block by block; each step of a formula is a loop over a block, which the compiler makes vectors of. What lies
+ * behind is alike for each point, wherever it stands: a block is filled up to whole vectors.
+ * The templates are included for float and for double.
+ */
+#include "geometry.h"
+
+#include <float.h>
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#if defined(_MSC_VER)
+#include <intrin.h>
+#define ALIGNED __declspec(align(64))
+#define INLINE static inline
+#define restrict __restrict
+#else
+#define ALIGNED __attribute__((aligned(64)))
+#define INLINE static inline __attribute__((always_inline))
+#endif
+
+#define JOINED_(a, b) a##_##b
+#define JOINED(a, b) JOINED_(a, b)
+#define THIS(name) JOINED(name, VARIANT)
+
+enum { LANES = 16 };      /* that a block is filled up to a multiple of */
+enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */
+#define PI 3.14159265358979323846
+
+/* Over the points of a block; `n` is a multiple of LANES */
+#define EACH(i) for (int i = 0; i < (n & -LANES); i++)
+
+/* How many numbers a part has: the `parameters` of its chart or stage */
+static int numbers_of(const Part *part) {
+    int count = 0;
+    if (part->kind == UNIFIED)
+        count = !!(part->flags & HAS_XI) + !!(part->flags & HAS_ALPHA) + !!(part->flags & HAS_BETA);
+    if (part->kind == FOV || part->kind == ONE_DIVISION) count = 1;
+    if (part->kind == TILT) count = 9;
+    if (part->kind == SHEAR) count = 2;
+    if (part->kind == PLANAR) count = 2 * !!(part->flags & TANGENTIAL) + 4 * !!(part->flags & PRISM);
+    if (part->factor == RADIUS_TABLE) return count + 4 * part->n;
+    return part->factor == NO_FACTOR ? count : count + part->n + (part->factor == RATIONAL ? part->m : 0);
+}
+
+/* The tile that whoever is free takes */
+static int64_t taken(Rows *rows) {
+#if defined(_MSC_VER)
+    return _InterlockedExchangeAdd64(&rows->next, 1);
+#else
+    return __atomic_fetch_add(&rows->next, 1, __ATOMIC_RELAXED);
+#endif
+}
+
+#define R float
+#define I int32_t
+#define T(name) name##_float
+#define BLOCK 256
+#define IS_DOUBLE 0
+#include "geometry_numbers.h"
+#include "geometry_charts.h"
+#include "geometry_lens.h"
+#include "geometry_rows.h"
+#undef R
+#undef I
+#undef T
+#undef BLOCK
+#undef IS_DOUBLE
+
+#define R double
+#define I int64_t
+#define T(name) name##_double
+#define BLOCK 128
+#define IS_DOUBLE 1
+#include "geometry_numbers.h"
+#include "geometry_charts.h"
+#include "geometry_lens.h"
+#include "geometry_rows.h"
+
+/* Makes tiles until none is left that nobody has taken; how many points wait for `limits2` */
+int64_t THIS(geometry)(Rows *rows) {
+    return rows->cameras->is_double ? rows_double(rows) : rows_float(rows);
+}

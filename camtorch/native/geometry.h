@@ -1,0 +1,76 @@
+/* What Python hands to the geometry: codes of what optics are made of, numbers, rows. `geometry.py` has the same fields.
+ *
+ * The formulas are those of camtorch/optics, named alike there, and their sources stand there.
+ */
+#ifndef CAMTORCH_GEOMETRY_H
+#define CAMTORCH_GEOMETRY_H
+
+#include <stdint.h>
+
+/* Charts: rays to a plane; the numbers of each are its `parameters` */
+enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED, CYLINDER, SPHERE };
+/* Flags of charts: which of xi, alpha, beta are numbers, and whether x and y change places */
+enum { HAS_XI = 1, HAS_ALPHA = 2, HAS_BETA = 4, TRANSVERSE = 8 };
+
+/* Stages of a lens on that plane */
+enum { PLANAR = 16, TILT, SHEAR };
+/* Flags of the planar stage */
+enum { TANGENTIAL = 1, PRISM = 2 };
+
+/* Radial factors, of the planar stage and of the inverted chart; n numbers each, n + m the ratio, 4 n the table */
+enum { NO_FACTOR, POLYNOMIAL, RATIONAL, RADIUS_POLYNOMIAL, ANGLE_PER_RADIUS, ANGLE_OF_ALL_POWERS, RADIUS_TABLE };
+
+enum { MOST_PARTS = 5 };
+enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabulate` */
+enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.Azimuths` */
+
+/* A chart or a stage */
+typedef struct {
+    int32_t kind, flags, factor, n, m;
+    double constant; /* alpha of a unified chart that does not learn it */
+} Part;
+
+/* Cameras (c) of one model. Pointers are to numbers of one type, float or double, without gaps */
+typedef struct {
+    const Part *parts; /* the chart, then the stages */
+    int64_t part_count, is_double, cameras;
+    const void *intrinsics; /* (c, 4) */
+    const void *parameters; /* (c, parameter_count): of all parts, in their order */
+    int64_t parameter_count;
+    const void *constants;  /* (c, constant_count): the nodes of a table, n + 1 */
+    int64_t constant_count;
+    const uint8_t *usable; /* (c), or NULL: all are. The numbers of one that is not are those of any that is */
+    /* of a lens: squared radii up to which it is regular, and no further out than images reach; squared limits (c,
+       AZIMUTHS), or NULL; tables of the inverse (c, 2 + 2 NODES), or NULL; whether it goes stage by stage (c), or NULL:
+       none; the squared radius (c) of the circle that its image lies in then */
+    const void *inner2, *usual2, *limits2, *table;
+    const uint8_t *stagewise;
+    const void *circle2;
+    /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */
+    const void *chart_inner2, *chart_most2, *chart_table;
+} Cameras;
+
+enum { PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP };
+
+/* Rows (c, n), strides in elements by camera, point and component; what is not wanted is NULL */
+typedef struct {
+    const Cameras *cameras;
+    const void *rows; /* points or pixels; */
+    int64_t row_strides[3];
+    void *results; /* pixels or rays; of a vjp, the cotangents of points or pixels */
+    int64_t result_strides[3];
+    uint8_t *valid; /* (c, n) without gaps: VALID, OPEN or 0; the vjp of unproject reads it */
+    void *solution; /* (2, c, n) without gaps: points on the chart's plane, which the vjp of unproject reads */
+    const void *cotangents; /* of pixels or rays */
+    int64_t cotangent_strides[3];
+    /* (c, tiles, 4 + parameter_count): the sums over a tile of the cotangents of intrinsics and parameters */
+    double *sums;
+    int64_t count, tile; /* points of a camera; of a tile */
+    int64_t direction;
+    int64_t next; /* the tile that whoever is free takes */
+} Rows;
+
+/* OPEN: a pixel that may have a ray, which steps of Newton's method have not found */
+enum { VALID = 1, OPEN = 2 };
+
+#endif

@@ -1,0 +1,343 @@
+"""Calls of the compiled geometry: cameras to codes and numbers, rows to pointers and strides, and tiles to threads."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Sequence
+from ctypes import addressof, c_double, c_int32, c_int64, c_void_p
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch import optics
+from camtorch._threads import spread, thread_count
+from camtorch.native import memory
+from camtorch.native.library import library
+from camtorch.optics.backprojection import FURTHEST
+from camtorch.optics.radial_inverse import _made_tables
+
+if TYPE_CHECKING:
+    from camtorch.optics.charts import Chart
+    from camtorch.optics.lens import Lens, Stage
+    from camtorch.projection.domain import Domain
+    from camtorch.projection.rows import Cameras
+
+PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
+_OPEN = 2  # of geometry.h
+_TILE = 1 << 14  # points of a tile, some 20 us
+_MOST_PARTS = 5
+
+_CHARTS: dict[type[Chart], int] = {
+    optics.Perspective: 0,
+    optics.Equidistant: 1,
+    optics.EquidistantUpTo: 1,
+    optics.Equisolid: 2,
+    optics.Unified: 3,
+    optics.Fov: 4,
+    optics.OneDivision: 5,
+    optics.Inverted: 6,
+    optics.CylinderChart: 7,
+    optics.SphereChart: 8,
+}
+_HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
+_PLANAR, _TILT, _SHEAR = 16, 17, 18
+_TANGENTIAL, _PRISM = 1, 2
+
+
+class _Part(ctypes.Structure):
+    """`Part` of geometry.h."""
+
+    _fields_ = (
+        ("kind", c_int32),
+        ("flags", c_int32),
+        ("factor", c_int32),
+        ("n", c_int32),
+        ("m", c_int32),
+        ("constant", c_double),
+    )
+
+
+class _Cameras(ctypes.Structure):
+    """`Cameras` of geometry.h."""
+
+    _fields_ = (
+        ("parts", c_void_p),
+        ("part_count", c_int64),
+        ("is_double", c_int64),
+        ("cameras", c_int64),
+        ("intrinsics", c_void_p),
+        ("parameters", c_void_p),
+        ("parameter_count", c_int64),
+        ("constants", c_void_p),
+        ("constant_count", c_int64),
+        ("usable", c_void_p),
+        ("inner2", c_void_p),
+        ("usual2", c_void_p),
+        ("limits2", c_void_p),
+        ("table", c_void_p),
+        ("stagewise", c_void_p),
+        ("circle2", c_void_p),
+        ("chart_inner2", c_void_p),
+        ("chart_most2", c_void_p),
+        ("chart_table", c_void_p),
+    )
+
+
+_Rows = c_int64 * 20  # `Rows` of geometry.h
+
+
+class Native:
+    """Cameras (C,) of one model as the compiled geometry takes them."""
+
+    _kept: list[Tensor]
+
+    def __init__(self, cameras: Cameras, parts: Sequence[_Part]):
+        domain, intrinsics = cameras.domain, cameras.intrinsics
+        self._domain, self._kept = domain, []
+        self._parts, self.struct = (_Part * len(parts))(*parts), _Cameras()
+        struct = self.struct
+        struct.parts, struct.part_count = addressof(self._parts), len(parts)
+        self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
+        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
+        struct.intrinsics = self._keep(intrinsics)
+        parameters = (*domain.chart.parameters, *domain.lens.parameters)
+        self.parameters = struct.parameter_count = len(parameters)
+        struct.parameters = self._keep_columns(parameters)
+        constants = _constants(domain.lens)
+        struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
+        if cameras.usable is not None:
+            struct.usable = self._keep(cameras.usable > 0)
+        if domain.lens.stages:
+            self._add_tables(domain)
+        if isinstance(domain.chart, optics.Inverted):
+            inner2, table = _made_tables(domain.chart.factor.name, torch.cat(domain.chart.parameters, -1), FURTHEST)
+            struct.chart_inner2, struct.chart_table = self._keep(inner2), self._keep(table)
+            struct.chart_most2 = self._keep(table[:, 1])
+        self.pointer = addressof(struct)
+
+    def _add_tables(self, domain: Domain) -> None:
+        struct, lens = self.struct, domain.lens
+        struct.inner2 = self._keep(domain.inner2)
+        struct.usual2 = self._keep(domain.usual2)
+        if lens.radial is not None:
+            struct.table = self._keep(domain.table)
+        if domain.stagewise is not None:
+            struct.stagewise, struct.circle2 = self._keep(domain.stagewise), self._keep(domain.circle2)
+
+    def add_limits(self) -> None:
+        """Make the limits of each azimuth, which take a while, and are asked for only when a point lies far out."""
+        self.struct.limits2 = self._keep(self._domain.limits2)
+
+    def _keep(self, tensor: Tensor) -> int:
+        self._kept.append(tensor.detach().contiguous())
+        return self._kept[-1].data_ptr()
+
+    def _keep_columns(self, columns: Sequence[Tensor]) -> int | None:
+        if not columns:
+            return None
+        return self._keep(torch.cat([c.detach().expand(self.cameras, 1) for c in columns], -1).to(self.dtype))
+
+
+def native_of(cameras: Cameras) -> Native | None:
+    """Those cameras, or None where there is no library or a part of their optics has no code: a user's own."""
+    if library() is None or cameras.intrinsics.device.type != "cpu":
+        return None
+    parts = codes(cameras.domain.chart, cameras.domain.lens)
+    return None if parts is None else Native(cameras, parts)
+
+
+def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
+    """What chart and lens are made of, or None where one part has no code."""
+    parts = [_chart(chart), *map(_stage, lens.stages)]
+    known = [part for part in parts if part is not None]
+    return known if len(known) == len(parts) <= _MOST_PARTS else None
+
+
+def _chart(chart: Chart) -> _Part | None:
+    flags = 0
+    if type(chart) is optics.Transverse:
+        chart, flags = chart.chart, _TRANSVERSE
+    kind = _CHARTS.get(type(chart))
+    if kind is None:
+        return None
+    part = _Part(kind, flags)
+    if isinstance(chart, optics.Unified):
+        part.flags |= _HAS_XI * chart.has_xi | _HAS_BETA * chart.has_beta
+        part.flags |= _HAS_ALPHA * (chart.fixed_alpha is None)
+        part.constant = chart.fixed_alpha or 0.0
+    if isinstance(chart, optics.Inverted):
+        part.factor, part.n = _factors().get(chart.factor, 0), len(chart.parameters)
+        return part if part.factor else None
+    return part
+
+
+def _stage(stage: Stage) -> _Part | None:
+    if type(stage) is optics.Tilt:
+        return _Part(_TILT)
+    if type(stage) is _shear():
+        return _Part(_SHEAR)
+    if type(stage) is not optics.Planar:
+        return None
+    part, radial = _Part(_PLANAR, _TANGENTIAL * bool(stage.tangential) | _PRISM * bool(stage.prism)), stage.radial
+    if radial is None:
+        return part
+    part.factor, part.n = _factors().get(type(radial), 0), len(radial.parameters)
+    if isinstance(radial, optics.Rational):
+        part.n, part.m = len(radial.numerator.parameters), len(radial.denominator.parameters)
+    if isinstance(radial, optics.RadiusTable):
+        part.n = len(radial.nodes)
+    return part if part.factor else None
+
+
+def _constants(lens: Lens) -> Sequence[Tensor]:
+    radial = lens.radial
+    return (*radial.nodes, radial.end) if isinstance(radial, optics.RadiusTable) else ()
+
+
+@functools.cache
+def _factors() -> dict[type, int]:
+    from camtorch.models.ocamcalib import AngleOfAllPowers
+
+    factors: list[type] = [optics.Polynomial, optics.Rational, optics.RadiusPolynomial, optics.AnglePerRadius]
+    factors += [AngleOfAllPowers, optics.RadiusTable]
+    return {factor: i for i, factor in enumerate(factors, 1)}
+
+
+@functools.cache
+def _shear() -> type[Stage]:
+    from camtorch.models.ocamcalib import Shear
+
+    return Shear
+
+
+# -- calls
+
+
+class Unprojected(NamedTuple):
+    """Rays (3, C, N); whether there is one (C, N); points on the chart's plane (2, C, N), if they were asked for; which
+    pixels are left open, where a ray may be that only a search finds, None where none is.
+    """
+
+    rays: Tensor
+    valid: Tensor
+    solution: Tensor | None
+    open: Tensor | None
+
+
+def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
+    count = points.shape[1]
+    pixels = _empty(2, native.cameras, count, native.dtype)
+    valid = torch.empty(native.cameras, count, dtype=torch.bool)
+    if _call(native, PROJECT, points, pixels, valid) and native.struct.limits2 is None:
+        native.add_limits()
+        _call(native, PROJECT, points, pixels, valid)
+    return pixels, valid
+
+
+def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
+    """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
+    count = pixels.shape[1]
+    rays = _empty(3, native.cameras, count, native.dtype)
+    valid = torch.empty(native.cameras, count, dtype=torch.uint8)
+    solution = torch.empty(2, native.cameras, count, dtype=native.dtype) if keeps else None
+    left = _call(native, UNPROJECT, pixels, rays, valid, solution)
+    if not left:
+        return Unprojected(rays, valid.view(torch.bool), solution, None)
+    return Unprojected(rays, valid == 1, solution, valid == _OPEN)
+
+
+def project_vjp(
+    native: Native, points: Tensor, cotangents: Tensor, want_points: bool, want_parameters: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    """The cotangents of points (C, N, 3), and of the cameras (C, 4 + n): intrinsics, the chart's and the lens's
+    `parameters`.
+
+    cotangents: of pixels, (2, C, N), of any strides.
+    """
+    results = torch.empty(points.shape, dtype=native.dtype) if want_points else None
+    sums = _sums(native, points) if want_parameters else None
+    by_row = None if results is None else results.movedim(-1, 0)
+    _call(native, PROJECT_VJP, points, by_row, cotangents=cotangents, sums=sums)
+    return results, None if sums is None else sums.sum(1).to(native.dtype)
+
+
+def unproject_vjp(
+    native: Native, found: Unprojected, cotangents: Tensor, want_pixels: bool, want_parameters: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    """The cotangents of pixels (C, N, 2), and of the cameras; see `project_vjp`. found: with its solution."""
+    shape = found.valid.shape
+    results = torch.empty(*shape, 2, dtype=native.dtype) if want_pixels else None
+    by_row = None if results is None else results.movedim(-1, 0)
+    sums = _sums(native, found.valid) if want_parameters else None
+    _call(native, UNPROJECT_VJP, None, by_row, found.valid, found.solution, cotangents=cotangents, sums=sums)
+    return results, None if sums is None else sums.sum(1).to(native.dtype)
+
+
+def _empty(size: int, cameras: int, count: int, dtype: torch.dtype) -> Tensor:
+    # of large results the first write to each page would take longer than the geometry
+    if size * cameras * count * dtype.itemsize >= memory.LEAST:
+        return memory.empty((size, cameras, count), dtype, torch.contiguous_format)
+    return torch.empty(size, cameras, count, dtype=dtype)
+
+
+def _sums(native: Native, rows: Tensor) -> Tensor:
+    tiles = -(-rows.shape[1] // _TILE)
+    return torch.zeros(native.cameras, tiles, 4 + native.parameters, dtype=torch.float64)
+
+
+def _call(
+    native: Native,
+    direction: int,
+    rows: Tensor | None,
+    results: Tensor | None,
+    valid: Tensor | None = None,
+    solution: Tensor | None = None,
+    *,
+    cotangents: Tensor | None = None,
+    sums: Tensor | None = None,
+) -> int:
+    """rows: (C, N, size). results, cotangents: (size, C, N)."""
+    shapes = [t.shape[:2] for t in (rows, valid) if t is not None]
+    shapes += [t.shape[1:] for t in (results, solution, cotangents) if t is not None]
+    count = shapes[0][1]
+    assert all(shape == (native.cameras, count) for shape in shapes)  # else C would write elsewhere
+    if not count or not native.cameras:
+        return 0
+    call = _Rows(
+        native.pointer,
+        *_place(rows, 0, 1, 2),
+        *_place(results, 1, 2, 0),
+        0 if valid is None else valid.data_ptr(),
+        0 if solution is None else solution.data_ptr(),
+        *_place(cotangents, 1, 2, 0),
+        0 if sums is None else sums.data_ptr(),
+        count,
+        _TILE,
+        direction,
+        0,
+    )
+    run = _entry()
+    tiles = -(-count // _TILE) * native.cameras
+    if count * native.cameras <= _TILE or tiles == 1:
+        return int(run(call))
+    left: list[int] = []
+    spread(lambda: left.append(run(call)), min(thread_count(), tiles))
+    return sum(left)
+
+
+def _place(tensor: Tensor | None, camera: int, point: int, component: int) -> tuple[int, ...]:
+    if tensor is None:
+        return 0, 0, 0, 0
+    strides = tensor.stride()
+    return tensor.data_ptr(), strides[camera], strides[point], strides[component]
+
+
+@functools.cache
+def _entry() -> ctypes._NamedFuncPointer:
+    found = library()
+    assert found is not None  # or nobody has a `Native`
+    found.camtorch_geometry.restype = c_int64
+    return found.camtorch_geometry

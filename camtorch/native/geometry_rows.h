@@ -1,0 +1,496 @@
+/* Rows of points and pixels, block by block: what is invalid, and why; projection/project.py, unproject.py, solve.py. */
+
+static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
+    const R *numbers = (const R *)all->parameters + camera * all->parameter_count;
+    const R *intrinsics = (const R *)all->intrinsics + 4 * camera;
+    memset(c, 0, sizeof *c);
+    c->parts = all->parts, c->stages = (int)all->part_count - 1;
+    for (int j = 0; j <= c->stages; j++) c->numbers[j] = numbers, numbers += numbers_of(c->parts + j);
+    c->constants = (const R *)all->constants + camera * all->constant_count;
+    c->fx = intrinsics[0], c->fy = intrinsics[1], c->cx = intrinsics[2], c->cy = intrinsics[3];
+    c->usable = !all->usable || all->usable[camera];
+    if (c->stages) {
+        const Part *first = c->parts + 1;
+        c->is_radial = c->stages == 1 && first->kind == PLANAR && !first->flags;
+        c->by_stages = all->stagewise && all->stagewise[camera];
+        c->inner2 = ((const R *)all->inner2)[camera];
+        c->usual2 = all->usual2 ? ((const R *)all->usual2)[camera] : c->inner2;
+        c->circle2 = all->circle2 ? ((const R *)all->circle2)[camera] : 0;
+        c->limits2 = all->limits2 ? (const R *)all->limits2 + camera * AZIMUTHS : NULL;
+        c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
+    }
+    if (c->parts->kind == INVERTED) {
+        c->chart_inner2 = ((const R *)all->chart_inner2)[camera];
+        c->chart_most2 = ((const R *)all->chart_most2)[camera];
+        c->chart_table = (const R *)all->chart_table + camera * (2 + 2 * NODES);
+    }
+    T(prepare_chart)(c);
+}
+
+/* -- memory */
+
+static void T(load)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
+    if (stride == 1) for (int i = 0; i < count; i++) to[i] = from[i];
+    else for (int i = 0; i < count; i++) to[i] = from[stride * i];
+    for (int i = count; i < n; i++) to[i] = filling;
+}
+
+static void T(store)(R *to, int64_t stride, int count, const R *restrict from) {
+    if (stride == 1) for (int i = 0; i < count; i++) to[i] = from[i];
+    else if (stride == 2) for (int i = 0; i < count; i++) to[2 * i] = from[i];
+    else if (stride == 3) for (int i = 0; i < count; i++) to[3 * i] = from[i];
+    else for (int i = 0; i < count; i++) to[stride * i] = from[i];
+}
+
+/* The points of a row; those that fill up a block lie on the axis */
+static void T(load_points)(const R *from, const int64_t *strides, int count, int n, R *restrict x, R *restrict y,
+                           R *restrict z) {
+    if (strides[1] == 3 && strides[2] == 1) { /* at once, from the same vectors */
+        for (int i = 0; i < count; i++) x[i] = from[3 * i], y[i] = from[3 * i + 1], z[i] = from[3 * i + 2];
+        for (int i = count; i < n; i++) x[i] = y[i] = 0, z[i] = 1;
+        return;
+    }
+    T(load)(from, strides[1], count, n, x, 0);
+    T(load)(from + strides[2], strides[1], count, n, y, 0);
+    T(load)(from + 2 * strides[2], strides[1], count, n, z, 1);
+}
+
+static void T(load_pixels)(const R *from, const int64_t *strides, int count, int n, R *restrict u, R *restrict v, R cx,
+                           R cy) {
+    if (strides[1] == 2 && strides[2] == 1) {
+        for (int i = 0; i < count; i++) u[i] = from[2 * i], v[i] = from[2 * i + 1];
+        for (int i = count; i < n; i++) u[i] = cx, v[i] = cy;
+        return;
+    }
+    T(load)(from, strides[1], count, n, u, cx);
+    T(load)(from + strides[2], strides[1], count, n, v, cy);
+}
+
+/* -- rays to pixels */
+
+/* The azimuth at or below that of a point, in even steps along the rim of the diamond |a| + |b| = 1 */
+static int T(azimuth)(R a, R b) {
+    const R size = T(absolute)(a) + T(absolute)(b), across = b / (size > 0 ? size : 1);
+    const double turn = floor((a < 0 ? 2 - across : across) * (AZIMUTHS / 4));
+    const int index = turn == turn ? (int)turn : 0; /* infinite points have none */
+    return (index + AZIMUTHS) % AZIMUTHS;
+}
+
+/* Of covered points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that
+   count wait for limits */
+static int T(beyond)(const T(Camera) *c, int count, int n, const R *restrict a, const R *restrict b, const I *covered,
+                     I *ok) {
+    ALIGNED R x[BLOCK], y[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
+    T(Jacobian) jacobian;
+    int places[BLOCK], some = 0;
+    for (int i = 0; i < n; i++)
+        if (covered[i] && !ok[i] && i < count) places[some++] = i;
+    if (!some || !c->limits2) return some;
+    for (int i = some; i % LANES; i++) places[i] = places[some - 1];
+    const int filled = (some + LANES - 1) & -LANES;
+    for (int i = 0; i < filled; i++) x[i] = a[places[i]], y[i] = b[places[i]];
+    T(lens)(c, 1, filled, x, y, u, v, &jacobian, least);
+    for (int i = 0; i < some; i++) {
+        const R limit2 = c->limits2[T(azimuth)(x[i], y[i])];
+        ok[places[i]] = (limit2 - (x[i] * x[i] + y[i] * y[i]) > 0) & (least[i] > TINY);
+    }
+    return 0;
+}
+
+/* Rays of which the largest component is from 1 to 2: points times `shrink`, a power of two. The axis where a point is
+   none: not finite, or the origin, next to which a derivative would leave the range of numbers */
+static void T(normalise)(int n, R *restrict x, R *restrict y, R *restrict z, R *restrict shrink, I *restrict ok) {
+    EACH(i) {
+        const R p = T(absolute)(x[i]), q = T(absolute)(y[i]), r = T(absolute)(z[i]);
+        const R larger = p > q ? p : q, size = larger > r ? larger : r;
+        const I is_ray = (size > FLOOR) & (p < INFINITY) & (q < INFINITY) & (r < INFINITY);
+        const R factor = T(shrink)(is_ray ? size : 1);
+        x[i] = is_ray ? x[i] * factor : 0, y[i] = is_ray ? y[i] * factor : 0, z[i] = is_ray ? z[i] * factor : 1;
+        shrink[i] = factor, ok[i] = is_ray;
+    }
+}
+
+typedef struct {
+    ALIGNED R x[BLOCK], y[BLOCK], z[BLOCK], shrink[BLOCK], scale[BLOCK], a[BLOCK], b[BLOCK];
+    ALIGNED I ok[BLOCK];
+} T(Seen);
+
+/* Where points are seen on the chart's plane, the centre where they are not. How many wait for limits */
+static int T(see)(const T(Camera) *c, int count, int n, T(Seen) *s) {
+    ALIGNED I covered[BLOCK];
+    int waiting = 0;
+    T(normalise)(n, s->x, s->y, s->z, s->shrink, s->ok);
+    T(to_plane)(c, n, s->x, s->y, s->z, s->a, s->b, s->scale, covered);
+    I *restrict ok = s->ok;
+    R *restrict a = s->a, *restrict b = s->b;
+    const I usable = c->usable;
+    if (!c->stages) {
+        EACH(i) {
+            ok[i] &= covered[i] & usable;
+            a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
+        }
+        return 0;
+    }
+    const R inner2 = c->inner2;
+    I all = 1;
+    EACH(i) {
+        covered[i] &= ok[i] & usable;
+        ok[i] = covered[i] & (inner2 - (a[i] * a[i] + b[i] * b[i]) > 0);
+        all &= ok[i];
+    }
+    if (!all && !c->is_radial && !c->by_stages) waiting = T(beyond)(c, count, n, a, b, covered, ok);
+    EACH(i) a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
+    return waiting;
+}
+
+static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
+    const int n = (count + LANES - 1) & -LANES;
+    const int64_t *from = rows->row_strides, *to = rows->result_strides;
+    const R *points = (const R *)rows->rows + camera * from[0] + first * from[1];
+    R *pixels = (R *)rows->results + camera * to[0] + first * to[1];
+    uint8_t *valid = rows->valid + camera * rows->count + first;
+    T(Seen) s;
+    ALIGNED R u[BLOCK], v[BLOCK];
+    T(load_points)(points, from, count, n, s.x, s.y, s.z);
+    const int waiting = T(see)(c, count, n, &s);
+    if (c->stages) T(lens)(c, 1, n, s.a, s.b, u, v, NULL, NULL);
+    else EACH(i) u[i] = s.a[i], v[i] = s.b[i];
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
+    EACH(i) {
+        u[i] = s.ok[i] ? fx * u[i] + cx : -1;
+        v[i] = s.ok[i] ? fy * v[i] + cy : -1;
+    }
+    T(store)(pixels, to[1], count, u);
+    T(store)(pixels + to[2], to[1], count, v);
+    for (int i = 0; i < count; i++) valid[i] = (uint8_t)s.ok[i];
+    return waiting;
+}
+
+/* The cotangents of points and numbers of those of pixels; `sums`: of intrinsics, then of the parts */
+static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count, double *sums) {
+    const int n = (count + LANES - 1) & -LANES;
+    const int64_t *from = rows->row_strides, *to = rows->result_strides, *by = rows->cotangent_strides;
+    const R *points = (const R *)rows->rows + camera * from[0] + first * from[1];
+    const R *cotangents = (const R *)rows->cotangents + camera * by[0] + first * by[1];
+    T(Seen) s;
+    ALIGNED R gu[BLOCK], gv[BLOCK], u[BLOCK], v[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK];
+    T(load_points)(points, from, count, n, s.x, s.y, s.z);
+    T(see)(c, count, n, &s);
+    T(load)(cotangents, by[1], count, n, gu, 0);
+    T(load)(cotangents + by[2], by[1], count, n, gv, 0);
+    EACH(i) {
+        /* what comes back of an invalid point need not be finite */
+        gu[i] = s.ok[i] ? gu[i] : 0, gv[i] = s.ok[i] ? gv[i] : 0;
+        s.x[i] = s.ok[i] ? s.x[i] : 0, s.y[i] = s.ok[i] ? s.y[i] : 0, s.z[i] = s.ok[i] ? s.z[i] : 1;
+        s.scale[i] = s.ok[i] ? s.scale[i] : 1;
+    }
+    if (sums) {
+        if (c->stages) T(lens)(c, 1, n, s.a, s.b, u, v, NULL, NULL);
+        else EACH(i) u[i] = s.a[i], v[i] = s.b[i];
+        sums[0] += T(dot)(n, gu, u), sums[1] += T(dot)(n, gv, v);
+        sums[2] += T(total)(n, gu), sums[3] += T(total)(n, gv);
+        sums += 4;
+    }
+    EACH(i) gu[i] *= c->fx, gv[i] *= c->fy;
+    T(lens_vjp)(c, n, s.a, s.b, gu, gv, sums);
+    T(to_plane_vjp)(c, n, s.x, s.y, s.z, s.scale, gu, gv, gx, gy, gz, sums);
+    if (!rows->results) return;
+    EACH(i) gx[i] *= s.shrink[i], gy[i] *= s.shrink[i], gz[i] *= s.shrink[i];
+    R *results = (R *)rows->results + camera * to[0] + first * to[1];
+    T(store)(results, to[1], count, gx);
+    T(store)(results + to[2], to[1], count, gy);
+    T(store)(results + 2 * to[2], to[1], count, gz);
+}
+
+/* -- pixels to rays */
+
+/* The step that a Jacobian sends to (du, dv), some finite one where it is singular; one over its determinant */
+INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
+    const R determinant = ua * vb - ub * va, one = 1 / (determinant + FLOOR / determinant);
+    *da = (vb * du - ub * dv) * one, *db = (ua * dv - va * du) * one;
+    return one;
+}
+
+/* Points near those that the stages from `first` on send to (u, v) */
+static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *v, R *restrict a, R *restrict b) {
+    ALIGNED R x[BLOCK], y[BLOCK];
+    EACH(i) a[i] = u[i], b[i] = v[i];
+    for (int j = c->stages; j >= first; j--) {
+        const R *k = c->numbers[j];
+        if (c->parts[j].kind == TILT) {
+            EACH(i) {
+                /* R's transpose is its inverse */
+                const R p = (a[i] + k[2]) / k[8], q = (b[i] + k[5]) / k[8], one = 1 / (k[2] * p + k[5] * q + k[8]);
+                a[i] = (k[0] * p + k[3] * q + k[6]) * one, b[i] = (k[1] * p + k[4] * q + k[7]) * one;
+            }
+        } else if (c->parts[j].kind == SHEAR) {
+            const R area = 1 - k[0] * k[1];
+            EACH(i) {
+                const R p = (a[i] - k[1] * b[i]) / area;
+                b[i] = (b[i] - k[0] * a[i]) / area, a[i] = p;
+            }
+        } else {
+            T(stage)(c, j, n, a, b, x, y, NULL);
+            EACH(i) a[i] = 2 * a[i] - x[i], b[i] = 2 * b[i] - y[i];
+        }
+    }
+}
+
+/* Newton's method for the stages from `first` on, wherever that leads; `ok` where the next step would be nothing */
+static void T(newton)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v, R *restrict a,
+                      R *restrict b, I *restrict ok, int fewest) {
+    ALIGNED R x[BLOCK], y[BLOCK];
+    ALIGNED I regular[BLOCK];
+    T(Jacobian) to;
+    EACH(i) ok[i] = 0, regular[i] = 0;
+    for (int count = 1; count <= MOST_STEPS; count++) {
+        I all = 1;
+        T(lens)(c, first, n, a, b, x, y, &to, NULL);
+        EACH(i) {
+            R da, db;
+            const R one = T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], u[i] - x[i], v[i] - y[i], &da, &db);
+            a[i] = ok[i] ? a[i] : a[i] + da, b[i] = ok[i] ? b[i] : b[i] + db;
+            const R t = a[i] * a[i] + b[i] * b[i];
+            ok[i] |= (EPS / 64 * (t + (R)0.01) - (da * da + db * db) > 0) & (count >= fewest);
+            regular[i] = T(absolute)(one) > 0;
+        }
+        EACH(i) all &= ok[i];
+        if (all) break;
+    }
+    EACH(i) ok[i] &= regular[i];
+}
+
+/* By the radial factor of the first stage alone: where it sends points to (p, q); `possible` within the fold's image */
+static void T(invert_radial)(const T(Camera) *c, int n, const R *restrict p, const R *restrict q, R *restrict a,
+                             R *restrict b, I *restrict ok, I *restrict possible) {
+    const R most2 = c->table[1], reach2 = most2 * (1 + 8 * EPS);
+    ALIGNED R r2[BLOCK], scale[BLOCK];
+    EACH(i) {
+        const R square = p[i] * p[i] + q[i] * q[i];
+        possible[i] = reach2 - square > 0;
+        /* what is beyond the fold would never settle */
+        r2[i] = possible[i] ? square < most2 ? square : most2 : 0;
+    }
+    T(solve)(c->parts + 1, c->numbers[1], c->constants, c->table, n, r2, scale, ok);
+    /* a ray's rounding must not carry it across the fold */
+    const R inside2 = c->inner2 * (1 - 32 * EPS);
+    EACH(i) {
+        a[i] = p[i] * scale[i], b[i] = q[i] * scale[i];
+        ok[i] &= possible[i] & (inside2 - r2[i] * scale[i] * scale[i] > 0);
+    }
+}
+
+/* `invert`, from a table and a few steps; what is not `ok`, and yet possible, is left */
+static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
+                      I *restrict ok, I *restrict possible) {
+    const int fewest = IS_DOUBLE ? 3 : 2;
+    ALIGNED R p[BLOCK], q[BLOCK];
+    if (c->is_radial) {
+        T(invert_radial)(c, n, u, v, a, b, ok, possible);
+    } else if (c->by_stages) {
+        ALIGNED R x[BLOCK], y[BLOCK];
+        ALIGNED I known[BLOCK], within[BLOCK];
+        const R circle2 = c->circle2;
+        EACH(i) {
+            within[i] = circle2 - (u[i] * u[i] + v[i] * v[i]) > 0;
+            x[i] = within[i] ? u[i] : 0, y[i] = within[i] ? v[i] : 0;
+        }
+        T(start)(c, 2, n, x, y, p, q);
+        T(newton)(c, 2, n, x, y, p, q, known, fewest - 1);
+        T(invert_radial)(c, n, p, q, a, b, ok, possible);
+        EACH(i) {
+            ok[i] &= known[i] & within[i];
+            possible[i] = within[i] & (possible[i] | !known[i]);
+        }
+    } else {
+        ALIGNED R r2[BLOCK], scale[BLOCK];
+        const int has_table = c->table != NULL;
+        const R usual2 = c->usual2;
+        T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
+        if (has_table) {
+            EACH(i) r2[i] = a[i] * a[i] + b[i] * b[i] < INFINITY ? a[i] * a[i] + b[i] * b[i] : 0;
+            T(tabulated)(c->table, n, r2, scale);
+            EACH(i) a[i] *= scale[i], b[i] *= scale[i];
+        }
+        T(newton)(c, 1, n, u, v, a, b, ok, fewest);
+        EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0, possible[i] = 1;
+    }
+}
+
+/* Of pixels that steps left open, by a bracket of the radial factor, whose fold is a circle; `_Search` */
+static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
+                      I *restrict ok) {
+    const R fold2 = c->inner2 * (1 - 64 * EPS), inner2 = c->inner2, most2 = c->table[1] * (1 + 64 * EPS);
+    ALIGNED R p[BLOCK], q[BLOCK], r2[BLOCK], scale[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK], stretch[BLOCK];
+    ALIGNED I covered[BLOCK];
+    T(Jacobian) to;
+    EACH(i) p[i] = u[i], q[i] = v[i], ok[i] = 1;
+    if (!c->is_radial) {
+        T(start)(c, 2, n, u, v, p, q);
+        for (int count = 0; count < 12; count++) { /* the first ones may take off no more than a third */
+            T(lens)(c, 2, n, p, q, x, y, &to, NULL);
+            EACH(i) {
+                R dp, dq;
+                T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], u[i] - x[i], v[i] - y[i], &dp, &dq);
+                p[i] += dp, q[i] += dq;
+            }
+        }
+        EACH(i) {
+            ok[i] = (u[i] * u[i] + v[i] * v[i] <= c->circle2) & (p[i] * p[i] + q[i] * q[i] <= most2);
+            p[i] = ok[i] ? p[i] : 0, q[i] = ok[i] ? q[i] : 0;
+        }
+    }
+    EACH(i) r2[i] = p[i] * p[i] + q[i] * q[i];
+    T(bracketed)(c->parts + 1, c->numbers[1], c->constants, fold2, n, r2, scale);
+    EACH(i) a[i] = p[i] * scale[i], b[i] = q[i] * scale[i], ok[i] &= a[i] * a[i] + b[i] * b[i] < inner2;
+    T(lens)(c, 1, n, a, b, x, y, &to, NULL);
+    EACH(i) {
+        const R across = T(absolute)(to.ua[i]) + T(absolute)(to.ub[i]), down = T(absolute)(to.va[i]) + T(absolute)(to.vb[i]);
+        const R far = T(absolute)(a[i]) > T(absolute)(b[i]) ? T(absolute)(a[i]) : T(absolute)(b[i]);
+        stretch[i] = (across > down ? across : down) * far;
+    }
+    for (int count = 0; count < 2; count++) { /* what rounding left */
+        EACH(i) {
+            R da, db;
+            T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], u[i] - x[i], v[i] - y[i], &da, &db);
+            a[i] = ok[i] ? a[i] + da : 0, b[i] = ok[i] ? b[i] + db : 0;
+        }
+        T(lens)(c, 1, n, a, b, x, y, NULL, NULL);
+    }
+    /* next to a fold the polished solution may lie on its other side: what counts is where its ray is seen */
+    T(to_ray)(c, n, a, b, x, y, z);
+    T(to_plane)(c, n, x, y, z, p, q, scale, covered);
+    EACH(i) {
+        ok[i] &= covered[i] & (p[i] * p[i] + q[i] * q[i] < inner2);
+        p[i] = ok[i] ? p[i] : 0, q[i] = ok[i] ? q[i] : 0;
+    }
+    T(lens)(c, 1, n, p, q, x, y, NULL, NULL);
+    EACH(i) {
+        const R du = T(absolute)(x[i] - u[i]), dv = T(absolute)(y[i] - v[i]);
+        const R far = T(absolute)(u[i]) > T(absolute)(v[i]) ? T(absolute)(u[i]) : T(absolute)(v[i]);
+        ok[i] &= (du > dv ? du : dv) <= 32 * EPS * (1 + far + stretch[i]);
+        a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
+    }
+}
+
+/* How many are left OPEN */
+static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
+    const int n = (count + LANES - 1) & -LANES;
+    const int64_t *from = rows->row_strides, *to = rows->result_strides;
+    const R *pixels = (const R *)rows->rows + camera * from[0] + first * from[1];
+    R *rays = (R *)rows->results + camera * to[0] + first * to[1];
+    uint8_t *valid = rows->valid + camera * rows->count + first;
+    ALIGNED R u[BLOCK], v[BLOCK], a[BLOCK], b[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
+    ALIGNED I ok[BLOCK], known[BLOCK], possible[BLOCK];
+    int left = 0;
+    T(load_pixels)(pixels, from, count, n, u, v, c->cx, c->cy);
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
+    const I usable = c->usable;
+    EACH(i) {
+        const R p = (u[i] - cx) / fx, q = (v[i] - cy) / fy;
+        known[i] = (T(absolute)(p) < SQUARABLE) & (T(absolute)(q) < SQUARABLE) & usable;
+        u[i] = known[i] ? p : 0, v[i] = known[i] ? q : 0;
+    }
+    if (!c->stages) {
+        T(on_plane)(c, n, u, v, ok);
+        EACH(i) a[i] = u[i], b[i] = v[i], possible[i] = ok[i];
+    } else {
+        T(invert)(c, n, u, v, a, b, ok, possible);
+        if (c->is_radial || c->by_stages) {
+            int places[BLOCK], some;
+            EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
+            if ((some = T(chosen)(n, possible, places))) {
+                ALIGNED R p[BLOCK], q[BLOCK], found_a[BLOCK], found_b[BLOCK];
+                ALIGNED I found[BLOCK];
+                const int filled = (some + LANES - 1) & -LANES;
+                for (int i = 0; i < filled; i++) p[i] = u[places[i]], q[i] = v[places[i]];
+                T(search)(c, filled, p, q, found_a, found_b, found);
+                for (int i = 0; i < some; i++)
+                    a[places[i]] = found_a[i], b[places[i]] = found_b[i], ok[places[i]] = found[i];
+            }
+            EACH(i) possible[i] = ok[i];
+        }
+    }
+    EACH(i) {
+        ok[i] &= known[i];
+        a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
+    }
+    T(to_ray)(c, n, a, b, x, y, z);
+    EACH(i) x[i] = ok[i] ? x[i] : 0, y[i] = ok[i] ? y[i] : 0, z[i] = ok[i] ? z[i] : 1;
+    T(store)(rays, to[1], count, x);
+    T(store)(rays + to[2], to[1], count, y);
+    T(store)(rays + 2 * to[2], to[1], count, z);
+    for (int i = 0; i < count; i++) {
+        const int open = !ok[i] & (possible[i] != 0) & (known[i] != 0);
+        valid[i] = ok[i] ? VALID : open ? OPEN : 0, left += open;
+    }
+    if (rows->solution) {
+        R *solution = (R *)rows->solution + camera * rows->count + first;
+        T(store)(solution, 1, count, a);
+        T(store)(solution + rows->cameras->cameras * rows->count, 1, count, b);
+    }
+    return left;
+}
+
+/* The cotangents of pixels and numbers of those of rays, of solutions that are known */
+static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count,
+                             double *sums) {
+    const int n = (count + LANES - 1) & -LANES;
+    const int64_t *to = rows->result_strides, *by = rows->cotangent_strides;
+    const R *cotangents = (const R *)rows->cotangents + camera * by[0] + first * by[1];
+    const R *solution = (const R *)rows->solution + camera * rows->count + first;
+    const uint8_t *valid = rows->valid + camera * rows->count + first;
+    ALIGNED R a[BLOCK], b[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], ga[BLOCK], gb[BLOCK], u[BLOCK], v[BLOCK];
+    T(load)(solution, 1, count, n, a, 0);
+    T(load)(solution + rows->cameras->cameras * rows->count, 1, count, n, b, 0);
+    T(load)(cotangents, by[1], count, n, gx, 0);
+    T(load)(cotangents + by[2], by[1], count, n, gy, 0);
+    T(load)(cotangents + 2 * by[2], by[1], count, n, gz, 0);
+    for (int i = 0; i < count; i++)
+        if (valid[i] != VALID) gx[i] = gy[i] = gz[i] = 0;
+    T(to_ray_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 : NULL);
+    EACH(i) u[i] = a[i], v[i] = b[i];
+    if (c->stages) {
+        T(Jacobian) jacobian;
+        T(lens)(c, 1, n, a, b, u, v, &jacobian, NULL);
+        EACH(i) {
+            R da, db;
+            T(step)(jacobian.ua[i], jacobian.va[i], jacobian.ub[i], jacobian.vb[i], ga[i], gb[i], &da, &db);
+            ga[i] = da, gb[i] = db;
+            gx[i] = -da, gy[i] = -db;
+        }
+        if (sums) T(lens_vjp)(c, n, a, b, gx, gy, sums + 4);
+    }
+    const R fx = c->fx, fy = c->fy;
+    EACH(i) ga[i] /= fx, gb[i] /= fy;
+    if (sums) {
+        sums[0] -= T(dot)(n, ga, u), sums[1] -= T(dot)(n, gb, v);
+        sums[2] -= T(total)(n, ga), sums[3] -= T(total)(n, gb);
+    }
+    if (!rows->results) return;
+    R *results = (R *)rows->results + camera * to[0] + first * to[1];
+    T(store)(results, to[1], count, ga);
+    T(store)(results + to[2], to[1], count, gb);
+}
+
+static int64_t T(rows)(Rows *rows) {
+    const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
+    int64_t left = 0, last = -1, at;
+    T(Camera) camera;
+    while ((at = taken(rows)) < tiles * rows->cameras->cameras) {
+        const int64_t index = at / tiles, first = at % tiles * rows->tile;
+        const int64_t end = first + rows->tile < rows->count ? first + rows->tile : rows->count;
+        double *sums = rows->sums ? rows->sums + at * width : NULL;
+        if (index != last) T(prepare)(rows->cameras, last = index, &camera);
+        for (int64_t i = first; i < end; i += BLOCK) {
+            const int count = (int)(end - i < BLOCK ? end - i : BLOCK);
+            switch (rows->direction) {
+            case PROJECT: left += T(project)(&camera, rows, index, i, count); break;
+            case UNPROJECT: left += T(unproject)(&camera, rows, index, i, count); break;
+            case PROJECT_VJP: T(project_vjp)(&camera, rows, index, i, count, sums); break;
+            default: T(unproject_vjp)(&camera, rows, index, i, count, sums);
+            }
+        }
+    }
+    return left;
+}

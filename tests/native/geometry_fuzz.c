@@ -1,0 +1,147 @@
+/* Random cameras and rows for every variant of the geometry: built with sanitizers, it shows that none reads or writes
+ * outside, and that results are finite. Memory is as large as what is addressed, to the byte.
+ *
+ * Called as: geometry_fuzz FIRST COUNT, the numbers of the jobs. Ends with 1, and the job's number, where one is not.
+ */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "geometry.h"
+
+int64_t geometry_fuzzed(Rows *);
+
+static uint64_t state; /* of chance: splitmix64 */
+
+static uint64_t bits(void) {
+    uint64_t z = (state += 0x9e3779b97f4a7c15u);
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
+    return z ^ (z >> 31);
+}
+
+static int64_t below(int64_t n) { return (int64_t)(bits() % (uint64_t)n); }
+static double share(void) { return (double)(bits() >> 11) / 9007199254740992.0; }
+
+/* Numbers of that size, some of them wild */
+static double number(double size) {
+    static const double wild[] = {0, -0.0, NAN, INFINITY, -INFINITY, 1e30, -1e30, 1e-30, 1e-300, 1e300, -1e300};
+    return below(20) ? size * (2 * share() - 1) : wild[below(11)];
+}
+
+static void *filled(int is_double, int64_t count, double size, double middle) {
+    const int64_t bytes = count * (is_double ? 8 : 4);
+    char *made = malloc((size_t)bytes + (bytes == 0));
+    for (int64_t i = 0; i < count; i++) {
+        if (is_double) ((double *)made)[i] = middle + number(size);
+        else ((float *)made)[i] = (float)(middle + number(size));
+    }
+    return made;
+}
+
+/* Rows of three dims, with strides in any order and with gaps; the memory begins at the first */
+static void *rows_of(int is_double, int64_t cameras, int64_t count, int64_t size, int64_t *strides, double middle) {
+    static const int orders[4][3] = {{0, 1, 2}, {2, 0, 1}, {0, 2, 1}, {1, 0, 2}};
+    const int64_t sides[3] = {cameras, count, size};
+    const int *order = orders[below(4)];
+    int64_t step = 1 + below(3) / 2, length = 1;
+    for (int i = 2; i >= 0; i--) {
+        strides[order[i]] = step;
+        length += (sides[order[i]] - 1) * step;
+        step *= sides[order[i]] + below(2);
+    }
+    return filled(is_double, length, 400, middle);
+}
+
+static int32_t factor_of(Part *part, int first, int last) {
+    part->factor = first + (int32_t)below(last - first + 1);
+    part->n = 1 + (int32_t)below(part->factor == RADIUS_TABLE ? 40 : 7);
+    part->m = part->factor == RATIONAL ? 1 + (int32_t)below(4) : 0;
+    return part->n * (part->factor == RADIUS_TABLE ? 4 : 1) + part->m;
+}
+
+static int fuzz(uint64_t job) {
+    Part parts[MOST_PARTS];
+    Cameras cameras = {0};
+    Rows rows = {0};
+    int64_t numbers = 0, i;
+    void *kept[24];
+    int used = 0, fine = 1;
+    memset(parts, 0, sizeof parts);
+    state = job * 0x2545f4914f6cdd1du;
+    const int d = (int)below(2), direction = (int)below(4), is_vjp = direction >= PROJECT_VJP;
+    parts[0].kind = (int32_t)below(SPHERE + 1);
+    if (parts[0].kind >= CYLINDER) parts[0].flags = below(2) ? TRANSVERSE : 0;
+    if (parts[0].kind == UNIFIED) parts[0].flags = (int32_t)below(8), parts[0].constant = (double)below(3) / 2;
+    if (parts[0].kind == UNIFIED)
+        for (i = 1; i < 8; i *= 2) numbers += !!(parts[0].flags & i);
+    if (parts[0].kind == FOV || parts[0].kind == ONE_DIVISION) numbers = 1;
+    if (parts[0].kind == INVERTED) numbers = factor_of(parts, POLYNOMIAL, ANGLE_OF_ALL_POWERS);
+    cameras.part_count = 1 + below(4);
+    for (i = 1; i < cameras.part_count; i++) {
+        Part *part = parts + i;
+        part->kind = PLANAR + (int32_t)below(3);
+        if (part->kind == TILT) numbers += 9;
+        if (part->kind == SHEAR) numbers += 2;
+        if (part->kind != PLANAR) continue;
+        part->flags = (int32_t)below(4);
+        numbers += factor_of(part, i == 1 ? POLYNOMIAL : NO_FACTOR, i == 1 ? RADIUS_TABLE : RADIUS_POLYNOMIAL);
+        if (part->factor == NO_FACTOR) numbers -= part->n + part->m, part->n = part->m = 0;
+        numbers += 2 * !!(part->flags & TANGENTIAL) + 4 * !!(part->flags & PRISM);
+    }
+    const int has_table = cameras.part_count > 1 && parts[1].kind == PLANAR;
+    const int64_t c = 1 + below(3), n = 1 + below(700), nodes = has_table ? parts[1].n + 1 : 0;
+#define KEPT(...) (kept[used++] = (__VA_ARGS__))
+    cameras.parts = parts, cameras.is_double = d, cameras.cameras = c, cameras.parameter_count = numbers;
+    cameras.intrinsics = KEPT(filled(d, 4 * c, 100, 300));
+    cameras.parameters = KEPT(filled(d, numbers * c, share(), 0));
+    cameras.constants = KEPT(filled(d, nodes * c, 1, 1)), cameras.constant_count = nodes;
+    cameras.inner2 = KEPT(filled(d, c, 2, 2)), cameras.usual2 = KEPT(filled(d, c, 2, 2));
+    if (below(2)) cameras.limits2 = KEPT(filled(d, c * AZIMUTHS, 2, 2));
+    if (has_table) cameras.table = KEPT(filled(d, c * (2 + 2 * NODES), 1, 1));
+    if (has_table && cameras.part_count > 2 && below(2)) {
+        uint8_t *by_stages = KEPT(malloc((size_t)c));
+        for (i = 0; i < c; i++) by_stages[i] = (uint8_t)below(2);
+        cameras.stagewise = by_stages, cameras.circle2 = KEPT(filled(d, c, 2, 2));
+    }
+    if (parts[0].kind == INVERTED) {
+        cameras.chart_inner2 = KEPT(filled(d, c, 2, 2)), cameras.chart_most2 = KEPT(filled(d, c, 2, 2));
+        cameras.chart_table = KEPT(filled(d, c * (2 + 2 * NODES), 1, 1));
+    }
+    const int64_t size_in = direction % 2 ? 2 : 3, size_out = 5 - size_in;
+    rows.cameras = &cameras, rows.count = n, rows.tile = 1 + below(600), rows.direction = direction;
+    rows.rows = KEPT(rows_of(d, c, n, size_in, rows.row_strides, below(2) ? 0 : 300));
+    rows.results = KEPT(rows_of(d, c, n, is_vjp ? size_in : size_out, rows.result_strides, 0));
+    rows.valid = KEPT(malloc((size_t)(c * n)));
+    for (i = 0; i < c * n; i++) rows.valid[i] = (uint8_t)below(3);
+    if (below(2) || direction == UNPROJECT_VJP) rows.solution = KEPT(filled(d, 2 * c * n, 1, 0));
+    if (is_vjp) {
+        const int64_t tiles = (n + rows.tile - 1) / rows.tile;
+        rows.cotangents = KEPT(rows_of(d, c, n, size_out, rows.cotangent_strides, 0));
+        if (below(2)) rows.sums = KEPT(calloc((size_t)(c * tiles * (4 + numbers)), 8));
+        if (below(4) == 0) rows.results = NULL;
+    }
+    geometry_fuzzed(&rows);
+    if (!is_vjp) /* what is not valid is finite, whatever came */
+        for (int64_t at = 0; at < c * n * size_out; at++) {
+            const int64_t camera = at / (n * size_out), point = at / size_out % n;
+            const int64_t place = camera * rows.result_strides[0] + point * rows.result_strides[1] +
+                                  at % size_out * rows.result_strides[2];
+            const double value = d ? ((double *)rows.results)[place] : ((float *)rows.results)[place];
+            fine &= rows.valid[camera * n + point] == VALID || isfinite(value);
+        }
+    while (used) free(kept[--used]);
+    return fine;
+}
+
+int main(int count, char **words) {
+    (void)count;
+    const uint64_t first = strtoull(words[1], NULL, 10), jobs = strtoull(words[2], NULL, 10);
+    for (uint64_t job = first; job < first + jobs; job++)
+        if (!fuzz(job)) {
+            printf("job %llu\n", (unsigned long long)job);
+            return 1;
+        }
+    return 0;
+}

@@ -1,0 +1,283 @@
+"""Laws of the compiled geometry: what Python's formulas say of a ray or a pixel, it says too, and their derivatives."""
+
+import math
+import os
+import subprocess
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+import torch
+from cameras import KEYS, every_model, fan, make, one, pixel_lattice, real, spread
+
+import camtorch as ct
+from camtorch._arguments import columns
+from camtorch.native import build as building
+from camtorch.native import geometry
+from camtorch.native.library import library
+from camtorch.optics import Equidistant, Lens, Stage
+from camtorch.projection.rows import Cameras
+
+pytestmark = pytest.mark.skipif(not ct.native_available(), reason="the library is not compiled here, or turned off")
+
+# one calibration of each model and the others, which take a while
+each_kind = pytest.mark.parametrize(
+    "key", [*KEYS, *(pytest.param(f"{k} others", marks=pytest.mark.slow) for k in KEYS)]
+)
+each_dtype = pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+
+# no rays, none that a chart may cover, and some that are
+WILD = [[0, 0, 0], [math.nan, 0, 1], [1, math.nan, 1], [math.inf, 0, 1], [0, -math.inf, math.nan], [0, 0, -1]]
+WILD += [[1e-30, 0, 1e-30], [1e30, 2e30, 3e30], [1e-12, 1e-12, 1], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, -1, -1e-9]]
+
+
+def native(camera):
+    """A camera's, or a batch's (C,)."""
+    intrinsics = camera.intrinsics.detach().reshape(-1, 4)
+    distortion = camera.distortion.detach().reshape(len(intrinsics), -1)
+    found = geometry.native_of(Cameras.of(type(camera), intrinsics, distortion))
+    assert found is not None
+    return found
+
+
+def cameras(name, dtype):
+    key, _, others = name.partition(" ")
+    found = list(real(key).values())[:-1] if others else [one(key), spread(key)]
+    return [camera.to(dtype) for camera in found]
+
+
+def points(dtype):
+    rays = fan(178, 46, 13) * 3.7
+    return torch.cat((rays, torch.tensor(WILD, dtype=torch.float64))).to(dtype)
+
+
+def pixels(camera):
+    """Some thrice as far out as the image, and some that are none."""
+    inside = pixel_lattice(camera, 23, 31)
+    wide = (inside - inside.mean(0)) * 3 + inside.mean(0)
+    return torch.cat((wide, wide.new_tensor([[math.nan, 0], [math.inf, 0], [1e30, 1]])))
+
+
+def _moved(tensor, sizes, seed):
+    noise = 2 * torch.rand(tensor.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
+    return tensor.double() * (1 + sizes * noise)
+
+
+def moved(camera):
+    """The coefficients, by some roundings; nodes stay."""
+    k = camera.distortion.detach()
+    nodes = k.shape[-1] // 2 if camera.key == "tabulated" else 0
+    return torch.cat((k[:nodes].double(), _moved(k[nodes:], 16 * torch.finfo(k.dtype).eps, 3)))
+
+
+def formula(camera, p, k):
+    """Pixels of a formula alone, in float64: of points that it has, whatever is valid."""
+    x, y, z = (p.double() / p.double().abs().amax(-1, keepdim=True)).unbind(-1)
+    chart, lens = type(camera).optics(columns(k.double()[None]))
+    a, b = chart.to_plane(x[None], y[None], z[None], order=1)
+    return torch.stack(lens(a, b), -1)[0] * camera.intrinsics.detach().double()[:2]
+
+
+def lost(camera, p):
+    """How far rounding may carry pixels: what a formula says where all that it is made of moves by some roundings."""
+    moves, k = 4 * torch.finfo(p.dtype).eps, camera.distortion.detach()
+    nodes = k.shape[-1] // 2 if camera.key == "tabulated" else 0
+    here, off = formula(camera, p, k), 0.0
+    for seed in range(3):
+        moved = _moved(k, moves, seed)
+        moved[:nodes] = k[:nodes].double()
+        off = torch.maximum((formula(camera, _moved(p, moves, seed), moved) - here).abs(), torch.as_tensor(off))
+    return 24 * off.amax(-1)
+
+
+@each_kind
+@each_dtype
+def test_projects_as_the_formula_does(key, dtype):
+    p, eps = points(dtype), torch.finfo(dtype).eps
+    for camera in cameras(key, dtype):
+        with torch.no_grad():
+            expected, valid = camera.project(p)
+            others = [
+                make(camera.key, camera.intrinsics.double(), k) for k in (camera.distortion.double(), moved(camera))
+            ]
+            near = torch.stack([exact.project(_moved(p, 64 * eps, seed))[1] for exact in others for seed in range(3)])
+        found, found_valid = (w[..., 0, :] for w in geometry.project(native(camera), p[None]))
+        found = found.mT
+        # next to a fold rounding decides
+        sure = (near == valid).all(0)
+        assert (found_valid == valid)[sure].all()
+        both = valid & found_valid
+        allowed = 32 * eps * (1000 + expected[both].abs().amax(-1)) + lost(camera, p[both])
+        assert ((found - expected)[both].abs().amax(-1) <= allowed).all()
+        assert (found[~found_valid] == -1).all()
+
+
+@each_kind
+@each_dtype
+def test_unprojects_as_the_formula_does(key, dtype):
+    eps = torch.finfo(dtype).eps
+    for camera in cameras(key, dtype):
+        q = pixels(camera)
+        with torch.no_grad():
+            expected, valid = camera.unproject(q)
+            exact = make(camera.key, camera.intrinsics.double(), camera.distortion.double())
+            around = [exact.unproject(_moved(q, 32 * eps, seed)) for seed in range(3)]
+            there = exact.unproject(q.double())[0]
+        found = geometry.unproject(native(camera), q[None], keeps=True)
+        rays, found_valid = found.rays[:, 0].mT, found.valid[0]
+        left = torch.zeros_like(valid) if found.open is None else found.open[0]
+        assert not (left & found_valid).any()
+        sure = torch.stack([ok for _, ok in around]).eq(valid).all(0)
+        assert (found_valid | left)[sure & valid].all()
+        assert not found_valid[sure & ~valid].any()
+        both = valid & found_valid
+        off = torch.stack([(ray - there).norm(dim=-1) for ray, _ in around]).amax(0)
+        assert ((rays - expected).norm(dim=-1) <= 32 * eps + 8 * off)[both].all()
+        assert (rays[~found_valid] == rays.new_tensor([0, 0, 1])).all()
+        # a radial lens leaves nothing open
+        if Cameras.of(type(camera), camera.intrinsics[None], camera.distortion[None]).domain.lens.is_radial:
+            assert not left.any()
+
+
+def close(found, expected, loss):
+    largest = expected.abs().max() + 1e-30
+    assert ((found - expected).abs() <= loss * torch.finfo(found.dtype).eps * largest).all()
+
+
+def of_coefficients(camera, sums):
+    """What cotangents of the parameters of chart and lens are those of the distortion."""
+    k = camera.distortion.detach().clone().requires_grad_()
+    chart, lens = type(camera).optics(columns(k[None]))
+    pairs = zip((*chart.parameters, *lens.parameters), sums, strict=True)
+    pairs = [(p, s.expand_as(p)) for p, s in pairs if p.requires_grad]
+    outputs, cotangents = zip(*pairs, strict=True)
+    return torch.autograd.grad(outputs, k, cotangents, materialize_grads=True)[0]
+
+
+@every_model
+@each_dtype
+def test_derivatives_are_those_of_the_formula(key, dtype):
+    generator = torch.Generator().manual_seed(1)
+    for camera in (one(key).to(dtype), spread(key, dtype)):
+        camera.requires_grad_()
+        leaves = [camera.intrinsics, *([camera.distortion] if camera.distortion.numel() else [])]
+        made = native(camera)
+        # away from the fold, where derivatives are of no size
+        inside = pixel_lattice(camera, 9, 11)
+        q = (inside - inside.mean(0)) * 0.4 + inside.mean(0)
+        q = torch.cat((q, q.new_tensor([[math.nan, 3]]), camera.intrinsics[None, 2:].detach())).requires_grad_()
+        p = torch.cat((camera.unproject(q)[0].detach() * 2, q.new_tensor([[0, 0, 1], [math.nan, 0, 1]])))
+        p.requires_grad_()
+
+        out, _ = camera.project(p)
+        weight = torch.randn(out.shape, generator=generator, dtype=dtype)
+        expected = torch.autograd.grad(out, [p, *leaves], weight)
+        by_points, sums = geometry.project_vjp(made, p.detach()[None], weight.mT[:, None], True, True)
+        found = [by_points[0], sums[0, :4]]
+        found += [of_coefficients(camera, sums[0, 4:])] if camera.distortion.numel() else []
+        for have, want in zip(found, expected, strict=True):
+            close(have, want, 256)
+
+        out, _ = camera.unproject(q)
+        weight = torch.randn(out.shape, generator=generator, dtype=dtype)
+        expected = torch.autograd.grad(out, [q, *leaves], weight)
+        solved = geometry.unproject(made, q.detach()[None], keeps=True)
+        assert solved.open is None
+        by_pixels, sums = geometry.unproject_vjp(made, solved, weight.mT[:, None], True, True)
+        found = [by_pixels[0], sums[0, :4]]
+        found += [of_coefficients(camera, sums[0, 4:])] if camera.distortion.numel() else []
+        for have, want in zip(found, expected, strict=True):
+            close(have, want, 4096)
+
+
+@every_model
+def test_a_row_is_what_it_is_alone(key):
+    base = one(key).float()
+    intrinsics = torch.stack([base.intrinsics * s for s in (1.0, 0.9, 1.1)])
+    batch = type(base)(intrinsics, *([base.distortion.expand(3, -1)] if base.distortion.numel() else []))
+    p = torch.cat((points(torch.float32), fan(100, 300, 80).float()))
+    rows = p.flip(0).expand(3, -1, -1)  # one row for all
+    with patch.object(geometry, "thread_count", lambda: 3):
+        together, valid = geometry.project(native(batch), rows)
+    for i in range(3):
+        alone = type(base)(intrinsics[i], *([base.distortion] if base.distortion.numel() else []))
+        found = geometry.project(native(alone), p[None])
+        assert together[:, i].flip(-1).equal(found[0][:, 0])
+        assert valid[i].flip(-1).equal(found[1][0])
+        few = geometry.project(native(alone), p[None, 5:17:3])
+        assert few[0].equal(found[0][..., 5:17:3])
+
+
+@pytest.mark.parametrize("key", ["kannala_brandt", "fisheye624", "double_sphere"])
+def test_any_strides_and_threads(key):
+    made = native(one(key).float())
+    q = pixels(one(key).float()).repeat(40, 1)
+    expected = geometry.unproject(made, q[None], keeps=True)
+    weight = torch.randn(expected.rays.shape, generator=torch.Generator().manual_seed(0))
+    cotangents = geometry.unproject_vjp(made, expected, weight, True, True)
+    wide = torch.full((len(q), 7), math.nan)
+    wide[:, 1:6:4] = q
+    for rows in (q.mT.contiguous().mT, wide[:, 1:6:4], q.flip(-1).flip(-1)):
+        assert geometry.unproject(made, rows[None]).rays.equal(expected.rays)
+    with patch.object(geometry, "thread_count", lambda: 3):
+        again = geometry.unproject(made, q[None], keeps=True)
+        assert again.rays.equal(expected.rays)
+        found = geometry.unproject_vjp(made, again, weight.movedim(0, -1).contiguous().movedim(-1, 0), True, True)
+    assert all(a.equal(b) for a, b in zip(found, cotangents, strict=True))
+
+
+def test_an_unusable_camera_has_invalid_rows_alone():
+    camera = one("kannala_brandt").float()
+    intrinsics = camera.intrinsics.detach().repeat(3, 1)
+    intrinsics[1, 0] = math.nan
+    distortion = camera.distortion.detach().repeat(3, 1)
+    distortion[2, 1] = math.inf
+    made = geometry.native_of(Cameras.of(type(camera), intrinsics, distortion))
+    p = fan(60, 5, 4).float().expand(3, -1, -1)
+    out, valid = geometry.project(made, p)
+    assert valid.all(-1).tolist() == [True, False, False]
+    assert (out[:, 1:] == -1).all()
+    results, sums = geometry.project_vjp(made, p, torch.full_like(out, math.nan), True, True)
+    assert (results[1:] == 0).all()
+    assert (sums[1:] == 0).all()
+
+
+def test_what_users_make_has_no_code():
+    class Wave(Stage):
+        def __call__(self, a, b):
+            return a + 0.1 * torch.sin(b), b
+
+    class Wide(Equidistant):
+        pass
+
+    assert geometry.codes(Equidistant(), Lens()) is not None
+    assert geometry.codes(Equidistant(), Lens(Wave())) is None
+    assert geometry.codes(Wide(), Lens()) is None
+
+
+def test_no_points():
+    made = native(one("kannala_brandt"))
+    out, valid = geometry.project(made, torch.empty(1, 0, 3, dtype=torch.float64))
+    assert out.shape == (2, 1, 0)
+    assert valid.shape == (1, 0)
+
+
+FUZZ = Path(__file__).parent / "geometry_fuzz.c"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", list(building.VARIANTS))
+def test_no_read_outside_and_nothing_undefined(variant, tmp_path):
+    here = list(building.VARIANTS).index(library().camtorch_variant().decode())
+    if list(building.VARIANTS).index(variant) > here:
+        pytest.skip(f"this CPU does not run {variant}")
+    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+    command = [*building._compiler(None), *building._FLAGS, "-O1", "-g", f"-I{building._HERE}", *sanitizers]
+    (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
+    if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=tmp_path, capture_output=True).returncode:
+        pytest.skip(f"{command[0]} has no sanitizers")
+    sources = ["-DVARIANT=fuzzed", *building.VARIANTS[variant], str(building._HERE / "geometry.c"), str(FUZZ)]
+    subprocess.run([*command, *sources, "-lm", "-o", "fuzz"], cwd=tmp_path, check=True)
+    environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
+    done = subprocess.run([tmp_path / "fuzz", "1", "3000"], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
