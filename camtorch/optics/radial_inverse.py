@@ -100,8 +100,7 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
             middle = low.sqrt() * high.sqrt()
             inside = is_number(middle)
             low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-        fold = torch.where(good, fold, low)
-        return fold
+        return torch.where(good, fold, low)
 
     radii = sampled()
 
