@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -133,6 +133,19 @@ class Plan:
         self.is_chart = isinstance(chart, optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
+        self._ends: dict[torch.dtype, tuple[float, float]] = {}
+
+    def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
+        """The radii at which the chart of some cameras ends, and beyond which there are no images."""
+        if self.is_chart:
+            return FURTHEST, FURTHEST
+        if dtype in self._ends:
+            return self._ends[dtype]
+        made = chart()
+        end, usual_end = made.end(dtype), made.usual_end(dtype)
+        if not (made.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
+            self._ends[dtype] = end, usual_end
+        return end, usual_end
 
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """(C, parameters) of coefficients (C, n)."""
@@ -159,7 +172,7 @@ def _plan(optics_of: Optics, k: Tensor) -> Plan | None:
 class Native:
     """Cameras (C,) of one model as the compiled geometry takes them."""
 
-    _kept: list[Tensor]
+    _kept: list[Any]
 
     def __init__(self, plan: Plan, optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None):
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, []
@@ -181,33 +194,36 @@ class Native:
             self._add_domain()
         self.pointer = addressof(struct)
 
-    @property
-    def _wide(self) -> Tensor:
-        return self._k.double()
+    def _optics(self) -> tuple[Chart, Lens]:
+        """In double precision."""
+        return self._optics_of(columns(self._k.double()))
 
     @functools.cached_property
     def _domain(self) -> _Domain:
         """What it is asked with; its optics are of double precision."""
-        made, plan, k = _Domain(), self.plan, self._wide
+        made, plan, k = _Domain(), self.plan, self._k.double()
         made.parts, made.part_count = addressof(plan.parts), plan.count
         made.is_double, made.cameras, made.is_radial = self.struct.is_double, self.cameras, plan.is_radial
         made.parameters, made.parameter_count = self._keep(plan.parameters_of(self._optics_of, k)), plan.parameters
         made.most = torch.finfo(self.dtype).max ** 0.25
-        chart, lens = self._optics_of(columns(k))
-        ends = (FURTHEST, FURTHEST) if plan.is_chart else (chart.end(self.dtype), chart.usual_end(self.dtype))
-        made.ends, made.usual_ends = map(self._keep_ends, ends)
-        if plan.places is None and (constants := _constants(lens)):
+        made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
+        if plan.places is None or plan.parameters > _MOST_DEGREE:
+            chart, lens = self._optics()
+            constants = _constants(lens)
             made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
-        factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
-        if factor is not None:
-            many = len(factor.parameters) > _MOST_DEGREE
-            fold = factor.closed_fold() if many and factor.fold is None else factor.fold
-            made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
+            factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
+            if factor is not None:
+                many = len(factor.parameters) > _MOST_DEGREE
+                fold = factor.closed_fold() if many and factor.fold is None else factor.fold
+                made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
         return made
 
     def _keep_ends(self, end: float | Tensor) -> int:
-        one = torch.as_tensor(end, dtype=torch.float64, device="cpu")
-        return self._keep(one.expand(self.cameras, 1))
+        if isinstance(end, float):
+            ends = (c_double * self.cameras)(*[end] * self.cameras)
+            self._kept.append(ends)
+            return addressof(ends)
+        return self._keep(end.expand(self.cameras, 1).double())
 
     def _ask(self, wanted: dict[str, int]) -> None:
         """Fill in what of the domain is wanted: names and where it goes."""
@@ -242,9 +258,7 @@ class Native:
             struct.circle2, struct.stagewise = self._new(1), self._new(1, torch.bool)
             wanted |= {"circle2": struct.circle2, "stagewise": struct.stagewise}
         if not plan.is_radial:
-            chart, _ = self._optics_of(columns(self._wide))
-            radii = chart.radii(_RADII, self._k).to(torch.float64)
-            wanted["radii"] = self._keep(radii)
+            wanted["radii"] = self._keep(self._optics()[0].radii(_RADII, self._k).double())
         self._ask(wanted)
 
     def add_table(self) -> None:
@@ -262,11 +276,12 @@ class Native:
         return Domain(self._optics_of, self._k)
 
     def _keep(self, tensor: Tensor) -> int:
-        self._kept.append(tensor.detach().contiguous())
-        return self._kept[-1].data_ptr()
+        tensor = tensor.contiguous()
+        self._kept.append(tensor)
+        return tensor.data_ptr()
 
     def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int | None:
-        return self._keep(torch.cat([c.detach().expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
+        return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
 
 
 def native_of(optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None) -> Native | None:
