@@ -209,8 +209,8 @@ class Native:
         made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
         if plan.places is None or plan.parameters > _MOST_DEGREE:
             chart, lens = self._optics()
-            constants = _constants(lens)
-            made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
+            if constants := _constants(lens):
+                made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
             factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
             if factor is not None:
                 many = len(factor.parameters) > _MOST_DEGREE
@@ -280,7 +280,7 @@ class Native:
         self._kept.append(tensor)
         return tensor.data_ptr()
 
-    def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int | None:
+    def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
 
 
