@@ -11,6 +11,14 @@ typedef struct {
     R omega, slope, slope_by_omega, tan2, tan2_by_omega; /* of the fov chart */
 } T(Chart);
 
+/* A radial factor, and for which of the loops over factors its numbers are padded with zeros */
+typedef struct {
+    const Part *part;
+    const R *numbers, *constants;
+    int form;
+    R padded[PADDED];
+} T(Factor);
+
 /* A planar stage without its factor */
 typedef struct {
     R px, py, s0, s1, s2, s3;
@@ -22,8 +30,7 @@ typedef struct {
     int stages, way, swapped, is_radial, by_stages, usable;
     int follows; /* whether the lens is to be followed along each azimuth */
     const R *numbers[MOST_PARTS], *constants;
-    int forms[MOST_PARTS];         /* of radial factors; */
-    R padded[MOST_PARTS][PADDED];  /* their numbers, with zeros behind */
+    T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
     const R *limits2, *table;
@@ -33,8 +40,8 @@ typedef struct {
 } T(Camera);
 
 /* The factor of a part and, if it is wanted, its derivative by t, of optics/radial.py; see geometry_lens.h */
-static void T(radial)(const T(Camera) *, int, int, const R *restrict, R *restrict, R *restrict);
-static void T(radial_sums)(const T(Camera) *, int, int, const R *restrict, const R *restrict, double *);
+static void T(radial)(const T(Factor) *, int, const R *restrict, R *restrict, R *restrict);
+static void T(radial_sums)(const T(Factor) *, int, const R *restrict, const R *restrict, double *);
 
 /* What does not hang on the point, in double precision */
 static void T(prepare_chart)(T(Camera) *c) {
@@ -236,7 +243,7 @@ static void T(to_plane_sums)(const T(Camera) *c, int n, const R *restrict x, con
             t[i] = (x[i] * x[i] + y[i] * y[i]) * s[i] * s[i];
             w[i] = -(ga[i] * x[i] + gb[i] * y[i]) * s[i] * by_angle[i];
         }
-        T(radial_sums)(c, 0, n, t, w, sums);
+        T(radial_sums)(c->factors, n, t, w, sums);
         break;
     }
 }

@@ -29,16 +29,17 @@ INLINE R T(factor)(const R *k, const int kind, const int n, const int m, R t, R 
     return value;
 }
 
-/* The form of a part's factor; its numbers, padded with zeros, where loops are made for so many */
-static void T(prepare_factor)(T(Camera) *c, int j) {
+static T(Factor) T(prepare_factor)(const Part *part, const R *numbers, const R *constants) {
     static const int forms[] = {ANY, FEW, RATIO, ROOTS, ANGLES, ALL, ANY};
-    const Part *part = c->parts + j;
+    T(Factor) made = {part, numbers, constants, ANY, {0}};
     const int many = part->factor == RATIONAL ? PADDED / 2 : PADDED;
-    c->forms[j] = part->n <= many && part->m <= many ? forms[part->factor] : ANY;
-    if (c->forms[j] == FEW && part->n > PADDED / 2) c->forms[j] = SOME;
-    if (c->forms[j] == ANY) return;
-    memcpy(c->padded[j], c->numbers[j], (size_t)part->n * sizeof(R));
-    if (part->m) memcpy(c->padded[j] + PADDED / 2, c->numbers[j] + part->n, (size_t)part->m * sizeof(R));
+    if (part->n <= many && part->m <= many) made.form = forms[part->factor];
+    if (made.form == FEW && part->n > PADDED / 2) made.form = SOME;
+    if (made.form != ANY) {
+        memcpy(made.padded, numbers, (size_t)part->n * sizeof(R));
+        if (part->m) memcpy(made.padded + PADDED / 2, numbers + part->n, (size_t)part->m * sizeof(R));
+    }
+    return made;
 }
 
 /* Of a table: the radius, 1 or -1 behind the end, the piece, and how far from its node the place is */
@@ -95,21 +96,21 @@ INLINE void T(radial_by)(const R *numbers, const int kind, const int count, cons
     EACH(i) factor[i] = T(factor)(k, kind, count, below, t[i], slope ? slope + i : NULL);
 }
 
-static void T(radial)(const T(Camera) *c, int j, int n, const R *restrict t, R *restrict factor, R *restrict slope) {
-    const Part *part = c->parts + j;
-    const R *k = c->numbers[j];
+static void T(radial)(const T(Factor) *of, int n, const R *restrict t, R *restrict factor, R *restrict slope) {
+    const Part *part = of->part;
+    const R *k = of->numbers;
     if (part->factor == NO_FACTOR) {
         EACH(i) factor[i] = 1;
         if (slope) EACH(i) slope[i] = 0;
     } else if (part->factor == RADIUS_TABLE) {
-        if (slope) T(table_factor)(part, k, c->constants, n, t, factor, slope);
-        else T(table_factor)(part, k, c->constants, n, t, factor, NULL);
-    } else if (c->forms[j] == ANY) { /* one by one */
+        if (slope) T(table_factor)(part, k, of->constants, n, t, factor, slope);
+        else T(table_factor)(part, k, of->constants, n, t, factor, NULL);
+    } else if (of->form == ANY) { /* one by one */
         EACH(i) factor[i] = T(factor)(k, part->factor, part->n, part->m, t[i], slope ? slope + i : NULL);
     } else if (slope) {
-        EACH_FORM(c->forms[j], T(radial_by)(c->padded[j], kind, count, below, n, t, factor, slope))
+        EACH_FORM(of->form, T(radial_by)(of->padded, kind, count, below, n, t, factor, slope))
     } else {
-        EACH_FORM(c->forms[j], T(radial_by)(c->padded[j], kind, count, below, n, t, factor, NULL))
+        EACH_FORM(of->form, T(radial_by)(of->padded, kind, count, below, n, t, factor, NULL))
     }
 }
 
@@ -122,9 +123,9 @@ static void T(powers)(int count, int n, const R *restrict t, R *restrict weight,
 }
 
 /* Adds the sums over the points of dR/dk weight, for each number k */
-static void T(radial_sums)(const T(Camera) *c, int j, int n, const R *restrict t, const R *restrict weight, double *sums) {
-    const Part *part = c->parts + j;
-    const R *k = c->numbers[j];
+static void T(radial_sums)(const T(Factor) *of, int n, const R *restrict t, const R *restrict weight, double *sums) {
+    const Part *part = of->part;
+    const R *k = of->numbers;
     ALIGNED R w[BLOCK], other[BLOCK], more[BLOCK];
     EACH(i) w[i] = weight[i], other[i] = part->factor == POLYNOMIAL ? 0 : T(root)(t[i] + FLOOR);
     switch (part->factor) {
@@ -153,7 +154,7 @@ static void T(radial_sums)(const T(Camera) *c, int j, int n, const R *restrict t
     case RADIUS_TABLE: {
         ALIGNED R side[BLOCK];
         ALIGNED I piece[BLOCK];
-        T(pieces)(part, c->constants, n, t, other, side, piece, more);
+        T(pieces)(part, of->constants, n, t, other, side, piece, more);
         EACH(i) w[i] /= other[i];
         for (int q = 0; q < 4; q++) {
             for (int i = 0; i < n; i++) sums[q * part->n + piece[i]] += w[i];
@@ -189,7 +190,7 @@ static void T(planar)(const T(Camera) *c, int j, int n, const R *restrict a, con
     ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
     const T(Plane) k = c->planes[j];
     EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-    T(radial)(c, j, n, t, factor, to ? slope : NULL);
+    T(radial)(c->factors + j, n, t, factor, to ? slope : NULL);
     EACH(i) T(planar_at)(k, a[i], b[i], factor[i], u + i, v + i);
     if (to)
         EACH(i) T(planar_slopes)(k, a[i], b[i], factor[i], slope[i], to->ua + i, to->ub + i, to->va + i, to->vb + i);
@@ -201,7 +202,7 @@ static void T(planar_vjp)(const T(Camera) *c, int j, int n, const R *restrict a,
     const Part *part = c->parts + j;
     const T(Plane) k = c->planes[j];
     EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-    T(radial)(c, j, n, t, factor, slope);
+    T(radial)(c->factors + j, n, t, factor, slope);
     EACH(i) {
         const R scale = factor[i] + 2 * (k.px * a[i] + k.py * b[i]), w = gu[i] * a[i] + gv[i] * b[i];
         const R out = 2 * (w * slope[i] + gu[i] * (k.px + k.s0 + 2 * k.s1 * t[i]) + gv[i] * (k.py + k.s2 + 2 * k.s3 * t[i]));
@@ -209,7 +210,7 @@ static void T(planar_vjp)(const T(Camera) *c, int j, int n, const R *restrict a,
         gu[i] = gu[i] * scale + 2 * w * k.px + a[i] * out, gv[i] = gv[i] * scale + 2 * w * k.py + b[i] * out;
     }
     if (!sums) return;
-    if (part->factor != NO_FACTOR) T(radial_sums)(c, j, n, t, along, sums);
+    if (part->factor != NO_FACTOR) T(radial_sums)(c->factors + j, n, t, along, sums);
     sums += part->factor == RADIUS_TABLE ? 4 * part->n : part->n + part->m;
     if (part->flags & TANGENTIAL) {
         *sums++ += T(total)(n, even_u) + 2 * T(dot)(n, along, a);
@@ -267,12 +268,16 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     } else T(planar)(c, stage, n, a, b, u, v, to);
 }
 
-/* Where the stages from `first` on send points; the Jacobian of all of them; if wanted, `least`: positive where each is
+/* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive where each is
    defined, regular and not turned over */
 static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to,
                     R *least) {
     ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
     T(Jacobian) here;
+    if (first == c->stages && !least) {
+        T(stage)(c, first, n, a, b, u, v, to);
+        return;
+    }
     EACH(i) x[i] = a[i], y[i] = b[i];
     for (int j = first; j <= c->stages; j++) {
         T(Jacobian) *made = !to ? NULL : j == first ? to : &here;
@@ -361,17 +366,17 @@ INLINE void T(solve_by)(const R *numbers, const int kind, const int count, const
 }
 
 /* The factor by which the inverse of a part's factor scales, from the table; `ok` where that is found by a few steps */
-static void T(solve)(const T(Camera) *c, int j, const R *table, int n, const R *restrict r2, R *restrict scale,
+static void T(solve)(const T(Factor) *of, const R *table, int n, const R *restrict r2, R *restrict scale,
                      I *restrict ok) {
     T(tabulated)(table, n, r2, scale);
-    if (c->forms[j] != ANY) {
-        EACH_FORM(c->forms[j], T(solve_by)(c->padded[j], kind, count, below, n, r2, scale, ok))
+    if (of->form != ANY) {
+        EACH_FORM(of->form, T(solve_by)(of->padded, kind, count, below, n, r2, scale, ok))
         return;
     }
     ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
     for (int step = 0; step < INVERSE_STEPS; step++) {
         EACH(i) t[i] = r2[i] * scale[i] * scale[i];
-        T(radial)(c, j, n, t, factor, slope);
+        T(radial)(of, n, t, factor, slope);
         EACH(i) {
             I found;
             scale[i] = T(nearer)(scale[i], t[i], factor[i], slope[i], &found), ok[i] = found;
@@ -380,7 +385,7 @@ static void T(solve)(const T(Camera) *c, int j, const R *table, int n, const R *
 }
 
 /* The same of few points in a bracket up to the fold: Newton's steps, and every other one halves the bracket */
-static void T(bracketed)(const T(Camera) *c, int j, R inner2, int n, const R *restrict r2, R *restrict scale) {
+static void T(bracketed)(const T(Factor) *of, R inner2, int n, const R *restrict r2, R *restrict scale) {
     const R end = T(root)(inner2);
     ALIGNED R rho[BLOCK], low[BLOCK], high[BLOCK], wanted[BLOCK], width[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK];
     ALIGNED I moves[BLOCK];
@@ -391,7 +396,7 @@ static void T(bracketed)(const T(Camera) *c, int j, R inner2, int n, const R *re
     for (int count = 0; count < (IS_DOUBLE ? 208 : 92); count++) {
         I any = 0;
         EACH(i) t[i] = rho[i] * rho[i];
-        T(radial)(c, j, n, t, factor, slope);
+        T(radial)(of, n, t, factor, slope);
         EACH(i) {
             const R error = wanted[i] - rho[i] * factor[i], ascent = factor[i] + 2 * t[i] * slope[i];
             low[i] = error > 0 ? rho[i] : low[i], high[i] = error > 0 ? high[i] : rho[i];
@@ -407,13 +412,16 @@ static void T(bracketed)(const T(Camera) *c, int j, R inner2, int n, const R *re
         if (!any) break;
     }
     EACH(i) t[i] = rho[i] * rho[i];
-    T(radial)(c, j, n, t, factor, NULL);
+    T(radial)(of, n, t, factor, NULL);
     EACH(i) scale[i] = 1 / factor[i];
 }
 
 /* How many of a block are 0, their places filled up to whole vectors with the last one */
-static int T(chosen)(int n, const I *open, int *places) {
+static int T(chosen)(int n, const I *restrict open, int *restrict places) {
     int count = 0;
+    I all = 1;
+    EACH(i) all &= open[i] != 0;
+    if (all) return 0;
     for (int i = 0; i < n; i++)
         if (!open[i]) places[count++] = i;
     for (int i = count; count && i % LANES; i++) places[i] = places[count - 1];
@@ -424,12 +432,12 @@ static int T(chosen)(int n, const I *open, int *places) {
 static void T(chart_inverse)(const T(Camera) *c, int n, R *restrict theta2, R *restrict found) {
     ALIGNED I ok[BLOCK];
     int places[BLOCK], count;
-    T(solve)(c, 0, c->chart_table, n, theta2, found, ok);
+    T(solve)(c->factors, c->chart_table, n, theta2, found, ok);
     if ((count = T(chosen)(n, ok, places))) {
         ALIGNED R some[BLOCK], made[BLOCK];
         const int filled = (count + LANES - 1) & -LANES;
         for (int i = 0; i < filled; i++) some[i] = theta2[places[i]];
-        T(bracketed)(c, 0, c->chart_inner2, filled, some, made);
+        T(bracketed)(c->factors, c->chart_inner2, filled, some, made);
         for (int i = 0; i < count; i++) found[places[i]] = made[i];
     }
 }

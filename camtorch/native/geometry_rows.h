@@ -4,7 +4,7 @@ static void T(prepare_stage)(T(Camera) *c, int j) {
     const Part *part = c->parts + j;
     const R *k = c->numbers[j] + (part->factor == RADIUS_TABLE ? 4 * part->n : part->n + part->m);
     T(Plane) *plane = c->planes + j;
-    T(prepare_factor)(c, j);
+    c->factors[j] = T(prepare_factor)(part, c->numbers[j], c->constants);
     if (part->kind != PLANAR) return;
     if (part->flags & TANGENTIAL) plane->px = k[0], plane->py = k[1], k += 2;
     if (part->flags & PRISM) plane->s0 = k[0], plane->s1 = k[1], plane->s2 = k[2], plane->s3 = k[3];
@@ -43,41 +43,58 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
 
 /* -- memory */
 
-static void T(load)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
-    if (stride == 1) for (int i = 0; i < count; i++) to[i] = from[i];
+/* A component of a row, with `filling` behind it */
+static void T(copy)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
+    if (stride == 1) memcpy(to, from, (size_t)count * sizeof(R));
     else for (int i = 0; i < count; i++) to[i] = from[stride * i];
     for (int i = count; i < n; i++) to[i] = filling;
 }
 
-static void T(store)(R *to, int64_t stride, int count, const R *restrict from) {
-    if (stride == 1) for (int i = 0; i < count; i++) to[i] = from[i];
-    else if (stride == 2) for (int i = 0; i < count; i++) to[2 * i] = from[i];
-    else if (stride == 3) for (int i = 0; i < count; i++) to[3 * i] = from[i];
-    else for (int i = 0; i < count; i++) to[stride * i] = from[i];
+/* The same: where it lies, if vectors can be read there, else in `to` */
+static const R *T(load)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
+    if (stride == 1 && count == n) return from;
+    T(copy)(from, stride, count, n, to, filling);
+    return to;
 }
+
+/* Components to results, at once where they are interleaved: from the same vectors */
+static void T(store)(R *restrict to, const int64_t *strides, int components, int count, const R *restrict x,
+                     const R *restrict y, const R *restrict z) {
+    const int64_t point = strides[1], next = strides[2];
+    if (components == 3 && point == 3 && next == 1)
+        for (int i = 0; i < count; i++) to[3 * i] = x[i], to[3 * i + 1] = y[i], to[3 * i + 2] = z[i];
+    else if (components == 2 && point == 2 && next == 1)
+        for (int i = 0; i < count; i++) to[2 * i] = x[i], to[2 * i + 1] = y[i];
+    else for (int j = 0; j < components; j++) {
+        const R *from = j == 0 ? x : j == 1 ? y : z;
+        if (point == 1) memcpy(to + j * next, from, (size_t)count * sizeof(R));
+        else for (int i = 0; i < count; i++) to[point * i + j * next] = from[i];
+    }
+}
+
+/* Where results go: at once where they belong, if vectors can be written there, else to a buffer that is stored then */
+static int T(is_plane)(const int64_t *strides, int count, int n) { return strides[1] == 1 && count == n; }
 
 /* The points of a row; those that fill up a block lie on the axis */
 static void T(load_points)(const R *from, const int64_t *strides, int count, int n, R *restrict x, R *restrict y,
                            R *restrict z) {
-    if (strides[1] == 3 && strides[2] == 1) { /* at once, from the same vectors */
-        for (int i = 0; i < count; i++) x[i] = from[3 * i], y[i] = from[3 * i + 1], z[i] = from[3 * i + 2];
-        for (int i = count; i < n; i++) x[i] = y[i] = 0, z[i] = 1;
+    if (strides[1] == 3 && strides[2] == 1 && count == n) { /* at once, from the same vectors */
+        EACH(i) x[i] = from[3 * i], y[i] = from[3 * i + 1], z[i] = from[3 * i + 2];
         return;
     }
-    T(load)(from, strides[1], count, n, x, 0);
-    T(load)(from + strides[2], strides[1], count, n, y, 0);
-    T(load)(from + 2 * strides[2], strides[1], count, n, z, 1);
+    T(copy)(from, strides[1], count, n, x, 0);
+    T(copy)(from + strides[2], strides[1], count, n, y, 0);
+    T(copy)(from + 2 * strides[2], strides[1], count, n, z, 1);
 }
 
 static void T(load_pixels)(const R *from, const int64_t *strides, int count, int n, R *restrict u, R *restrict v, R cx,
                            R cy) {
-    if (strides[1] == 2 && strides[2] == 1) {
-        for (int i = 0; i < count; i++) u[i] = from[2 * i], v[i] = from[2 * i + 1];
-        for (int i = count; i < n; i++) u[i] = cx, v[i] = cy;
+    if (strides[1] == 2 && strides[2] == 1 && count == n) {
+        EACH(i) u[i] = from[2 * i], v[i] = from[2 * i + 1];
         return;
     }
-    T(load)(from, strides[1], count, n, u, cx);
-    T(load)(from + strides[2], strides[1], count, n, v, cy);
+    T(copy)(from, strides[1], count, n, u, cx);
+    T(copy)(from + strides[2], strides[1], count, n, v, cy);
 }
 
 /* -- rays to pixels */
@@ -192,21 +209,27 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     uint8_t *valid = rows->valid + camera * rows->count + first;
     T(Seen) s;
     ALIGNED R p[BLOCK], q[BLOCK];
-    const int direct = to[1] == 1 && count == n; /* into the result's memory */
+    const int direct = T(is_plane)(to, count, n);
     R *restrict u = direct ? pixels : p, *restrict v = direct ? pixels + to[2] : q;
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
     const int waiting = T(see)(c, 0, count, n, &s);
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
     if (c->is_radial) { /* most often */
         EACH(i) s.x[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
-        T(radial)(c, 1, n, s.x, s.scale, NULL);
-        EACH(i) s.a[i] *= s.scale[i], s.b[i] *= s.scale[i];
-    } else if (c->stages) T(lens)(c, 1, n, s.a, s.b, s.a, s.b, NULL, NULL);
-    EACH(i) {
-        u[i] = s.ok[i] ? fx * s.a[i] + cx : -1;
-        v[i] = s.ok[i] ? fy * s.b[i] + cy : -1;
+        T(radial)(c->factors + 1, n, s.x, s.scale, NULL);
+        EACH(i) {
+            const R x = fx * (s.a[i] * s.scale[i]) + cx, y = fy * (s.b[i] * s.scale[i]) + cy;
+            u[i] = s.ok[i] ? x : -1, v[i] = s.ok[i] ? y : -1;
+        }
+    } else {
+        const R *restrict a = c->stages ? s.x : s.a, *restrict b = c->stages ? s.y : s.b;
+        if (c->stages) T(lens)(c, 1, n, s.a, s.b, s.x, s.y, NULL, NULL);
+        EACH(i) {
+            const R x = fx * a[i] + cx, y = fy * b[i] + cy;
+            u[i] = s.ok[i] ? x : -1, v[i] = s.ok[i] ? y : -1;
+        }
     }
-    if (!direct) T(store)(pixels, to[1], count, u), T(store)(pixels + to[2], to[1], count, v);
+    if (!direct) T(store)(pixels, to, 2, count, u, v, NULL);
     for (int i = 0; i < count; i++) valid[i] = (uint8_t)s.ok[i];
     return waiting;
 }
@@ -241,9 +264,8 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
     T(see)(c, 1, count, n, &s);
-    T(load)(cotangents, by[1], count, n, gu, 0);
-    T(load)(cotangents + by[2], by[1], count, n, gv, 0);
-    EACH(i) gu[i] = s.ok[i] ? gu[i] : 0, gv[i] = s.ok[i] ? gv[i] : 0;
+    const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0), *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
+    EACH(i) gu[i] = s.ok[i] ? to_u[i] : 0, gv[i] = s.ok[i] ? to_v[i] : 0;
     if (sums) {
         const R *restrict u = s.a, *restrict v = s.b;
         if (c->stages) T(lens)(c, 1, n, s.a, s.b, gx, gy, NULL, NULL), u = gx, v = gy;
@@ -255,7 +277,7 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     T(lens_vjp)(c, n, s.a, s.b, gu, gv, sums);
     if (c->way == INVERTED) {
         EACH(i) gx[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
-        T(radial)(c, 0, n, gx, gy, gz);
+        T(radial)(c->factors, n, gx, gy, gz);
         EACH(i) by_angle[i] = 1 / (gy[i] + 2 * gx[i] * gz[i]);
     }
     if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums);
@@ -263,10 +285,7 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     const int swapped = c->swapped;
     T(unsee)(c, n, swapped ? s.y : s.x, swapped ? s.x : s.y, s.z, s.shrink, s.scale, by_angle, swapped ? gv : gu,
              swapped ? gu : gv, swapped ? gy : gx, swapped ? gx : gy, gz);
-    R *results = (R *)rows->results + camera * to[0] + first * to[1];
-    T(store)(results, to[1], count, gx);
-    T(store)(results + to[2], to[1], count, gy);
-    T(store)(results + 2 * to[2], to[1], count, gz);
+    T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 3, count, gx, gy, gz);
 }
 
 /* -- pixels to rays */
@@ -276,7 +295,7 @@ static void T(angles)(const T(Camera) *c, int n, const R *restrict a, const R *r
                       R *restrict factor, R *restrict slope) {
     ALIGNED R t[BLOCK];
     EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-    T(radial)(c, 0, n, t, factor, slope);
+    T(radial)(c->factors, n, t, factor, slope);
     EACH(i) p[i] = a[i] * factor[i], q[i] = b[i] * factor[i];
 }
 
@@ -333,7 +352,7 @@ static void T(rays_vjp)(const T(Camera) *c, int n, const R *a, const R *b, const
         ga[i] = gp[i] * factor[i] + a[i] * 2 * slope[i] * along, gb[i] = gq[i] * factor[i] + b[i] * 2 * slope[i] * along;
         gp[i] = along;
     }
-    if (sums) T(radial_sums)(c, 0, n, t, gp, sums);
+    if (sums) T(radial_sums)(c->factors, n, t, gp, sums);
 }
 
 INLINE void T(cover_by)(const T(Camera) *c, const int way, int n, R *restrict a, R *restrict b, const I *restrict known,
@@ -417,7 +436,7 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
         ALIGNED R t[BLOCK];
         const T(Plane) k = c->planes[first];
         EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-        T(radial)(c, first, n, t, x, y);
+        T(radial)(c->factors + first, n, t, x, y);
         EACH(i) {
             R p, q, ua, ub, va, vb;
             T(planar_at)(k, a[i], b[i], x[i], &p, &q);
@@ -460,7 +479,7 @@ static void T(invert_radial)(const T(Camera) *c, int n, const R *restrict p, con
         /* what is beyond the fold would never settle */
         r2[i] = possible[i] ? square < most2 ? square : most2 : 0;
     }
-    T(solve)(c, 1, c->table, n, r2, scale, ok);
+    T(solve)(c->factors + 1, c->table, n, r2, scale, ok);
     /* a ray's rounding must not carry it across the fold */
     const R inside2 = c->inner2 * (1 - 32 * EPS);
     EACH(i) {
@@ -530,7 +549,7 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
         }
     }
     EACH(i) r2[i] = p[i] * p[i] + q[i] * q[i];
-    T(bracketed)(c, 1, fold2, n, r2, scale);
+    T(bracketed)(c->factors + 1, fold2, n, r2, scale);
     EACH(i) a[i] = p[i] * scale[i], b[i] = q[i] * scale[i], ok[i] &= a[i] * a[i] + b[i] * b[i] < inner2;
     T(lens)(c, 1, n, a, b, x, y, &to, NULL);
     EACH(i) {
@@ -595,14 +614,10 @@ static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, in
             u[i] = ok[i] ? a[i] : 0, v[i] = ok[i] ? b[i] : 0;
         }
     } else T(cover)(c, n, u, v, known, ok);
-    const int direct = to[1] == 1 && count == n; /* into the result's memory */
+    const int direct = T(is_plane)(to, count, n);
     R *p = direct ? rays : x, *q = direct ? rays + to[2] : y, *r = direct ? rays + 2 * to[2] : z;
     T(rays)(c, n, u, v, ok, p, q, r);
-    if (!direct) {
-        T(store)(rays, to[1], count, p);
-        T(store)(rays + to[2], to[1], count, q);
-        T(store)(rays + 2 * to[2], to[1], count, r);
-    }
+    if (!direct) T(store)(rays, to, 3, count, p, q, r);
     if (follows)
         for (int i = 0; i < count; i++) {
             const int open = !ok[i] & (known[i] != 0);
@@ -610,9 +625,8 @@ static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, in
         }
     else for (int i = 0; i < count; i++) valid[i] = (uint8_t)ok[i];
     if (rows->solution) {
-        R *solution = (R *)rows->solution + camera * rows->count + first;
-        T(store)(solution, 1, count, u);
-        T(store)(solution + rows->cameras->cameras * rows->count, 1, count, v);
+        const int64_t planes[3] = {0, 1, rows->cameras->cameras * rows->count};
+        T(store)((R *)rows->solution + camera * rows->count + first, planes, 2, count, u, v, NULL);
     }
     return left;
 }
@@ -625,21 +639,20 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     const R *cotangents = (const R *)rows->cotangents + camera * by[0] + first * by[1];
     const R *solution = (const R *)rows->solution + camera * rows->count + first;
     const uint8_t *valid = rows->valid + camera * rows->count + first;
-    ALIGNED R a[BLOCK], b[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], ga[BLOCK], gb[BLOCK], u[BLOCK], v[BLOCK];
-    T(load)(solution, 1, count, n, a, 0);
-    T(load)(solution + rows->cameras->cameras * rows->count, 1, count, n, b, 0);
-    T(load)(cotangents, by[1], count, n, gx, 0);
-    T(load)(cotangents + by[2], by[1], count, n, gy, 0);
-    T(load)(cotangents + 2 * by[2], by[1], count, n, gz, 0);
+    ALIGNED R p[BLOCK], q[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], ga[BLOCK], gb[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
+    const R *a = T(load)(solution, 1, count, n, p, 0), *u = a;
+    const R *b = T(load)(solution + rows->cameras->cameras * rows->count, 1, count, n, q, 0), *v = b;
+    const R *to_x = T(load)(cotangents, by[1], count, n, x, 0), *to_y = T(load)(cotangents + by[2], by[1], count, n, y, 0);
+    const R *to_z = T(load)(cotangents + 2 * by[2], by[1], count, n, z, 0);
     for (int i = 0; i < count; i++) {
         const int is_known = valid[i] == VALID;
-        gx[i] = is_known ? gx[i] : 0, gy[i] = is_known ? gy[i] : 0, gz[i] = is_known ? gz[i] : 0;
+        gx[i] = is_known ? to_x[i] : 0, gy[i] = is_known ? to_y[i] : 0, gz[i] = is_known ? to_z[i] : 0;
     }
+    for (int i = count; i < n; i++) gx[i] = gy[i] = gz[i] = 0;
     T(rays_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 : NULL);
-    EACH(i) u[i] = a[i], v[i] = b[i];
     if (c->stages) {
         T(Jacobian) jacobian;
-        T(lens)(c, 1, n, a, b, u, v, &jacobian, NULL);
+        T(lens)(c, 1, n, a, b, x, y, &jacobian, NULL), u = x, v = y;
         EACH(i) {
             R da, db;
             T(step)(jacobian.ua[i], jacobian.va[i], jacobian.ub[i], jacobian.vb[i], ga[i], gb[i], &da, &db);
@@ -654,10 +667,7 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
         sums[0] -= T(dot)(n, ga, u), sums[1] -= T(dot)(n, gb, v);
         sums[2] -= T(total)(n, ga), sums[3] -= T(total)(n, gb);
     }
-    if (!rows->results) return;
-    R *results = (R *)rows->results + camera * to[0] + first * to[1];
-    T(store)(results, to[1], count, ga);
-    T(store)(results + to[2], to[1], count, gb);
+    if (rows->results) T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 2, count, ga, gb, NULL);
 }
 
 static int64_t T(rows)(Rows *rows) {
