@@ -73,11 +73,12 @@ static int numbers_of(const Part *part) {
 }
 
 /* The tile that whoever is free takes */
-static int64_t taken(Rows *rows) {
+static int64_t taken(const Rows *rows, int64_t *own) {
+    if (!rows->next) return (*own)++;
 #if defined(_MSC_VER)
-    return _InterlockedExchangeAdd64(&rows->next, 1);
+    return _InterlockedExchangeAdd64(rows->next, 1);
 #else
-    return __atomic_fetch_add(&rows->next, 1, __ATOMIC_RELAXED);
+    return __atomic_fetch_add(rows->next, 1, __ATOMIC_RELAXED);
 #endif
 }
 
@@ -110,6 +111,6 @@ static int64_t taken(Rows *rows) {
 #include "geometry_rows.h"
 
 /* Makes tiles until none is left that nobody has taken; how many points wait for `limits2` */
-int64_t THIS(geometry)(Rows *rows) {
+int64_t THIS(geometry)(const Rows *rows) {
     return rows->cameras->is_double ? rows_double(rows) : rows_float(rows);
 }

@@ -670,11 +670,11 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     if (rows->results) T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 2, count, ga, gb, NULL);
 }
 
-static int64_t T(rows)(Rows *rows) {
+static int64_t T(rows)(const Rows *rows) {
     const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
-    int64_t left = 0, last = -1, at;
+    int64_t left = 0, last = -1, own = 0, at;
     T(Camera) camera;
-    while ((at = taken(rows)) < tiles * rows->cameras->cameras) {
+    while ((at = taken(rows, &own)) < tiles * rows->cameras->cameras) {
         const int64_t index = at / tiles, first = at % tiles * rows->tile;
         const int64_t end = first + rows->tile < rows->count ? first + rows->tile : rows->count;
         double *sums = rows->sums ? rows->sums + at * width : NULL;
