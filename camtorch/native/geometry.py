@@ -232,7 +232,7 @@ class Unprojected(NamedTuple):
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
     cameras, count, _ = points.shape
-    pixels = _empty(2, cameras, count, native.dtype)
+    pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     rows = points.data_ptr(), *points.stride(), *_planes(pixels, cameras, count), valid.data_ptr(), 0, *_NO_ROWS, 0
     if _call(native, cameras, count, PROJECT, rows) and native.struct.limits2 is None:
@@ -244,9 +244,9 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
 def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
     """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
     cameras, count, _ = pixels.shape
-    rays = _empty(3, cameras, count, native.dtype)
+    rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-    solution = torch.empty(2, cameras, count, dtype=native.dtype, device="cpu") if keeps else None
+    solution = _empty((2, cameras, count), native.dtype) if keeps else None
     rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
     kept = 0 if solution is None else solution.data_ptr()
     if not _call(native, cameras, count, UNPROJECT, (*rows, kept, *_NO_ROWS, 0)):
@@ -264,7 +264,7 @@ def project_vjp(
     cotangents: of pixels, (2, C, N), of any strides.
     """
     cameras, count, _ = points.shape
-    results = torch.empty(cameras, count, 3, dtype=native.dtype, device="cpu") if want_points else None
+    results = _empty((cameras, count, 3), native.dtype) if want_points else None
     sums = _sums(native, cameras, count) if want_parameters else None
     rows = points.data_ptr(), *points.stride(), *_points(results), 0, 0
     _call(native, cameras, count, PROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
@@ -279,18 +279,18 @@ def unproject_vjp(
     valid, solution: of `unproject`.
     """
     cameras, count = valid.shape
-    results = torch.empty(cameras, count, 2, dtype=native.dtype, device="cpu") if want_pixels else None
+    results = _empty((cameras, count, 2), native.dtype) if want_pixels else None
     sums = _sums(native, cameras, count) if want_parameters else None
     rows = *_NO_ROWS, *_points(results), valid.data_ptr(), solution.data_ptr()
     _call(native, cameras, count, UNPROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
-def _empty(size: int, cameras: int, count: int, dtype: torch.dtype) -> Tensor:
+def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     # of large results the first write to each page would take longer than the geometry
-    if size * cameras * count * dtype.itemsize >= memory.LEAST:
-        return memory.empty((size, cameras, count), dtype, torch.contiguous_format)
-    return torch.empty(size, cameras, count, dtype=dtype, device="cpu")
+    if size[0] * size[1] * size[2] * dtype.itemsize >= memory.LEAST:
+        return memory.empty(size, dtype, torch.contiguous_format)
+    return torch.empty(size, dtype=dtype, device="cpu")
 
 
 def _sums(native: Native, cameras: int, count: int) -> Tensor:

@@ -365,23 +365,42 @@ INLINE void T(solve_by)(const R *numbers, const int kind, const int count, const
     }
 }
 
-/* The factor by which the inverse of a part's factor scales, from the table; `ok` where that is found by a few steps */
+/* How many of a block are 0, their places filled up to whole vectors with the last one */
+static int T(chosen)(int n, const I *restrict open, int *restrict places) {
+    int count = 0;
+    I all = 1;
+    EACH(i) all &= open[i] != 0;
+    if (all) return 0;
+    for (int i = 0; i < n; i++) places[count] = i, count += !open[i]; /* no branch, that nobody could foretell */
+    for (int i = count; count && i % LANES; i++) places[i] = places[count - 1];
+    return count;
+}
+
+/* The factor by which the inverse of a factor scales points, from the table; `ok` where that is found by a few steps */
 static void T(solve)(const T(Factor) *of, const R *table, int n, const R *restrict r2, R *restrict scale,
                      I *restrict ok) {
+    int places[BLOCK], some;
     T(tabulated)(table, n, r2, scale);
-    if (of->form != ANY) {
-        EACH_FORM(of->form, T(solve_by)(of->padded, kind, count, below, n, r2, scale, ok))
-        return;
-    }
-    ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
-    for (int step = 0; step < INVERSE_STEPS; step++) {
-        EACH(i) t[i] = r2[i] * scale[i] * scale[i];
+    EACH(i) ok[i] = 0;
+    EACH_FORM(of->form, T(solve_by)(of->padded, kind, count, below, n, r2, scale, ok))
+    if (!(some = T(chosen)(n, ok, places))) return;
+    ALIGNED R square[BLOCK], found[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK];
+    ALIGNED I done[BLOCK];
+    n = (some + LANES - 1) & -LANES;
+    for (int i = 0; i < n; i++) square[i] = r2[places[i]], found[i] = scale[places[i]], done[i] = 0;
+    for (int count = 0; count < MOST_STEPS; count++) {
+        EACH(i) t[i] = square[i] * found[i] * found[i];
         T(radial)(of, n, t, factor, slope);
         EACH(i) {
-            I found;
-            scale[i] = T(nearer)(scale[i], t[i], factor[i], slope[i], &found), ok[i] = found;
+            I is_short;
+            const R ahead = T(nearer)(found[i], t[i], factor[i], slope[i], &is_short);
+            found[i] = done[i] ? found[i] : ahead, done[i] |= is_short;
         }
+        I all = 1;
+        EACH(i) all &= done[i];
+        if (all) break;
     }
+    for (int i = 0; i < some; i++) scale[places[i]] = found[i], ok[places[i]] = done[i];
 }
 
 /* The same of few points in a bracket up to the fold: Newton's steps, and every other one halves the bracket */
@@ -414,18 +433,6 @@ static void T(bracketed)(const T(Factor) *of, R inner2, int n, const R *restrict
     EACH(i) t[i] = rho[i] * rho[i];
     T(radial)(of, n, t, factor, NULL);
     EACH(i) scale[i] = 1 / factor[i];
-}
-
-/* How many of a block are 0, their places filled up to whole vectors with the last one */
-static int T(chosen)(int n, const I *restrict open, int *restrict places) {
-    int count = 0;
-    I all = 1;
-    EACH(i) all &= open[i] != 0;
-    if (all) return 0;
-    for (int i = 0; i < n; i++)
-        if (!open[i]) places[count++] = i;
-    for (int i = count; count && i % LANES; i++) places[i] = places[count - 1];
-    return count;
 }
 
 /* The factor by which an inverted chart scales angles, of squares of these */

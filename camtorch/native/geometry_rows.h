@@ -453,18 +453,24 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
 /* Newton's method for the stages from `first` on, wherever that leads; `ok` where the next step would be nothing */
 static void T(newton)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v, R *restrict a,
                       R *restrict b, I *restrict ok, int fewest) {
-    int places[BLOCK], some;
-    for (int count = 1; count <= fewest; count++) {
-        EACH(i) ok[i] = 0;
+    int places[BLOCK], some = n, count = 0;
+    while (count < MOST_STEPS && some > n / 4) { /* few are left to a block of their own */
+        if (count < fewest) EACH(i) ok[i] = 0;
         T(newton_step)(c, first, n, u, v, a, b, ok);
+        if (++count >= fewest) some = T(chosen)(n, ok, places);
     }
-    if (!(some = T(chosen)(n, ok, places))) return;
+    if (!some || count == MOST_STEPS) return;
     ALIGNED R p[BLOCK], q[BLOCK], x[BLOCK], y[BLOCK];
     ALIGNED I done[BLOCK];
     const int filled = (some + LANES - 1) & -LANES;
     for (int i = 0; i < filled; i++)
         p[i] = u[places[i]], q[i] = v[places[i]], x[i] = a[places[i]], y[i] = b[places[i]], done[i] = 0;
-    for (int count = fewest + 1; count <= MOST_STEPS; count++) T(newton_step)(c, first, filled, p, q, x, y, done);
+    while (count++ < MOST_STEPS) {
+        I all = 1;
+        T(newton_step)(c, first, filled, p, q, x, y, done);
+        for (int i = 0; i < filled; i++) all &= done[i];
+        if (all) break;
+    }
     for (int i = 0; i < some; i++) a[places[i]] = x[i], b[places[i]] = y[i], ok[places[i]] = done[i];
 }
 
@@ -670,6 +676,19 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     if (rows->results) T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 2, count, ga, gb, NULL);
 }
 
+/* Asks for the memory of rows that come next, while others are computed */
+static void T(fetch)(const void *memory, const int64_t *strides, int components, int64_t camera, int64_t first, int64_t count) {
+#if defined(__GNUC__)
+    const int64_t bytes = count * strides[1] * (int64_t)sizeof(R);
+    if (!memory || strides[1] < 1 || strides[1] > 16) return;
+    const char *from = (const char *)((const R *)memory + camera * strides[0] + first * strides[1]);
+    for (int j = 0; j < (strides[2] == 1 ? 1 : components); j++)
+        for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(from + j * strides[2] * (int64_t)sizeof(R) + i);
+#else
+    (void)memory, (void)strides, (void)components, (void)camera, (void)first, (void)count;
+#endif
+}
+
 static int64_t T(rows)(const Rows *rows) {
     const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
     int64_t left = 0, last = -1, own = 0, at;
@@ -681,6 +700,11 @@ static int64_t T(rows)(const Rows *rows) {
         if (index != last) T(prepare)(rows->cameras, last = index, &camera);
         for (int64_t i = first; i < end; i += BLOCK) {
             const int count = (int)(end - i < BLOCK ? end - i : BLOCK);
+            const int64_t next = i + BLOCK, after = end - next < BLOCK ? end - next : BLOCK;
+            if (after > 0) {
+                T(fetch)(rows->rows, rows->row_strides, 3 - rows->direction % 2, index, next, after);
+                T(fetch)(rows->cotangents, rows->cotangent_strides, 2 + rows->direction % 2, index, next, after);
+            }
             switch (rows->direction) {
             case PROJECT: left += T(project)(&camera, rows, index, i, count); break;
             case UNPROJECT: left += T(unproject)(&camera, rows, index, i, count); break;
