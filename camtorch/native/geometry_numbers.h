@@ -109,18 +109,18 @@ INLINE void T(turn)(R t, R *sinc, R *cosine) {
 /* The sum over a block of products, by lanes: alike for each compiler */
 static double T(dot)(int n, const R *restrict a, const R *restrict b) {
     R lanes[LANES] = {0};
-    double sum = 0;
     for (int i = 0; i < n; i += LANES)
         for (int j = 0; j < LANES; j++) lanes[j] += a[i + j] * b[i + j];
-    for (int j = 0; j < LANES; j++) sum += lanes[j];
-    return sum;
+    for (int half = LANES / 2; half; half /= 2)
+        for (int j = 0; j < half; j++) lanes[j] += lanes[j + half];
+    return lanes[0];
 }
 
 static double T(total)(int n, const R *restrict a) {
     R lanes[LANES] = {0};
-    double sum = 0;
     for (int i = 0; i < n; i += LANES)
         for (int j = 0; j < LANES; j++) lanes[j] += a[i + j];
-    for (int j = 0; j < LANES; j++) sum += lanes[j];
-    return sum;
+    for (int half = LANES / 2; half; half /= 2)
+        for (int j = 0; j < half; j++) lanes[j] += lanes[j + half];
+    return lanes[0];
 }

@@ -265,15 +265,17 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
     T(see)(c, 1, count, n, &s);
     const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0), *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
-    EACH(i) gu[i] = s.ok[i] ? to_u[i] : 0, gv[i] = s.ok[i] ? to_v[i] : 0;
+    EACH(i) {
+        const R p = fx * to_u[i], q = fy * to_v[i];
+        gu[i] = s.ok[i] ? p : 0, gv[i] = s.ok[i] ? q : 0;
+    }
     if (sums) {
         const R *restrict u = s.a, *restrict v = s.b;
         if (c->stages) T(lens)(c, 1, n, s.a, s.b, gx, gy, NULL, NULL), u = gx, v = gy;
-        sums[0] += T(dot)(n, gu, u), sums[1] += T(dot)(n, gv, v);
-        sums[2] += T(total)(n, gu), sums[3] += T(total)(n, gv);
+        sums[0] += T(dot)(n, gu, u) / fx, sums[1] += T(dot)(n, gv, v) / fy;
+        sums[2] += T(total)(n, gu) / fx, sums[3] += T(total)(n, gv) / fy;
         sums += 4;
     }
-    EACH(i) gu[i] *= fx, gv[i] *= fy;
     T(lens_vjp)(c, n, s.a, s.b, gu, gv, sums);
     if (c->way == INVERTED) {
         EACH(i) gx[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
