@@ -24,7 +24,7 @@ from camtorch._arguments import (
 )
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
-from camtorch._module import BatchedModule, Memo, remade, typed_as
+from camtorch._module import BatchedModule, Memo, held, remade, typed_as
 from camtorch._numbers import (
     camera_of_fov,
     checked_distortion,
@@ -114,8 +114,8 @@ class Camera(BatchedModule):
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
-    intrinsics: Tensor
-    distortion: Tensor
+    intrinsics: Tensor = held("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")
+    distortion: Tensor = held("distortion", "(*B, n) coefficients in the order of `distortion_names`.")
     distortion_names: tuple[str, ...] = ()
     image_size: tuple[int, int] | None
     odd_in_x: ClassVar[frozenset[str]] = frozenset()
@@ -150,23 +150,29 @@ class Camera(BatchedModule):
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
-        super().__init__()
-        owner = type(self).__name__
-        intrinsics = checked_intrinsics(type(self), intrinsics)
+        model = type(self)
+        owner = model.__name__
+        intrinsics = checked_intrinsics(model, intrinsics)
         if distortion is None:
-            ideal = intrinsics.new_tensor(self.ideal(self.default_count))
-            distortion = ideal.expand(*intrinsics.shape[:-1], self.default_count)
+            ideal = self.ideal(self.default_count)
+            k = intrinsics.new_tensor(ideal) if ideal else intrinsics.new_empty(0)
+            distortion = k if intrinsics.ndim == 1 else k.expand(*intrinsics.shape[:-1], len(ideal))
         else:
-            distortion = checked_distortion(type(self), distortion, intrinsics)
+            distortion = checked_distortion(model, distortion, intrinsics)
         batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
-        self.distortion_names = self.names_of(distortion.shape[-1]) or ()
-        self.image_size = size = as_image_size(image_size, owner)
+        count, size = distortion.shape[-1], as_image_size(image_size, owner)
         if size is not None:
             warn_of_order(intrinsics, size, owner)
-        self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
-        self._warned = is_predicted(intrinsics) or is_predicted(distortion)
+        super().__init__(
+            distortion_names=self.names_of(count) or (),
+            image_size=size,
+            _memo=Memo(),
+            _rays=Memo(),
+            _fields=Memo(),
+            _warned=is_predicted(intrinsics) or is_predicted(distortion),
+        )
         self.hold("intrinsics", intrinsics, (*batch, 4))
-        self.hold("distortion", distortion, (*batch, distortion.shape[-1]))
+        self.hold("distortion", distortion, (*batch, count))
 
     @classmethod
     def from_matrix(
