@@ -6,17 +6,26 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import forward_ad
+from torch.autograd import Function, forward_ad
 from torch.nn.utils import parametrize
 
 from camtorch._arguments import Numbers, as_points
 from camtorch._module import Memo, is_constant, with_values
 from camtorch._portable import is_portable_export
-from camtorch._tracing import FAKE_MODE, has_tangent, in_jit_trace, is_concrete, is_exporting, keeps_graph
+from camtorch._tracing import (
+    FAKE_MODE,
+    has_tangent,
+    in_jit_trace,
+    in_memory,
+    is_concrete,
+    is_exporting,
+    is_recorded,
+    keeps_graph,
+)
 from camtorch.projection.explanation import unusable
 from camtorch.projection.project import Project
 from camtorch.projection.rows import Cameras
@@ -70,7 +79,7 @@ def evaluated(
         with with_values(camera):
             intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
             cameras = rows_of(camera, intrinsics, distortion)
-            cameras = cameras._replace(domain=cameras.domain.with_all_tables())
+            cameras = cameras.with_all_tables()
         order = 1 if keeps_graph(rows) else 0
         return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
     intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
@@ -82,17 +91,67 @@ def evaluated(
                 "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
                 "requires_grad_(False) and called once before the export"
             )
-        learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
-        keeps = learns and torch.is_grad_enabled()
-        cameras = cameras_of(intrinsics, distortion)
-        planes, valid = direction.apply(*inputs, cameras, type(camera), keeps)  # type: ignore[no-untyped-call]
-        return planes, valid
+        if rows.is_cpu and in_memory(rows) and not is_recorded():
+            cameras = cameras_of(intrinsics, distortion)
+            if (made := cameras.native) is not None:
+                learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
+                if learns and torch.is_grad_enabled():
+                    planes, valid = _Native.apply(*inputs, cameras, type(camera), direction)  # type: ignore[no-untyped-call]
+                    return planes, valid
+                return direction.native(cameras, made, rows.detach())[:2]
     # what is compiled has no derivatives of derivatives
     order = 1 if torch.compiler.is_compiling() else 2
     known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
     if is_portable_export() and not keeps_graph(*inputs):
         inputs = rows, intrinsics.detach(), distortion.detach()
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
+
+
+class _Native(Function):
+    """The compiled geometry, with derivatives; those of derivatives come from the formula."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rows: Tensor,
+        intrinsics: Tensor,
+        distortion: Tensor,
+        cameras: Cameras,
+        model: type[Camera],
+        direction: type[Project] | type[Unproject],
+    ) -> tuple[Tensor, Tensor]:
+        made = cameras.native
+        assert made is not None  # who calls has looked
+        planes, valid, kept = direction.native(cameras, made, rows, keeps=True)
+        ctx.save_for_backward(rows, intrinsics, distortion, *kept)
+        ctx.cameras, ctx.model, ctx.direction = cameras, model, direction
+        ctx.mark_non_differentiable(valid)
+        ctx.set_materialize_grads(False)
+        return planes, valid
+
+    @staticmethod
+    def backward(ctx: Any, by_planes: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
+        """The cotangents of rows and parameters; with a graph if that is asked for."""
+        if by_planes is None:
+            return (None,) * 6
+        rows, intrinsics, distortion, *kept = ctx.saved_tensors
+        wanted, cameras = ctx.needs_input_grad, ctx.cameras
+        if torch.is_grad_enabled() or is_recorded() or not in_memory(by_planes):
+            again = _by_formula(ctx, (rows, intrinsics, distortion), by_planes)
+            return *again, None, None, None
+        of_parameters = wanted[1] or wanted[2]
+        by_rows, sums = ctx.direction.native_vjp(cameras.native, *kept, by_planes, wanted[0], of_parameters)
+        return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None, None
+
+
+def _by_formula(ctx: Any, inputs: Sequence[Tensor], by_planes: Tensor) -> tuple[Tensor | None, ...]:
+    """The cotangents of rows, intrinsics and distortion with a graph of their own."""
+    wanted = ctx.needs_input_grad[:3]
+    leaves = [t for t, needed in zip(inputs, wanted, strict=True) if needed]
+    with torch.enable_grad():
+        planes, _ = ctx.direction.traced(ctx.model, *inputs, ctx.cameras)
+        gradients = iter(torch.autograd.grad(planes, leaves, by_planes, create_graph=True, materialize_grads=True))
+    return tuple([next(gradients) if needed else None for needed in wanted])
 
 
 def rows_of(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> Cameras:
@@ -140,7 +199,7 @@ def _is_plain(inputs: Sequence[Tensor]) -> bool:
 def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The cameras (C,) of one model, kept in a memo."""
     inputs = intrinsics, distortion
-    cameras: Cameras = memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras.of(model, *inputs))
+    cameras: Cameras = memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras(model, *inputs))
     return cameras
 
 

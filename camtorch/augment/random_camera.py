@@ -19,12 +19,10 @@ from camtorch._tracing import in_graph
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.camera import Camera
+from camtorch.camera import Camera, fixed_camera
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.domain import domain_of
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
-from camtorch.projection.unproject import has_ray
 from camtorch.rotations import mount_rotation
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.shutter import RollingShutter
@@ -458,13 +456,18 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     result, left = given.clone(), torch.arange(len(steps), device=steps.device)
     for part in _PARTS:
         candidate, defined = _defined(camera, given[left] + part * steps[left], given[left])
-        lenses = domain_of(camera._model, candidate, camera.optics)
-        fits = defined & has_ray(lenses, p[left], q[left]).all(-1)
+        fits = defined & _has_ray(camera, candidate, torch.stack((p[left], q[left]), -1)).all(-1)
         result[left[fits]] = candidate[fits]
         left = left[~fits]
         if not len(left):
             break
     return (result.view(*amounts.shape[:-1], count),)
+
+
+def _has_ray(camera: Camera, k: Tensor, points: Tensor) -> Tensor:
+    """Bool (C, N): whether points (C, N, 2) of the sensor in focal lengths have a ray, by coefficients (C, n)."""
+    ideal = k.new_tensor([1.0, 1.0, 0.0, 0.0]).expand(len(k), 4)
+    return fixed_camera(type(camera), ideal, k).unproject(points)[1]
 
 
 _measured = Memo(24)  # of a batch of eight models
@@ -521,15 +524,15 @@ def _rim(camera: Camera) -> tuple[Tensor, ...]:
     intrinsics, k = camera.intrinsics.reshape(-1, 1, 4), camera.distortion.detach()
     focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
     edges = (_border(camera._size_for("its rim")).to(focal) - centre) / focal
-    own = domain_of(camera._model, k.reshape(-1, k.shape[-1]), camera.optics)
-    rim = edges.expand(len(own.k), -1, -1) if len(edges) == 1 else edges
+    k = k.reshape(-1, k.shape[-1])
+    rim = edges.expand(len(k), -1, -1) if len(edges) == 1 else edges
 
     def seen(points: Tensor) -> Tensor:
-        return has_ray(own, *(w.reshape(len(own.k), -1) for w in points.unbind(-1))).view(points.shape[:-1])
+        return _has_ray(camera, k, points)
 
     if not bool(seen(rim).all()):
         # edited images have different intrinsics, and few kinds of coefficients
-        lenses, which = own.k.unique(dim=0, return_inverse=True)
+        lenses, which = k.unique(dim=0, return_inverse=True)
         ends = _kept(_ends, camera, lenses).to(focal)[which]
         ends = torch.where(camera.contains(ends * focal + centre).unsqueeze(-1), ends, rim[:, :1])
         rim = torch.cat((rim, ends), 1)

@@ -230,7 +230,7 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
     count = points.shape[1]
     pixels = _empty(2, native.cameras, count, native.dtype)
-    valid = torch.empty(native.cameras, count, dtype=torch.bool)
+    valid = torch.empty(native.cameras, count, dtype=torch.bool, device="cpu")
     if _call(native, PROJECT, points, pixels, valid) and native.struct.limits2 is None:
         native.add_limits()
         _call(native, PROJECT, points, pixels, valid)
@@ -241,8 +241,8 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
     count = pixels.shape[1]
     rays = _empty(3, native.cameras, count, native.dtype)
-    valid = torch.empty(native.cameras, count, dtype=torch.uint8)
-    solution = torch.empty(2, native.cameras, count, dtype=native.dtype) if keeps else None
+    valid = torch.empty(native.cameras, count, dtype=torch.uint8, device="cpu")
+    solution = torch.empty(2, native.cameras, count, dtype=native.dtype, device="cpu") if keeps else None
     left = _call(native, UNPROJECT, pixels, rays, valid, solution)
     if not left:
         return Unprojected(rays, valid.view(torch.bool), solution, None)
@@ -257,7 +257,7 @@ def project_vjp(
 
     cotangents: of pixels, (2, C, N), of any strides.
     """
-    results = torch.empty(points.shape, dtype=native.dtype) if want_points else None
+    results = torch.empty(points.shape, dtype=native.dtype, device="cpu") if want_points else None
     sums = _sums(native, points) if want_parameters else None
     by_row = None if results is None else results.movedim(-1, 0)
     _call(native, PROJECT_VJP, points, by_row, cotangents=cotangents, sums=sums)
@@ -265,14 +265,17 @@ def project_vjp(
 
 
 def unproject_vjp(
-    native: Native, found: Unprojected, cotangents: Tensor, want_pixels: bool, want_parameters: bool
+    native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
-    """The cotangents of pixels (C, N, 2), and of the cameras; see `project_vjp`. found: with its solution."""
-    shape = found.valid.shape
-    results = torch.empty(*shape, 2, dtype=native.dtype) if want_pixels else None
+    """The cotangents of pixels (C, N, 2), and of the cameras; see `project_vjp`.
+
+    valid, solution: of `unproject`.
+    """
+    shape = valid.shape
+    results = torch.empty(*shape, 2, dtype=native.dtype, device="cpu") if want_pixels else None
     by_row = None if results is None else results.movedim(-1, 0)
-    sums = _sums(native, found.valid) if want_parameters else None
-    _call(native, UNPROJECT_VJP, None, by_row, found.valid, found.solution, cotangents=cotangents, sums=sums)
+    sums = _sums(native, valid) if want_parameters else None
+    _call(native, UNPROJECT_VJP, None, by_row, valid, solution, cotangents=cotangents, sums=sums)
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -280,12 +283,12 @@ def _empty(size: int, cameras: int, count: int, dtype: torch.dtype) -> Tensor:
     # of large results the first write to each page would take longer than the geometry
     if size * cameras * count * dtype.itemsize >= memory.LEAST:
         return memory.empty((size, cameras, count), dtype, torch.contiguous_format)
-    return torch.empty(size, cameras, count, dtype=dtype)
+    return torch.empty(size, cameras, count, dtype=dtype, device="cpu")
 
 
 def _sums(native: Native, rows: Tensor) -> Tensor:
     tiles = -(-rows.shape[1] // _TILE)
-    return torch.zeros(native.cameras, tiles, 4 + native.parameters, dtype=torch.float64)
+    return torch.zeros(native.cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
 
 
 def _call(

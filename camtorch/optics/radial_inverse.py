@@ -34,8 +34,6 @@ _PARTS = 256  # of the interval in which a fold is looked for; twice, then the s
 _NODES = 1024  # of the table of an inverse
 _LIMITING = 4  # steps of Newton's method towards the radius of the largest image, as at most nearly all need
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
-# Steps of Newton's method that most points need, by whether they can be counted while they are made
-_STEPS = {torch.float32: 1, torch.float64: 2}
 MOST_STEPS = 5
 """Of Newton's method; what then still moves is left to slower methods."""
 
@@ -207,50 +205,25 @@ class InverseTable:
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
 
 
-class SmallTable:
-    """The same up to a radius, read off the factor at few radii: for few points of a camera that is about to change."""
-
-    images: Tensor
-    values: Tensor
-    slopes: Tensor
-
-    def __init__(self, radial: RadialFactor, radii: Tensor):
-        """radii: (C, K) ascending from 0, on which the factor is followed without a fold."""
-        factor = radial(radii * radii)
-        self.images, self.values = (radii * factor).contiguous(), factor.reciprocal()
-        self.slopes = self.values.diff(dim=-1) / self.images.diff(dim=-1)
-
-    def __call__(self, r2: Tensor) -> Tensor:
-        """The factor for (C, N), to about 1e-5."""
-        r = r2.sqrt()
-        node = (torch.searchsorted(self.images, r) - 1).clamp(0, self.slopes.shape[-1] - 1)
-        value, image, slope = (w.gather(-1, node) for w in (self.values, self.images, self.slopes))
-        return torch.addcmul(value, r - image, slope)
-
-
 # -- the solution
 
 
-def solve(radial: RadialFactor, table: InverseTable | SmallTable, r2: Tensor, adaptive: bool) -> tuple[Tensor, Tensor]:
+def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:
     """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
 
     Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
-    positive where the last step was so short that the next one would be nothing. adaptive: whether the steps may stop
-    where that is so everywhere.
+    positive where the last step was so short that the next one would be nothing.
     """
     scale, converged = table(r2), None
-    for count in range(1, MOST_STEPS + 1):
+    for _ in range(MOST_STEPS):
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
         if converged is not None:  # what is converged stays, whatever else is in its batch
             step = torch.where(converged > 0, 0.0, step)
         scale = scale + step
-        if count >= _STEPS[r2.dtype]:
-            converged = short(scale.dtype) * scale - step.abs()
-            if not adaptive or bool(converged.amin() > 0):
-                break
-    assert converged is not None  # there are more steps than those before the first look
+        converged = short(scale.dtype) * scale - step.abs()
+    assert converged is not None  # there are steps
     return scale, converged
 
 
@@ -353,7 +326,7 @@ def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
 
 def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
-    scale, converged = solve(CLASSES[name](columns(k)), table, r2, r2.is_cpu and not is_portable_export())
+    scale, converged = solve(CLASSES[name](columns(k)), table, r2)
     camera, point = (~(converged > 0)).nonzero(as_tuple=True)
     if is_portable_export() or len(camera):
         radial = CLASSES[name](of_points(k, camera))

@@ -22,19 +22,16 @@ if TYPE_CHECKING:
 Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
 
 _RADII = 512
-_STEPS, _UNTABULATED = 129, 2  # radii that few points are answered from, and how often
+_STEPS = 129
 # Stages after a radial one that change distances by less than a quarter, and so by less than that move what they are
 # given, are inverted by Newton's method from anywhere: a step comes nearer by a third at least
 _LEAST_SLOPE, _WIDER = 0.75, 1.25
 
 
 def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
-    """A table (C, ...) that is made when it is first asked for; that of some cameras is a part of the whole one."""
+    """A table (C, ...) that is made when it is first asked for."""
 
     def table(self: Domain) -> Tensor:
-        if self.whole is not None:
-            of_all: Tensor = getattr(self.whole, make.__name__)
-            return of_all[self.cameras]
         if is_portable_export():
             return make(self)
         # what inference mode makes could not be used in a graph later
@@ -56,27 +53,13 @@ class Domain:
 
     optics: Optics
     k: Tensor
-    whole: Domain | None
-    cameras: slice
     chart: Chart
     lens: Lens
-    untabulated: int
 
-    def __init__(self, optics: Optics, k: Tensor, whole: Domain | None = None, cameras: slice | None = None):
-        """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points.
-
-        whole, cameras: the domain of which this is a part.
-        """
-        self.optics, self.k, self.whole = optics, k, whole
-        self.cameras = slice(None) if cameras is None else cameras
+    def __init__(self, optics: Optics, k: Tensor):
+        """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points."""
+        self.optics, self.k = optics, k
         self.chart, self.lens = optics(columns(k))
-        self.untabulated = 0
-
-    def part(self, cameras: slice) -> Domain:
-        """The domain of some of the cameras."""
-        if cameras.stop - cameras.start == len(self.k):
-            return self
-        return Domain(self.optics, self.k[cameras], self, cameras)
 
     def optics_of(self, camera: Tensor) -> tuple[Chart, Lens]:
         """Of single points (M,), each seen by the camera of that index."""
@@ -125,9 +108,9 @@ class Domain:
 
     @cached_property
     def azimuths(self) -> Azimuths:
-        """Of all cameras, also where this is a part."""
+        """Of all cameras."""
         with torch.inference_mode(False):
-            return Azimuths(self.optics, self.k) if self.whole is None else self.whole.azimuths
+            return Azimuths(self.optics, self.k)
 
     @_per_camera
     def edge2(self) -> Tensor:
@@ -226,45 +209,10 @@ class Domain:
         inner2: Tensor = self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
         return inner2
 
-    def radii_without_fold(self, furthest2: Tensor) -> Tensor | None:
-        """Radii (C, K) from the centre to the given ones, (C, 1) squared, if few radii show no fold before them.
-
-        What changes less from radius to radius than it is large has no zero in between. None where that is not so, and
-        for a lens that has its tables, or is asked for often enough to make them.
-        """
-        radial = self.lens.radial
-        self.untabulated += 1
-        if (
-            self.untabulated > _UNTABULATED
-            or "inner2" in self.__dict__
-            or (radial is not None and radial.fold is not None)
-        ):
-            return None
-        radii = furthest2.sqrt() * torch.linspace(0, 1, _STEPS, dtype=self.k.dtype, device=self.k.device)
-        if radial is not None and self.lens.is_radial:
-            least = radial.orientation(radii)
-        else:
-            least, _ = self.lens.lower_bound(radii)
-        certain = least.amin(-1) - least.diff(dim=-1).abs().amax(-1)
-        end = self.chart.usual_end(self.k.dtype)
-        certain = torch.minimum(certain.unsqueeze(-1), end - 1.01 * radii[..., -1:])
-        return radii if bool(certain.amin() > 0) else None
-
-    def margin(self, a: Tensor, b: Tensor, t: Tensor, adaptive: bool) -> Tensor:
-        """Positive for the plane points (C, N) in the domain.
-
-        t: a^2 + b^2. adaptive: whether it may look at values.
-        """
+    def margin(self, a: Tensor, b: Tensor, t: Tensor) -> Tensor:
+        """Positive for the plane points (C, N) in the domain. t: a^2 + b^2."""
         inside = self.inner2 - t
         if self.lens.is_radial or self.all_stagewise:
-            return inside
-        if adaptive:  # at the azimuths on which something lies so far out, only
-            outside = ~(inside > 0) if self.stagewise is None else ~((inside > 0) | self.stagewise)
-            camera, point = outside.nonzero(as_tuple=True)
-            a, b, t = a[camera, point], b[camera, point], t[camera, point]
-            first = self.cameras.start or 0
-            limits2 = self.azimuths.limits2(camera + first, azimuth(a, b))
-            inside[camera, point] = torch.minimum(limits2 - t, regular(self.optics_of(camera)[1], a, b))
             return inside
         index = azimuth(a, b)
         index = index + torch.arange(self.k.shape[0], device=t.device, dtype=index.dtype).unsqueeze(-1) * AZIMUTHS

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 import camtorch as ct
 from camtorch.optics.charts import Perspective
-from camtorch.projection import rows
 from camtorch.warp import grid, sampling
 from camtorch.warp.grid import Sampling
 
@@ -38,22 +37,6 @@ def everything(camera, method, values):
     weights = torch.linspace(-1, 2, result.numel(), dtype=result.dtype).view_as(result)
     leaves = [values, *(p for p in camera.parameters() if p.numel())]
     return result.detach(), valid, *torch.autograd.grad((result * weights).sum(), leaves)
-
-
-@each_kind
-@pytest.mark.parametrize("method", ["project", "unproject"])
-@pytest.mark.parametrize("cameras", [1, 3])
-@pytest.mark.parametrize("block", [20])
-def test_blocks_change_nothing(key, method, cameras, block, monkeypatch):
-    camera = batch_of(key, cameras)
-    values = awkward_points(key, 101).view(1, -1, 3).expand(cameras, -1, -1)
-    if method == "unproject":
-        values = torch.cat((pixel_lattice(camera, 9, 11), torch.tensor([[math.nan, 1], [1e9, 3]]).double()))
-        values = values.expand(cameras, -1, -1)
-    whole = everything(camera, method, values)
-    monkeypatch.setattr(rows, "_BLOCK", block)
-    for result, expected in zip(everything(camera, method, values), whole, strict=True):
-        torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
 
 
 @each_kind

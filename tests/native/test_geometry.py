@@ -16,7 +16,9 @@ from camtorch.native import build as building
 from camtorch.native import geometry
 from camtorch.native.library import library
 from camtorch.optics import Equidistant, Lens, Stage
+from camtorch.projection.project import Project
 from camtorch.projection.rows import Cameras
+from camtorch.projection.unproject import Unproject
 
 pytestmark = pytest.mark.skipif(not ct.native_available(), reason="the library is not compiled here, or turned off")
 
@@ -35,9 +37,18 @@ def native(camera):
     """A camera's, or a batch's (C,)."""
     intrinsics = camera.intrinsics.detach().reshape(-1, 4)
     distortion = camera.distortion.detach().reshape(len(intrinsics), -1)
-    found = geometry.native_of(Cameras.of(type(camera), intrinsics, distortion))
+    found = geometry.native_of(Cameras(type(camera), intrinsics, distortion))
     assert found is not None
     return found
+
+
+def formula_of(camera, direction, values):
+    """What the recorded formula says, (N, size), and of which it is valid; with a graph to the camera's parameters."""
+    intrinsics, distortion = camera.intrinsics[None], camera.distortion[None]
+    planes, valid = direction.traced(
+        type(camera), values[None], intrinsics, distortion, Cameras(type(camera), intrinsics, distortion)
+    )
+    return planes[:, 0].mT, valid[0]
 
 
 def cameras(name, dtype):
@@ -96,11 +107,13 @@ def test_projects_as_the_formula_does(key, dtype):
     p, eps = points(dtype), torch.finfo(dtype).eps
     for camera in cameras(key, dtype):
         with torch.no_grad():
-            expected, valid = camera.project(p)
+            expected, valid = formula_of(camera, Project, p)
             others = [
                 make(camera.key, camera.intrinsics.double(), k) for k in (camera.distortion.double(), moved(camera))
             ]
-            near = torch.stack([exact.project(_moved(p, 64 * eps, seed))[1] for exact in others for seed in range(3)])
+            near = torch.stack(
+                [formula_of(exact, Project, _moved(p, 64 * eps, seed))[1] for exact in others for seed in range(3)]
+            )
         found, found_valid = (w[..., 0, :] for w in geometry.project(native(camera), p[None]))
         found = found.mT
         # next to a fold rounding decides
@@ -119,10 +132,10 @@ def test_unprojects_as_the_formula_does(key, dtype):
     for camera in cameras(key, dtype):
         q = pixels(camera)
         with torch.no_grad():
-            expected, valid = camera.unproject(q)
+            expected, valid = formula_of(camera, Unproject, q)
             exact = make(camera.key, camera.intrinsics.double(), camera.distortion.double())
-            around = [exact.unproject(_moved(q, 32 * eps, seed)) for seed in range(3)]
-            there = exact.unproject(q.double())[0]
+            around = [formula_of(exact, Unproject, _moved(q, 32 * eps, seed)) for seed in range(3)]
+            there = formula_of(exact, Unproject, q.double())[0]
         found = geometry.unproject(native(camera), q[None], keeps=True)
         rays, found_valid = found.rays[:, 0].mT, found.valid[0]
         left = torch.zeros_like(valid) if found.open is None else found.open[0]
@@ -135,7 +148,7 @@ def test_unprojects_as_the_formula_does(key, dtype):
         assert ((rays - expected).norm(dim=-1) <= 32 * eps + 8 * off)[both].all()
         assert (rays[~found_valid] == rays.new_tensor([0, 0, 1])).all()
         # a radial lens leaves nothing open
-        if Cameras.of(type(camera), camera.intrinsics[None], camera.distortion[None]).domain.lens.is_radial:
+        if Cameras(type(camera), camera.intrinsics[None], camera.distortion[None]).domain.lens.is_radial:
             assert not left.any()
 
 
@@ -169,7 +182,7 @@ def test_derivatives_are_those_of_the_formula(key, dtype):
         p = torch.cat((camera.unproject(q)[0].detach() * 2, q.new_tensor([[0, 0, 1], [math.nan, 0, 1]])))
         p.requires_grad_()
 
-        out, _ = camera.project(p)
+        out, _ = formula_of(camera, Project, p)
         weight = torch.randn(out.shape, generator=generator, dtype=dtype)
         expected = torch.autograd.grad(out, [p, *leaves], weight)
         by_points, sums = geometry.project_vjp(made, p.detach()[None], weight.mT[:, None], True, True)
@@ -178,12 +191,12 @@ def test_derivatives_are_those_of_the_formula(key, dtype):
         for have, want in zip(found, expected, strict=True):
             close(have, want, 256)
 
-        out, _ = camera.unproject(q)
+        out, _ = formula_of(camera, Unproject, q)
         weight = torch.randn(out.shape, generator=generator, dtype=dtype)
         expected = torch.autograd.grad(out, [q, *leaves], weight)
         solved = geometry.unproject(made, q.detach()[None], keeps=True)
         assert solved.open is None
-        by_pixels, sums = geometry.unproject_vjp(made, solved, weight.mT[:, None], True, True)
+        by_pixels, sums = geometry.unproject_vjp(made, solved.valid, solved.solution, weight.mT[:, None], True, True)
         found = [by_pixels[0], sums[0, :4]]
         found += [of_coefficients(camera, sums[0, 4:])] if camera.distortion.numel() else []
         for have, want in zip(found, expected, strict=True):
@@ -214,7 +227,7 @@ def test_any_strides_and_threads(key):
     q = pixels(one(key).float()).repeat(40, 1)
     expected = geometry.unproject(made, q[None], keeps=True)
     weight = torch.randn(expected.rays.shape, generator=torch.Generator().manual_seed(0))
-    cotangents = geometry.unproject_vjp(made, expected, weight, True, True)
+    cotangents = geometry.unproject_vjp(made, expected.valid, expected.solution, weight, True, True)
     wide = torch.full((len(q), 7), math.nan)
     wide[:, 1:6:4] = q
     for rows in (q.mT.contiguous().mT, wide[:, 1:6:4], q.flip(-1).flip(-1)):
@@ -222,7 +235,9 @@ def test_any_strides_and_threads(key):
     with patch.object(geometry, "thread_count", lambda: 3):
         again = geometry.unproject(made, q[None], keeps=True)
         assert again.rays.equal(expected.rays)
-        found = geometry.unproject_vjp(made, again, weight.movedim(0, -1).contiguous().movedim(-1, 0), True, True)
+        found = geometry.unproject_vjp(
+            made, again.valid, again.solution, weight.movedim(0, -1).contiguous().movedim(-1, 0), True, True
+        )
     assert all(a.equal(b) for a, b in zip(found, cotangents, strict=True))
 
 
@@ -232,7 +247,7 @@ def test_an_unusable_camera_has_invalid_rows_alone():
     intrinsics[1, 0] = math.nan
     distortion = camera.distortion.detach().repeat(3, 1)
     distortion[2, 1] = math.inf
-    made = geometry.native_of(Cameras.of(type(camera), intrinsics, distortion))
+    made = geometry.native_of(Cameras(type(camera), intrinsics, distortion))
     p = fan(60, 5, 4).float().expand(3, -1, -1)
     out, valid = geometry.project(made, p)
     assert valid.all(-1).tolist() == [True, False, False]
