@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._tracing import in_graph, is_concrete, may_look
+from camtorch._tracing import has_tangent, in_graph, in_transform, is_concrete, is_recorded, keeps_graph, may_look
 
 Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
@@ -66,6 +66,13 @@ def holds(condition: Tensor) -> bool:
 def values_of(tensor: Tensor) -> Tensor | None:
     """The values in float64 in the CPU's memory; None where they may not be looked at."""
     return tensor.detach().to("cpu", torch.float64) if is_concrete(tensor) else None
+
+
+def are_numbers(*tensors: Tensor) -> bool:
+    """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
+    if in_transform() or is_recorded() or keeps_graph(*tensors):
+        return False
+    return all(t.is_cpu and is_concrete(t) and not has_tangent(t) for t in tensors)
 
 
 def is_kept(value: Tensor) -> bool:

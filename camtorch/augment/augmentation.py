@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -115,15 +115,12 @@ def draw(
         values = {"apply": torch.rand(rows, generator=generator, device=device) < p}
     else:
         values = {"apply": torch.full((rows,), p >= 1, device=device)}
-    # in float64, so that what is drawn is what every precision sees
-    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
-    shares = [torch.rand(size, generator=generator, dtype=torch.float64, device=device) for size in sizes]
     if ranges:
-        pairs = zip(ranges.values(), sizes, strict=True)
-        each = [(interval.low, interval.high - interval.low) for interval, size in pairs for _ in range(size)]
-        low, extent = torch.tensor(each, dtype=torch.float64, device=device).reshape(-1, 2).unbind(-1)
-        drawn = (low + extent * torch.cat(shares)).split(sizes)
-        for (name, interval), value in zip(ranges.items(), drawn, strict=True):
+        sizes = [rows * (interval.size or 1) for interval in ranges.values()]
+        # in float64, so that what is drawn is what every precision sees
+        shares = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device).split(sizes)
+        for (name, interval), share in zip(ranges.items(), shares, strict=True):
+            value = share.mul_(interval.high - interval.low).add_(interval.low)
             values[name] = value if interval.size is None else value.view(rows, interval.size)
     if rows == count:
         return values
@@ -198,6 +195,8 @@ class Augmentation(SampleTransform):
     """
 
     ranges: dict[str, Range]
+    beside_the_camera: ClassVar[frozenset[str]] = frozenset()
+    """The ranges of what the new images have beside a camera."""
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
     p: float
@@ -289,7 +288,7 @@ class Augmentation(SampleTransform):
             return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
 
         looks = may_look(applied) or count == 0
-        if not looks or bool(applied.all()):  # traced, all rows move, and a gate chooses
+        if not looks or all(applied.tolist()):  # traced, all rows move, and a gate chooses
             return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
         parts, chosen = [], applied.tolist()
         for rows, group in groups:
@@ -330,21 +329,32 @@ class Augmentation(SampleTransform):
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         values = self._values(source, draw)
-        target, rotation = self.new_camera(source, values)
+        target, rotation = self._new_camera(source, values)
         if self.min_filled:
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_too_few(found, self.min_filled)
             self._tell_of_zoom(source, target, factor, found)
-        warp = self._warp(source, target, rotation, self._shutter(values))
-        return Part(rows, warp, source, *self._seen_through(warp, values))
+        more = self._like(source, {name: value for name, value in values.items() if name in self.beside_the_camera})
+        warp = self._warp(source, target, rotation, self._shutter(more))
+        return Part(rows, warp, source, *self._seen_through(warp, more))
 
     def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """What `new_camera` is given."""
+        """What was drawn, (*B,) or (*B, size): of a single camera without batch dims where all samples draw the same,
+        as one map then serves them all.
+        """
         values = {name: value for name, value in draw.items() if name != "apply"}
-        # one map serves the whole batch where all samples draw the same
-        if not source.batch_shape and all(holds(value == value[:1]) for value in values.values()):
+        if not source.batch_shape and all(len(value) == 1 or holds(value == value[:1]) for value in values.values()):
             values = {name: value[0] for name, value in values.items()}
+        return values
+
+    def _new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+        """`new_camera` of values as drawn."""
+        return self.new_camera(source, self._like(source, values))
+
+    @staticmethod
+    def _like(source: Camera, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The values in the source's dtype and on its device."""
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
 
@@ -386,7 +396,7 @@ class Augmentation(SampleTransform):
         with torch.no_grad():
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
-            shares = filled(first, *self.new_camera(first, self._values(first, values)))
+            shares = filled(first, *self._new_camera(first, self._values(first, values)))
         if shares.mean() < _FEW:
             warnings.warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
