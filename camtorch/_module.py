@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -61,7 +61,11 @@ class GeometryModule(nn.Module):
             for name, value in attributes.items():
                 setattr(self, name, value)
         else:
-            self.__dict__.update(_bare(), **attributes)
+            state = self.__dict__
+            state.update(_bare())
+            modules = state["_modules"]
+            for name, value in attributes.items():
+                (modules if isinstance(value, nn.Module) else state)[name] = value
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
         """As of `nn.Module`."""
@@ -84,30 +88,30 @@ class GeometryModule(nn.Module):
         Those keep their own shape, which broadcasts to `shape`: a lens shared by a batch of cameras stays one.
         """
         if shape[-1] == 0:  # an optimizer has nothing to learn here
-            self._put(name, value if value.shape == shape and not value.requires_grad else value.detach().expand(shape))
+            self.put(name, value if value.shape == shape and not value.requires_grad else value.detach().expand(shape))
         elif is_parameter(value):
-            self._put(name, value)
+            self.put(name, value)
         elif in_graph(value):
-            self._put(name, _widened(value))
+            self.put(name, _widened(value))
         else:
             own = _widened(value)
-            self._put(name, nn.Parameter((own if own.shape == shape else own.expand(shape)).clone()))
+            self.put(name, nn.Parameter((own if own.shape == shape else own.expand(shape)).clone()))
 
-    def _put(self, name: str, tensor: Tensor) -> None:
-        """Register a Parameter, or anything else as a buffer that no state_dict holds."""
+    def put(self, name: str, tensor: Tensor | None, persistent: bool = False) -> None:
+        """Register a Parameter, or anything else as a buffer, which a state_dict holds where it is persistent."""
+        is_learnt = tensor is not None and is_parameter(tensor)
         if torch.compiler.is_compiling():
-            if isinstance(tensor, nn.Parameter):
-                self.register_parameter(name, tensor)
+            if is_learnt:
+                self.register_parameter(name, cast("nn.Parameter", tensor))
             else:
-                self.register_buffer(name, tensor, persistent=False)
+                self.register_buffer(name, tensor, persistent)
             return
         state = self.__dict__
-        if is_parameter(tensor):
-            state["_parameters"][name] = tensor
+        state["_parameters" if is_learnt else "_buffers"][name] = state["_own"][name] = tensor
+        if persistent or is_learnt:
+            state["_non_persistent_buffers_set"].discard(name)
         else:
-            state["_buffers"][name] = tensor
             state["_non_persistent_buffers_set"].add(name)
-        state["_own"][name] = tensor
 
     def freeze_like(self, *sources: nn.Module) -> Self:
         """Leave nothing to learn where the modules that this one was made from have nothing either."""
@@ -342,9 +346,9 @@ def remade(module: Made, **changes: Any) -> Made:
     for name, tensor in tensors.items():
         if tensor.shape[-1]:
             tensor = fixed(tensor)
-            made._put(name, tensor if is_parameter(tensor) else _widened(tensor))
+            made.put(name, tensor if is_parameter(tensor) else _widened(tensor))
         else:
-            made._put(name, tensor.detach() if tensor.requires_grad else tensor)
+            made.put(name, tensor.detach() if tensor.requires_grad else tensor)
     return made
 
 
