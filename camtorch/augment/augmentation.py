@@ -388,8 +388,10 @@ class Augmentation(SampleTransform):
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
+        if self.min_filled is not None or self._warned or self.p == 0:
+            return
         camera = camera[0] if camera.is_mixed else camera
-        if self.min_filled is not None or self._warned or self.p == 0 or not is_concrete(camera.intrinsics):
+        if not is_concrete(camera.intrinsics):
             return
         self._warned = True
         values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))

@@ -190,12 +190,14 @@ class RandomCamera(Augmentation):
         return self._made(source, values, torch)
 
     def _new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        like = () if self.like is None else self.like._tensors
-        tensors = *source._tensors, *like, *values.values()
-        if type(self).new_camera is not RandomCamera.new_camera or not are_numbers(*tensors):
+        if type(self).new_camera is not RandomCamera.new_camera:
             return super()._new_camera(source, values)
-        # a hundred operations on some numbers, which torch takes microseconds for, each
-        return self._made(source, {name: value.numpy() for name, value in values.items()}, np)
+        tensors = *source._tensors, *(() if self.like is None else self.like._tensors), *values.values()
+        if are_numbers(*tensors):
+            # a hundred operations on some numbers, which torch takes microseconds for, each
+            return self._made(source, {name: value.numpy() for name, value in values.items()}, np)
+        like = _wide(source.intrinsics.detach())
+        return self._made(source, {name: value.to(like) for name, value in values.items()}, torch)
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, or by arrays in float64, with the functions of torch or of numpy."""
@@ -322,17 +324,22 @@ class RandomCamera(Augmentation):
         return kept
 
 
+def _wide(values: Tensor) -> Tensor:
+    """In float64, where a device has that."""
+    return values.float() if values.device.type == "mps" else values.double()
+
+
 def _split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
-    """fx, fy, cx, cy of intrinsics (*B, 4), as tensors, or numbers and arrays in float64."""
+    """fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
     if xp is torch:
-        return intrinsics.unbind(-1)
+        return _wide(intrinsics).unbind(-1)
     return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
 
 
 def _joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
     """(*B, n) of n tensors (*B,); or of numbers and arrays, in the dtype of a tensor."""
     if xp is torch:
-        return torch.stack(torch.broadcast_tensors(*numbers), -1)
+        return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
     kind = np.float64 if like.dtype == torch.float64 else np.float32
     if all(isinstance(number, float) for number in numbers):
         return torch.from_numpy(np.array(numbers, kind))
