@@ -70,9 +70,12 @@ def values_of(tensor: Tensor) -> Tensor | None:
 
 def are_numbers(*tensors: Tensor) -> bool:
     """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
-    if in_transform() or is_recorded() or keeps_graph(*tensors):
+    if torch.compiler.is_compiling() or in_transform() or is_recorded() or keeps_graph(*tensors):
         return False
-    return all(t.is_cpu and is_concrete(t) and not has_tangent(t) for t in tensors)
+    return all(t.is_cpu and type(t) in _PLAIN and not has_tangent(t) for t in tensors)
+
+
+_PLAIN = Tensor, nn.Parameter
 
 
 def is_kept(value: Tensor) -> bool:

@@ -226,6 +226,8 @@ class BatchedModule(GeometryModule):
 
     tensor_names: ClassVar[tuple[str, ...]]
     """Of the tensors (*B, n); each may have fewer batch dims, or of size 1, where it is shared."""
+    memo_names: ClassVar[tuple[str, ...]] = ()
+    """Of what is kept of their values, which begins empty in another module."""
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -338,11 +340,11 @@ def remade(module: Made, **changes: Any) -> Made:
         return model(*numbers, image_size=changes.get("image_size", module.image_size))
     made = model.__new__(model)
     state = made.__dict__
-    state.update(module.__dict__)
-    state.update(_bare(), training=module.training, **changes)
-    for name, value in module.__dict__.items():
-        if type(value) is Memo:
-            state[name] = Memo(value.capacity)
+    state.update(module.__dict__, _is_full_backward_hook=None, _own={}, **changes)
+    for name, make in _CONTAINERS:
+        state[name] = make()
+    for name in module.memo_names:
+        state[name] = Memo()
     for name, tensor in tensors.items():
         if tensor.shape[-1]:
             tensor = fixed(tensor)

@@ -67,6 +67,9 @@ _ELSEWHERE = {
 """What OpenCV, ROS, Kalibr and COLMAP call some of them."""
 
 
+_NO_BATCH = torch.Size()
+
+
 def _intrinsic(index: int, doc: str) -> Any:
     def one(camera: Camera) -> Tensor:
         return camera.intrinsics[..., index].expand(camera.batch_shape)
@@ -114,6 +117,7 @@ class Camera(BatchedModule):
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
+    memo_names: ClassVar[tuple[str, ...]] = ("_memo", "_rays", "_fields")
     intrinsics: Tensor = held("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")
     distortion: Tensor = held("distortion", "(*B, n) coefficients in the order of `distortion_names`.")
     distortion_names: tuple[str, ...] = ()
@@ -166,9 +170,7 @@ class Camera(BatchedModule):
         super().__init__(
             distortion_names=self.names_of(count) or (),
             image_size=size,
-            _memo=Memo(),
-            _rays=Memo(),
-            _fields=Memo(),
+            **{name: Memo() for name in self.memo_names},
             _warned=is_predicted(intrinsics) or is_predicted(distortion),
         )
         self.hold("intrinsics", intrinsics, (*batch, 4))
@@ -249,8 +251,10 @@ class Camera(BatchedModule):
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the parameters."""
-        shapes = self.intrinsics.shape[:-1], self.distortion.shape[:-1]
-        return shapes[0] if shapes[0] == shapes[1] else broadcast_shapes(*shapes)
+        intrinsics, distortion = self.intrinsics.shape, self.distortion.shape
+        if len(intrinsics) == len(distortion) == 1:
+            return _NO_BATCH
+        return broadcast_shapes(intrinsics[:-1], distortion[:-1])
 
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name for it)

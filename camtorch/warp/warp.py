@@ -166,7 +166,7 @@ class Warp(GeometryModule):
     def turned_by(self, rotation: Tensor | None) -> Self:
         """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
         self._set_rotation(rotation)
-        if rotation is not None:
+        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
             self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
         return self
 
