@@ -78,6 +78,7 @@ static int64_t taken(Rows *rows) {
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_domain.h"
 
 /* Makes tiles until none is left that nobody has taken; how many points wait for `limits2` */
 int64_t THIS(geometry)(Rows *rows) {
