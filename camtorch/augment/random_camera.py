@@ -568,6 +568,10 @@ def _rim(camera: Camera) -> Tensor:
     """
     border = _border(camera._size_for("its rim")).to(camera.intrinsics)
     rim = border.expand(*camera.batch_shape, *border.shape)
+    if len(camera.distortion) == 1:
+        least = _kept(_least_end, camera, camera.distortion.detach())
+        if bool((covering(camera.intrinsics, least, camera._size_for("its rim")) == 1).all()):
+            return rim
     if not bool(camera.unproject(rim)[1].all()):
         focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]
         # edited images have different intrinsics, and few kinds of coefficients
@@ -598,3 +602,8 @@ def _ends(camera: Camera, distortion: Tensor) -> Tensor:
 
     ends = reach(lambda rays: seen(rays)[1], azimuths, steps=_ANGLES, rounds=2)
     return seen(polar_rays(ends, azimuths).unsqueeze(-2))[0].squeeze(-2)
+
+
+def _least_end(camera: Camera, distortion: Tensor) -> Tensor:
+    """(*B,): the least of the distances of `_ends`; what is nearer to the principal point has a ray."""
+    return torch.linalg.vector_norm(_ends(camera, distortion), dim=-1).amin(-1)
