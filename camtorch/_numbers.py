@@ -117,6 +117,28 @@ def as_numbers_of(camera: Camera, value: Numbers, name: str) -> Tensor:
     return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
 
 
+def wide(values: Tensor) -> Tensor:
+    """In float64, where a device has that."""
+    return values.float() if values.device.type == "mps" else values.double()
+
+
+def split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
+    """fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
+    if xp is torch:
+        return wide(intrinsics).unbind(-1)
+    return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
+
+
+def joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
+    """(*B, n) of n tensors (*B,); or of numbers and arrays, in the dtype of a tensor."""
+    if xp is torch:
+        return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
+    kind = np.float64 if like.dtype == torch.float64 else np.float32
+    if all(isinstance(number, float) for number in numbers):
+        return torch.from_numpy(np.array(numbers, kind))
+    return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind))
+
+
 def _is_column(model: type[Camera], distortion: Tensor) -> bool:
     """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
     count = max(distortion.shape[:-1], default=1) if distortion.shape[-1:] == (1,) else 1

@@ -8,11 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from camtorch._arguments import (
     GUESS_CAMERA,
+    are_numbers,
     as_flag,
     as_mapping,
     as_number,
@@ -102,29 +104,46 @@ def as_range(
 
 def draw(
     ranges: Mapping[str, Range], count: int, p: float, same: bool, generator: torch.Generator | None
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     """`apply` (count,) bool, which is true with probability p, and a value (count,) or (count, size) for every range.
 
     The numbers come in the order in which kornia asks for them: first the gate, if there is a choice, then the ranges.
+    They are arrays, which take less time than tensors, and tensors where the generator is on another device or what is
+    done with them is compiled.
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
     device = generator.device if generator is not None else torch.device("cpu")
-    if 0 < p < 1:
-        values = {"apply": torch.rand(rows, generator=generator, device=device) < p}
+    gate = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
+    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
+    # in float64, so that what is drawn is what every precision sees
+    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device) if sizes else None
+    plain = device.type == "cpu" and not torch.compiler.is_compiling()
+    if plain:
+        values: dict[str, Any] = {"apply": np.full(rows, p >= 1) if gate is None else gate.numpy()}
+        shares = None if shares is None else shares.numpy()
     else:
-        values = {"apply": torch.full((rows,), p >= 1, device=device)}
-    if ranges:
-        sizes = [rows * (interval.size or 1) for interval in ranges.values()]
-        # in float64, so that what is drawn is what every precision sees
-        shares = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device).split(sizes)
-        for (name, interval), share in zip(ranges.items(), shares, strict=True):
-            value = share.mul_(interval.high - interval.low).add_(interval.low)
-            values[name] = value if interval.size is None else value.view(rows, interval.size)
+        values = {"apply": torch.full((rows,), p >= 1, device=device) if gate is None else gate}
+    start = 0
+    for (name, interval), size in zip(ranges.items(), sizes, strict=True):
+        value = interval.low + (interval.high - interval.low) * shares[start : start + size]
+        values[name] = value if interval.size is None else value.reshape(rows, interval.size)
+        start += size
     if rows == count:
         return values
+    if plain:
+        return {name: np.repeat(value, count, 0) for name, value in values.items()}
     return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
+
+
+def _as_numbers(values: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Draws as arrays in float64, where nothing records what becomes of them."""
+    if not are_numbers(*values.values()):
+        return dict(values)
+    return {
+        name: value.numpy() if value.dtype == torch.bool else value.double().numpy() for name, value in values.items()
+    }
 
 
 class EditOptions(SampleOptions, total=False):
@@ -257,6 +276,11 @@ class Augmentation(SampleTransform):
         self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
         """`draw` with another p and same_on_batch."""
+        numbers = self._numbers(count, p, same_on_batch, generator)
+        return {name: torch.as_tensor(value) for name, value in numbers.items()}
+
+    def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
+        """The draw as arrays or tensors; see the function `draw`."""
         return draw(self.ranges, count, p, same_on_batch, generator)
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
@@ -269,9 +293,9 @@ class Augmentation(SampleTransform):
         if camera is None:
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
-        return self._change(as_one(camera), self._checked_draw(draw))
+        return self._change(as_one(camera), _as_numbers(self._checked_draw(draw)))
 
-    def _change(self, camera: Camera, draw: Mapping[str, Tensor]) -> Change:
+    def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         applied, camera = draw["apply"], alone(camera)
         count = len(applied)
         groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
@@ -287,7 +311,7 @@ class Augmentation(SampleTransform):
         def part(rows: list[int] | None, source: Camera) -> Part:
             return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
 
-        looks = may_look(applied) or count == 0
+        looks = isinstance(applied, np.ndarray) or may_look(applied) or count == 0
         if not looks or all(applied.tolist()):  # traced, all rows move, and a gate chooses
             return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
         parts, chosen = [], applied.tolist()
@@ -327,7 +351,7 @@ class Augmentation(SampleTransform):
                     raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {values[name].tolist()}")
         return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
 
-    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
         target, rotation = self._new_camera(source, values)
         if self.min_filled:
@@ -339,24 +363,24 @@ class Augmentation(SampleTransform):
         warp = self._warp(source, target, rotation, self._shutter(more))
         return Part(rows, warp, source, *self._seen_through(warp, more))
 
-    def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """What was drawn, (*B,) or (*B, size): of a single camera without batch dims where all samples draw the same,
         as one map then serves them all.
         """
         values = {name: value for name, value in draw.items() if name != "apply"}
-        if not source.batch_shape and all(len(value) == 1 or holds(value == value[:1]) for value in values.values()):
+        if not source.batch_shape and all(len(value) == 1 or _are_alike(value) for value in values.values()):
             values = {name: value[0] for name, value in values.items()}
         return values
 
-    def _new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+    def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         """`new_camera` of values as drawn."""
         return self.new_camera(source, self._like(source, values))
 
     @staticmethod
-    def _like(source: Camera, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The values in the source's dtype and on its device."""
+    def _like(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
+        """The values as tensors in the source's dtype and on its device."""
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
-        return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
+        return {name: torch.as_tensor(value).to(source.intrinsics.device, dtype) for name, value in values.items()}
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
@@ -436,7 +460,10 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
-        change = self._change(camera, self.draw(count, generator)) if draw is None else self.change(camera, draw)
+        if draw is None:
+            change = self._change(camera, self._numbers(count, self.p, self.same_on_batch, generator))
+        else:
+            change = self.change(camera, draw)
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
@@ -489,6 +516,12 @@ class Augmentation(SampleTransform):
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
+
+
+def _are_alike(value: Any) -> bool:
+    """Whether all rows of an array or a tensor are known to be the same."""
+    same = value == value[:1]
+    return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else holds(same)
 
 
 # -- for front ends, which hold an augmentation and the camera of their images

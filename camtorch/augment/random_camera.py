@@ -15,6 +15,7 @@ from torch import Tensor
 
 from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails
 from camtorch._module import Memo, remade
+from camtorch._numbers import joined, split, wide
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph
 from camtorch.augment.augmentation import Augmentation, Range, as_range
@@ -189,15 +190,15 @@ class RandomCamera(Augmentation):
         """The new camera and its turn; see `Augmentation.new_camera`."""
         return self._made(source, values, torch)
 
-    def _new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+    def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         if type(self).new_camera is not RandomCamera.new_camera:
             return super()._new_camera(source, values)
-        tensors = *source._tensors, *(() if self.like is None else self.like._tensors), *values.values()
-        if are_numbers(*tensors):
-            # a hundred operations on some numbers, which torch takes microseconds for, each
-            return self._made(source, {name: value.numpy() for name, value in values.items()}, np)
-        like = _wide(source.intrinsics.detach())
-        return self._made(source, {name: value.to(like) for name, value in values.items()}, torch)
+        lens = () if self.like is None else self.like._tensors
+        if are_numbers(*source._tensors, *lens) and not any(isinstance(value, Tensor) for value in values.values()):
+            # a hundred operations on some numbers, for each of which torch takes microseconds
+            return self._made(source, values, np)
+        like = wide(source.intrinsics.detach())
+        return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, or by arrays in float64, with the functions of torch or of numpy."""
@@ -208,7 +209,7 @@ class RandomCamera(Augmentation):
         angle = next(values[name] for name in names if name in values)
         angles = [xp.deg2rad(values.get(name, 0 * angle)) for name in names]
         elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
-        return target, _joined(elements, source.intrinsics, xp).unflatten(-1, (3, 3))
+        return target, joined(elements, source.intrinsics, xp).unflatten(-1, (3, 3))
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
@@ -271,7 +272,7 @@ class RandomCamera(Augmentation):
         if any(t.dtype != dtype or t.device != device for t in base._tensors):
             base = base.each(lambda t: t.to(device, dtype))
         if self.fov == "source":
-            numbers = _split(self._from_source(source, base, size), xp)
+            numbers = split(self._from_source(source, base, size), xp)
         else:
             numbers = _sized(base, size, values.get("fov"), xp)
         fx, fy, cx, cy = before = numbers
@@ -282,13 +283,13 @@ class RandomCamera(Augmentation):
         if "centre" in values:
             cx, cy = cx + values["centre"][..., 0] * width, cy + values["centre"][..., 1] * height
         if self._is_real:
-            factor = covering(_joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
+            factor = covering(joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
             factor = factor if xp is torch else factor.numpy()
             fx, fy = fx * factor, fy * factor
         distortion = base.distortion
         if "distortion" in values and distortion.shape[-1]:
-            drawn_to = remade(base, intrinsics=_joined((fx, fy, cx, cy), distortion, xp), image_size=size).detach()
-            usual = self._usual(base, size) if "fov" in values else _joined(before, distortion, xp).detach()
+            drawn_to = remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), image_size=size).detach()
+            usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp).detach()
             amounts = torch.as_tensor(values["distortion"], dtype=dtype, device=device)
             distortion = jittered(drawn_to, amounts, usual)
             if in_graph(base.distortion):
@@ -297,16 +298,14 @@ class RandomCamera(Augmentation):
             share, place = values["crop"], values["place"]
             left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
             fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
-        return remade(
-            base, intrinsics=_joined((fx, fy, cx, cy), distortion, xp), distortion=distortion, image_size=size
-        )
+        return remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), distortion=distortion, image_size=size)
 
     def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens with the field of view in the middle of the range; graph-free."""
 
         def made() -> Tensor:
             middle = base.intrinsics.new_tensor(self.ranges["fov"].middle)
-            return _joined(_sized(base, size, middle, torch), base.intrinsics, torch).detach()
+            return joined(_sized(base, size, middle, torch), base.intrinsics, torch).detach()
 
         kept: Tensor = self._memo(base._tensors, (type(base), base.image_size, size), made)
         return kept
@@ -316,7 +315,7 @@ class RandomCamera(Augmentation):
 
         def narrowed() -> Tensor:
             fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
-            whole = remade(base, intrinsics=_joined(_sized(base, size, fov, torch), base.intrinsics, torch))
+            whole = remade(base, intrinsics=joined(_sized(base, size, fov, torch), base.intrinsics, torch))
             whole = remade(whole, image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
@@ -324,34 +323,12 @@ class RandomCamera(Augmentation):
         return kept
 
 
-def _wide(values: Tensor) -> Tensor:
-    """In float64, where a device has that."""
-    return values.float() if values.device.type == "mps" else values.double()
-
-
-def _split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
-    """fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
-    if xp is torch:
-        return _wide(intrinsics).unbind(-1)
-    return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
-
-
-def _joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
-    """(*B, n) of n tensors (*B,); or of numbers and arrays, in the dtype of a tensor."""
-    if xp is torch:
-        return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
-    kind = np.float64 if like.dtype == torch.float64 else np.float32
-    if all(isinstance(number, float) for number in numbers):
-        return torch.from_numpy(np.array(numbers, kind))
-    return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind))
-
-
 def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[Any]:
     """fx, fy, cx, cy of a lens before an image of another size, showing as much in width or a fov in degrees.
 
     The old image is scaled to the new width, and cropped or padded evenly to the new height.
     """
-    fx, fy, cx, cy = own = _split(base.intrinsics, xp)
+    fx, fy, cx, cy = own = split(base.intrinsics, xp)
     across, down = (size[1] - 1) / 2, (size[0] - 1) / 2
     if base.image_size is None:
         cx, cy = cx + across, cy + down
@@ -364,7 +341,7 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         return fx, fy, cx, cy
     half = xp.deg2rad(fov / 2)
     sine, cosine = xp.sin(half), xp.cos(half)
-    ends = [_joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
+    ends = [joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
     rays = torch.stack(ends, -2)
     if base.batch_shape:
         rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
