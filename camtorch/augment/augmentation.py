@@ -115,35 +115,19 @@ def draw(
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
     device = generator.device if generator is not None else torch.device("cpu")
-    gate = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
+    gate: Any = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
+    gate = torch.full((rows,), p >= 1, device=device) if gate is None else gate
     sizes = [rows * (interval.size or 1) for interval in ranges.values()]
     # in float64, so that what is drawn is what every precision sees
-    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device) if sizes else None
-    plain = device.type == "cpu" and not torch.compiler.is_compiling()
-    if plain:
-        values: dict[str, Any] = {"apply": np.full(rows, p >= 1) if gate is None else gate.numpy()}
-        shares = None if shares is None else shares.numpy()
-    else:
-        values = {"apply": torch.full((rows,), p >= 1, device=device) if gate is None else gate}
-    start = 0
+    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device) if sizes else gate
+    if device.type == "cpu" and not torch.compiler.is_compiling():
+        gate, shares = gate.numpy(), shares.numpy()
+    values, start = {"apply": gate}, 0
     for (name, interval), size in zip(ranges.items(), sizes, strict=True):
         value = interval.low + (interval.high - interval.low) * shares[start : start + size]
         values[name] = value if interval.size is None else value.reshape(rows, interval.size)
         start += size
-    if rows == count:
-        return values
-    if plain:
-        return {name: np.repeat(value, count, 0) for name, value in values.items()}
-    return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
-
-
-def _as_numbers(values: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Draws as arrays in float64, where nothing records what becomes of them."""
-    if not are_numbers(*values.values()):
-        return dict(values)
-    return {
-        name: value.numpy() if value.dtype == torch.bool else value.double().numpy() for name, value in values.items()
-    }
+    return values if rows == count else {name: value[[0] * count] for name, value in values.items()}
 
 
 class EditOptions(SampleOptions, total=False):
@@ -293,7 +277,7 @@ class Augmentation(SampleTransform):
         if camera is None:
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
-        return self._change(as_one(camera), _as_numbers(self._checked_draw(draw)))
+        return self._change(as_one(camera), self._checked_draw(draw))
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         applied, camera = draw["apply"], alone(camera)
@@ -331,25 +315,25 @@ class Augmentation(SampleTransform):
             )
         return Change(count, parts, batch_type=type(camera) if isinstance(camera, Mixed) else None)
 
-    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
+        """As arrays, where nothing records what becomes of it."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
         missing = [name for name in ("apply", *self.ranges) if name not in draw]
         if missing:
             has = ", ".join(map(str, draw)) or "nothing"
             raise ValueError(f"{self._name}: the draw lacks {', '.join(missing)}; it has {has}")
-        values = {name: torch.as_tensor(draw[name]) for name in ("apply", *self.ranges)}
+        given = {name: torch.as_tensor(draw[name]) for name in ("apply", *self.ranges)}
+        values: dict[str, Any] = {"apply": given["apply"] > 0.5, **{name: given[name] for name in self.ranges}}
+        if are_numbers(*values.values()):
+            values = {"apply": values["apply"].numpy(), **{name: given[name].double().numpy() for name in self.ranges}}
         count = len(values["apply"])
         for name, interval in self.ranges.items():
-            shape = (count,) if interval.size is None else (count, interval.size)
-            if tuple(values[name].shape) != shape:
-                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(values[name].shape)}")
-        numbers = [values[name] for name in self.ranges]
-        # a sum tells of all at once
-        if numbers and all(map(may_look, numbers)) and not math.isfinite(sum(float(value.sum()) for value in numbers)):
-            for name in self.ranges:
-                if not bool(torch.isfinite(values[name]).all()):
-                    raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {values[name].tolist()}")
-        return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
+            value, shape = values[name], (count,) if interval.size is None else (count, interval.size)
+            if tuple(value.shape) != shape:
+                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
+            if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+                raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {value.tolist()}")
+        return values
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)

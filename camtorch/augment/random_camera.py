@@ -315,8 +315,8 @@ class RandomCamera(Augmentation):
 
         def narrowed() -> Tensor:
             fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
-            whole = remade(base, intrinsics=joined(_sized(base, size, fov, torch), base.intrinsics, torch))
-            whole = remade(whole, image_size=size)
+            intrinsics = joined(_sized(base, size, fov, torch), base.intrinsics, torch)
+            whole = remade(base, intrinsics=intrinsics, image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
         kept: Tensor = self._memo(source._tensors + base._tensors, (type(source), source.image_size, size), narrowed)
@@ -472,8 +472,7 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
     count = camera.distortion.shape[-1]
     measured = _kept(_sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
-    order = [i % DRAWN for i in range(count)]
-    steps = amounts.reshape(-1, DRAWN)[:, order if count > DRAWN else slice(count)] * measured
+    steps = amounts.reshape(-1, DRAWN).repeat(1, -(-count // DRAWN))[:, :count] * measured
     lens = remade(camera, intrinsics=camera.intrinsics.reshape(-1, 4), distortion=camera.distortion.reshape(-1, count))
     rim, given = _rim(lens), lens.distortion.expand_as(steps)
     if len(rim) < len(steps):
