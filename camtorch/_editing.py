@@ -58,14 +58,13 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     """
     if camera.is_mixed:
         return cast("Mixed", camera).by_groups(lambda group: edited(group, matrix, image_size))  # type: ignore[return-value]
-    own = camera.intrinsics
+    own, given = camera.intrinsics, [matrix] if isinstance(matrix, Tensor) else []
+    xp: Any = np if are_numbers(own, camera.distortion, *given) else torch
+    rows: Any = matrix
     if isinstance(matrix, Tensor):
-        xp: Any = np if are_numbers(own, camera.distortion, matrix) else torch
-        matrix = matrix.detach().double().numpy() if xp is np else wide(matrix)
-        (a, b, left), (c, d, top) = ([matrix[..., i, j] for j in range(3)] for i in range(2))
-    else:
-        xp = np if are_numbers(own, camera.distortion) else torch
-        (a, b, left), (c, d, top) = matrix
+        maps: Any = matrix.detach().double().numpy() if xp is np else wide(matrix)
+        rows = [[maps[..., i, j] for j in range(3)] for i in range(2)]
+    (a, b, left), (c, d, top) = rows
     fx, fy, cx, cy = split(own, xp)
     numbers = (
         *(abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy),

@@ -211,7 +211,7 @@ def held(name: str, doc: str) -> Any:
     """The property of a tensor that a module holds, which `nn.Module.__getattr__` finds in three times the time."""
 
     def tensor(module: GeometryModule) -> Tensor:
-        found = module._parameters.get(name)
+        found: Tensor | None = module._parameters.get(name)
         if found is None:
             found = module._buffers.get(name)
             if found is None:

@@ -238,9 +238,8 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, stackle
     if is_kept(intrinsics) or is_predicted(intrinsics):
         return
     row = row_of(intrinsics)
-    if row is None and (known := values_of(intrinsics)) is None:
-        return
-    rows = known.reshape(-1, 4)[:_LOOKED_AT].tolist() if row is None else [row]
+    known = values_of(intrinsics) if row is None else None
+    rows = [row] if row is not None else [] if known is None else known.reshape(-1, 4)[:_LOOKED_AT].tolist()
     if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
         return
     given = f"fx, fy, cx, cy = {rows[0]}"

@@ -150,6 +150,10 @@ class Camera(BatchedModule):
             _add_model(cls)
 
     _model: ClassVar[str]
+    _memo: Memo
+    _rays: Memo
+    _fields: Memo
+    _warned: bool
 
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None

@@ -145,7 +145,8 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
         check_devices("mount_rotation", **given)
         shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
         raise ValueError(f"mount_rotation: the angles must be of one shape (*B,); got {shapes}") from None
-    return torch.stack(mount_elements(angles.cos().unbind(), angles.sin().unbind()), -1).unflatten(-1, (3, 3))
+    matrix: Tensor = torch.stack(mount_elements(angles.cos().unbind(), angles.sin().unbind()), -1).unflatten(-1, (3, 3))
+    return matrix
 
 
 def mount_elements(cosines: Sequence[Any], sines: Sequence[Any]) -> tuple[Any, ...]:

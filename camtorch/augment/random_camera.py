@@ -283,7 +283,7 @@ class RandomCamera(Augmentation):
         if "centre" in values:
             cx, cy = cx + values["centre"][..., 0] * width, cy + values["centre"][..., 1] * height
         if self._is_real:
-            factor = covering(joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
+            factor: Any = covering(joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
             factor = factor if xp is torch else factor.numpy()
             fx, fy = fx * factor, fy * factor
         distortion = base.distortion
@@ -349,8 +349,8 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
     if fails(valid):
         raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
     wide = pixels[..., 1, 0] - pixels[..., 0, 0]
-    scale = size[1] / (wide if xp is torch else wide.numpy())
-    return own[0] * scale, own[1] * scale, cx, cy
+    ratio = size[1] / (wide if xp is torch else wide.numpy())
+    return own[0] * ratio, own[1] * ratio, cx, cy
 
 
 class RandomMount(RandomCamera):
@@ -582,4 +582,4 @@ def _ends(camera: Camera, distortion: Tensor) -> Tensor:
 
 def _least_end(camera: Camera, distortion: Tensor) -> Tensor:
     """(*B,): the least of the distances of `_ends`; what is nearer to the principal point has a ray."""
-    return torch.linalg.vector_norm(_ends(camera, distortion), dim=-1).amin(-1)
+    return (_ends(camera, distortion) ** 2).sum(-1).amin(-1).sqrt()

@@ -92,6 +92,11 @@ class Warp(GeometryModule):
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
     rotation: Tensor | None
     batch_shape: torch.Size
+    mode: Mode
+    padding_mode: PaddingMode
+    _tolerance: float | None
+    _memos: dict[PaddingMode, Memo]
+    _constants: Memo
     _pinned: Sampling | Lattice | None
     source: Camera
     target: Camera
