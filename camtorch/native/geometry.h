@@ -87,7 +87,7 @@ typedef struct {
     double *sums;
     int64_t count, tile; /* points of a camera; of a tile */
     int64_t direction;
-    int64_t next; /* the tile that whoever is free takes */
+    int64_t *next; /* the tile that whoever is free takes; NULL: one caller takes all */
 } Rows;
 
 /* OPEN: a pixel that may have a ray, which steps of Newton's method have not found */

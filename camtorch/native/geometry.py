@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
 _OPEN = 2  # of geometry.h
-_TILE = 1 << 14  # points of a tile, some 20 us
+_TILE = 1 << 14  # points of a tile, some 30 us
+_SHARED = 1 << 15  # points that threads are woken for
 _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII = 512
@@ -87,7 +89,8 @@ class _Cameras(ctypes.Structure):
     )
 
 
-_Rows = c_int64 * 20  # `Rows` of geometry.h
+_Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
+_NO_ROWS = (0, 0, 0, 0)
 
 
 class _Domain(ctypes.Structure):
@@ -133,6 +136,19 @@ class Plan:
         self.is_chart = isinstance(chart, optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
+        self._ends: dict[torch.dtype, tuple[float, float]] = {}
+
+    def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
+        """The radii at which the chart of some cameras ends, and beyond which there are no images."""
+        if self.is_chart:
+            return FURTHEST, FURTHEST
+        if dtype in self._ends:
+            return self._ends[dtype]
+        made = chart()
+        end, usual_end = made.end(dtype), made.usual_end(dtype)
+        if not (made.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
+            self._ends[dtype] = end, usual_end
+        return end, usual_end
 
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """(C, parameters) of coefficients (C, n)."""
@@ -159,7 +175,7 @@ def _plan(optics_of: Optics, k: Tensor) -> Plan | None:
 class Native:
     """Cameras (C,) of one model as the compiled geometry takes them."""
 
-    _kept: list[Tensor]
+    _kept: list[Any]
 
     def __init__(self, plan: Plan, optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None):
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, []
@@ -181,33 +197,36 @@ class Native:
             self._add_domain()
         self.pointer = addressof(struct)
 
-    @property
-    def _wide(self) -> Tensor:
-        return self._k.double()
+    def _optics(self) -> tuple[Chart, Lens]:
+        """In double precision."""
+        return self._optics_of(columns(self._k.double()))
 
     @functools.cached_property
     def _domain(self) -> _Domain:
         """What it is asked with; its optics are of double precision."""
-        made, plan, k = _Domain(), self.plan, self._wide
+        made, plan, k = _Domain(), self.plan, self._k.double()
         made.parts, made.part_count = addressof(plan.parts), plan.count
         made.is_double, made.cameras, made.is_radial = self.struct.is_double, self.cameras, plan.is_radial
         made.parameters, made.parameter_count = self._keep(plan.parameters_of(self._optics_of, k)), plan.parameters
         made.most = torch.finfo(self.dtype).max ** 0.25
-        chart, lens = self._optics_of(columns(k))
-        ends = (FURTHEST, FURTHEST) if plan.is_chart else (chart.end(self.dtype), chart.usual_end(self.dtype))
-        made.ends, made.usual_ends = map(self._keep_ends, ends)
-        if plan.places is None and (constants := _constants(lens)):
-            made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
-        factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
-        if factor is not None:
-            many = len(factor.parameters) > _MOST_DEGREE
-            fold = factor.closed_fold() if many and factor.fold is None else factor.fold
-            made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
+        made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
+        if plan.places is None or plan.parameters > _MOST_DEGREE:
+            chart, lens = self._optics()
+            if constants := _constants(lens):
+                made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
+            factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
+            if factor is not None:
+                many = len(factor.parameters) > _MOST_DEGREE
+                fold = factor.closed_fold() if many and factor.fold is None else factor.fold
+                made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
         return made
 
     def _keep_ends(self, end: float | Tensor) -> int:
-        one = torch.as_tensor(end, dtype=torch.float64, device="cpu")
-        return self._keep(one.expand(self.cameras, 1))
+        if isinstance(end, float):
+            ends = (c_double * self.cameras)(*[end] * self.cameras)
+            self._kept.append(ends)
+            return addressof(ends)
+        return self._keep(end.expand(self.cameras, 1).double())
 
     def _ask(self, wanted: dict[str, int]) -> None:
         """Fill in what of the domain is wanted: names and where it goes."""
@@ -242,9 +261,7 @@ class Native:
             struct.circle2, struct.stagewise = self._new(1), self._new(1, torch.bool)
             wanted |= {"circle2": struct.circle2, "stagewise": struct.stagewise}
         if not plan.is_radial:
-            chart, _ = self._optics_of(columns(self._wide))
-            radii = chart.radii(_RADII, self._k).to(torch.float64)
-            wanted["radii"] = self._keep(radii)
+            wanted["radii"] = self._keep(self._optics()[0].radii(_RADII, self._k).double())
         self._ask(wanted)
 
     def add_table(self) -> None:
@@ -262,11 +279,12 @@ class Native:
         return Domain(self._optics_of, self._k)
 
     def _keep(self, tensor: Tensor) -> int:
-        self._kept.append(tensor.detach().contiguous())
-        return self._kept[-1].data_ptr()
+        tensor = tensor.contiguous()
+        self._kept.append(tensor)
+        return tensor.data_ptr()
 
-    def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int | None:
-        return self._keep(torch.cat([c.detach().expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
+    def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
+        return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
 
 
 def native_of(optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None) -> Native | None:
@@ -362,27 +380,30 @@ class Unprojected(NamedTuple):
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
-    count = points.shape[1]
-    pixels = _empty(2, native.cameras, count, native.dtype)
-    valid = torch.empty(native.cameras, count, dtype=torch.bool, device="cpu")
-    if _call(native, PROJECT, points, pixels, valid) and native.struct.limits2 is None:
+    cameras, count, _ = points.shape
+    pixels = _empty((2, cameras, count), native.dtype)
+    valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+    rows = points.data_ptr(), *points.stride(), *_planes(pixels, cameras, count), valid.data_ptr(), 0, *_NO_ROWS, 0
+    if _call(native, cameras, count, PROJECT, rows) and native.struct.limits2 is None:
         native.add_limits()
-        _call(native, PROJECT, points, pixels, valid)
+        _call(native, cameras, count, PROJECT, rows)
     return pixels, valid
 
 
 def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
     """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
-    count = pixels.shape[1]
-    rays = _empty(3, native.cameras, count, native.dtype)
-    valid = torch.empty(native.cameras, count, dtype=torch.uint8, device="cpu")
-    solution = torch.empty(2, native.cameras, count, dtype=native.dtype, device="cpu") if keeps else None
+    cameras, count, _ = pixels.shape
+    rays = _empty((3, cameras, count), native.dtype)
+    valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+    solution = _empty((2, cameras, count), native.dtype) if keeps else None
     if native.plan.has_factor and native.struct.table is None:
         native.add_table()
-    left = _call(native, UNPROJECT, pixels, rays, valid, solution)
-    if not left:
-        return Unprojected(rays, valid.view(torch.bool), solution, None)
-    return Unprojected(rays, valid == 1, solution, valid == _OPEN)
+    rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
+    kept = 0 if solution is None else solution.data_ptr()
+    if not _call(native, cameras, count, UNPROJECT, (*rows, kept, *_NO_ROWS, 0)):
+        return Unprojected(rays, valid, solution, None)
+    states = valid.view(torch.uint8)
+    return Unprojected(rays, states == 1, solution, states == _OPEN)
 
 
 def project_vjp(
@@ -393,10 +414,11 @@ def project_vjp(
 
     cotangents: of pixels, (2, C, N), of any strides.
     """
-    results = torch.empty(points.shape, dtype=native.dtype, device="cpu") if want_points else None
-    sums = _sums(native, points) if want_parameters else None
-    by_row = None if results is None else results.movedim(-1, 0)
-    _call(native, PROJECT_VJP, points, by_row, cotangents=cotangents, sums=sums)
+    cameras, count, _ = points.shape
+    results = _empty((cameras, count, 3), native.dtype) if want_points else None
+    sums = _sums(native, cameras, count) if want_parameters else None
+    rows = points.data_ptr(), *points.stride(), *_points(results), 0, 0
+    _call(native, cameras, count, PROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -407,71 +429,58 @@ def unproject_vjp(
 
     valid, solution: of `unproject`.
     """
-    shape = valid.shape
-    results = torch.empty(*shape, 2, dtype=native.dtype, device="cpu") if want_pixels else None
-    by_row = None if results is None else results.movedim(-1, 0)
-    sums = _sums(native, valid) if want_parameters else None
-    _call(native, UNPROJECT_VJP, None, by_row, valid, solution, cotangents=cotangents, sums=sums)
+    cameras, count = valid.shape
+    results = _empty((cameras, count, 2), native.dtype) if want_pixels else None
+    sums = _sums(native, cameras, count) if want_parameters else None
+    rows = *_NO_ROWS, *_points(results), valid.data_ptr(), solution.data_ptr()
+    _call(native, cameras, count, UNPROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
-def _empty(size: int, cameras: int, count: int, dtype: torch.dtype) -> Tensor:
+def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     # of large results the first write to each page would take longer than the geometry
-    if size * cameras * count * dtype.itemsize >= memory.LEAST:
-        return memory.empty((size, cameras, count), dtype, torch.contiguous_format)
-    return torch.empty(size, cameras, count, dtype=dtype, device="cpu")
+    if size[0] * size[1] * size[2] * dtype.itemsize >= memory.LEAST:
+        return memory.empty(size, dtype, torch.contiguous_format)
+    return torch.empty(size, dtype=dtype, device="cpu")
 
 
-def _sums(native: Native, rows: Tensor) -> Tensor:
-    tiles = -(-rows.shape[1] // _TILE)
-    return torch.zeros(native.cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
+def _sums(native: Native, cameras: int, count: int) -> Tensor:
+    tiles = -(-count // _TILE)
+    return torch.zeros(cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
 
 
-def _call(
-    native: Native,
-    direction: int,
-    rows: Tensor | None,
-    results: Tensor | None,
-    valid: Tensor | None = None,
-    solution: Tensor | None = None,
-    *,
-    cotangents: Tensor | None = None,
-    sums: Tensor | None = None,
-) -> int:
-    """rows: (C, N, size). results, cotangents: (size, C, N)."""
-    shapes = [t.shape[:2] for t in (rows, valid) if t is not None]
-    shapes += [t.shape[1:] for t in (results, solution, cotangents) if t is not None]
-    count = shapes[0][1]
-    assert all(shape == (native.cameras, count) for shape in shapes)  # else C would write elsewhere
-    if not count or not native.cameras:
-        return 0
-    call = _Rows(
-        native.pointer,
-        *_place(rows, 0, 1, 2),
-        *_place(results, 1, 2, 0),
-        0 if valid is None else valid.data_ptr(),
-        0 if solution is None else solution.data_ptr(),
-        *_place(cotangents, 1, 2, 0),
-        0 if sums is None else sums.data_ptr(),
-        count,
-        _TILE,
-        direction,
-        0,
-    )
-    run = _entry("camtorch_geometry", c_int64)
-    tiles = -(-count // _TILE) * native.cameras
-    if count * native.cameras <= _TILE or tiles == 1:
-        return int(run(call))
+def _planes(results: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
+    """Where new ones lie, (size, C, N), and their strides by camera, point and component."""
+    return results.data_ptr(), count, 1, cameras * count
+
+
+def _points(results: Tensor | None) -> tuple[int, ...]:
+    """The same of (C, N, size)."""
+    return _NO_ROWS if results is None else (results.data_ptr(), *results.stride())
+
+
+def _cotangents(given: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
+    """The same of (size, C, N) of any strides."""
+    assert given.shape[1:] == (cameras, count)  # else C would read elsewhere
+    component, camera, point = given.stride()
+    return given.data_ptr(), camera, point, component
+
+
+def _address(tensor: Tensor | None) -> int:
+    return 0 if tensor is None else tensor.data_ptr()
+
+
+def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...]) -> int:
+    """rows: what of `Rows` is between its cameras and its count."""
+    assert cameras == native.cameras
+    run, points = _entry("camtorch_geometry", c_int64), cameras * count
+    if points < _SHARED:
+        return run(_Rows(native.pointer, *rows, count, _TILE, direction, 0)) if points else 0
+    following = c_int64(0)
+    call = _Rows(native.pointer, *rows, count, _TILE, direction, addressof(following))
     left: list[int] = []
-    spread(lambda: left.append(run(call)), min(thread_count(), tiles))
+    spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE) * cameras))
     return sum(left)
-
-
-def _place(tensor: Tensor | None, camera: int, point: int, component: int) -> tuple[int, ...]:
-    if tensor is None:
-        return 0, 0, 0, 0
-    strides = tensor.stride()
-    return tensor.data_ptr(), strides[camera], strides[point], strides[component]
 
 
 @functools.cache

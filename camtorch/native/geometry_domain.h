@@ -15,12 +15,12 @@ typedef struct {
 } Lens;
 
 static void factors(const Lens *lens, int n, const double *t, double *factor, double *slope) {
+    const Factor_double of = prepare_factor_double(lens->part, lens->numbers, lens->constants);
     for (int i = 0; i < n; i += BLOCK) {
         const int here = n - i < BLOCK ? n - i : BLOCK;
         ALIGNED double square[BLOCK] = {0}, value[BLOCK], by_t[BLOCK];
         memcpy(square, t + i, (size_t)here * sizeof(double));
-        radial_double(lens->part, lens->numbers, lens->constants, (here + LANES - 1) & -LANES, square, value,
-                      slope ? by_t : NULL);
+        radial_double(&of, (here + LANES - 1) & -LANES, square, value, slope ? by_t : NULL);
         memcpy(factor + i, value, (size_t)here * sizeof(double));
         if (slope) memcpy(slope + i, by_t, (size_t)here * sizeof(double));
     }

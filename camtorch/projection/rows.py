@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -41,8 +42,8 @@ class Cameras:
         self._model, self._learns = model, distortion.requires_grad
         with torch.no_grad():
             self.given = intrinsics.detach().clone(), distortion.detach().clone()
-            usable, values, self.usable = _usable(model, *self.given), self.given, None
-            if not holds(usable):
+            values, self.usable = self.given, None
+            if not (_are_plain(model, *self.given) or holds(usable := _usable(model, *self.given))):
                 ideal = _ideal(model, *self.given)
                 values = torch.where(usable, self.given[0], ideal[0]), torch.where(usable, self.given[1], ideal[1])
                 self.usable = usable.to(intrinsics.dtype)  # (C, 1)
@@ -97,6 +98,17 @@ class Cameras:
             outputs, of_outputs = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
             (by_coefficients,) = torch.autograd.grad(outputs, k, of_outputs, materialize_grads=True)
         return by_coefficients
+
+
+def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> bool:
+    """Whether a short look says that all are usable."""
+    if (
+        not intrinsics.is_cpu
+        or 0 in intrinsics.shape
+        or (distortion.numel() and model.defined(distortion.unbind(-1)) is not None)
+    ):
+        return False
+    return math.isfinite(float(intrinsics.sum()) + float(distortion.sum())) and float(intrinsics[:, :2].amin()) > 0
 
 
 def _usable(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Tensor:
