@@ -187,7 +187,7 @@ def robustly(loss, scale, share, batch):
     return adjusted.state.parameters[0] - problem.parameters[0], values.std, noise
 
 
-@pytest.mark.parametrize(("loss", "scale", "share"), [("huber", 1.0, 0.0), ("huber", 0.3, 0.05), ("cauchy", 0.5, 0.05)])
+@pytest.mark.parametrize(("loss", "scale", "share"), [("huber", 1.0, 0.0), ("cauchy", 0.5, 0.05)])
 def test_robust_refits_scatter_as_predicted(loss, scale, share):
     """Nearly: outliers come to views by chance, and the formulas know only their share."""
     errors, std, noise = robustly(loss, scale, share, 200)

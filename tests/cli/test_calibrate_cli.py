@@ -339,16 +339,16 @@ def test_images_that_cannot_be_matched():
 def test_the_model_is_taken_that_predicts_best():
     corners = corners_of()
     pixels = np.stack([image.pixels for image in corners.images])
-    candidates = [("pinhole", 0), ("brown_conrady", 5), ("kannala_brandt", 4), ("fisheye624", 12)]
+    candidates = [("pinhole", 0), ("kannala_brandt", 4), ("kannala_brandt", 6)]
     chosen = select(corners.points, pixels, image_size=(480, 640), candidates=candidates)
-    assert chosen.best.model == "kannala_brandt"
+    assert chosen.best.calibration.camera.distortion.shape == (4,)
     assert chosen.best.calibration.rms < 0.15
     lines = chosen.lines()
-    assert [line.split()[0] for line in lines[1:5]] == [key for key, _ in candidates]
-    assert [line.endswith("taken") for line in lines[1:5]] == [False, False, True, False]
-    errors = {trial.model: trial.held_out for trial in chosen.trials}
-    assert errors["pinhole"] > 3 * errors["kannala_brandt"]
-    assert errors["fisheye624"] >= 0.99 * errors["kannala_brandt"]
+    assert [line.split()[0] for line in lines[1:4]] == [key for key, _ in candidates]
+    assert [line.endswith("taken") for line in lines[1:4]] == [False, True, False]
+    least, fits, more = (trial.held_out for trial in chosen.trials)
+    assert least > 3 * fits
+    assert more >= 0.99 * fits
 
 
 @pytest.mark.slow

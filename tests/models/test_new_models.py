@@ -137,7 +137,7 @@ def check_derivatives(function, inputs):
     assert gradgradcheck(function, inputs, atol=1e-4, fast_mode=True)
 
 
-@pytest.mark.parametrize("model", slow_unless({Waved, Backwards}.__contains__, list(CAMERAS)))
+@pytest.mark.parametrize("model", slow_unless({Waved}.__contains__, list(CAMERAS)))
 def test_derivatives(model):
     camera = camera_of(model)
     leaves = [p.detach().clone().requires_grad_() for p in camera.parameters()]
@@ -200,9 +200,8 @@ def test_reverse_mode_of_torch_func(model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", list(CAMERAS)[:2])
-def test_traced(model):
-    camera = camera_of(model)
+def test_traced():
+    camera = camera_of(Waved)
     rays = fan(50)
     pixels, _ = camera.project(rays)
     for method, values in (("project", rays), ("unproject", pixels.detach())):

@@ -52,7 +52,6 @@ assert sorted(n for n in dir(ct) if not n.startswith("_")) == sorted(ct.__all__)
 assert not hasattr(ct, "Pinhole2") and not hasattr(ct, "_public2")
 """: "",
     "from camtorch.camera import Camera\nimport camtorch as ct\nprint(*ct.MODELS)": " ".join(ct.MODELS),
-    "import camtorch.io as io\nimport camtorch as ct\nprint(*ct.MODELS)": " ".join(ct.MODELS),
     """
 import camtorch as ct, torch
 focal = torch.nn.Parameter(torch.ones(4))
@@ -63,7 +62,7 @@ print(function(torch.ones(3))[0].item())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("code", FIRST_USES, ids=["names", "camera", "io", "compiled"])
+@pytest.mark.parametrize("code", FIRST_USES, ids=["names", "camera", "compiled"])
 def test_what_is_used_first_may_be_anything(code):
     assert python(code).strip() == FIRST_USES[code]
 
