@@ -573,12 +573,8 @@ def test_copies_and_pickles():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("cls", "p"), [(adapter.RandomMount, 1.0), (adapter.RandomLens, 1.0), (adapter.RandomCamera, 0.5)]
-)
-def test_compiled_without_a_break(cls, p):
-    torch.compiler.reset()
-    aug = cls(camera(), p=p)
+def test_compiled_without_a_break():
+    aug = adapter.RandomCamera(camera(), p=0.5)
     compiled = torch.compile(aug, fullgraph=True, backend="eager")
     torch.manual_seed(15)
     drawn = compiled(images())

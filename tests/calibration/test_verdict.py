@@ -254,4 +254,3 @@ def test_double_spheres_have_twins():
     assert all(f"fx {optimum[0]:.4g}, xi {optimum[4]:.4g}" in text for optimum in optima)
     # corners without noise tell them apart
     assert found("double_sphere", seen_by(sphere, 6)[0]).twins == ()
-    assert found("eucm", corners).twins == ()

@@ -79,9 +79,8 @@ def test_compile_to_machine_code():
 
 
 @pytest.mark.slow
-@both_directions
-def test_export(method):
-    module, values = module_and_input("kannala_brandt", method)
+def test_export():
+    module, values = module_and_input("kannala_brandt", "project")
     count = torch.export.Dim("count", min=2)
     exported = torch.export.export(module, (values,), dynamic_shapes=({0: count},)).module()
     for rows in (values, values[:9]):
@@ -463,9 +462,8 @@ def test_a_model_is_one_class():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [4, 14])
-def test_compile_with_every_number_of_coefficients(count):
-    camera = ct.BrownConrady([300.0, 300.0, 32.0, 24.0], [-0.3, 0.1, 1e-3, -5e-4, *[1e-3] * 10][:count])
+def test_compile_with_the_most_coefficients():
+    camera = ct.BrownConrady([300.0, 300.0, 32.0, 24.0], [-0.3, 0.1, 1e-3, -5e-4, *[1e-3] * 10])
     points = torch.tensor([[0.1, -0.2, 1.0], [0.3, 0.2, -1.0]])
     compiled = torch.compile(camera, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(points)[0], camera(points)[0])
