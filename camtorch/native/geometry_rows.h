@@ -217,18 +217,13 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     if (c->is_radial) { /* most often */
         EACH(i) s.x[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
         T(radial)(c->factors + 1, n, s.x, s.scale, NULL);
-        EACH(i) {
-            const R x = fx * (s.a[i] * s.scale[i]) + cx, y = fy * (s.b[i] * s.scale[i]) + cy;
-            u[i] = s.ok[i] ? x : -1, v[i] = s.ok[i] ? y : -1;
-        }
-    } else {
-        const R *restrict a = c->stages ? s.x : s.a, *restrict b = c->stages ? s.y : s.b;
-        if (c->stages) T(lens)(c, 1, n, s.a, s.b, s.x, s.y, NULL, NULL);
-        EACH(i) {
-            const R x = fx * a[i] + cx, y = fy * b[i] + cy;
-            u[i] = s.ok[i] ? x : -1, v[i] = s.ok[i] ? y : -1;
-        }
-    }
+        EACH(i) s.x[i] = fx * (s.a[i] * s.scale[i]), s.y[i] = fy * (s.b[i] * s.scale[i]);
+    } else if (c->stages) {
+        T(lens)(c, 1, n, s.a, s.b, s.x, s.y, NULL, NULL);
+        EACH(i) s.x[i] *= fx, s.y[i] *= fy;
+    } else EACH(i) s.x[i] = fx * s.a[i], s.y[i] = fy * s.b[i];
+    /* in a loop of its own, so that no processor does both at once: edges of images lie where round numbers put them */
+    EACH(i) u[i] = s.ok[i] ? s.x[i] + cx : -1, v[i] = s.ok[i] ? s.y[i] + cy : -1;
     if (!direct) T(store)(pixels, to, 2, count, u, v, NULL);
     for (int i = 0; i < count; i++) valid[i] = (uint8_t)s.ok[i];
     return waiting;
