@@ -5,7 +5,7 @@
 #define DECLARED(variant)                                                                                              \
     int32_t sample_##variant(Job *);                                                                                      \
     int32_t classify_##variant(const Classification *);                                                                \
-    int64_t geometry_##variant(const Rows *);                                                                                \
+    int64_t geometry_##variant(const Rows *);                                                                          \
     void domain_##variant(const Domain *);
 DECLARED(baseline)
 #ifdef HAS_AVX2

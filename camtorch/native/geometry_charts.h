@@ -210,7 +210,8 @@ static void T(to_plane_sums)(const T(Camera) *c, int n, const R *restrict x, con
     switch (c->parts->kind) {
     case UNIFIED: {
         EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], distance = T(root)(rho2 + z[i] * z[i]), along = ga[i] * x[i] + gb[i] * y[i];
+            const R rho2 = x[i] * x[i] + y[i] * y[i], distance = T(root)(rho2 + z[i] * z[i]);
+            const R along = ga[i] * x[i] + gb[i] * y[i];
             const R shifted = z[i] + k.xi * distance, sphere = T(root)(k.beta * rho2 + shifted * shifted);
             const R by_below = -along * s[i] * s[i], by_root = by_below * k.alpha / sphere;
             w[i] = (by_below * (1 - k.alpha) + by_root * shifted) * distance;

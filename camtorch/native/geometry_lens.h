@@ -262,8 +262,8 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     } else T(planar)(c, stage, n, a, b, u, v, to);
 }
 
-/* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive where each is
-   defined, regular and not turned over */
+/* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive
+   where each is defined, regular and not turned over */
 static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to,
                     R *least) {
     ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];

@@ -252,7 +252,8 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
     T(see)(c, 1, count, n, &s);
-    const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0), *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
+    const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0);
+    const R *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
     EACH(i) {
         const R p = fx * to_u[i], q = fy * to_v[i];
         gu[i] = s.ok[i] ? p : 0, gv[i] = s.ok[i] ? q : 0;
@@ -623,7 +624,8 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     ALIGNED R p[BLOCK], q[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], ga[BLOCK], gb[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
     const R *a = T(load)(solution, 1, count, n, p, 0), *u = a;
     const R *b = T(load)(solution + rows->cameras->cameras * rows->count, 1, count, n, q, 0), *v = b;
-    const R *to_x = T(load)(cotangents, by[1], count, n, x, 0), *to_y = T(load)(cotangents + by[2], by[1], count, n, y, 0);
+    const R *to_x = T(load)(cotangents, by[1], count, n, x, 0);
+    const R *to_y = T(load)(cotangents + by[2], by[1], count, n, y, 0);
     const R *to_z = T(load)(cotangents + 2 * by[2], by[1], count, n, z, 0);
     for (int i = 0; i < count; i++) {
         const int is_known = valid[i] == VALID;
@@ -652,7 +654,8 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
 }
 
 /* Asks for the memory of rows that come next, while others are computed */
-static void T(fetch)(const void *memory, const int64_t *strides, int components, int64_t camera, int64_t first, int64_t count) {
+static void T(fetch)(const void *memory, const int64_t *strides, int components, int64_t camera, int64_t first,
+                     int64_t count) {
 #if defined(__GNUC__)
     const int64_t bytes = count * strides[1] * (int64_t)sizeof(R);
     if (!memory || strides[1] < 1 || strides[1] > 16) return;
