@@ -1,14 +1,13 @@
 """Laws of the augmentations: whatever the cameras, all fields of a sample move together."""
 
 import copy
-import itertools
 import math
 import pickle
 
 import kornia
 import pytest
 import torch
-from cameras import KEYS, PAIRS, slow_unless, spread
+from cameras import DISTINCT, KEYS, PAIRS, slow_unless, spread
 
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
@@ -70,7 +69,7 @@ def likes():
 # Every preset with some models, and some pairs of models: all would take minutes
 WITH_PRESETS = [(i, KEYS[(5 * i + j) % len(KEYS)]) for j in range(2) for i in range(0, len(PRESETS), 2)]
 WITH_MODELS = [(len(PRESETS) + KEYS.index(like), key) for like, key in PAIRS[::6]]
-FEW = {WITH_PRESETS[0], WITH_PRESETS[2], WITH_MODELS[4]}
+FEW = {WITH_PRESETS[0], WITH_MODELS[4]}
 
 
 @pytest.mark.parametrize(("which", "key"), slow_unless(FEW.__contains__, WITH_PRESETS + WITH_MODELS))
@@ -395,17 +394,17 @@ def test_depth_is_that_along_the_new_axis():
 
 
 def test_jittered_lenses_stay_invertible_and_bounded():
-    for key, amount in itertools.product(KEYS, (0.05, 1.0)):
+    for key, amount in [(key, 0.05) for key in KEYS] + [(key, 1.0) for key in sorted(DISTINCT)]:
         camera = source(key)
         change = RandomLens(camera=camera, focal=(1, 1), centre=(0, 0), distortion=amount).change(
-            None, RandomLens(focal=(1, 1), centre=(0, 0), distortion=amount).draw(16, torch.Generator().manual_seed(0))
+            None, RandomLens(focal=(1, 1), centre=(0, 0), distortion=amount).draw(8, torch.Generator().manual_seed(0))
         )
         edge = torch.cat((camera.pixel_grid()[[0, -1]].reshape(-1, 2), camera.pixel_grid()[:, [0, -1]].reshape(-1, 2)))
         rays, seen = camera.unproject(edge)
         target = change.target
-        still = target.unproject(edge.expand(16, -1, -1))[1]
+        still = target.unproject(edge.expand(8, -1, -1))[1]
         assert (still | ~seen).all(), key
-        moved, valid = target.project(rays.expand(16, -1, -1))
+        moved, valid = target.project(rays.expand(8, -1, -1))
         if target.distortion.shape[-1] and amount < 1:
             shift = (moved - edge).norm(dim=-1)[valid & seen].max() / math.hypot(SIZE[0] / 2, SIZE[1] / 2)
             assert amount / 50 < shift < 1.5 * amount, key

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from boards import chessboard, seen_by
+from boards import chessboard
 
 import camtorch as ct
 from camtorch.rotations import rotation_matrix, rotation_vector
@@ -104,9 +104,9 @@ def test_views_of_different_moments_are_asked_about():
 
 @pytest.mark.slow
 def test_cameras_that_are_linked_by_a_third_one():
-    pixels, _, _ = seen(views=20)
-    pixels["right"][:10] = math.nan
-    pixels["side"][10:] = math.nan
+    pixels, _, _ = seen(views=10)
+    pixels["right"][:5] = math.nan
+    pixels["side"][5:] = math.nan
     found = calibrated(pixels)
     assert found.converged
     _, _, shifts = the_rig()
@@ -155,17 +155,6 @@ def test_views_are_copies_where_all_cameras_saw_the_same():
     assert found.views == (*range(6), 7)
     assert {copy for camera in found.cameras.values() for copy in camera.copies} <= {6, 8}
     assert any("show another view again" in text or "shows another view again" in text for text in found.warnings)
-
-
-@pytest.mark.slow
-def test_double_spheres_of_a_rig_have_twins():
-    lens = ct.DoubleSphere([200.0, 200, 320, 240], [-0.18, 0.59], image_size=(480, 640))
-    corners, *_ = seen_by(lens, 8, noise=0.2)
-    points = {"left": corners.image_points, "right": seen_by(lens, 8, noise=0.2, seed=0)[0].image_points + 0.01}
-    models, sizes = dict.fromkeys(points, "double_sphere"), dict.fromkeys(points, (480, 640))
-    found = ct.calibrate_rig(models, corners.object_points, points, image_sizes=sizes)
-    named = [text.split(":")[0] for text in found.warnings if "The parameters are not known, though" in text]
-    assert named == ["left", "right"]
 
 
 @pytest.mark.slow

@@ -187,13 +187,12 @@ def robustly(loss, scale, share, batch):
     return adjusted.state.parameters[0] - problem.parameters[0], values.std, noise
 
 
-@pytest.mark.parametrize(("loss", "scale", "share"), [("huber", 1.0, 0.0), ("huber", 0.3, 0.05), ("cauchy", 0.5, 0.05)])
-def test_robust_refits_scatter_as_predicted(loss, scale, share):
+def test_robust_refits_scatter_as_predicted():
     """Nearly: outliers come to views by chance, and the formulas know only their share."""
-    errors, std, noise = robustly(loss, scale, share, 200)
+    errors, std, _ = robustly("cauchy", 0.5, 0.05, 200)
     check(errors, std, slack=3.0)
-    if not share and scale >= 5 * NOISE:  # what the loss leaves alone
-        assert torch.allclose(noise, noise.new_full((), NOISE), rtol=0.1)
+    *_, noise = robustly("huber", 1.0, 0.0, 20)  # which the loss leaves alone
+    assert torch.allclose(noise, noise.new_full((), NOISE), rtol=0.1)
 
 
 def test_projections_are_known_where_parameters_are_not():

@@ -1,7 +1,6 @@
 """What a calibration says of itself: warnings where data do not carry it, none where they do, and a verdict."""
 
 import contextlib
-import math
 import re
 
 import pytest
@@ -199,7 +198,7 @@ def test_a_single_view_of_a_plane(key, tilt):
 
 @pytest.mark.parametrize(
     ("count", "noise"),
-    [(1, 0.0), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, 0.2), (2, 0.0), (2, 0.2), (6, 0.2)))],
+    [(1, 0.0), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 0.0), (6, 0.2)))],
 )
 def test_planes_across_the_axis(count, noise):
     """However many, they leave the focal length of a pinhole open; without noise too, where sigma tells nothing."""
@@ -211,7 +210,7 @@ def test_planes_across_the_axis(count, noise):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["equal", "in another order", "saved again"])
+@pytest.mark.parametrize("how", ["in another order", "saved again"])
 def test_copies_of_views_count_once(how):
     board, pixels = views(NARROW, *all_over(5))
     pixels[2, 7] = torch.nan
@@ -244,9 +243,8 @@ def test_photographs_from_a_tripod_are_no_copies():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("xi", "alpha", "focal"), [(-0.18, 0.59, 200.0), (0.3, 0.6, 317.0)])
-def test_double_spheres_have_twins(xi, alpha, focal):
-    sphere = lens(ct.DoubleSphere, (focal, focal, 320, 240), xi, alpha)
+def test_double_spheres_have_twins():
+    sphere = lens(ct.DoubleSphere, (317.0, 317.0, 320, 240), 0.3, 0.6)
     corners, *_ = seen_by(sphere, 8, noise=0.2)
     result = found("double_sphere", corners)
     optima = [result.spread.parameters[0].tolist(), *result.twins]
@@ -254,15 +252,5 @@ def test_double_spheres_have_twins(xi, alpha, focal):
     assert max(optimum[4] for optimum in optima) > 0.2
     text = one(result.warnings, "The parameters are not known, though projections are")
     assert all(f"fx {optimum[0]:.4g}, xi {optimum[4]:.4g}" in text for optimum in optima)
-    if xi > 0:  # corners without noise tell them apart
-        assert found("double_sphere", seen_by(sphere, 6)[0]).twins == ()
-        assert found("eucm", corners).twins == ()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("key", ["eucm", "division"])
-def test_every_model_has_a_verdict(key):
-    result = found(key, opencv_left()[0])
-    assert math.isfinite(result.sigma)
-    assert result.verdict.endswith(".")
-    assert "nan" not in " ".join((result.verdict, *result.warnings))
+    # corners without noise tell them apart
+    assert found("double_sphere", seen_by(sphere, 6)[0]).twins == ()

@@ -237,26 +237,20 @@ def two_cameras(board):
     return Corners(board, board.points(), images), turn, shift
 
 
-@pytest.mark.parametrize(
-    "board",
-    [pytest.param(board, marks=pytest.mark.slow) for board in (BOARD, Chessboard(7, 7, 0.03))],
-    ids=["clear", "ambiguous"],
-)
-def test_a_pair_becomes_a_rig(capsys, board):
+@pytest.mark.slow
+def test_a_pair_becomes_a_rig(capsys):
+    board, rng = Chessboard(7, 7, 0.03), np.random.default_rng(5)
     corners, turn, shift = two_cameras(board)
-    rng = np.random.default_rng(5)
-    if board.symmetries > 1:
-        for image in corners.images:  # as a detector may begin anywhere
-            image.pixels = reordered(board, image.pixels[None], [int(rng.integers(board.symmetries))])[0]
+    for image in corners.images:  # as a detector may begin anywhere
+        image.pixels = reordered(board, image.pixels[None], [int(rng.integers(board.symmetries))])[0]
     write_corners(corners, "corners.json")
     words = "--corners", "corners.json", "--square", "30mm", "--model", "kannala_brandt", "-o", "rig.yml"
-    calibrate(*words, *(() if board.symmetries > 1 else ("--report", "report.html")))
-    if board.symmetries == 1:
-        assert "right3.png" in Path("report.html").read_text()
+    calibrate(*words, "--report", "report.html")
+    assert "right3.png" in Path("report.html").read_text()
     captured = capsys.readouterr()
     assert "left: chessboard" in captured.out
     assert "in 9 of 9 images of 640x480" in captured.out
-    assert ("this board looks the same after a turn" in captured.err) == (board.symmetries > 1)
+    assert "this board looks the same after a turn" in captured.err
     rig = ct.load("rig.yml")
     assert list(rig.cameras) == ["left", "right"]
     mount = rig.extrinsics["right"].compose(rig.extrinsics["left"].inverse())
@@ -339,23 +333,23 @@ def test_images_that_cannot_be_matched():
 def test_the_model_is_taken_that_predicts_best():
     corners = corners_of()
     pixels = np.stack([image.pixels for image in corners.images])
-    candidates = [("pinhole", 0), ("brown_conrady", 5), ("kannala_brandt", 4), ("fisheye624", 12)]
+    candidates = [("pinhole", 0), ("kannala_brandt", 4), ("kannala_brandt", 6)]
     chosen = select(corners.points, pixels, image_size=(480, 640), candidates=candidates)
-    assert chosen.best.model == "kannala_brandt"
+    assert chosen.best.calibration.camera.distortion.shape == (4,)
     assert chosen.best.calibration.rms < 0.15
     lines = chosen.lines()
-    assert [line.split()[0] for line in lines[1:5]] == [key for key, _ in candidates]
-    assert [line.endswith("taken") for line in lines[1:5]] == [False, False, True, False]
-    errors = {trial.model: trial.held_out for trial in chosen.trials}
-    assert errors["pinhole"] > 3 * errors["kannala_brandt"]
-    assert errors["fisheye624"] >= 0.99 * errors["kannala_brandt"]
+    assert [line.split()[0] for line in lines[1:4]] == [key for key, _ in candidates]
+    assert [line.endswith("taken") for line in lines[1:4]] == [False, True, False]
+    least, fits, more = (trial.held_out for trial in chosen.trials)
+    assert least > 3 * fits
+    assert more >= 0.99 * fits
 
 
 @pytest.mark.slow
 def test_models_that_the_file_cannot_hold_are_not_tried(capsys, monkeypatch):
     from camtorch.calibration import selection
 
-    monkeypatch.setattr(selection, "CANDIDATES", (("pinhole", 0), ("kannala_brandt", 1), ("double_sphere", 2)))
+    monkeypatch.setattr(selection, "CANDIDATES", (("kannala_brandt", 1), ("double_sphere", 2)))
     write_corners(corners_of(count=5), "corners.json")
     calibrate("--corners", "corners.json", "-o", "camera.yml")
     captured = capsys.readouterr()

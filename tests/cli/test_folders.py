@@ -232,17 +232,17 @@ def test_processes_make_the_same(folder):
 
 @pytest.mark.slow
 def test_killed_at_any_moment_and_gone_on(folder):
-    write_images({f"{i}.png": "RGB" for i in range(10, 40)})
+    write_images({f"{i}.png": "RGB" for i in range(10, 26)})
     words = [sys.executable, "-m", "camtorch", *WORDS[:-1]]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     begin = time.monotonic()
     subprocess.run([*words, "whole", "--jobs", "2"], check=True, capture_output=True, env=environment)
     took, whole = time.monotonic() - begin, outputs("whole")
-    assert len(whole) == 35
+    assert len(whole) == 21
     generator = random.Random(7)
     for trial in range(TRIALS):
         place = f"{trial}"
-        for everyone in (False, True):  # it is broken off as it goes on as well
+        for everyone in (False, True) if TRIALS > 1 else (True,):  # it is broken off as it goes on as well
             going_on = ["--resume"] if Path(place).exists() else []
             process = subprocess.Popen(
                 [*words, place, "--jobs", "2", *going_on],

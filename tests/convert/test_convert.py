@@ -5,7 +5,7 @@ from math import radians
 
 import pytest
 import torch
-from cameras import GOLDEN, KEYS, drawn, each_kind, golden_camera, make, one, pixel_lattice, slow_unless
+from cameras import DISTINCT, GOLDEN, KEYS, drawn, each_kind, golden_camera, make, one, pixel_lattice, slow_unless
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -100,7 +100,8 @@ def test_to_every_model_as_the_numbers_say(key):
     assert float(result.max_error) < (60 if not one(key).distortion_names else 20)
 
 
-@few_models
+@pytest.mark.slow
+@each_kind
 def test_a_conversion_back_finds_the_camera(key):
     source = one(key)
     there = source.convert(ct.Fisheye624, max_angle=radians(35))
@@ -429,7 +430,7 @@ def test_nothing_between_the_nodes_is_worse(key, target, intrinsics, distortion)
 @pytest.mark.slow
 @each_kind
 @given(data=st.data())
-@settings(max_examples=4)
+@settings(max_examples=2)
 def test_nothing_between_the_nodes_of_drawn_cameras_is_worse(key, data):
     source = data.draw(drawn(key, wild=data.draw(st.booleans()))).requires_grad_(False)
     angle = data.draw(st.sampled_from([None, 0.3, 0.7, 1.2]))
@@ -440,7 +441,7 @@ def test_nothing_between_the_nodes_of_drawn_cameras_is_worse(key, data):
         assert largest(source, result) <= margin * float(result.max_error) + 1e-9
 
 
-@few_models
+@pytest.mark.parametrize("key", slow_unless({"division", "fisheye624"}.__contains__, sorted(DISTINCT)))
 @given(data=st.data())
 @settings(max_examples=1)
 def test_wild_cameras_become_something_finite(key, data):

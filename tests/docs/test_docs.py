@@ -51,7 +51,7 @@ def photographs():
     board = Chessboard(9, 6, 0.024)
     poses = [
         ((0.5 * np.cos(a), 0.5 * np.sin(a), 0.1), (0.06 * np.sin(a) - 0.1, 0.05 * np.cos(a) - 0.07, 0.2 + 0.01 * a))
-        for a in np.linspace(0, 6, 8)
+        for a in np.linspace(0, 6, 6)
     ]
     return [photograph(board, fisheye(), *pose)[0] for pose in poses]
 
@@ -60,13 +60,13 @@ def write_corners():
     """Of OpenCV's photographs."""
     left, _ = opencv_left()
     unseen = np.full_like(left.image_points[:1], np.nan)  # as an image in which no board was found
-    seen = np.concatenate([left.image_points[:2], unseen, left.image_points[2:]])
+    seen = np.concatenate([left.image_points[:2], unseen, left.image_points[2:8]])
     np.savez("corners.npz", object_points=left.object_points, image_points=seen)
 
 
 def write_calibration_data():
     """Corners of a stereo pair, and photographs, as the pages on calibration speak of them."""
-    pair, right, *_ = stereo(12)
+    pair, right, *_ = stereo(8)
     np.savez("stereo.npz", object_points=pair.object_points, left=pair.image_points, right=right)
     Path("images").mkdir()
     for i, image in enumerate(photographs()):

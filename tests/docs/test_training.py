@@ -10,11 +10,11 @@ import pytest
 import torch
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "training.md"
-# Counts what the network learns, dies once where it is told to, and keeps all samples.
+# Trains on two ranks in each folder that is named with the step at which rank 1 dies, or 0; says how both ended, and
+# keeps all samples. The ranks are forks, so that torch is imported once.
 WATCH = """
-import os, signal, sys, torch, train
+import os, shutil, signal, socket, sys, torch, train
 
-kill_at = int(sys.argv[1])
 step, load, count = torch.optim.Adam.step, train.Faces.__getitem__, 0
 
 def counted(self, *arguments):
@@ -30,38 +30,28 @@ def kept(self, index):
     return sample
 
 torch.optim.Adam.step, train.Faces.__getitem__ = counted, kept
-train.main()
+start = os.getcwd()
+for words in sys.argv[1:]:
+    folder, kill_at = words.split(":")
+    kill_at, ranks = int(kill_at), []
+    os.chdir(os.path.join(start, folder))
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    os.environ |= {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    for rank in "01":
+        os.environ["RANK"] = rank
+        ranks.append(os.fork())
+        if not ranks[-1]:
+            train.main()
+            os._exit(0)
+    print(*(os.waitstatus_to_exitcode(os.waitpid(rank, 0)[1]) for rank in ranks), flush=True)
+    if kill_at:
+        shutil.copy("checkpoint.pt", "at_death.pt")
 """
 
 
-def run(folder, ranks, kill_at=0):
-    """Run the guide's training in a folder; rank 1 dies at a step."""
-    command = [sys.executable]
-    if ranks > 1:
-        command += ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
-    environment = {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}
-    done = subprocess.run(
-        [*command, "watch.py", str(kill_at)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=os.environ | environment,
-    )
-    assert (done.returncode != 0) == ("exitcode: -9" in done.stderr) == (kill_at > 0), done.stderr
-
-
-def trained(folder, ranks, kill_at=0):
-    """The weights that a run ends with, and all samples that it saw."""
-    (folder / "seen").mkdir(parents=True)
-    (code,) = re.findall(r"```python\n(# train\.py\n.*?)```", PAGE.read_text(), re.S)
-    (folder / "train.py").write_text(code)
-    (folder / "watch.py").write_text(WATCH)
-    if kill_at:
-        run(folder, ranks, kill_at)
-        state = torch.load(folder / "checkpoint.pt", weights_only=True)
-        assert (state["epoch"], state["done"]) == (1, 3)
-    run(folder, ranks)
+def results(folder):
+    """The weights that training ends with, and all samples that it saw."""
     seen = {}
     for path in sorted((folder / "seen").iterdir()):
         try:
@@ -79,15 +69,35 @@ def trained(folder, ranks, kill_at=0):
     reason="needs gloo, and signals",
 )
 def test_two_ranks_and_a_killed_run_train_as_one_process(tmp_path):
-    _, samples = trained(tmp_path / "alone", 1)
-    assert len(samples) == 64
-    whole, seen = trained(tmp_path / "whole", 2)
+    (code,) = re.findall(r"```python\n(# train\.py\n.*?)```", PAGE.read_text(), re.S)
+    (tmp_path / "train.py").write_text(code)
+    (tmp_path / "watch.py").write_text(WATCH)
+    for name in ("whole", "killed"):
+        (tmp_path / name / "seen").mkdir(parents=True)
+    environment = {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}
     # in the last step of the second epoch, after a checkpoint of the step before it
-    killed, again = trained(tmp_path / "killed", 2, kill_at=8)
+    command = [sys.executable, "watch.py", "whole:0", "killed:8", "killed:0"]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=240, env=os.environ | environment
+    )
+    whole, first, second = done.stdout.splitlines()
+    assert (whole, second) == ("0 0", "0 0"), done.stderr
+    assert first.endswith(" -9"), done.stderr
+    state = torch.load(tmp_path / "killed" / "at_death.pt", weights_only=True)
+    assert (state["epoch"], state["done"]) == (1, 3)
+
+    space = {"__name__": "train"}
+    exec(code, space)
+    data, samples = space["Faces"](), {}
+    for epoch in range(2):
+        data.augment.set_epoch(epoch)
+        samples |= {f"{epoch}-{index}": data[index] for index in range(len(data))}
+    weights, seen = results(tmp_path / "whole")
+    after, again = results(tmp_path / "killed")
     for others in (seen, again):
         assert others.keys() == samples.keys()
         for name, sample in samples.items():
             for field, value in sample.items():
                 assert torch.equal(others[name][field], value), (name, field)
     assert not torch.equal(samples["0-5"]["image"], samples["1-5"]["image"])
-    assert all(torch.equal(killed[name], weights) for name, weights in whole.items())
+    assert all(torch.equal(after[name], value) for name, value in weights.items())

@@ -79,7 +79,7 @@ def valid_at(key, coefficients, radius):
     return camera.project(torch.stack(rays, -1).unsqueeze(1))[1].squeeze(1)
 
 
-@pytest.mark.parametrize("name", slow_unless({"kannala_brandt", "rational", "f_theta_backward"}.__contains__, MODELS))
+@pytest.mark.parametrize("name", slow_unless("kannala_brandt".__eq__, MODELS))
 def test_a_lens_is_valid_up_to_the_first_root(name):
     key, spread, polynomials, of_squares, furthest = MODELS[name]
     draws = torch.randn(COUNT, len(spread), generator=torch.Generator().manual_seed(7), dtype=torch.float64)
@@ -95,8 +95,8 @@ def test_a_lens_is_valid_up_to_the_first_root(name):
 
 @pytest.mark.slow
 def test_real_lenses_are_valid_up_to_the_first_root():
-    real = [lens for lens in lenses.search("") if min(lens.intrinsics[:2]) > 0][::8]
-    assert len(real) > 1000
+    real = [lens for lens in lenses.search("") if min(lens.intrinsics[:2]) > 0][::40]
+    assert len(real) > 200
     coefficients = torch.tensor([lens.distortion for lens in real], dtype=torch.float64)
     folds = folds_of(coefficients, odd, True)
     some = folds < torch.pi

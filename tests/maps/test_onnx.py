@@ -56,9 +56,8 @@ def kinds(model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("learns", "dtype"), [(False, torch.float32), (True, torch.float64)])
-def test_a_dewarp_is_a_plain_gridsample(learns, dtype):
-    warp = ct.Dewarp(fisheye().to(dtype)).requires_grad_(learns)
+def test_a_dewarp_is_a_plain_gridsample():
+    warp = ct.Dewarp(fisheye().double())
     images = smooth()
     model, run = to_onnx(warp, images, opset_version=16)
     assert kinds(model) == ["GridSample"]
@@ -70,22 +69,20 @@ def test_a_dewarp_is_a_plain_gridsample(learns, dtype):
 
 @pytest.mark.slow
 def test_a_dewarp_takes_any_batch_and_bytes():
-    warp = ct.Dewarp(fisheye())
-    for images in (smooth(), (255 * smooth()).to(torch.uint8)):
-        model, run = to_onnx(warp, images, dynamic_shapes={"images": {0: "batch"}})
-        assert kinds(model).count("GridSample") == 1
-        many = images.expand(3, -1, -1, -1).contiguous()
-        (result,), expected = run(many), warp(many).detach()
-        assert result.dtype == expected.dtype
-        # what lies within rounding of one half may become the next integer
-        off = (result.double() - expected).abs()
-        assert off.max() <= (1 if images.dtype == torch.uint8 else 1e-5)
-        assert (off > 1e-5).double().mean() < 1e-3
+    warp, images = ct.Dewarp(fisheye()), (255 * smooth()).to(torch.uint8)
+    model, run = to_onnx(warp, images, dynamic_shapes={"images": {0: "batch"}})
+    assert kinds(model).count("GridSample") == 1
+    many = images.expand(3, -1, -1, -1).contiguous()
+    (result,), expected = run(many), warp(many)
+    assert result.dtype == expected.dtype == torch.uint8
+    # what lies within rounding of one half may become the next integer
+    off = (result.double() - expected).abs()
+    assert off.max() <= 1
+    assert (off > 0).double().mean() < 1e-3
 
 
 OPTIONS = [
-    {"padding_mode": "border", "fill": (0.1, 0.2, 0.3)},
-    {"mode": "bicubic", "fill": 0.5},
+    {"mode": "bicubic", "padding_mode": "border", "fill": (0.1, 0.2, 0.3)},
     {"antialias": True, "image_size": (24, 32)},
 ]
 
@@ -165,9 +162,8 @@ COUNT = {"points": {0: "count"}, "pixels": {0: "pixel_count"}}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", ["cylindrical", "kannala_brandt", "double_sphere"])  # others take a minute
-def test_a_camera_is_a_constant(key):
-    camera = one(key).float().requires_grad_(False)
+def test_a_camera_is_a_constant():
+    camera = one("kannala_brandt").float().requires_grad_(False)  # others take a minute
     points, pixels = inputs_of(camera)
     model, run = to_onnx(Both(camera, True), points, pixels, dynamic_shapes=COUNT)
     assert not any(node.domain for node in model.graph)
@@ -176,16 +172,15 @@ def test_a_camera_is_a_constant(key):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", ["pinhole", "double_sphere"])
-def test_a_camera_is_made_of_inputs(key):
-    camera = one(key).float().requires_grad_(False)
+def test_a_camera_is_made_of_inputs():
+    camera = one("double_sphere").float().requires_grad_(False)
     points, pixels = inputs_of(camera)
-    given = [t.detach().clone() for t in (camera.intrinsics, camera.distortion) if t.numel()]
-    shapes = {**COUNT, **dict.fromkeys(("intrinsics", "distortion")[: len(given)])}
+    given = [t.detach().clone() for t in (camera.intrinsics, camera.distortion)]
+    shapes = {**COUNT, "intrinsics": None, "distortion": None}
     _, run = to_onnx(Both(camera, False), points, pixels, *given, dynamic_shapes=shapes)
     assert_agrees(camera, run(points, pixels, *given), points, pixels)
     # another camera, by the same program
-    other = make(key, given[0] * 1.1, *given[1:], image_size=camera.image_size).requires_grad_(False)
+    other = make(camera.key, given[0] * 1.1, *given[1:], image_size=camera.image_size).requires_grad_(False)
     assert_agrees(other, run(points, pixels, given[0] * 1.1, *given[1:]), points, pixels)
 
 
@@ -193,11 +188,11 @@ def test_a_camera_is_made_of_inputs(key):
 @pytest.mark.filterwarnings("ignore:# The axis name")  # of one batch dim, which torch names once
 def test_a_batch_of_cameras_of_any_size():
     values = torch.tensor([[60.0, 60, 64, 48], [70, 72, 60, 50], [90, 90, 62, 47]])
-    k = torch.tensor([[0.02, -0.01, 0.003, -0.001], [0.1, 0.0, 0.0, 0.0], [-0.05, 0.01, 0.0, 0.0]])
+    k = torch.tensor([[-0.2, 0.59], [0.0, 0.5], [0.1, 0.6]])
 
     class Rays(nn.Module):
         def forward(self, pixels, intrinsics, distortion):
-            return ct.KannalaBrandt(intrinsics, distortion).unproject(pixels)
+            return ct.DoubleSphere(intrinsics, distortion).unproject(pixels)
 
     pixels = 128 * torch.rand(3, 40, 2)
     batch, count = (torch.export.Dim(name, min=2) for name in ("batch", "count"))
@@ -205,7 +200,7 @@ def test_a_batch_of_cameras_of_any_size():
     _, run = to_onnx(Rays(), pixels, values, k, dynamic_shapes=shapes)
     for n in (3, 2):
         rays, valid = run(pixels[:n, 3:], values[:n], k[:n])
-        expected, is_valid = ct.KannalaBrandt(values[:n], k[:n]).unproject(pixels[:n, 3:])
+        expected, is_valid = ct.DoubleSphere(values[:n], k[:n]).unproject(pixels[:n, 3:])
         assert torch.equal(valid, is_valid)
         torch.testing.assert_close(rays, expected.detach(), atol=1e-5, rtol=0)
 
@@ -267,12 +262,13 @@ class Network(nn.Module):
 @pytest.mark.slow
 def test_a_network_that_learns_its_camera():
     network, images = Network(), smooth(2)
-    _, run = to_onnx(network, images, dynamic_shapes={"images": {0: "batch"}})
-    torch.testing.assert_close(run(images)[0], network(images).detach(), atol=1e-5, rtol=1e-5)
+    before = network(images)
     with torch.no_grad():
         network.dewarp.source.intrinsics[:2] *= 1.2
-    _, run = to_onnx(network, images[:1])
-    torch.testing.assert_close(run(images[:1])[0], network(images[:1]).detach(), atol=1e-5, rtol=1e-5)
+    _, run = to_onnx(network, images[:1], dynamic_shapes={"images": {0: "batch"}})
+    result = network(images).detach()
+    assert (result - before).abs().max() > 0.01
+    torch.testing.assert_close(run(images)[0], result, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -318,14 +314,11 @@ assert "camtorch" not in sys.modules
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("key", "is_own"), [("kannala_brandt", True), ("double_sphere", False)])
-def test_a_saved_program_runs_without_camtorch(key, is_own, tmp_path):
-    camera = one(key).float().requires_grad_(False)
-    given = inputs_of(camera)
-    given = given if is_own else (*given, camera.intrinsics.detach().clone(), camera.distortion.detach().clone())
-    count = [{0: torch.export.Dim(name, min=2)} for name in ("count", "pixel_count")]
-    module = Both(camera, is_own)
-    program = torch.export.export(module, given, dynamic_shapes=(*count, None, None)[: len(given)])
+def test_a_saved_program_runs_without_camtorch(tmp_path):
+    camera = one("kannala_brandt").float().requires_grad_(False)
+    given, module = inputs_of(camera), Both(camera, True)
+    count = tuple({0: torch.export.Dim(name, min=2)} for name in ("count", "pixel_count"))
+    program = torch.export.export(module, given, dynamic_shapes=count)
     torch.export.save(program, tmp_path / "camera.pt2")
     torch.save((given, module(*given)), tmp_path / "values.pt")
     # not from the folder of the sources

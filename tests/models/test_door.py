@@ -6,7 +6,7 @@ from collections import UserList
 import numpy as np
 import pytest
 import torch
-from cameras import KEYS, each_kind, every_model, make, spread
+from cameras import KEYS, every_model, make, spread
 
 import camtorch as ct
 
@@ -18,7 +18,7 @@ def refuses(error, *words):
     return pytest.raises(error, match=re.compile(".*".join(re.escape(word) for word in words), re.DOTALL))
 
 
-@each_kind
+@pytest.mark.parametrize("key", ["pinhole", "fisheye624"])
 @pytest.mark.parametrize(
     ("intrinsics", "error", "words"),
     [
@@ -86,7 +86,6 @@ def test_values_of_coefficients(key):
         model(torch.tensor([INTRINSICS] * 2), torch.tensor([good] * 3))
 
 
-@each_kind
 @pytest.mark.parametrize(
     ("image_size", "error"),
     [
@@ -101,20 +100,19 @@ def test_values_of_coefficients(key):
         ((480, -640), ValueError),
     ],
 )
-def test_image_size(key, image_size, error):
+def test_image_size(image_size, error):
     with pytest.raises(error) as caught:
-        ct.MODELS[key](INTRINSICS, image_size=image_size)
+        ct.KannalaBrandt(INTRINSICS, image_size=image_size)
     message = str(caught.value)
-    assert ct.MODELS[key].__name__ in message
+    assert "KannalaBrandt" in message
     assert "image_size" in message
     assert "height" in message
     assert str(image_size) in message
 
 
-@each_kind
 @pytest.mark.parametrize("size", [(np.int64(480), np.int32(640)), [480, 640], torch.Size([480, 640])])
-def test_image_sizes_that_are_integers_are_taken(key, size):
-    assert ct.MODELS[key](INTRINSICS, image_size=size).image_size == (480, 640)
+def test_image_sizes_that_are_integers_are_taken(size):
+    assert ct.Pinhole(INTRINSICS, image_size=size).image_size == (480, 640)
 
 
 @every_model
@@ -142,7 +140,6 @@ def test_values(key, method, argument, columns):
         refused(ValueError, wrong, "(2, 3)", str(tuple(wrong.shape)), of=deep)
 
 
-@each_kind
 @pytest.mark.parametrize(
     ("what", "call"),
     [
@@ -155,13 +152,11 @@ def test_values(key, method, argument, columns):
         ("vflip", lambda c: c.vflip()),
     ],
 )
-def test_a_camera_without_image_size_where_one_is_needed(key, what, call):
-    camera = ct.MODELS[key](INTRINSICS)
-    with refuses(ValueError, type(camera).__name__, what, "image_size"):
-        call(camera)
+def test_a_camera_without_image_size_where_one_is_needed(what, call):
+    with refuses(ValueError, "Pinhole", what, "image_size"):
+        call(ct.Pinhole(INTRINSICS))
 
 
-@each_kind
 @pytest.mark.parametrize(
     ("call", "error", "shown"),
     [
@@ -173,10 +168,9 @@ def test_a_camera_without_image_size_where_one_is_needed(key, what, call):
         (lambda c: c.pad(-700, 0, 0, 0), ValueError, "(480, -60)"),
     ],
 )
-def test_sizes_of_edited_images(key, call, error, shown):
-    camera = ct.MODELS[key](INTRINSICS, image_size=(480, 640))
-    with refuses(error, type(camera).__name__, shown):
-        call(camera)
+def test_sizes_of_edited_images(call, error, shown):
+    with refuses(error, "Pinhole", shown):
+        call(ct.Pinhole(INTRINSICS, image_size=(480, 640)))
 
 
 @every_model

@@ -7,7 +7,6 @@ import re
 import pytest
 import torch
 from cameras import (
-    DISTINCT,
     RARE_ARE_SLOW,
     constants,
     each_kind,
@@ -16,7 +15,6 @@ from cameras import (
     make,
     one,
     pixel_lattice,
-    slow_unless,
     spread,
 )
 from torch import nn
@@ -57,12 +55,8 @@ def parameters_of(module):
 # -- compile, export, transforms
 
 
-# tracing takes seconds
-BOTH_WAYS = [(key, method) for key in sorted(DISTINCT) for method in ("project", "unproject")]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("key", "method"), BOTH_WAYS[::3])
+@pytest.mark.parametrize(("key", "method"), [("kannala_brandt", "unproject"), ("fisheye624", "project")])
 def test_compile_without_graph_breaks(key, method):
     module, values = module_and_input(key, method)
     compiled = torch.compile(module, fullgraph=True, backend="aot_eager")
@@ -84,15 +78,9 @@ def test_compile_to_machine_code():
     assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("key", "method"),
-    slow_unless(
-        ("kannala_brandt", "project").__eq__,
-        [("kannala_brandt", "project"), ("kannala_brandt", "unproject"), ("fisheye624", "project")],
-    ),
-)
-def test_export(key, method):
-    module, values = module_and_input(key, method)
+@pytest.mark.slow
+def test_export():
+    module, values = module_and_input("kannala_brandt", "project")
     count = torch.export.Dim("count", min=2)
     exported = torch.export.export(module, (values,), dynamic_shapes=({0: count},)).module()
     for rows in (values, values[:9]):
@@ -474,9 +462,8 @@ def test_a_model_is_one_class():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
-def test_compile_with_every_number_of_coefficients(count):
-    camera = ct.BrownConrady([300.0, 300.0, 32.0, 24.0], [-0.3, 0.1, 1e-3, -5e-4, *[1e-3] * 10][:count])
+def test_compile_with_the_most_coefficients():
+    camera = ct.BrownConrady([300.0, 300.0, 32.0, 24.0], [-0.3, 0.1, 1e-3, -5e-4, *[1e-3] * 10])
     points = torch.tensor([[0.1, -0.2, 1.0], [0.3, 0.2, -1.0]])
     compiled = torch.compile(camera, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(points)[0], camera(points)[0])

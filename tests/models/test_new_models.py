@@ -137,7 +137,7 @@ def check_derivatives(function, inputs):
     assert gradgradcheck(function, inputs, atol=1e-4, fast_mode=True)
 
 
-@pytest.mark.parametrize("model", slow_unless({Waved, Backwards}.__contains__, list(CAMERAS)))
+@pytest.mark.parametrize("model", slow_unless({Waved}.__contains__, list(CAMERAS)))
 def test_derivatives(model):
     camera = camera_of(model)
     leaves = [p.detach().clone().requires_grad_() for p in camera.parameters()]
@@ -200,15 +200,14 @@ def test_reverse_mode_of_torch_func(model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", list(CAMERAS)[:2])
-def test_traced(model):
-    camera = camera_of(model)
+def test_traced():
+    camera = camera_of(Waved)
     rays = fan(50)
     pixels, _ = camera.project(rays)
+    compiled = torch.compile(camera, backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(rays)[0], pixels, rtol=1e-9, atol=1e-9)
     for method, values in (("project", rays), ("unproject", pixels.detach())):
         expected = getattr(camera, method)(values)[0]
-        compiled = torch.compile(getattr(camera, method), backend="eager", fullgraph=True)
-        torch.testing.assert_close(compiled(values)[0], expected, rtol=1e-9, atol=1e-9)
         mapped = torch.func.vmap(lambda v, m=method: getattr(camera, m)(v)[0])(values.view(5, -1, values.shape[-1]))
         torch.testing.assert_close(mapped.flatten(0, 1), expected, rtol=1e-9, atol=1e-9)
 

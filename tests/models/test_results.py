@@ -62,9 +62,8 @@ def test_validity_may_be_edited_in_a_chain_of_layers(key):
     assert valid.any()
 
 
-@pytest.mark.parametrize("key", ["pinhole", "equirectangular"])
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["project", "unproject"])
+@pytest.mark.parametrize(("key", "method"), [("pinhole", "project"), ("equirectangular", "unproject")])
 def test_an_exported_camera_without_coefficients_can_be_loaded(key, method):
     camera = next(iter(real(key).values())).requires_grad_(False)
     values = values_of(key, method)

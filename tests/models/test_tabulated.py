@@ -117,7 +117,7 @@ def test_both_directions_are_those_of_the_reference(name, dtype):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_every_pixel_of_a_table_that_ascends_has_a_ray(dtype):
     """Slopes may change thirtyfold from node to node: that is no fold, and no reason to give up."""
-    for seed in range(100, 106):
+    for seed in range(100, 103):
         made, _ = both(drawn(seed, most=300), dtype)
         radius = torch.linspace(0, 499.9, 1500, dtype=dtype)
         pixels = made.intrinsics[2:] + torch.stack((radius * 0.6, radius * 0.8), -1)

@@ -342,7 +342,7 @@ def runs_here():
 @pytest.mark.slow
 def test_no_read_outside_and_nothing_undefined_in_any_variant(tmp_path):
     sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-    fuzz(tmp_path, runs_here(), sanitizers, 4_000, 1_000)
+    fuzz(tmp_path, runs_here(), sanitizers, 4_000, 250)
 
 
 # -- positions from a lattice
@@ -353,7 +353,7 @@ def kept(warp):
 
 
 def test_lattices_of_a_batch_of_cameras_and_images():
-    rotations = ct.augment.mount_rotation(torch.tensor([0.0, 20.0, 70.0]), torch.tensor(0.0), torch.tensor(5.0))
+    rotations = ct.augment.mount_rotation(torch.tensor([0.0, 10.0, 40.0]), torch.tensor(0.0), torch.tensor(5.0))
     source = ct.KannalaBrandt([100.0, 100, 80, 60], [0.02, -0.01, 0.004, -0.001], image_size=(120, 160))
     target = ct.Pinhole([80.0, 80, 80, 60], image_size=(101, 163))
     source, target = (camera.requires_grad_(False) for camera in (source, target))
@@ -507,7 +507,7 @@ def larger(tolerance):
 @pytest.mark.parametrize("tolerance", [0.0, 0.01])
 def test_results_do_not_depend_on_threads(tolerance):
     images, results = samples(), []
-    for count in (1, 2, 4, 3, 1):
+    for count in (1, 3, 2):
         with threads(count):
             for given_images in (images, images.float(), hwc(images)):
                 warp = larger(tolerance)

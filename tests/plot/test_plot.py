@@ -28,7 +28,7 @@ def axes():
     return Figure(layout="constrained").add_subplot()
 
 
-@pytest.mark.parametrize("key", slow_unless({"fisheye624", "cylindrical"}.__contains__, sorted(DISTINCT)))
+@pytest.mark.parametrize("key", slow_unless("fisheye624".__eq__, sorted(DISTINCT)))
 def test_every_model_has_a_portrait(key):
     camera = one(key)
     figure = plot.portrait(camera, camera.convert("kannala_brandt", count=4).camera)

@@ -56,7 +56,7 @@ def random_pair(seed, vertical=False):
 
 @pytest.mark.parametrize("vertical", [False, True])
 @pytest.mark.parametrize("projection", PROJECTIONS)
-@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 20), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 8), marks=pytest.mark.slow)])
 def test_rows_correspond_and_disparities_give_the_points(projection, vertical, seeds):
     axis, across = (1, 0) if vertical else (0, 1)
     refused = 0
@@ -275,9 +275,7 @@ def test_it_is_a_graph_and_has_a_shape_on_meta():
     images = torch.rand(1, 1, 480, 640, dtype=torch.float64)
     expected = found(images, images)
     compiled = torch.compile(found, fullgraph=True, backend="eager")
-    exported = torch.export.export(found, (images, images)).module()
-    for program in (compiled, exported):
-        torch.testing.assert_close(program(images, images), expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(compiled(images, images), expected, rtol=0, atol=1e-9)
     assert [image.shape for image in found.to("meta")(images.to("meta"), images.to("meta"))] == [(1, 1, 24, 32)] * 2
 
 

@@ -177,6 +177,6 @@ def test_steps_of_the_curvature_keep_their_tolerance(pair):
 
 @pytest.mark.slow
 @given(pairs())
-@settings(max_examples=80)
+@settings(max_examples=30)
 def test_drawn_warps_keep_their_tolerance(pair):
     check_drawn(*pair)

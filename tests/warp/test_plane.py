@@ -168,7 +168,7 @@ def test_it_is_kept_until_something_changes_and_compiles():
     warp = ct.PlaneWarp(source, target, extrinsics, NORMAL, DISTANCE)
     images = torch.rand(1, 1, 100, 120).double()
     before = warp(images)
-    torch.testing.assert_close(torch.compile(warp, backend="aot_eager")(images), before, rtol=0, atol=1e-9)
+    torch.testing.assert_close(torch.compile(warp, backend="eager")(images), before, rtol=0, atol=1e-9)
     with torch.no_grad():
         extrinsics.translation += 0.2
     assert (warp(images) - before).abs().max() > 1e-3

@@ -56,8 +56,8 @@ def test_a_room_rendered_row_by_row(direction):
     camera, rates = fisheye(fov=40), (0.4, 1.5, 0.8)
     matrix = torch.from_numpy(turns(moments(camera.image_size, direction), rates)).float()
     matrix = matrix[:, None] if direction in ("down", "up") else matrix[None]
-    rolled = expose(camera, lambda rays: room.radiance((matrix @ rays[..., None])[..., 0]), samples=6)
-    still = room.render(camera, samples=6)
+    rolled = expose(camera, lambda rays: room.radiance((matrix @ rays[..., None])[..., 0]), samples=4)
+    still = room.render(camera, samples=4)
     undo = ct.Warp(camera, camera, shutter=shutter(rates=rates, direction=direction), mode="bicubic")
     put_on = undo.inverse()
     for warp, before, after in ((undo, rolled, still), (put_on, still, rolled)):
@@ -320,7 +320,7 @@ def test_it_is_copied_pickled_and_moved():
 
 @pytest.mark.slow
 def test_it_compiles_as_one_graph():
-    camera = fisheye((40, 60), dtype=torch.float32)
+    camera = ct.Pinhole.from_fov(60, image_size=(40, 60)).requires_grad_(False)
     image = torch.rand(2, 3, 40, 60)
 
     def rolled(image, rates):
@@ -328,7 +328,7 @@ def test_it_compiles_as_one_graph():
 
     rates = torch.tensor(RATES)
     assert torch.allclose(
-        torch.compile(rolled, fullgraph=True, backend="aot_eager")(image, rates), rolled(image, rates), atol=2e-3
+        torch.compile(rolled, fullgraph=True, backend="eager")(image, rates), rolled(image, rates), atol=2e-3
     )
 
 
