@@ -207,20 +207,6 @@ def with_values(module: nn.Module) -> Iterator[None]:
                 tensors[name] = tensor
 
 
-def held(name: str, doc: str) -> Any:
-    """The property of a tensor that a module holds, which `nn.Module.__getattr__` finds in three times the time."""
-
-    def tensor(module: GeometryModule) -> Tensor:
-        found: Tensor | None = module._parameters.get(name)
-        if found is None:
-            found = module._buffers.get(name)
-            if found is None:
-                raise AttributeError(f"{type(module).__name__} has no {name}")
-        return found
-
-    return property(tensor, doc=doc)
-
-
 class BatchedModule(GeometryModule):
     """A module whose tensors share batch dims, which is indexed and counted by them as a tensor is."""
 

@@ -24,7 +24,7 @@ from camtorch._arguments import (
 )
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
-from camtorch._module import BatchedModule, Memo, held, remade, typed_as
+from camtorch._module import BatchedModule, Memo, remade, typed_as
 from camtorch._numbers import (
     camera_of_fov,
     checked_distortion,
@@ -77,6 +77,20 @@ def _intrinsic(index: int, doc: str) -> Any:
     return property(one, doc=doc)
 
 
+def _held(name: str, doc: str) -> Any:
+    """The property of a tensor of the module, which `nn.Module.__getattr__` finds in ten times the time."""
+
+    def tensor(camera: Camera) -> Tensor:
+        found: Tensor | None = camera._parameters.get(name)
+        if found is None:
+            found = camera._buffers.get(name)
+            if found is None:
+                raise AttributeError(f"{type(camera).__name__} has no {name}")
+        return found
+
+    return property(tensor, doc=doc)
+
+
 class Camera(BatchedModule):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
@@ -118,8 +132,8 @@ class Camera(BatchedModule):
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
     memo_names: ClassVar[tuple[str, ...]] = ("_memo", "_rays", "_fields")
-    intrinsics: Tensor = held("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")
-    distortion: Tensor = held("distortion", "(*B, n) coefficients in the order of `distortion_names`.")
+    intrinsics: Tensor = _held("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")
+    distortion: Tensor = _held("distortion", "(*B, n) coefficients in the order of `distortion_names`.")
     distortion_names: tuple[str, ...] = ()
     image_size: tuple[int, int] | None
     odd_in_x: ClassVar[frozenset[str]] = frozenset()

@@ -17,11 +17,10 @@ from camtorch._arguments import (
     broadcast_shapes,
     check_devices,
     check_radians,
-    columns,
     fails,
     values_of,
 )
-from camtorch._module import BatchedModule, held, learning_as, remade, typed_as
+from camtorch._module import BatchedModule, learning_as, remade, typed_as
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
 
@@ -48,8 +47,8 @@ class Extrinsics(BatchedModule):
     """
 
     tensor_names: ClassVar[tuple[str, ...]] = ("rotation", "translation")
-    rotation: Tensor = held("rotation", "(*B, 3) rotation vectors, camera from world, in radians.")
-    translation: Tensor = held("translation", "(*B, 3): the world's origin seen from the camera.")
+    rotation: Tensor
+    translation: Tensor
 
     def __init__(self, rotation: Numbers, translation: Numbers):
         super().__init__()
@@ -75,7 +74,7 @@ class Extrinsics(BatchedModule):
         rows, lead, restore = as_rows(points_world, "points_world", 3, self.batch_shape, parameters, "Extrinsics")
         rotation, translation = (t.expand(*lead, 3).reshape(-1, 3) for t in parameters)
         turned = rotate_planes(rotation_matrix(rotation), rows.unbind(-1))
-        return restore(torch.stack([p + t for p, t in zip(turned, columns(translation), strict=True)]))
+        return restore(turned + translation.mT.unsqueeze(-1))
 
     if TYPE_CHECKING:
 
@@ -140,17 +139,16 @@ class Extrinsics(BatchedModule):
         check_devices("Extrinsics", this=self.rotation, other=other.rotation)
         as_batch("Extrinsics", this=(*self.batch_shape, 3), other=(*other.batch_shape, 3))
         mine, its = rotation_matrix(self.rotation), rotation_matrix(other.rotation)
-        columns = rotate_planes(mine.unsqueeze(-3), its.mT.unsqueeze(-1).unbind(-2))
-        moved = rotate_planes(mine, other.translation.unsqueeze(-1).unbind(-2))
-        product = torch.cat(columns, -1).mT
-        composed = Extrinsics(rotation_vector(product).unsqueeze(-1), torch.cat(moved, -1) + self.translation)
+        product = rotate_planes(mine, its.unbind(-2)).movedim(0, -2)
+        moved = rotate_planes(mine, other.translation.unsqueeze(-1).unbind(-2)).squeeze(-1).movedim(0, -1)
+        composed = Extrinsics(rotation_vector(product).unsqueeze(-1), moved + self.translation)
         return composed.freeze_like(self, other)
 
     @property
     def position(self) -> Tensor:
         """(*B, 3): where the camera stands in the world, -R^T t."""
         turned_back = rotate_planes(rotation_matrix(-self.rotation), self.translation.unsqueeze(-1).unbind(-2))
-        return -torch.cat(turned_back, -1)
+        return -turned_back.squeeze(-1).movedim(0, -1)
 
     def extra_repr(self) -> str:
         """Batch, or the numbers of a single pose."""

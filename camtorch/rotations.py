@@ -62,21 +62,22 @@ def vector_quaternion(rotation: Tensor) -> Tensor:
     return torch.cat((cos_root(angle2), sinc_root(angle2) * half), -1)
 
 
-def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...], whole: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Apply (*B, 3, 3) to three planes (*B, N): by components, which autocast leaves in their precision.
+def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...], whole: Tensor | None = None) -> Tensor:
+    """Apply (*B, 3, 3) to three planes (*B, N): (3, *B, N). By components, which autocast leaves in their precision.
 
     A point that is not finite becomes NaN, which has no part in the gradient of the matrix. `whole` is the tensor that
     the planes are taken from, where there is one.
     """
     x, y, z = planes
-    rows = [row.unbind(-2) for row in matrix.unsqueeze(-1).unbind(-3)]
+    matrix = matrix[(None,) * (x.ndim + 1 - matrix.ndim)]
+    a, b, c = matrix.movedim((-1, -2), (0, 1)).unsqueeze(-1).unbind(0)
     # a sum shows what is not finite: the whole planes are looked at once
-    given = planes if whole is None else (whole,)
-    if x.is_cpu and holds(torch.isfinite(torch.stack([plane.detach().sum() for plane in given]))):
-        return tuple(torch.addcmul(torch.addcmul(a * x, b, y), c, z) for a, b, c in rows)
+    sums = [plane.detach().sum() for plane in (planes if whole is None else (whole,))]
+    if x.is_cpu and holds(torch.isfinite(sums[0] if len(sums) == 1 else torch.stack(sums))):
+        return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
     finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
     x, y, z = (torch.where(finite, plane, 0.0) for plane in planes)
-    return tuple(torch.where(finite, a * x + b * y + c * z, torch.nan) for a, b, c in rows)
+    return torch.where(finite, a * x + b * y + c * z, torch.nan)
 
 
 def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> None:
@@ -126,7 +127,7 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
         return rays
     rows, lead, restore = as_rows(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
     rotation = rotation.to(rows.dtype).expand(*lead, 3, 3).reshape(-1, 3, 3)
-    return restore(torch.stack(rotate_planes(rotation, rows.unbind(-1), rows)))
+    return restore(rotate_planes(rotation, rows.unbind(-1), rows))
 
 
 def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:

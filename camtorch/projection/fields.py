@@ -104,7 +104,7 @@ def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: s
     dtype, (height, width) = working_dtype(rays, extrinsics.rotation, extrinsics.translation), rays.shape[-3:-1]
     batch = _broadcast(rays.shape[:-3], extrinsics.batch_shape, "extrinsics", owner)
     planes = [plane.to(dtype).expand(*batch, height, width).flatten(-2) for plane in rays.unbind(-1)]
-    direction = torch.stack(rotate_planes(rotation_matrix(-extrinsics.rotation).to(dtype), (*planes,)), -1)
+    direction = rotate_planes(rotation_matrix(-extrinsics.rotation).to(dtype), (*planes,)).movedim(0, -1)
     moment = torch.linalg.cross(extrinsics.position.to(dtype).unsqueeze(-2).expand_as(direction), direction)
     lines, valid = (
         torch.cat((direction, moment), -1).unflatten(-2, (height, width)),

@@ -64,7 +64,7 @@ class ProxyWarp(Warp):
 def turned(rotation: Tensor, rays: Tensor) -> Tensor:
     """Matrices (*B, 3, 3) applied to (B, *N, 3) or (*N, 3)."""
     if rotation.ndim == 2:
-        return torch.stack(rotate_planes(rotation, rays.unbind(-1)), -1)
+        return rotate_planes(rotation, rays.unbind(-1)).movedim(0, -1)
     rows = rays.expand(len(rotation), *rays.shape[1:]) if len(rays) == 1 else rays
     planes = rows.flatten(1, -2).unbind(-1)
-    return torch.stack(rotate_planes(rotation, planes), -1).view(max(len(rows), len(rotation)), *rows.shape[1:])
+    return rotate_planes(rotation, planes).movedim(0, -1).reshape(max(len(rows), len(rotation)), *rows.shape[1:])
