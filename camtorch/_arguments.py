@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._tracing import in_graph, is_concrete, may_look
+from camtorch._tracing import has_tangent, in_graph, in_transform, is_concrete, is_recorded, keeps_graph, may_look
 
 Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
@@ -27,7 +27,9 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
         TypeError: not real numbers, or a list of tensors that require grad, whose graph would be lost.
         ValueError: NaN or infinite values.
     """
-    if not isinstance(value, Tensor):
+    if type(value) in (list, tuple) and {float, int}.issuperset(map(type, value)):  # type: ignore[arg-type]
+        value = torch.tensor(value, dtype=torch.get_default_dtype())
+    elif not isinstance(value, Tensor):
         _check_list(value, name, owner)
         try:
             if isinstance(value, (list, tuple)) and value and all(getattr(v, "ndim", 0) for v in value):
@@ -41,7 +43,12 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
     _check_real(value, name, owner)
     if not value.dtype.is_floating_point:
         value = value.to(torch.get_default_dtype())
-    if is_concrete(value) and not is_predicted(value) and not _all_finite(value):
+    row = row_of(value)
+    if row is not None:
+        finite = all(map(math.isfinite, row))
+    else:
+        finite = not is_concrete(value) or is_predicted(value) or bool(torch.isfinite(value).all())
+    if not finite:
         raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
     return value
 
@@ -61,6 +68,16 @@ def values_of(tensor: Tensor) -> Tensor | None:
     return tensor.detach().to("cpu", torch.float64) if is_concrete(tensor) else None
 
 
+def are_numbers(*tensors: Tensor) -> bool:
+    """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
+    if torch.compiler.is_compiling() or in_transform() or is_recorded() or keeps_graph(*tensors):
+        return False
+    return all(t.is_cpu and type(t) in _PLAIN and not has_tangent(t) for t in tensors)
+
+
+_PLAIN = Tensor, nn.Parameter
+
+
 def is_kept(value: Tensor) -> bool:
     """Whether a module keeps the tensor itself: a Parameter, or a tensor of a graph. Of other values it has a copy."""
     return isinstance(value, nn.Parameter) or in_graph(value)
@@ -71,11 +88,9 @@ def as_own(value: Tensor) -> Tensor:
     return value if is_kept(value) else value.detach().clone()
 
 
-def _all_finite(value: Tensor) -> bool:
-    # of a few numbers that is asked sooner here than by torch
-    if value.ndim == 1 and value.shape[0] <= 64:
-        return all(map(math.isfinite, value.tolist()))
-    return bool(torch.isfinite(value).all())
+def row_of(value: Tensor) -> list[float] | None:
+    """The numbers of a single short row (n,) that may be looked at: less time than one operator of torch takes."""
+    return value.tolist() if value.ndim == 1 and value.shape[0] <= 64 and is_concrete(value) else None
 
 
 def _check_list(value: object, name: str, owner: str) -> None:
@@ -140,6 +155,8 @@ def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int
     """
     if value is None:
         return None
+    if type(value) is tuple and [type(side) for side in value] == [int, int] and min(value) > 0:
+        return value
     try:
         if isinstance(value, (set, frozenset, dict)) or any(isinstance(side, bool) for side in value):
             raise TypeError
@@ -319,6 +336,8 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     Raises:
         ValueError: there is none.
     """
+    if shapes and shapes.count(shapes[0]) == len(shapes):
+        return torch.Size(shapes[0])
     shape: list[int] = []
     for other in shapes:
         shape = [1] * (len(other) - len(shape)) + shape

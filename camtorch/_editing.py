@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, fails, values_of
+from camtorch._arguments import are_numbers, as_image_size, fails
 from camtorch._module import learning_as, remade
+from camtorch._numbers import joined, split, wide
+from camtorch._tracing import is_concrete
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -38,11 +41,10 @@ def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence
     new_size = as_image_size(size, type(camera).__name__)
     if camera.is_mixed:
         return cast("Mixed", camera).by_groups(lambda group: edited_by(group, matrix, size))  # type: ignore[return-value]
-    made = edited(camera, camera.intrinsics.new_tensor(matrix), new_size, turns=matrix[0][1] != 0)
-    return learning_as(made, camera)
+    return learning_as(edited(camera, matrix, new_size), camera)
 
 
-def edited(camera: CameraT, matrix: Tensor, image_size: tuple[int, int] | None, turns: bool | None = None) -> CameraT:
+def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_size: tuple[int, int] | None) -> CameraT:
     """The camera of an image whose pixels move by a map each.
 
     Args:
@@ -50,40 +52,39 @@ def edited(camera: CameraT, matrix: Tensor, image_size: tuple[int, int] | None, 
         matrix: (*B, 2, 3), from pixels (u, v, 1) to those of the edited image: a quarter turn clockwise or none,
             flips, scales, and a shift.
         image_size: (height, width) of the edited image.
-        turns: whether it is a quarter turn, where that is known without a look at values.
 
     Raises:
         ValueError: a quarter turn of a model that is not the same on its side.
     """
     if camera.is_mixed:
-        return cast("Mixed", camera).by_groups(  # type: ignore[return-value]
-            lambda group: edited(group, matrix, image_size, turns)
-        )
-    own = camera.intrinsics
-    dtype = torch.promote_types(matrix.dtype, own.dtype)
-    (a, b, left), (c, d, top) = (row.unbind(-1) for row in matrix.to(dtype).unbind(-2))
-    fx, fy, cx, cy = own.to(dtype).unbind(-1)
+        return cast("Mixed", camera).by_groups(lambda group: edited(group, matrix, image_size))  # type: ignore[return-value]
+    own, given = camera.intrinsics, [matrix] if isinstance(matrix, Tensor) else []
+    xp: Any = np if are_numbers(own, camera.distortion, *given) else torch
+    rows: Any = matrix
+    if isinstance(matrix, Tensor):
+        maps: Any = matrix.detach().double().numpy() if xp is np else wide(matrix)
+        rows = [[maps[..., i, j] for j in range(3)] for i in range(2)]
+    (a, b, left), (c, d, top) = rows
+    fx, fy, cx, cy = split(own, xp)
     numbers = (
-        *(a.abs() * fx + b.abs() * fy, c.abs() * fx + d.abs() * fy),
+        *(abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy),
         *(a * cx + b * cy + left, c * cx + d * cy + top),
     )
-    intrinsics = torch.stack(torch.broadcast_tensors(*numbers), -1).to(own.dtype)
-    if turns is None:
-        known = values_of(b)
-        turns = known is None or bool((known != 0).any())
-    distortion = _edited_distortion(camera, a - b, c + d, b != 0 if turns else None)
-    return remade(camera, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
+    turned = b != 0
+    turns = np.any(turned) if not isinstance(turned, Tensor) else not is_concrete(turned) or bool(turned.any())
+    distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
+    return remade(camera, intrinsics=joined(numbers, own, xp), distortion=distortion, image_size=image_size)
 
 
-def _edited_distortion(camera: Camera, across: Tensor, down: Tensor, on_side: Tensor | None) -> Tensor:
+def _edited_distortion(camera: Camera, across: Any, down: Any, on_side: Any) -> Tensor:
     """Coefficients after a quarter turn clockwise where it is on its side, (*B,) bool, and flips by signs (*B,)."""
     k, names = camera.distortion, camera.distortion_names
     if on_side is not None:
-        k = torch.where(on_side.unsqueeze(-1), _on_side(camera), k)
+        k = torch.where(torch.as_tensor(on_side, device=k.device).unsqueeze(-1), _on_side(camera), k)
     for sign, odd in ((across, camera.odd_in_x), (down, camera.odd_in_y)):
         if not odd.isdisjoint(names):
             is_odd = torch.tensor([name in odd for name in names], device=k.device)
-            k = torch.where(is_odd & (sign < 0).unsqueeze(-1), -k, k)
+            k = torch.where(is_odd & torch.as_tensor(sign < 0, device=k.device).unsqueeze(-1), -k, k)
     return k.clone() if k is camera.distortion else k
 
 

@@ -21,6 +21,7 @@ from camtorch._tracing import (
     has_tangent,
     in_jit_trace,
     in_memory,
+    in_transform,
     is_concrete,
     is_exporting,
     is_recorded,
@@ -198,8 +199,11 @@ def _is_plain(inputs: Sequence[Tensor]) -> bool:
 
 def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The cameras (C,) of one model, kept in a memo."""
-    inputs = intrinsics, distortion
-    cameras: Cameras = memo(inputs, (intrinsics.dtype, intrinsics.device), lambda: Cameras(model, *inputs))
+    if in_transform():  # what a transform makes dies with it
+        return Cameras(model, intrinsics, distortion)
+    # what inference mode makes could not be used in a graph later
+    with torch.inference_mode(False):
+        memo.result = cameras = Cameras(model, intrinsics, distortion)
     return cameras
 
 

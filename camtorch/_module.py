@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -36,11 +36,36 @@ def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable
     return lambda call: call
 
 
+_BARE = nn.Module().__dict__
+_CONTAINERS = [(name, type(value)) for name, value in _BARE.items() if isinstance(value, (dict, set))]
+
+
+def _bare() -> dict[str, Any]:
+    """What `nn.Module.__init__` puts into the `__dict__` of a module."""
+    state = _BARE.copy()
+    for name, make in _CONTAINERS:
+        state[name] = make()
+    state["_own"] = {}
+    return state
+
+
 class GeometryModule(nn.Module):
     """A module whose tensors are geometry: Parameters, or tensors of a graph, never of less than float32."""
 
     _own: dict[str, Tensor | None]
     """The tensors that were registered, also while others stand in their place."""
+
+    def __init__(self, **attributes: Any):
+        if torch.compiler.is_compiling():  # which follows torch's own way, that takes 1 us an attribute
+            super().__init__()
+            for name, value in attributes.items():
+                setattr(self, name, value)
+        else:
+            state = self.__dict__
+            state.update(_bare())
+            modules = state["_modules"]
+            for name, value in attributes.items():
+                (modules if isinstance(value, nn.Module) else state)[name] = value
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
         """As of `nn.Module`."""
@@ -63,14 +88,30 @@ class GeometryModule(nn.Module):
         Those keep their own shape, which broadcasts to `shape`: a lens shared by a batch of cameras stays one.
         """
         if shape[-1] == 0:  # an optimizer has nothing to learn here
-            empty = value if value.shape == shape and not value.requires_grad else value.detach().expand(shape)
-            self.register_buffer(name, empty, persistent=False)
-        elif isinstance(value, nn.Parameter):
-            self.register_parameter(name, value)
+            self.put(name, value if value.shape == shape and not value.requires_grad else value.detach().expand(shape))
+        elif is_parameter(value):
+            self.put(name, value)
         elif in_graph(value):
-            self.register_buffer(name, _widened(value), persistent=False)
+            self.put(name, _widened(value))
         else:
-            self.register_parameter(name, nn.Parameter(_widened(value.detach()).expand(shape).clone()))
+            own = _widened(value)
+            self.put(name, nn.Parameter((own if own.shape == shape else own.expand(shape)).clone()))
+
+    def put(self, name: str, tensor: Tensor | None, persistent: bool = False) -> None:
+        """Register a Parameter, or anything else as a buffer, which a state_dict holds where it is persistent."""
+        is_learnt = tensor is not None and is_parameter(tensor)
+        if torch.compiler.is_compiling():
+            if is_learnt:
+                self.register_parameter(name, cast("nn.Parameter", tensor))
+            else:
+                self.register_buffer(name, tensor, persistent)
+            return
+        state = self.__dict__
+        state["_parameters" if is_learnt else "_buffers"][name] = state["_own"][name] = tensor
+        if persistent or is_learnt:
+            state["_non_persistent_buffers_set"].discard(name)
+        else:
+            state["_non_persistent_buffers_set"].add(name)
 
     def freeze_like(self, *sources: nn.Module) -> Self:
         """Leave nothing to learn where the modules that this one was made from have nothing either."""
@@ -166,11 +207,27 @@ def with_values(module: nn.Module) -> Iterator[None]:
                 tensors[name] = tensor
 
 
+def held(name: str, doc: str) -> Any:
+    """The property of a tensor that a module holds, which `nn.Module.__getattr__` finds in three times the time."""
+
+    def tensor(module: GeometryModule) -> Tensor:
+        found: Tensor | None = module._parameters.get(name)
+        if found is None:
+            found = module._buffers.get(name)
+            if found is None:
+                raise AttributeError(f"{type(module).__name__} has no {name}")
+        return found
+
+    return property(tensor, doc=doc)
+
+
 class BatchedModule(GeometryModule):
     """A module whose tensors share batch dims, which is indexed and counted by them as a tensor is."""
 
     tensor_names: ClassVar[tuple[str, ...]]
     """Of the tensors (*B, n); each may have fewer batch dims, or of size 1, where it is shared."""
+    memo_names: ClassVar[tuple[str, ...]] = ()
+    """Of what is kept of their values, which begins empty in another module."""
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -264,29 +321,36 @@ class BatchedModule(GeometryModule):
 Made = TypeVar("Made", bound=BatchedModule)
 
 
+def model_of(module: Made) -> type[Made]:
+    """Its class, but of a parametrized one what it was before."""
+    return type_before_parametrizations(module) if "parametrizations" in module._modules else type(module)
+
+
 def remade(module: Made, **changes: Any) -> Made:
     """The module with other tensors and attributes, which are not checked: what camtorch computed needs no check.
 
     A Parameter and a tensor of a graph are kept as they are. Any other tensor is held as it is, without a copy, by a
     Parameter that does not learn.
     """
-    model: type[Made] = type_before_parametrizations(module)
-    kept = {name: getattr(module, name) for name in module.tensor_names if name not in changes}
-    tensors = {name: fixed(tensor) for name, tensor in {**kept, **changes}.items() if name in module.tensor_names}
-    others = {name: value for name, value in changes.items() if name not in tensors}
+    model = model_of(module)
+    tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
     if torch.compiler.is_compiling() and "image_size" in module.__dict__:
         # the compiler follows a constructor, and nothing that does without
-        numbers = [tensors[name] for name in module.tensor_names if tensors[name].shape[-1]]
-        return model(*numbers, image_size=others.get("image_size", module.image_size))
+        numbers = [fixed(tensor) for tensor in tensors.values() if tensor.shape[-1]]
+        return model(*numbers, image_size=changes.get("image_size", module.image_size))
     made = model.__new__(model)
-    nn.Module.__init__(made)
-    for name, value in module.__dict__.items():
-        if name not in made.__dict__:
-            made.__dict__[name] = Memo(value.capacity) if isinstance(value, Memo) else value
-    made.training = module.training
-    made.__dict__.update(others)
+    state = made.__dict__
+    state.update(module.__dict__, _is_full_backward_hook=None, _own={}, **changes)
+    for name, make in _CONTAINERS:
+        state[name] = make()
+    for name in module.memo_names:
+        state[name] = Memo()
     for name, tensor in tensors.items():
-        made.hold(name, tensor, tuple(tensor.shape))
+        if tensor.shape[-1]:
+            tensor = fixed(tensor)
+            made.put(name, tensor if is_parameter(tensor) else _widened(tensor))
+        else:
+            made.put(name, tensor.detach() if tensor.requires_grad else tensor)
     return made
 
 
@@ -306,9 +370,15 @@ def learning_as(made: Made, source: BatchedModule) -> Made:
 
 def fixed(tensor: Tensor) -> Tensor:
     """A Parameter or a tensor of a graph as it is, and any other as a Parameter that does not learn, without a copy."""
-    if isinstance(tensor, nn.Parameter) or (in_graph(tensor) and not _is_cut_off(tensor)):
+    if is_parameter(tensor) or (in_graph(tensor) and not _is_cut_off(tensor)):
         return tensor
     return nn.Parameter(tensor, requires_grad=False)
+
+
+def is_parameter(tensor: Tensor) -> bool:
+    """Whether it is an `nn.Parameter`, which torch asks a metaclass."""
+    kind = type(tensor)
+    return kind is nn.Parameter or (kind is not Tensor and isinstance(tensor, nn.Parameter))
 
 
 def _is_cut_off(tensor: Tensor) -> bool:

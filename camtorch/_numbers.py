@@ -21,6 +21,7 @@ from camtorch._arguments import (
     fails,
     is_kept,
     is_predicted,
+    row_of,
     shown,
     values_of,
 )
@@ -52,7 +53,8 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
         raise ValueError(
             f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
         )
-    if not is_predicted(intrinsics) and fails(intrinsics[..., :2] > 0):
+    row = row_of(intrinsics)
+    if not is_predicted(intrinsics) and (fails(intrinsics[..., :2] > 0) if row is None else min(row[:2]) <= 0):
         raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
     return intrinsics
 
@@ -113,6 +115,28 @@ def as_numbers_of(camera: Camera, value: Numbers, name: str) -> Tensor:
         return value
     as_real(value, name, type_before_parametrizations(camera).__name__)
     return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
+
+
+def wide(values: Tensor) -> Tensor:
+    """In float64, where a device has that."""
+    return values.float() if values.device.type == "mps" else values.double()
+
+
+def split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
+    """fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
+    if xp is torch:
+        return wide(intrinsics).unbind(-1)
+    return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
+
+
+def joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
+    """(*B, n) of n tensors (*B,); or of numbers and arrays, in the dtype of a tensor."""
+    if xp is torch:
+        return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
+    kind = np.float64 if like.dtype == torch.float64 else np.float32
+    if all(isinstance(number, float) for number in numbers):
+        return torch.from_numpy(np.array(numbers, kind))
+    return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind))
 
 
 def _is_column(model: type[Camera], distortion: Tensor) -> bool:
@@ -211,9 +235,11 @@ def camera_of_fov(
 
 def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, stacklevel: int = 3) -> None:
     """Warn of plain numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
-    if is_kept(intrinsics) or is_predicted(intrinsics) or (known := values_of(intrinsics)) is None:
+    if is_kept(intrinsics) or is_predicted(intrinsics):
         return
-    rows = known.reshape(-1, 4)[:_LOOKED_AT].tolist()
+    row = row_of(intrinsics)
+    known = values_of(intrinsics) if row is None else None
+    rows = [row] if row is not None else [] if known is None else known.reshape(-1, 4)[:_LOOKED_AT].tolist()
     if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
         return
     given = f"fx, fy, cx, cy = {rows[0]}"
@@ -237,4 +263,5 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, stackle
 
 def _off_centre(cx: float, cy: float, size: tuple[int, int]) -> float:
     """How far a point is from the middle of an image, the larger one of the parts of its height and width."""
-    return max(abs(c - (side - 1) / 2) / side for c, side in zip((cx, cy), size[::-1], strict=True))
+    height, width = size
+    return max(abs(cx - (width - 1) / 2) / width, abs(cy - (height - 1) / 2) / height)

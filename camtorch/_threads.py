@@ -77,12 +77,6 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 # process has the core of one. To a chain of a hundred operations that happens a hundred times. So such chains run on
 # one thread, or on several that each do a part of their own.
 
-ALONE = (1 << 15) - 1
-"""Elements up to which torch does not split an operation."""
-EVEN = 3 * 4 * 2 * 16
-"""Multiples of so many elements are split between pairs of vectors, up to 64 bytes wide, by one to four threads."""
-
-
 _in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
 
 

@@ -24,7 +24,7 @@ from camtorch._arguments import (
 )
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
-from camtorch._module import BatchedModule, Memo, remade, typed_as
+from camtorch._module import BatchedModule, Memo, held, remade, typed_as
 from camtorch._numbers import (
     camera_of_fov,
     checked_distortion,
@@ -65,6 +65,9 @@ _ELSEWHERE = {
     "omnidir": "mei",
 }
 """What OpenCV, ROS, Kalibr and COLMAP call some of them."""
+
+
+_NO_BATCH = torch.Size()
 
 
 def _intrinsic(index: int, doc: str) -> Any:
@@ -114,8 +117,9 @@ class Camera(BatchedModule):
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
-    intrinsics: Tensor
-    distortion: Tensor
+    memo_names: ClassVar[tuple[str, ...]] = ("_memo", "_rays", "_fields")
+    intrinsics: Tensor = held("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")
+    distortion: Tensor = held("distortion", "(*B, n) coefficients in the order of `distortion_names`.")
     distortion_names: tuple[str, ...] = ()
     image_size: tuple[int, int] | None
     odd_in_x: ClassVar[frozenset[str]] = frozenset()
@@ -146,27 +150,35 @@ class Camera(BatchedModule):
             _add_model(cls)
 
     _model: ClassVar[str]
+    _memo: Memo
+    _rays: Memo
+    _fields: Memo
+    _warned: bool
 
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
-        super().__init__()
-        owner = type(self).__name__
-        intrinsics = checked_intrinsics(type(self), intrinsics)
+        model = type(self)
+        owner = model.__name__
+        intrinsics = checked_intrinsics(model, intrinsics)
         if distortion is None:
-            ideal = intrinsics.new_tensor(self.ideal(self.default_count))
-            distortion = ideal.expand(*intrinsics.shape[:-1], self.default_count)
+            ideal = self.ideal(self.default_count)
+            k = intrinsics.new_tensor(ideal) if ideal else intrinsics.new_empty(0)
+            distortion = k if intrinsics.ndim == 1 else k.expand(*intrinsics.shape[:-1], len(ideal))
         else:
-            distortion = checked_distortion(type(self), distortion, intrinsics)
+            distortion = checked_distortion(model, distortion, intrinsics)
         batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
-        self.distortion_names = self.names_of(distortion.shape[-1]) or ()
-        self.image_size = size = as_image_size(image_size, owner)
+        count, size = distortion.shape[-1], as_image_size(image_size, owner)
         if size is not None:
             warn_of_order(intrinsics, size, owner)
-        self._memo, self._rays, self._fields = Memo(), Memo(), Memo()
-        self._warned = is_predicted(intrinsics) or is_predicted(distortion)
+        super().__init__(
+            distortion_names=self.names_of(count) or (),
+            image_size=size,
+            **{name: Memo() for name in self.memo_names},
+            _warned=is_predicted(intrinsics) or is_predicted(distortion),
+        )
         self.hold("intrinsics", intrinsics, (*batch, 4))
-        self.hold("distortion", distortion, (*batch, distortion.shape[-1]))
+        self.hold("distortion", distortion, (*batch, count))
 
     @classmethod
     def from_matrix(
@@ -243,8 +255,10 @@ class Camera(BatchedModule):
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the parameters."""
-        shapes = self.intrinsics.shape[:-1], self.distortion.shape[:-1]
-        return shapes[0] if shapes[0] == shapes[1] else broadcast_shapes(*shapes)
+        intrinsics, distortion = self.intrinsics.shape, self.distortion.shape
+        if len(intrinsics) == len(distortion) == 1:
+            return _NO_BATCH
+        return broadcast_shapes(intrinsics[:-1], distortion[:-1])
 
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name for it)

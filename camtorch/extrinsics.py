@@ -21,7 +21,7 @@ from camtorch._arguments import (
     fails,
     values_of,
 )
-from camtorch._module import BatchedModule, learning_as, remade, typed_as
+from camtorch._module import BatchedModule, held, learning_as, remade, typed_as
 from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
 
 
@@ -48,8 +48,8 @@ class Extrinsics(BatchedModule):
     """
 
     tensor_names: ClassVar[tuple[str, ...]] = ("rotation", "translation")
-    rotation: Tensor
-    translation: Tensor
+    rotation: Tensor = held("rotation", "(*B, 3) rotation vectors, camera from world, in radians.")
+    translation: Tensor = held("translation", "(*B, 3): the world's origin seen from the camera.")
 
     def __init__(self, rotation: Numbers, translation: Numbers):
         super().__init__()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -142,13 +145,17 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
         check_devices("mount_rotation", **given)
         shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
         raise ValueError(f"mount_rotation: the angles must be of one shape (*B,); got {shapes}") from None
-    (ca, cb, cc), (sa, sb, sc) = angles.cos().unbind(), angles.sin().unbind()
+    matrix: Tensor = torch.stack(mount_elements(angles.cos().unbind(), angles.sin().unbind()), -1).unflatten(-1, (3, 3))
+    return matrix
+
+
+def mount_elements(cosines: Sequence[Any], sines: Sequence[Any]) -> tuple[Any, ...]:
+    """The nine elements, row by row, of `mount_rotation`, by the cosines and sines of yaw, pitch and roll."""
+    (ca, cb, cc), (sa, sb, sc) = cosines, sines
     # the turn, the look and the lean multiplied out, each about the turned camera's axes, and transposed
     right, ahead = sa * sb, ca * sb
-    rows = (
+    return (
         *(ca * cc + right * sc, cb * sc, ahead * sc - sa * cc),
         *(right * cc - ca * sc, cb * cc, sa * sc + ahead * cc),
         *(sa * cb, -sb, ca * cb),
     )
-    matrix: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
-    return matrix

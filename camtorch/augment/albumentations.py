@@ -102,10 +102,10 @@ class Transform(A.DualTransform):
     # -- what moves
 
     def apply(self, img: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        return as_array(change.images(as_tensor("image", img))[0], img)
+        return as_array(change.images(as_tensor("image", img)[None])[0], img)
 
     def apply_to_mask(self, mask: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        return as_array(change.labels(as_tensor("mask", mask), self.augmentation.mask_fill)[0], mask)
+        return as_array(change.labels(as_tensor("mask", mask)[None], self.augmentation.mask_fill)[0], mask)
 
     def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
@@ -124,7 +124,7 @@ class Transform(A.DualTransform):
         return np.concatenate((moved.numpy().astype(bboxes.dtype), bboxes[:, 4:]), 1)
 
     def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
-        return change.target[0].clone()
+        return change.single.clone()
 
     def _mover(self, kind: str) -> Callable[..., np.ndarray]:
         def move(value: np.ndarray, change: Change, **params: Any) -> np.ndarray:

@@ -6,13 +6,15 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from camtorch._arguments import (
     GUESS_CAMERA,
+    are_numbers,
     as_flag,
     as_mapping,
     as_number,
@@ -102,32 +104,30 @@ def as_range(
 
 def draw(
     ranges: Mapping[str, Range], count: int, p: float, same: bool, generator: torch.Generator | None
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     """`apply` (count,) bool, which is true with probability p, and a value (count,) or (count, size) for every range.
 
     The numbers come in the order in which kornia asks for them: first the gate, if there is a choice, then the ranges.
+    They are arrays, which take less time than tensors, and tensors where the generator is on another device or what is
+    done with them is compiled.
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
     device = generator.device if generator is not None else torch.device("cpu")
-    if 0 < p < 1:
-        values = {"apply": torch.rand(rows, generator=generator, device=device) < p}
-    else:
-        values = {"apply": torch.full((rows,), p >= 1, device=device)}
-    # in float64, so that what is drawn is what every precision sees
+    gate: Any = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
+    gate = torch.full((rows,), p >= 1, device=device) if gate is None else gate
     sizes = [rows * (interval.size or 1) for interval in ranges.values()]
-    shares = [torch.rand(size, generator=generator, dtype=torch.float64, device=device) for size in sizes]
-    if ranges:
-        pairs = zip(ranges.values(), sizes, strict=True)
-        each = [(interval.low, interval.high - interval.low) for interval, size in pairs for _ in range(size)]
-        low, extent = torch.tensor(each, dtype=torch.float64, device=device).reshape(-1, 2).unbind(-1)
-        drawn = (low + extent * torch.cat(shares)).split(sizes)
-        for (name, interval), value in zip(ranges.items(), drawn, strict=True):
-            values[name] = value if interval.size is None else value.view(rows, interval.size)
-    if rows == count:
-        return values
-    return {name: value.expand(count, *value.shape[1:]).contiguous() for name, value in values.items()}
+    # in float64, so that what is drawn is what every precision sees
+    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device) if sizes else gate
+    if device.type == "cpu" and not torch.compiler.is_compiling():
+        gate, shares = gate.numpy(), shares.numpy()
+    values, start = {"apply": gate}, 0
+    for (name, interval), size in zip(ranges.items(), sizes, strict=True):
+        value = interval.low + (interval.high - interval.low) * shares[start : start + size]
+        values[name] = value if interval.size is None else value.reshape(rows, interval.size)
+        start += size
+    return values if rows == count else {name: value[[0] * count] for name, value in values.items()}
 
 
 class EditOptions(SampleOptions, total=False):
@@ -198,6 +198,8 @@ class Augmentation(SampleTransform):
     """
 
     ranges: dict[str, Range]
+    beside_the_camera: ClassVar[frozenset[str]] = frozenset()
+    """The ranges of what the new images have beside a camera."""
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
     p: float
@@ -258,6 +260,11 @@ class Augmentation(SampleTransform):
         self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
         """`draw` with another p and same_on_batch."""
+        numbers = self._numbers(count, p, same_on_batch, generator)
+        return {name: torch.as_tensor(value) for name, value in numbers.items()}
+
+    def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
+        """The draw as arrays or tensors; see the function `draw`."""
         return draw(self.ranges, count, p, same_on_batch, generator)
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
@@ -272,7 +279,7 @@ class Augmentation(SampleTransform):
             raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
         return self._change(as_one(camera), self._checked_draw(draw))
 
-    def _change(self, camera: Camera, draw: Mapping[str, Tensor]) -> Change:
+    def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         applied, camera = draw["apply"], alone(camera)
         count = len(applied)
         groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
@@ -288,8 +295,8 @@ class Augmentation(SampleTransform):
         def part(rows: list[int] | None, source: Camera) -> Part:
             return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
 
-        looks = may_look(applied) or count == 0
-        if not looks or bool(applied.all()):  # traced, all rows move, and a gate chooses
+        looks = isinstance(applied, np.ndarray) or may_look(applied) or count == 0
+        if not looks or all(applied.tolist()):  # traced, all rows move, and a gate chooses
             return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
         parts, chosen = [], applied.tolist()
         for rows, group in groups:
@@ -308,45 +315,56 @@ class Augmentation(SampleTransform):
             )
         return Change(count, parts, batch_type=type(camera) if isinstance(camera, Mixed) else None)
 
-    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
+        """As arrays, where nothing records what becomes of it."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
         missing = [name for name in ("apply", *self.ranges) if name not in draw]
         if missing:
             has = ", ".join(map(str, draw)) or "nothing"
             raise ValueError(f"{self._name}: the draw lacks {', '.join(missing)}; it has {has}")
-        values = {name: torch.as_tensor(draw[name]) for name in ("apply", *self.ranges)}
+        given = {name: torch.as_tensor(draw[name]) for name in ("apply", *self.ranges)}
+        values: dict[str, Any] = {"apply": given["apply"] > 0.5, **{name: given[name] for name in self.ranges}}
+        if are_numbers(*values.values()):
+            values = {"apply": values["apply"].numpy(), **{name: given[name].double().numpy() for name in self.ranges}}
         count = len(values["apply"])
         for name, interval in self.ranges.items():
-            shape = (count,) if interval.size is None else (count, interval.size)
-            if tuple(values[name].shape) != shape:
-                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(values[name].shape)}")
-        numbers = [values[name] for name in self.ranges]
-        # a sum tells of all at once
-        if numbers and all(map(may_look, numbers)) and not math.isfinite(sum(float(value.sum()) for value in numbers)):
-            for name in self.ranges:
-                if not bool(torch.isfinite(values[name]).all()):
-                    raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {values[name].tolist()}")
-        return {**values, "apply": values["apply"] > 0.5 if values["apply"].dtype != torch.bool else values["apply"]}
+            value, shape = values[name], (count,) if interval.size is None else (count, interval.size)
+            if tuple(value.shape) != shape:
+                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
+            if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+                raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {value.tolist()}")
+        return values
 
-    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
-        target, rotation = self.new_camera(source, values)
+        target, rotation = self._new_camera(source, values)
         if self.min_filled:
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_too_few(found, self.min_filled)
             self._tell_of_zoom(source, target, factor, found)
-        warp = self._warp(source, target, rotation, self._shutter(values))
-        return Part(rows, warp, source, *self._seen_through(warp, values))
+        more = self._like(source, {name: value for name, value in values.items() if name in self.beside_the_camera})
+        warp = self._warp(source, target, rotation, self._shutter(more))
+        return Part(rows, warp, source, *self._seen_through(warp, more))
 
-    def _values(self, source: Camera, draw: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """What `new_camera` is given."""
+    def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
+        """What was drawn, (*B,) or (*B, size): of a single camera without batch dims where all samples draw the same,
+        as one map then serves them all.
+        """
         values = {name: value for name, value in draw.items() if name != "apply"}
-        # one map serves the whole batch where all samples draw the same
-        if not source.batch_shape and all(holds(value == value[:1]) for value in values.values()):
+        if not source.batch_shape and all(len(value) == 1 or _are_alike(value) for value in values.values()):
             values = {name: value[0] for name, value in values.items()}
+        return values
+
+    def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
+        """`new_camera` of values as drawn."""
+        return self.new_camera(source, self._like(source, values))
+
+    @staticmethod
+    def _like(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
+        """The values as tensors in the source's dtype and on its device."""
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
-        return {name: value.to(source.intrinsics.device, dtype) for name, value in values.items()}
+        return {name: torch.as_tensor(value).to(source.intrinsics.device, dtype) for name, value in values.items()}
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
@@ -378,15 +396,17 @@ class Augmentation(SampleTransform):
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
+        if self.min_filled is not None or self._warned or self.p == 0:
+            return
         camera = camera[0] if camera.is_mixed else camera
-        if self.min_filled is not None or self._warned or self.p == 0 or not is_concrete(camera.intrinsics):
+        if not is_concrete(camera.intrinsics):
             return
         self._warned = True
         values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
-            shares = filled(first, *self.new_camera(first, self._values(first, values)))
+            shares = filled(first, *self._new_camera(first, self._values(first, values)))
         if shares.mean() < _FEW:
             warnings.warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
@@ -424,7 +444,10 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
-        change = self._change(camera, self.draw(count, generator)) if draw is None else self.change(camera, draw)
+        if draw is None:
+            change = self._change(camera, self._numbers(count, self.p, self.same_on_batch, generator))
+        else:
+            change = self.change(camera, draw)
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
@@ -477,6 +500,12 @@ class Augmentation(SampleTransform):
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
+
+
+def _are_alike(value: Any) -> bool:
+    """Whether all rows of an array or a tensor are known to be the same."""
+    same = value == value[:1]
+    return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else holds(same)
 
 
 # -- for front ends, which hold an augmentation and the camera of their images

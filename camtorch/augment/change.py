@@ -173,6 +173,11 @@ class Change:
             ]
         return self._cameras(after)
 
+    @property
+    def single(self) -> Camera:
+        """The camera after, of a change of one sample."""
+        return self.target[0] if self.gate is not None else alone(self.parts[0].target)
+
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
         ours, theirs = (one.intrinsics.detach().reshape(-1, 4) for one in (self.target, as_one(camera)))
@@ -202,15 +207,13 @@ class Change:
         """(count, 3, 3): `ray_after = R ray_before`."""
 
         def turned(part: Part, n: int) -> Tensor:
-            eye = torch.eye(3, dtype=part.camera.intrinsics.dtype, device=part.camera.intrinsics.device)
             turned = None if part.warp is None else part.warp.rotation
-            return (eye if turned is None else turned).expand(n, 3, 3)
+            return (_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3)
 
         parts = [turned(part, n) for part, n in zip(self.parts, self._counts, strict=True)]
         rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
         if self.gate is not None:
-            eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-            rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, eye)
+            rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, _eye(rotation))
         return rotation
 
     @property
@@ -381,8 +384,7 @@ class Change:
             if read is _same or warp.rotation.ndim == 2:
                 return moved
             # reading and writing rounds
-            eye = torch.eye(3, dtype=warp.rotation.dtype, device=warp.rotation.device)
-            still = (warp.rotation == eye).all(-1).all(-1)
+            still = (warp.rotation == _eye(warp.rotation)).all(-1).all(-1)
             return torch.where(still.reshape(-1, *[1] * (rows.ndim - 1)), rows.to(moved), moved)
 
         return self.each(rays, move, lambda camera, rows: rows)
@@ -432,6 +434,10 @@ def as_one(camera: Camera | Sequence[Camera]) -> Camera:
 def alone(camera: Camera) -> Camera:
     """A batch of one as the camera that it holds, which serves any number of samples."""
     return camera[0] if tuple(camera.batch_shape) == (1,) else camera
+
+
+def _eye(like: Tensor) -> Tensor:
+    return torch.eye(3, dtype=like.dtype, device=like.device)
 
 
 def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -128,13 +129,12 @@ class Compose(Augmentation):
 
     # -- drawing
 
-    def drawn(
-        self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
-    ) -> dict[str, Tensor]:
+    def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
         values = draw({}, count, p, same_on_batch, generator)
         for i, part in enumerate(self.parts):
-            own = part.drawn(count, part.p, same_on_batch or part.same_on_batch, generator)
-            values |= {f"{i}.{key}": value.double() for key, value in own.items()}
+            own = part._numbers(count, part.p, same_on_batch or part.same_on_batch, generator)
+            for key, value in own.items():
+                values[f"{i}.{key}"] = value.double() if isinstance(value, Tensor) else value.astype(np.float64)
         return values
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
@@ -158,13 +158,13 @@ class Compose(Augmentation):
         for part in self.parts:
             part.tell_of_empty_images(camera)
 
-    def _change(self, camera: Camera, draw: Mapping[str, Tensor]) -> Change:
+    def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         total, options = None, {**self.options, "antialias": self.antialias}
         steps = self._steps(draw)
         while steps:
             edits = []
             while steps and isinstance(steps[0][0], Edit):  # those that follow each other are one
-                edits.append(cast("tuple[Edit, dict[str, Tensor]]", steps.pop(0)))
+                edits.append(cast("tuple[Edit, dict[str, Any]]", steps.pop(0)))
             if edits:
                 step = change_by(edits, camera, options)
             else:
@@ -181,7 +181,7 @@ class Compose(Augmentation):
             )
         return total.with_options(options)  # type: ignore[arg-type]
 
-    def _steps(self, draw: Mapping[str, Tensor]) -> list[tuple[Augmentation, dict[str, Tensor]]]:
+    def _steps(self, draw: Mapping[str, Any]) -> list[tuple[Augmentation, dict[str, Any]]]:
         """The augmentations, and what each was drawn."""
         steps = []
         for i, part in enumerate(self.parts):

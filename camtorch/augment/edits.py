@@ -79,13 +79,14 @@ class Edit(Augmentation):
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Nothing is empty that is not asked for."""
 
-    def _change(self, camera: Camera, draw: Mapping[str, Tensor]) -> Change:
+    def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
 
-    def map_of(self, draw: Mapping[str, Tensor], size: tuple[int, int]) -> tuple[Tensor | None, tuple[int, int]]:
+    def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Tensor | None, tuple[int, int]]:
         """What a draw does to images of a size: `edit`, where it applies; None where it never does."""
-        applied = draw["apply"]
-        matrix, new = self.edit(size, {name: value.double() for name, value in draw.items() if name != "apply"})
+        applied = torch.as_tensor(draw["apply"])
+        values = {name: torch.as_tensor(value).double() for name, value in draw.items() if name != "apply"}
+        matrix, new = self.edit(size, values)
         all_are = holds(applied) or (self.p == 1 and not fails(applied))
         if new != size and (not all_are or 0 < self.p < 1):
             raise ValueError(
@@ -104,7 +105,7 @@ class Edit(Augmentation):
         return super().extra_repr().replace(f"antialias={bool(self.antialias)}", f"antialias={self.antialias}")
 
 
-def change_by(edits: Sequence[tuple[Edit, Mapping[str, Tensor]]], camera: Camera, options: Mapping[str, Any]) -> Change:
+def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, options: Mapping[str, Any]) -> Change:
     """What edits and their draws, one after the other, do to images of `camera`, by warps of these options."""
 
     def part(rows: list[int] | None, source: Camera) -> Part:
@@ -134,7 +135,10 @@ def _turn(matrix: Tensor, source: Camera) -> Tensor | None:
 
 def _map(across: Tensor | float, left: Tensor | float, down: Tensor | float, top: Tensor | float) -> Tensor:
     """(*B, 2, 3): (across u + left, down v + top)."""
-    numbers = [torch.as_tensor(n, dtype=torch.float64) for n in (across, 0.0, left, 0.0, down, top)]
+    given = across, 0.0, left, 0.0, down, top
+    if not any(isinstance(n, Tensor) for n in given):
+        return torch.tensor(given, dtype=torch.float64).view(2, 3)
+    numbers = [torch.as_tensor(n, dtype=torch.float64) for n in given]
     matrix: Tensor = torch.stack(torch.broadcast_tensors(*numbers), -1).unflatten(-1, (2, 3))
     return matrix
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, check, kind_of
+from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, Single, check, kind_of
 from camtorch.camera import Camera
 
 Array: TypeAlias = "np.ndarray[Any, Any]"
@@ -121,32 +121,29 @@ class Transform:
                 f"{_OWNER}: the fields go in by name, as in transform(image=...); got {type(sample).__name__}"
             )
         sample = {**(sample or {}), **fields}
-        inside: Sample = {}
+        inside = Single()
         entries: dict[str, tuple[dict[str, Tensor], Restore | None]] = {}
         for name, value in sample.items():
             tensors, restore = entries[name] = self._entry(name, value, sample)
             inside.update({name: value} if restore is None else tensors)
         with torch.no_grad():
             moved = move(inside, **{key: value for key, value in options.items() if value is not None})
-        camera = moved.get("camera")
-        if isinstance(camera, Camera) and camera.batch_shape:
-            camera = moved["camera"] = camera[0]
-        after: Any = camera
-        if camera is None and isinstance(self.last, Change):
+        after: Any = moved.get("camera")
+        if after is None and isinstance(self.last, Change):
             after = self.last.parts[0].target
         result = {}
         for name, (tensors, restore) in entries.items():
             if restore is not None and tensors.keys() <= moved.keys():
-                result[name] = restore([moved.pop(key)[0] for key in tensors], after.image_size)
+                result[name] = restore([moved.pop(key) for key in tensors], after.image_size)
             elif name in moved:
                 result[name] = moved.pop(name)
         for name, value in moved.items():
-            value = value[0].cpu().numpy() if isinstance(value, Tensor) else value
+            value = value.cpu().numpy() if isinstance(value, Tensor) else value
             result[name] = value[0] if name == _SEEN else value
         return result
 
     def _entry(self, name: str, value: Any, sample: Mapping[str, Any]) -> tuple[dict[str, Tensor], Restore | None]:
-        """A field as the augmentation takes it, tensors with a batch dim of one, and how it gets its layout back.
+        """A field as the augmentation takes it, tensors, and how it gets its layout back.
 
         The latter is a function of what became of the tensors, and of the new image_size; None for what is passed on.
         """
@@ -155,19 +152,19 @@ class Transform:
         if name == _SEEN or (name.endswith("_valid") and name.removesuffix("_valid") in sample):
             valid = _tensor(np.asarray(value, dtype=bool))
             if name == _SEEN:
-                return {name: valid[None, None]}, lambda moved, size: moved[0][0].cpu().numpy()
-            return {name: valid[None]}, lambda moved, size: moved[0].cpu().numpy()
+                return {name: valid[None]}, lambda moved, size: moved[0][0].cpu().numpy()
+            return {name: valid}, lambda moved, size: moved[0].cpu().numpy()
         kind = kind_of(name, value, self.augmentation.fields, _OWNER)
         if kind is None:
             mirroring = self.augmentation.mirroring
             if mirroring is None or name not in mirroring.by_name:
                 return {}, None
-            return {name: _tensor(_checked(name, np.asarray(value)))[None]}, lambda moved, size: moved[0].cpu().numpy()
+            return {name: _tensor(_checked(name, np.asarray(value)))}, lambda moved, size: moved[0].cpu().numpy()
         if kind not in IMAGES:
             value = _checked(name, _numbers(value, kind))
             tensor = _tensor(value)
             check(kind, name, tensor, False, _OWNER)
-            return {name: tensor[None]}, lambda moved, size: moved[0].cpu().numpy().astype(value.dtype, copy=False)
+            return {name: tensor}, lambda moved, size: moved[0].cpu().numpy().astype(value.dtype, copy=False)
         camera = sample.get("camera")
         size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
         many = isinstance(value, (list, tuple))
@@ -198,7 +195,7 @@ def _numbers(value: Any, kind: str) -> Any:
 
 
 def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> Tensor:
-    """(1, C, H, W) of an array (H, W, C) or (H, W), which should be of that size."""
+    """(C, H, W) of an array (H, W, C) or (H, W), which should be of that size."""
     array = _checked(name, value)
     shape = array.shape
     if len(shape) not in (2, 3):
@@ -209,7 +206,7 @@ def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> 
             "np.moveaxis(image, 0, -1) puts them last"
         )
     tensor = _tensor(array)
-    return (tensor.permute(2, 0, 1) if len(shape) == 3 else tensor[None])[None]
+    return tensor.permute(2, 0, 1) if len(shape) == 3 else tensor[None]
 
 
 def as_array(image: Tensor, like: Array) -> Array:

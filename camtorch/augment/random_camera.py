@@ -9,21 +9,23 @@ from difflib import get_close_matches
 from functools import lru_cache
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, broadcast_shapes, check_degrees, fails
+from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails
 from camtorch._module import Memo, remade
+from camtorch._numbers import joined, split, wide
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.camera import Camera, fixed_camera
+from camtorch.camera import Camera
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
-from camtorch.rotations import mount_rotation
+from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.vignetting import vignetting
@@ -101,6 +103,7 @@ class RandomCamera(Augmentation):
         **dict.fromkeys(("preset", "model", "lens"), "like"),
         **{"center": "centre", "size": "image_size"},
     }
+    beside_the_camera = frozenset({"chromatic", "vignetting", "cos4", "rates", "readout", "exposure"})
     like: Camera | None
 
     def __init__(
@@ -185,12 +188,28 @@ class RandomCamera(Augmentation):
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """The new camera and its turn; see `Augmentation.new_camera`."""
+        return self._made(source, values, torch)
+
+    def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
+        if type(self).new_camera is not RandomCamera.new_camera:
+            return super()._new_camera(source, values)
+        lens = () if self.like is None else self.like._tensors
+        if are_numbers(*source._tensors, *lens) and not any(isinstance(value, Tensor) for value in values.values()):
+            # a hundred operations on some numbers, for each of which torch takes microseconds
+            return self._made(source, values, np)
+        like = wide(source.intrinsics.detach())
+        return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
+
+    def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
+        """The same by tensors, or by arrays in float64, with the functions of torch or of numpy."""
+        target = self._target(source, values, xp)
         names = "yaw", "pitch", "roll"
-        angle = next((values[name] for name in names if name in values), None)
-        if angle is None:
-            return self._target(source, values), None
-        zero = torch.zeros_like(angle)
-        return self._target(source, values), mount_rotation(*(values.get(name, zero) for name in names))
+        if not any(name in values for name in names):
+            return target, None
+        angle = next(values[name] for name in names if name in values)
+        angles = [xp.deg2rad(values.get(name, 0 * angle)) for name in names]
+        elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
+        return target, joined(elements, source.intrinsics, xp).unflatten(-1, (3, 3))
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
@@ -242,46 +261,51 @@ class RandomCamera(Augmentation):
             values.get("readout", 0.0), torch.deg2rad(values["rates"]), exposure=values.get("exposure", 0.0)
         )
 
-    def _target(self, source: Camera, values: Mapping[str, Tensor]) -> Camera:
+    def _target(self, source: Camera, values: Mapping[str, Any], xp: Any) -> Camera:
         size = self.image_size or (source.height, source.width)
         base = source if self.like is None else self.like
-        if self._is_real:
-            intrinsics, k, reach = drawn(values["lens"], size, self._among)
-            base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
+        if self._is_real:
+            share = torch.as_tensor(values["lens"], dtype=dtype, device=device)
+            intrinsics, k, reach = drawn(share, size, self._among)
+            base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
         if any(t.dtype != dtype or t.device != device for t in base._tensors):
             base = base.each(lambda t: t.to(device, dtype))
         if self.fov == "source":
-            intrinsics = usual = self._from_source(source, base, size)
+            numbers = split(self._from_source(source, base, size), xp)
         else:
-            intrinsics = _sized(base, size, values.get("fov"))
-            usual = self._usual(base, size) if "fov" in values and "distortion" in values else intrinsics.detach()
-        focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
+            numbers = _sized(base, size, values.get("fov"), xp)
+        fx, fy, cx, cy = before = numbers
         for name in ("focal", "zoom"):
             if name in values:
-                focal = focal * values[name].unsqueeze(-1)
-        sides = focal.new_tensor(size[::-1])
+                fx, fy = fx * values[name], fy * values[name]
+        height, width = size
         if "centre" in values:
-            centre = centre + values["centre"] * sides
+            cx, cy = cx + values["centre"][..., 0] * width, cy + values["centre"][..., 1] * height
         if self._is_real:
-            focal = focal * covering(_numbers(focal, centre), reach, size).unsqueeze(-1)
+            factor: Any = covering(joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
+            factor = factor if xp is torch else factor.numpy()
+            fx, fy = fx * factor, fy * factor
         distortion = base.distortion
         if "distortion" in values and distortion.shape[-1]:
-            drawn_to = remade(base, intrinsics=_numbers(focal, centre), image_size=size).detach()
-            distortion = jittered(drawn_to, values["distortion"], usual)
+            drawn_to = remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), image_size=size).detach()
+            usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp).detach()
+            amounts = torch.as_tensor(values["distortion"], dtype=dtype, device=device)
+            distortion = jittered(drawn_to, amounts, usual)
             if in_graph(base.distortion):
                 distortion = base.distortion + (distortion - base.distortion.detach())
         if "crop" in values:  # a part of the image, enlarged to the full size
-            share = values["crop"].unsqueeze(-1)
-            corner = (1 - share) * values["place"] * sides
-            focal, centre = focal / share, (centre + 0.5 - corner) / share - 0.5
-        return remade(base, intrinsics=_numbers(focal, centre), distortion=distortion, image_size=size)
+            share, place = values["crop"], values["place"]
+            left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
+            fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
+        return remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), distortion=distortion, image_size=size)
 
     def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens with the field of view in the middle of the range; graph-free."""
 
         def made() -> Tensor:
-            return _sized(base, size, base.intrinsics.new_tensor(self.ranges["fov"].middle)).detach()
+            middle = base.intrinsics.new_tensor(self.ranges["fov"].middle)
+            return joined(_sized(base, size, middle, torch), base.intrinsics, torch).detach()
 
         kept: Tensor = self._memo(base._tensors, (type(base), base.image_size, size), made)
         return kept
@@ -291,43 +315,42 @@ class RandomCamera(Augmentation):
 
         def narrowed() -> Tensor:
             fov = torch.rad2deg(field_of_view(source)[..., 0]) if base.image_size is None else None
-            whole = remade(base, intrinsics=_sized(base, size, fov), image_size=size)
+            intrinsics = joined(_sized(base, size, fov, torch), base.intrinsics, torch)
+            whole = remade(base, intrinsics=intrinsics, image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
         kept: Tensor = self._memo(source._tensors + base._tensors, (type(source), source.image_size, size), narrowed)
         return kept
 
 
-def _numbers(focal: Tensor, centre: Tensor) -> Tensor:
-    """Intrinsics (*B, 4)."""
-    return torch.cat(torch.broadcast_tensors(focal, centre), -1)
-
-
-def _sized(base: Camera, size: tuple[int, int], fov: Tensor | None) -> Tensor:
-    """Intrinsics (*B, 4) of a lens before an image of another size, showing as much in width or a fov in degrees.
+def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[Any]:
+    """fx, fy, cx, cy of a lens before an image of another size, showing as much in width or a fov in degrees.
 
     The old image is scaled to the new width, and cropped or padded evenly to the new height.
     """
-    focal, centre = base.intrinsics[..., :2], base.intrinsics[..., 2:]
-    middle = (focal.new_tensor(size[::-1]) - 1) / 2
+    fx, fy, cx, cy = own = split(base.intrinsics, xp)
+    across, down = (size[1] - 1) / 2, (size[0] - 1) / 2
     if base.image_size is None:
-        centre = centre + middle
+        cx, cy = cx + across, cy + down
     elif base.image_size != size:
-        scale = size[1] / base.image_size[1]
-        focal, centre = focal * scale, (centre - (focal.new_tensor(base.image_size[::-1]) - 1) / 2) * scale + middle
-    if fov is not None:
-        ends = torch.deg2rad(fov / 2).unsqueeze(-1) * focal.new_tensor([-1.0, 1.0])
-        rays = polar_rays(ends, torch.zeros_like(ends))
-        if base.batch_shape:
-            rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
-        pixels, valid = base.project(rays)
-        if fails(valid):
-            raise ValueError(
-                f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees"
-            )
-        wide = pixels[..., 1, :1] - pixels[..., 0, :1]
-        focal = base.intrinsics[..., :2] * (size[1] / wide)
-    return _numbers(focal, centre)
+        height, width = base.image_size
+        scale = size[1] / width
+        fx, fy = fx * scale, fy * scale
+        cx, cy = (cx - (width - 1) / 2) * scale + across, (cy - (height - 1) / 2) * scale + down
+    if fov is None:
+        return fx, fy, cx, cy
+    half = xp.deg2rad(fov / 2)
+    sine, cosine = xp.sin(half), xp.cos(half)
+    ends = [joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
+    rays = torch.stack(ends, -2)
+    if base.batch_shape:
+        rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
+    pixels, valid = base.project(rays)
+    if fails(valid):
+        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
+    wide = pixels[..., 1, 0] - pixels[..., 0, 0]
+    ratio = size[1] / (wide if xp is torch else wide.numpy())
+    return own[0] * ratio, own[1] * ratio, cx, cy
 
 
 class RandomMount(RandomCamera):
@@ -449,25 +472,21 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
     count = camera.distortion.shape[-1]
     measured = _kept(_sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
-    steps = amounts.reshape(-1, DRAWN)[:, [i % DRAWN for i in range(count)]] * measured
-    given = camera.distortion.reshape(-1, count)
-    p, q = (w.expand(len(steps), -1) for w in _rim(camera))
-    given = given.expand_as(steps)
-    result, left = given.clone(), torch.arange(len(steps), device=steps.device)
+    steps = amounts.reshape(-1, DRAWN).repeat(1, -(-count // DRAWN))[:, :count] * measured
+    lens = remade(camera, intrinsics=camera.intrinsics.reshape(-1, 4), distortion=camera.distortion.reshape(-1, count))
+    rim, given = _rim(lens), lens.distortion.expand_as(steps)
+    if len(rim) < len(steps):
+        rim = rim.expand(len(steps), -1, -1)
+    result, done = given, torch.zeros(len(steps), dtype=torch.bool, device=steps.device)
     for part in _PARTS:
-        candidate, defined = _defined(camera, given[left] + part * steps[left], given[left])
-        fits = defined & _has_ray(camera, candidate, torch.stack((p[left], q[left]), -1)).all(-1)
-        result[left[fits]] = candidate[fits]
-        left = left[~fits]
-        if not len(left):
+        candidate, defined = _defined(camera, given + part * steps, given)
+        fits = remade(lens, distortion=candidate).unproject(rim)[1].all(-1)
+        fits = fits if defined is None else fits & defined
+        result = torch.where((fits & ~done).unsqueeze(-1), candidate, result)
+        done |= fits
+        if bool(done.all()):
             break
-    return (result.view(*amounts.shape[:-1], count),)
-
-
-def _has_ray(camera: Camera, k: Tensor, points: Tensor) -> Tensor:
-    """Bool (C, N): whether points (C, N, 2) of the sensor in focal lengths have a ray, by coefficients (C, n)."""
-    ideal = k.new_tensor([1.0, 1.0, 0.0, 0.0]).expand(len(k), 4)
-    return fixed_camera(type(camera), ideal, k).unproject(points)[1]
+    return (result.view(*amounts.shape[:-1], count).clone(),)
 
 
 _measured = Memo(24)  # of a batch of eight models
@@ -507,37 +526,37 @@ def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
     return share * torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
 
 
-def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor]:
-    """Coefficients (*B, n), others where the model's formula does not exist for them, and bool (*B,): it does."""
+def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Coefficients (*B, n), others where the model's formula does not exist for them; and where it does, (*B,) bool,
+    None: everywhere.
+    """
     sense = camera.defined(distortion.unbind(-1))
     if sense is None:
-        return distortion, torch.ones_like(distortion[..., 0], dtype=torch.bool)
+        return distortion, None
     return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
 
 
-def _rim(camera: Camera) -> tuple[Tensor, ...]:
-    """Planes (C, N) of points of the sensor in focal lengths: the outline of what the lens shows of the image.
+def _rim(camera: Camera) -> Tensor:
+    """(C, N, 2): the pixels of the outline of what the cameras (C,) show of the image.
 
-    Of both: the image's edges, and where the lens ends on it; (0, 0) for what it does not show. What is mapped has no
-    holes: a lens that is invertible on the outline is so inside.
+    Of both: the image's edges, and where the lens ends on it; the principal point for what it does not show. What is
+    mapped has no holes: a lens that is invertible on the outline is so inside.
     """
-    intrinsics, k = camera.intrinsics.reshape(-1, 1, 4), camera.distortion.detach()
-    focal, centre = intrinsics[..., :2], intrinsics[..., 2:]
-    edges = (_border(camera._size_for("its rim")).to(focal) - centre) / focal
-    k = k.reshape(-1, k.shape[-1])
-    rim = edges.expand(len(k), -1, -1) if len(edges) == 1 else edges
-
-    def seen(points: Tensor) -> Tensor:
-        return _has_ray(camera, k, points)
-
-    if not bool(seen(rim).all()):
+    border = _border(camera._size_for("its rim")).to(camera.intrinsics)
+    rim = border.expand(*camera.batch_shape, *border.shape)
+    if len(camera.distortion) == 1:
+        least = _kept(_least_end, camera, camera.distortion.detach())
+        if bool((covering(camera.intrinsics, least, camera._size_for("its rim")) == 1).all()):
+            return rim
+    if not bool(camera.unproject(rim)[1].all()):
+        focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]
         # edited images have different intrinsics, and few kinds of coefficients
-        lenses, which = k.unique(dim=0, return_inverse=True)
-        ends = _kept(_ends, camera, lenses).to(focal)[which]
-        ends = torch.where(camera.contains(ends * focal + centre).unsqueeze(-1), ends, rim[:, :1])
-        rim = torch.cat((rim, ends), 1)
-        rim = torch.where(seen(rim).unsqueeze(-1), rim, 0.0)
-    return rim.unbind(-1)
+        lenses, which = camera.distortion.detach().unique(dim=0, return_inverse=True)
+        ends = _kept(_ends, camera, lenses).to(focal)[which] * focal + centre
+        ends = torch.where(camera.contains(ends).unsqueeze(-1), ends, rim[:, :1])
+        rim = torch.cat((rim, ends.expand(len(rim), -1, -1)), 1)
+        rim = torch.where(camera.unproject(rim)[1].unsqueeze(-1), rim, centre)
+    return rim
 
 
 @lru_cache(maxsize=16)
@@ -559,3 +578,8 @@ def _ends(camera: Camera, distortion: Tensor) -> Tensor:
 
     ends = reach(lambda rays: seen(rays)[1], azimuths, steps=_ANGLES, rounds=2)
     return seen(polar_rays(ends, azimuths).unsqueeze(-2))[0].squeeze(-2)
+
+
+def _least_end(camera: Camera, distortion: Tensor) -> Tensor:
+    """(*B,): the least of the distances of `_ends`; what is nearer to the principal point has a ray."""
+    return (_ends(camera, distortion) ** 2).sum(-1).amin(-1).sqrt()

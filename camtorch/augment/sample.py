@@ -44,6 +44,10 @@ Named = dict[str, tuple[str, Any]]
 """Name -> (kind, tensor or list of tensors)."""
 
 
+class Single(dict[str, Any]):
+    """A sample that is known to be a single one, without batch dims."""
+
+
 # -- the kinds of fields
 
 KEEP = "keep"
@@ -147,6 +151,9 @@ KINDS = {
 _SINGLE_FILE = ("keypoints", "landmarks")  # which OpenCV has as (N, 1, 2)
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
+
+
+_RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.items())}
 
 
 def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str | None:
@@ -258,8 +265,7 @@ def is_batch(named: Named, camera: object) -> bool:
     """
     if isinstance(camera, (list, tuple)):
         return True
-    order = list(KINDS)
-    for kind, value in sorted(named.values(), key=lambda pair: (not KINDS[pair[0]].decides, order.index(pair[0]))):
+    for kind, value in sorted(named.values(), key=lambda pair: _RANKS[pair[0]]):
         if isinstance(value, (list, tuple)):
             return True
         if KINDS[kind].decides:
@@ -403,7 +409,7 @@ class SampleTransform(nn.Module):
         if sample is not None and not isinstance(sample, Mapping):
             got = type(sample).__name__
             raise TypeError(f"{self._name}: a sample is a dict of fields, or keywords, as in image=...; got {got}")
-        return {**(sample or {}), **fields}
+        return sample if isinstance(sample, Single) and not fields else {**(sample or {}), **fields}
 
     def _sorted(self, sample: Sample) -> Named:
         """The fields that move."""
@@ -429,7 +435,7 @@ class SampleTransform(nn.Module):
         if not named:
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
         camera = self._camera_of(named) if camera is None else camera
-        batched = is_batch(named, camera)
+        batched = not isinstance(sample, Single) and is_batch(named, camera)
         count = -1
         for name, (found, value) in named.items():
             several = isinstance(value, (list, tuple))
@@ -522,9 +528,7 @@ class SampleTransform(nn.Module):
             put("image_valid", before.contiguous())
         if "rotation" not in named:
             put("rotation", change.rotation.clone())
-        target = change.target
-        if not batched and target.batch_shape:
-            target = target[0]
+        target = change.target if batched else change.single
         if self.mirroring is not None:
             self._mirror(moved, named, change.mirrored, batched)
         if not isinstance(change.parts[0].target, Unknown):

@@ -109,7 +109,7 @@ class Transform(v2.Transform):
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.change(camera, self.augmentation.draw(1))
             self.augmentation.last, self._flags = change, []
-            return {"change": change, "camera": change.target[0]}
+            return {"change": change, "camera": change.single}
 
     def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
         """Move one input of a sample by the `params` of `make_params`."""
@@ -189,7 +189,7 @@ def _pil(change: Change, image: PIL.Image.Image) -> PIL.Image.Image:
             "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
         )
     array = np.asarray(image)
-    moved = as_array(change.images(as_tensor("image", array))[0], array)
+    moved = as_array(change.images(as_tensor("image", array)[None])[0], array)
     return PIL.Image.frombuffer(image.mode, moved.shape[1::-1], moved, "raw", image.mode, 0, 1)
 
 

@@ -13,7 +13,7 @@ from camtorch._arguments import Numbers, as_real, fails
 from camtorch.camera import Camera
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Stage
 from camtorch.optics.lens import StageAt
-from camtorch.optics.radial import RadialFactor, total
+from camtorch.optics.radial import RadialFactor
 from camtorch.optics.special import first_root
 
 if TYPE_CHECKING:
@@ -63,11 +63,6 @@ class ShearAt(StageAt):
     def jacobian(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         d, e = (w + torch.zeros_like(self.a) for w in self.stage.parameters)
         return torch.ones_like(d), e, d, torch.ones_like(e)
-
-    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[tuple[Tensor, Tensor], list[Tensor]]:
-        d, e = self.stage.parameters
-        sums = [total(g * w) for g, w in ((gv, self.a), (gu, self.b))] if want_parameters else []
-        return (gu + d * gv, gv + e * gu), sums
 
 
 class OCamCalib(Camera):

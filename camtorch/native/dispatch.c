@@ -5,7 +5,8 @@
 #define DECLARED(variant)                                                                                              \
     int32_t sample_##variant(Job *);                                                                                      \
     int32_t classify_##variant(const Classification *);                                                                \
-    int64_t geometry_##variant(Rows *);
+    int64_t geometry_##variant(const Rows *);                                                                                \
+    void domain_##variant(const Domain *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
 DECLARED(avx2)
@@ -59,4 +60,6 @@ EXPORTED int32_t camtorch_sample(Job *job) { CALLED(sample, job) }
 
 EXPORTED int32_t camtorch_classify(const Classification *given) { CALLED(classify, given) }
 
-EXPORTED int64_t camtorch_geometry(Rows *rows) { CALLED(geometry, rows) }
+EXPORTED int64_t camtorch_geometry(const Rows *rows) { CALLED(geometry, rows) }
+
+EXPORTED void camtorch_domain(const Domain *domain) { CALLED(domain, domain) }

@@ -15,10 +15,12 @@
 #include <intrin.h>
 #define ALIGNED __declspec(align(64))
 #define INLINE static inline
+#define NOT_INLINE
 #define restrict __restrict
 #else
 #define ALIGNED __attribute__((aligned(64)))
 #define INLINE static inline __attribute__((always_inline))
+#define NOT_INLINE __attribute__((noinline))
 #endif
 
 #define JOINED_(a, b) a##_##b
@@ -27,10 +29,35 @@
 
 enum { LANES = 16 };      /* that a block is filled up to a multiple of */
 enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */
+enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
 #define PI 3.14159265358979323846
 
 /* Over the points of a block; `n` is a multiple of LANES */
 #define EACH(i) for (int i = 0; i < (n & -LANES); i++)
+
+/* Charts that have loops of their own: unified ones of alpha 0, of alpha 1 and no xi, and of no xi */
+enum { SHIFTED = SPHERE + 1, SPHERICAL, ENHANCED };
+/* Factors that have: polynomials of few numbers and of some, and so on; any other one */
+enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
+
+/* The same loop for each chart, and for each factor: what differs is constant, and no branch is left in it */
+#define CASE(name, ...) case name: { __VA_ARGS__; break; }
+#define WAY(name, ...) CASE(name, enum { way = name }; __VA_ARGS__)
+#define EACH_WAY(given, ...)                                                                                           \
+    switch (given) {                                                                                                   \
+        WAY(PERSPECTIVE, __VA_ARGS__) WAY(EQUIDISTANT, __VA_ARGS__) WAY(EQUISOLID, __VA_ARGS__)                        \
+        WAY(UNIFIED, __VA_ARGS__) WAY(FOV, __VA_ARGS__) WAY(ONE_DIVISION, __VA_ARGS__) WAY(INVERTED, __VA_ARGS__)      \
+        WAY(CYLINDER, __VA_ARGS__) WAY(SPHERE, __VA_ARGS__) WAY(SHIFTED, __VA_ARGS__) WAY(SPHERICAL, __VA_ARGS__)      \
+        WAY(ENHANCED, __VA_ARGS__)                                                                                     \
+    }
+#define FORM(name, made, n, m, ...) CASE(name, enum { kind = made, count = n, below = m }; __VA_ARGS__)
+#define EACH_FORM(given, ...)                                                                                          \
+    switch (given) {                                                                                                   \
+        FORM(FEW, POLYNOMIAL, PADDED / 2, 0, __VA_ARGS__) FORM(SOME, POLYNOMIAL, PADDED, 0, __VA_ARGS__)               \
+        FORM(RATIO, RATIONAL, PADDED / 2, PADDED / 2, __VA_ARGS__)                                                     \
+        FORM(ROOTS, RADIUS_POLYNOMIAL, PADDED, 0, __VA_ARGS__) FORM(ANGLES, ANGLE_PER_RADIUS, PADDED, 0, __VA_ARGS__)  \
+        FORM(ALL, ANGLE_OF_ALL_POWERS, PADDED, 0, __VA_ARGS__)                                                         \
+    }
 
 /* How many numbers a part has: the `parameters` of its chart or stage */
 static int numbers_of(const Part *part) {
@@ -46,11 +73,12 @@ static int numbers_of(const Part *part) {
 }
 
 /* The tile that whoever is free takes */
-static int64_t taken(Rows *rows) {
+static int64_t taken(const Rows *rows, int64_t *own) {
+    if (!rows->next) return (*own)++;
 #if defined(_MSC_VER)
-    return _InterlockedExchangeAdd64(&rows->next, 1);
+    return _InterlockedExchangeAdd64(rows->next, 1);
 #else
-    return __atomic_fetch_add(&rows->next, 1, __ATOMIC_RELAXED);
+    return __atomic_fetch_add(rows->next, 1, __ATOMIC_RELAXED);
 #endif
 }
 
@@ -59,6 +87,7 @@ static int64_t taken(Rows *rows) {
 #define T(name) name##_float
 #define BLOCK 256
 #define IS_DOUBLE 0
+#define INVERSE_STEPS 1
 #include "geometry_numbers.h"
 #include "geometry_charts.h"
 #include "geometry_lens.h"
@@ -68,18 +97,21 @@ static int64_t taken(Rows *rows) {
 #undef T
 #undef BLOCK
 #undef IS_DOUBLE
+#undef INVERSE_STEPS
 
 #define R double
 #define I int64_t
 #define T(name) name##_double
 #define BLOCK 128
 #define IS_DOUBLE 1
+#define INVERSE_STEPS 2
 #include "geometry_numbers.h"
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_domain.h"
 
 /* Makes tiles until none is left that nobody has taken; how many points wait for `limits2` */
-int64_t THIS(geometry)(Rows *rows) {
+int64_t THIS(geometry)(const Rows *rows) {
     return rows->cameras->is_double ? rows_double(rows) : rows_float(rows);
 }

@@ -21,7 +21,9 @@ enum { TANGENTIAL = 1, PRISM = 2 };
 enum { NO_FACTOR, POLYNOMIAL, RATIONAL, RADIUS_POLYNOMIAL, ANGLE_PER_RADIUS, ANGLE_OF_ALL_POWERS, RADIUS_TABLE };
 
 enum { MOST_PARTS = 5 };
+enum { MOST_DEGREE = 64 }; /* of a polynomial whose root is asked for, and of a ratio's denominator */
 enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabulate` */
+enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of its stages */
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.Azimuths` */
 
 /* A chart or a stage */
@@ -50,6 +52,24 @@ typedef struct {
     const void *chart_inner2, *chart_most2, *chart_table;
 } Cameras;
 
+/* What is asked for of lenses (c), or of the factors of inverted charts; what is not wanted is NULL. Results are float
+   or double */
+typedef struct {
+    const Part *parts; /* as of `Cameras` */
+    int64_t part_count, is_double, cameras;
+    const double *parameters; /* (c, parameter_count) */
+    int64_t parameter_count;
+    const double *constants; /* (c, constant_count) */
+    int64_t constant_count;
+    int64_t is_chart, is_radial;     /* whether the factor is an inverted chart's; whether the lens is a factor alone */
+    const double *ends, *usual_ends; /* (c): the radius at which the chart ends, and beyond which there are no images */
+    const double *folds;             /* (c): of factors whose fold is not the root of a polynomial, or NULL */
+    double most;                     /* the largest image that is a number to calculate with */
+    const double *radii;             /* (MOST_RADII): from the centre to the end of the chart */
+    void *inner2, *usual2, *circle2, *table; /* (c), (c), (c), (c, 2 + 2 NODES); see `Cameras` */
+    uint8_t *stagewise;                      /* (c); with circle2 */
+} Domain;
+
 enum { PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP };
 
 /* Rows (c, n), strides in elements by camera, point and component; what is not wanted is NULL */
@@ -67,7 +87,7 @@ typedef struct {
     double *sums;
     int64_t count, tile; /* points of a camera; of a tile */
     int64_t direction;
-    int64_t next; /* the tile that whoever is free takes */
+    int64_t *next; /* the tile that whoever is free takes; NULL: one caller takes all */
 } Rows;
 
 /* OPEN: a pixel that may have a ray, which steps of Newton's method have not found */

@@ -4,30 +4,34 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Sequence
-from ctypes import addressof, c_double, c_int32, c_int64, c_void_p
-from typing import TYPE_CHECKING, NamedTuple
+import struct
+from collections.abc import Callable, Sequence
+from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from camtorch import optics
+from camtorch._arguments import columns
 from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
 from camtorch.optics.backprojection import FURTHEST
-from camtorch.optics.radial_inverse import _made_tables
+from camtorch.projection.domain import Domain
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens, Stage
-    from camtorch.projection.domain import Domain
-    from camtorch.projection.rows import Cameras
+    from camtorch.projection.domain import Optics
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
 _OPEN = 2  # of geometry.h
-_TILE = 1 << 14  # points of a tile, some 20 us
-_MOST_PARTS = 5
+_TILE = 1 << 14  # points of a tile, some 30 us
+_SHARED = 1 << 15  # points that threads are woken for
+_MOST_PARTS, _MOST_DEGREE = 5, 64
+_TABLE = 2 + 2 * 1024
+_RADII = 512
 
 _CHARTS: dict[type[Chart], int] = {
     optics.Perspective: 0,
@@ -85,67 +89,213 @@ class _Cameras(ctypes.Structure):
     )
 
 
-_Rows = c_int64 * 20  # `Rows` of geometry.h
+_Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
+_NO_ROWS = (0, 0, 0, 0)
+
+
+class _Domain(ctypes.Structure):
+    """`Domain` of geometry.h."""
+
+    _fields_ = (
+        ("parts", c_void_p),
+        ("part_count", c_int64),
+        ("is_double", c_int64),
+        ("cameras", c_int64),
+        ("parameters", c_void_p),
+        ("parameter_count", c_int64),
+        ("constants", c_void_p),
+        ("constant_count", c_int64),
+        ("is_chart", c_int64),
+        ("is_radial", c_int64),
+        ("ends", c_void_p),
+        ("usual_ends", c_void_p),
+        ("folds", c_void_p),
+        ("most", c_double),
+        ("radii", c_void_p),
+        ("inner2", c_void_p),
+        ("usual2", c_void_p),
+        ("circle2", c_void_p),
+        ("table", c_void_p),
+        ("stagewise", c_void_p),
+    )
+
+
+class Plan:
+    """What all cameras of a model and a number of coefficients have in common."""
+
+    def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
+        """Of the optics of coefficients, columns, whatever their values."""
+        self.parts, self.count = (_Part * len(parts))(*parts), len(parts)
+        parameters = (*chart.parameters, *lens.parameters)
+        self.parameters = len(parameters)
+        places = {id(c): i for i, c in enumerate(coefficients)}
+        known = [places[id(p)] for p in parameters if id(p) in places]
+        # which coefficients the parameters are; None where the model computes some
+        self.places = torch.tensor(known, device="cpu") if len(known) == len(parameters) else None
+        self.is_all = known == list(range(len(coefficients)))
+        self.is_chart = isinstance(chart, optics.Inverted)
+        self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
+        self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
+        self._ends: dict[torch.dtype, tuple[float, float]] = {}
+
+    def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
+        """The radii at which the chart of some cameras ends, and beyond which there are no images."""
+        if self.is_chart:
+            return FURTHEST, FURTHEST
+        if dtype in self._ends:
+            return self._ends[dtype]
+        made = chart()
+        end, usual_end = made.end(dtype), made.usual_end(dtype)
+        if not (made.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
+            self._ends[dtype] = end, usual_end
+        return end, usual_end
+
+    def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
+        """(C, parameters) of coefficients (C, n)."""
+        if self.places is not None:
+            return k if self.is_all else k[:, self.places]
+        chart, lens = optics_of(columns(k))
+        return torch.cat([c.expand(len(k), 1) for c in (*chart.parameters, *lens.parameters)], -1)
+
+
+_plans: dict[tuple[Optics, int], Plan | None] = {}
+
+
+def _plan(optics_of: Optics, k: Tensor) -> Plan | None:
+    """That of coefficients (C, n); None where a part of the optics has no code."""
+    key = optics_of, k.shape[-1]
+    if key not in _plans:
+        given = [c.clone() for c in columns(k[:1].double())]
+        chart, lens = optics_of(given)
+        parts = codes(chart, lens)
+        _plans[key] = None if parts is None else Plan(chart, lens, parts, given)
+    return _plans[key]
 
 
 class Native:
     """Cameras (C,) of one model as the compiled geometry takes them."""
 
-    _kept: list[Tensor]
+    _kept: list[Any]
 
-    def __init__(self, cameras: Cameras, parts: Sequence[_Part]):
-        domain, intrinsics = cameras.domain, cameras.intrinsics
-        self._domain, self._kept = domain, []
-        self._parts, self.struct = (_Part * len(parts))(*parts), _Cameras()
-        struct = self.struct
-        struct.parts, struct.part_count = addressof(self._parts), len(parts)
+    def __init__(self, plan: Plan, optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None):
+        self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, []
+        self.struct = struct = _Cameras()
+        struct.parts, struct.part_count = addressof(plan.parts), plan.count
         self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
         struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
         struct.intrinsics = self._keep(intrinsics)
-        parameters = (*domain.chart.parameters, *domain.lens.parameters)
-        self.parameters = struct.parameter_count = len(parameters)
-        struct.parameters = self._keep_columns(parameters)
-        constants = _constants(domain.lens)
-        struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
-        if cameras.usable is not None:
-            struct.usable = self._keep(cameras.usable > 0)
-        if domain.lens.stages:
-            self._add_tables(domain)
-        if isinstance(domain.chart, optics.Inverted):
-            inner2, table = _made_tables(domain.chart.factor.name, torch.cat(domain.chart.parameters, -1), FURTHEST)
-            struct.chart_inner2, struct.chart_table = self._keep(inner2), self._keep(table)
-            struct.chart_most2 = self._keep(table[:, 1])
+        self.parameters = struct.parameter_count = plan.parameters
+        if plan.parameters:
+            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
+        if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
+            struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
+        if usable is not None:
+            struct.usable = self._keep(usable > 0)
+        if plan.is_chart:
+            self._add_chart()
+        if plan.has_stages:
+            self._add_domain()
         self.pointer = addressof(struct)
 
-    def _add_tables(self, domain: Domain) -> None:
-        struct, lens = self.struct, domain.lens
-        struct.inner2 = self._keep(domain.inner2)
-        struct.usual2 = self._keep(domain.usual2)
-        if lens.radial is not None:
-            struct.table = self._keep(domain.table)
-        if domain.stagewise is not None:
-            struct.stagewise, struct.circle2 = self._keep(domain.stagewise), self._keep(domain.circle2)
+    def _optics(self) -> tuple[Chart, Lens]:
+        """In double precision."""
+        return self._optics_of(columns(self._k.double()))
+
+    @functools.cached_property
+    def _domain(self) -> _Domain:
+        """What it is asked with; its optics are of double precision."""
+        made, plan, k = _Domain(), self.plan, self._k.double()
+        made.parts, made.part_count = addressof(plan.parts), plan.count
+        made.is_double, made.cameras, made.is_radial = self.struct.is_double, self.cameras, plan.is_radial
+        made.parameters, made.parameter_count = self._keep(plan.parameters_of(self._optics_of, k)), plan.parameters
+        made.most = torch.finfo(self.dtype).max ** 0.25
+        made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
+        if plan.places is None or plan.parameters > _MOST_DEGREE:
+            chart, lens = self._optics()
+            if constants := _constants(lens):
+                made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
+            factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
+            if factor is not None:
+                many = len(factor.parameters) > _MOST_DEGREE
+                fold = factor.closed_fold() if many and factor.fold is None else factor.fold
+                made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
+        return made
+
+    def _keep_ends(self, end: float | Tensor) -> int:
+        if isinstance(end, float):
+            ends = (c_double * self.cameras)(*[end] * self.cameras)
+            self._kept.append(ends)
+            return addressof(ends)
+        return self._keep(end.expand(self.cameras, 1).double())
+
+    def _ask(self, wanted: dict[str, int]) -> None:
+        """Fill in what of the domain is wanted: names and where it goes."""
+        domain = self._domain
+        for name, place in wanted.items():
+            setattr(domain, name, place)
+        _entry("camtorch_domain", None)(byref(domain))
+        for name in wanted:
+            setattr(domain, name, None)
+
+    def _new(self, columns: int, dtype: torch.dtype | None = None) -> int:
+        return self._keep(torch.empty(self.cameras, columns, dtype=dtype or self.dtype, device="cpu"))
+
+    def _add_chart(self) -> None:
+        """The fold and the inverse of a chart that is given the other way round."""
+        self._domain.is_chart = True
+        struct, table = self.struct, self._new(_TABLE)
+        struct.chart_inner2, struct.chart_table = self._new(1), table
+        self._ask({"inner2": struct.chart_inner2, "table": table})
+        struct.chart_most2 = self._keep(self._kept[-2][:, 1])
+        self._domain.is_chart = False
+
+    def _add_domain(self) -> None:
+        struct, plan = self.struct, self.plan
+        struct.inner2, struct.usual2 = self._new(1), self._new(1)
+        if plan.is_chart:  # whose end is that of a search
+            domain = self.domain
+            struct.inner2, struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
+            return
+        wanted = {"inner2": struct.inner2, "usual2": struct.usual2}
+        if plan.has_rest:
+            struct.circle2, struct.stagewise = self._new(1), self._new(1, torch.bool)
+            wanted |= {"circle2": struct.circle2, "stagewise": struct.stagewise}
+        if not plan.is_radial:
+            wanted["radii"] = self._keep(self._optics()[0].radii(_RADII, self._k).double())
+        self._ask(wanted)
+
+    def add_table(self) -> None:
+        """Make what the inverse of the radial factor starts from."""
+        self.struct.table = self._new(_TABLE)
+        self._ask({"table": self.struct.table})
 
     def add_limits(self) -> None:
         """Make the limits of each azimuth, which take a while, and are asked for only when a point lies far out."""
-        self.struct.limits2 = self._keep(self._domain.limits2)
+        self.struct.limits2 = self._keep(self.domain.limits2)
+
+    @functools.cached_property
+    def domain(self) -> Domain:
+        """For what the compiled geometry does not do."""
+        return Domain(self._optics_of, self._k)
 
     def _keep(self, tensor: Tensor) -> int:
-        self._kept.append(tensor.detach().contiguous())
-        return self._kept[-1].data_ptr()
+        tensor = tensor.contiguous()
+        self._kept.append(tensor)
+        return tensor.data_ptr()
 
-    def _keep_columns(self, columns: Sequence[Tensor]) -> int | None:
-        if not columns:
-            return None
-        return self._keep(torch.cat([c.detach().expand(self.cameras, 1) for c in columns], -1).to(self.dtype))
+    def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
+        return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
 
 
-def native_of(cameras: Cameras) -> Native | None:
-    """Those cameras, or None where there is no library or a part of their optics has no code: a user's own."""
-    if library() is None or cameras.intrinsics.device.type != "cpu":
+def native_of(optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None) -> Native | None:
+    """Cameras of intrinsics (C, 4), coefficients (C, n) and the mask (C, 1) of those that are usable.
+
+    None where there is no library, on another device, and where a part of the optics has no code: a user's own.
+    """
+    if library() is None or not intrinsics.is_cpu or not len(k):
         return None
-    parts = codes(cameras.domain.chart, cameras.domain.lens)
-    return None if parts is None else Native(cameras, parts)
+    plan = _plan(optics_of, k)
+    return None if plan is None else Native(plan, optics_of, intrinsics, k, usable)
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
@@ -186,6 +336,8 @@ def _stage(stage: Stage) -> _Part | None:
     part.factor, part.n = _factors().get(type(radial), 0), len(radial.parameters)
     if isinstance(radial, optics.Rational):
         part.n, part.m = len(radial.numerator.parameters), len(radial.denominator.parameters)
+        if part.n + part.m > _MOST_DEGREE:
+            return None
     if isinstance(radial, optics.RadiusTable):
         part.n = len(radial.nodes)
     return part if part.factor else None
@@ -228,25 +380,30 @@ class Unprojected(NamedTuple):
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
-    count = points.shape[1]
-    pixels = _empty(2, native.cameras, count, native.dtype)
-    valid = torch.empty(native.cameras, count, dtype=torch.bool, device="cpu")
-    if _call(native, PROJECT, points, pixels, valid) and native.struct.limits2 is None:
+    cameras, count, _ = points.shape
+    pixels = _empty((2, cameras, count), native.dtype)
+    valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+    rows = points.data_ptr(), *points.stride(), *_planes(pixels, cameras, count), valid.data_ptr(), 0, *_NO_ROWS, 0
+    if _call(native, cameras, count, PROJECT, rows) and native.struct.limits2 is None:
         native.add_limits()
-        _call(native, PROJECT, points, pixels, valid)
+        _call(native, cameras, count, PROJECT, rows)
     return pixels, valid
 
 
 def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
     """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
-    count = pixels.shape[1]
-    rays = _empty(3, native.cameras, count, native.dtype)
-    valid = torch.empty(native.cameras, count, dtype=torch.uint8, device="cpu")
-    solution = torch.empty(2, native.cameras, count, dtype=native.dtype, device="cpu") if keeps else None
-    left = _call(native, UNPROJECT, pixels, rays, valid, solution)
-    if not left:
-        return Unprojected(rays, valid.view(torch.bool), solution, None)
-    return Unprojected(rays, valid == 1, solution, valid == _OPEN)
+    cameras, count, _ = pixels.shape
+    rays = _empty((3, cameras, count), native.dtype)
+    valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+    solution = _empty((2, cameras, count), native.dtype) if keeps else None
+    if native.plan.has_factor and native.struct.table is None:
+        native.add_table()
+    rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
+    kept = 0 if solution is None else solution.data_ptr()
+    if not _call(native, cameras, count, UNPROJECT, (*rows, kept, *_NO_ROWS, 0)):
+        return Unprojected(rays, valid, solution, None)
+    states = valid.view(torch.uint8)
+    return Unprojected(rays, states == 1, solution, states == _OPEN)
 
 
 def project_vjp(
@@ -257,10 +414,11 @@ def project_vjp(
 
     cotangents: of pixels, (2, C, N), of any strides.
     """
-    results = torch.empty(points.shape, dtype=native.dtype, device="cpu") if want_points else None
-    sums = _sums(native, points) if want_parameters else None
-    by_row = None if results is None else results.movedim(-1, 0)
-    _call(native, PROJECT_VJP, points, by_row, cotangents=cotangents, sums=sums)
+    cameras, count, _ = points.shape
+    results = _empty((cameras, count, 3), native.dtype) if want_points else None
+    sums = _sums(native, cameras, count) if want_parameters else None
+    rows = points.data_ptr(), *points.stride(), *_points(results), 0, 0
+    _call(native, cameras, count, PROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -271,76 +429,64 @@ def unproject_vjp(
 
     valid, solution: of `unproject`.
     """
-    shape = valid.shape
-    results = torch.empty(*shape, 2, dtype=native.dtype, device="cpu") if want_pixels else None
-    by_row = None if results is None else results.movedim(-1, 0)
-    sums = _sums(native, valid) if want_parameters else None
-    _call(native, UNPROJECT_VJP, None, by_row, valid, solution, cotangents=cotangents, sums=sums)
+    cameras, count = valid.shape
+    results = _empty((cameras, count, 2), native.dtype) if want_pixels else None
+    sums = _sums(native, cameras, count) if want_parameters else None
+    rows = *_NO_ROWS, *_points(results), valid.data_ptr(), solution.data_ptr()
+    _call(native, cameras, count, UNPROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
-def _empty(size: int, cameras: int, count: int, dtype: torch.dtype) -> Tensor:
+def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     # of large results the first write to each page would take longer than the geometry
-    if size * cameras * count * dtype.itemsize >= memory.LEAST:
-        return memory.empty((size, cameras, count), dtype, torch.contiguous_format)
-    return torch.empty(size, cameras, count, dtype=dtype, device="cpu")
+    if size[0] * size[1] * size[2] * dtype.itemsize >= memory.LEAST:
+        return memory.empty(size, dtype, torch.contiguous_format)
+    return torch.empty(size, dtype=dtype, device="cpu")
 
 
-def _sums(native: Native, rows: Tensor) -> Tensor:
-    tiles = -(-rows.shape[1] // _TILE)
-    return torch.zeros(native.cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
+def _sums(native: Native, cameras: int, count: int) -> Tensor:
+    tiles = -(-count // _TILE)
+    return torch.zeros(cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
 
 
-def _call(
-    native: Native,
-    direction: int,
-    rows: Tensor | None,
-    results: Tensor | None,
-    valid: Tensor | None = None,
-    solution: Tensor | None = None,
-    *,
-    cotangents: Tensor | None = None,
-    sums: Tensor | None = None,
-) -> int:
-    """rows: (C, N, size). results, cotangents: (size, C, N)."""
-    shapes = [t.shape[:2] for t in (rows, valid) if t is not None]
-    shapes += [t.shape[1:] for t in (results, solution, cotangents) if t is not None]
-    count = shapes[0][1]
-    assert all(shape == (native.cameras, count) for shape in shapes)  # else C would write elsewhere
-    if not count or not native.cameras:
-        return 0
-    call = _Rows(
-        native.pointer,
-        *_place(rows, 0, 1, 2),
-        *_place(results, 1, 2, 0),
-        0 if valid is None else valid.data_ptr(),
-        0 if solution is None else solution.data_ptr(),
-        *_place(cotangents, 1, 2, 0),
-        0 if sums is None else sums.data_ptr(),
-        count,
-        _TILE,
-        direction,
-        0,
-    )
-    run = _entry()
-    tiles = -(-count // _TILE) * native.cameras
-    if count * native.cameras <= _TILE or tiles == 1:
-        return int(run(call))
+def _planes(results: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
+    """Where new ones lie, (size, C, N), and their strides by camera, point and component."""
+    return results.data_ptr(), count, 1, cameras * count
+
+
+def _points(results: Tensor | None) -> tuple[int, ...]:
+    """The same of (C, N, size)."""
+    return _NO_ROWS if results is None else (results.data_ptr(), *results.stride())
+
+
+def _cotangents(given: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
+    """The same of (size, C, N) of any strides."""
+    assert given.shape[1:] == (cameras, count)  # else C would read elsewhere
+    component, camera, point = given.stride()
+    return given.data_ptr(), camera, point, component
+
+
+def _address(tensor: Tensor | None) -> int:
+    return 0 if tensor is None else tensor.data_ptr()
+
+
+def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...]) -> int:
+    """rows: what of `Rows` is between its cameras and its count."""
+    assert cameras == native.cameras
+    run, points = _entry("camtorch_geometry", c_int64), cameras * count
+    if points < _SHARED:
+        return run(_Rows(native.pointer, *rows, count, _TILE, direction, 0)) if points else 0
+    following = c_int64(0)
+    call = _Rows(native.pointer, *rows, count, _TILE, direction, addressof(following))
     left: list[int] = []
-    spread(lambda: left.append(run(call)), min(thread_count(), tiles))
+    spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE) * cameras))
     return sum(left)
 
 
-def _place(tensor: Tensor | None, camera: int, point: int, component: int) -> tuple[int, ...]:
-    if tensor is None:
-        return 0, 0, 0, 0
-    strides = tensor.stride()
-    return tensor.data_ptr(), strides[camera], strides[point], strides[component]
-
-
 @functools.cache
-def _entry() -> ctypes._NamedFuncPointer:
+def _entry(name: str, result: type | None) -> ctypes._NamedFuncPointer:
     found = library()
     assert found is not None  # or nobody has a `Native`
-    found.camtorch_geometry.restype = c_int64
-    return found.camtorch_geometry
+    entry: ctypes._NamedFuncPointer = getattr(found, name)
+    entry.restype = result
+    return entry

@@ -4,314 +4,246 @@
  * function of x^2 + y^2 and z; and rays are (a S, b S, C), S and C functions of a^2 + b^2.
  */
 
+/* What a chart is made of, by value: loops keep it in registers */
+typedef struct {
+    R xi, alpha, beta; /* of a unified chart */
+    R k;               /* of one division */
+    R omega, slope, slope_by_omega, tan2, tan2_by_omega; /* of the fov chart */
+} T(Chart);
+
+/* A radial factor, and for which of the loops over factors its numbers are padded with zeros */
+typedef struct {
+    const Part *part;
+    const R *numbers, *constants;
+    int form;
+    R padded[PADDED];
+} T(Factor);
+
+/* A planar stage without its factor */
+typedef struct {
+    R px, py, s0, s1, s2, s3;
+} T(Plane);
+
 /* A camera: its numbers, by parts, and what follows from them alone */
 typedef struct {
     const Part *parts;
-    int stages;
+    int stages, way, swapped, is_radial, by_stages, usable;
+    int follows; /* whether the lens is to be followed along each azimuth */
     const R *numbers[MOST_PARTS], *constants;
+    T(Factor) factors[MOST_PARTS];
+    T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
     const R *limits2, *table;
-    int has_lens, is_radial, by_stages, usable;
     R chart_inner2, chart_most2;
     const R *chart_table;
-    R xi, alpha, beta; /* of a unified chart */
-    R omega, slope, slope_by_omega, tan2, tan2_by_omega; /* of the fov chart */
+    T(Chart) chart;
 } T(Camera);
 
-/* The factor and, if it is wanted, its derivative by t, of optics/radial.py; see geometry_lens.h */
-static void T(radial)(const Part *, const R *, const R *, int, const R *restrict, R *restrict, R *restrict);
-static void T(radial_sums)(const Part *, const R *, const R *, int, const R *restrict, const R *restrict, double *);
-static void T(chart_inverse)(const T(Camera) *, int, R *restrict, R *restrict);
+/* The factor of a part and, if it is wanted, its derivative by t, of optics/radial.py; see geometry_lens.h */
+static void T(radial)(const T(Factor) *, int, const R *restrict, R *restrict, R *restrict);
+static void T(radial_sums)(const T(Factor) *, int, const R *restrict, const R *restrict, double *);
 
 /* What does not hang on the point, in double precision */
 static void T(prepare_chart)(T(Camera) *c) {
-    const Part *chart = c->parts;
+    const Part *part = c->parts;
     const R *k = c->numbers[0];
-    if (chart->kind == UNIFIED) {
-        c->xi = chart->flags & HAS_XI ? *k++ : 0;
-        c->alpha = chart->flags & HAS_ALPHA ? *k++ : (R)chart->constant;
-        c->beta = chart->flags & HAS_BETA ? *k++ : 1;
-    } else if (chart->kind == FOV) {
+    T(Chart) *chart = &c->chart;
+    c->way = part->kind;
+    if (part->kind == UNIFIED) {
+        chart->xi = part->flags & HAS_XI ? *k++ : 0;
+        chart->alpha = part->flags & HAS_ALPHA ? *k++ : (R)part->constant;
+        chart->beta = part->flags & HAS_BETA ? *k : 1;
+        const int fixed = !(part->flags & HAS_ALPHA);
+        if (part->flags & HAS_XI) c->way = fixed && chart->alpha == 0 ? SHIFTED : UNIFIED;
+        else c->way = fixed && chart->alpha == 1 ? SPHERICAL : ENHANCED;
+    } else if (part->kind == ONE_DIVISION) {
+        chart->k = k[0];
+    } else if (part->kind == FOV) {
         const double omega = k[0], t = omega * omega / 4;
         const double tanc = t < 1e-4 ? 1 + t * (1 / 3.0 + t * (2 / 15.0 + t * 17 / 315.0)) : tan(omega / 2) / (omega / 2);
         const double secant2 = 1 + t * tanc * tanc;
-        c->omega = (R)omega, c->slope = (R)tanc;
+        chart->omega = (R)omega, chart->slope = (R)tanc;
         /* the derivative of tan(w) / w, w = omega / 2 */
-        c->slope_by_omega = (R)(t < 1e-4 ? omega * (1 / 6.0 + t * (2 / 15.0 + t * 17 / 210.0)) : (secant2 - tanc) / omega);
-        c->tan2 = (R)(4 * t * tanc * tanc), c->tan2_by_omega = (R)(2 * omega * tanc * secant2);
+        chart->slope_by_omega =
+            (R)(t < 1e-4 ? omega * (1 / 6.0 + t * (2 / 15.0 + t * 17 / 210.0)) : (secant2 - tanc) / omega);
+        chart->tan2 = (R)(4 * t * tanc * tanc), chart->tan2_by_omega = (R)(2 * omega * tanc * secant2);
     }
 }
 
 /* The angle over x^2 + y^2's root */
 INLINE R T(angle_per_radius)(R rho2, R z) {
     const R rho = T(root)(rho2 + FLOOR);
-    return T(atan2)(rho, z) / rho;
+    return T(angle)(rho, z, rho);
 }
 
 /* z' + root where difference = root^2 - z^2, without the cancellation behind */
 INLINE R T(sum_of)(R z, R root, R difference) { return z > 0 ? z + root : difference / (z > 0 ? 1 : root - z); }
 
-/* The denominator of the unified chart, of x^2 + y^2, z' and d' */
-INLINE R T(below)(R rho2, R z, R sphere, R alpha, R beta) {
-    const R behind = (alpha * alpha * beta * rho2 + (2 * alpha - 1) * (z * z)) /
-                     (z > 0 ? 1 : alpha * sphere - (1 - alpha) * z);
-    return z > 0 ? z + alpha * (sphere - z) : behind;
-}
-
-INLINE void T(unified_scale)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y, const R *restrict z,
-                             R *restrict scale, I *restrict ok, const int has_xi, const int way) {
-    const R xi = c->xi, alpha = c->alpha, beta = c->beta;
-    EACH(i) {
-        const R rho2 = x[i] * x[i] + y[i] * y[i], far = T(most)(T(absolute)(x[i]), T(absolute)(y[i]));
-        const R distance = has_xi ? T(root)(rho2 + z[i] * z[i]) : 0, shifted = has_xi ? z[i] + xi * distance : z[i];
-        const R sphere = way == 0 ? 0 : T(root)(beta * rho2 + shifted * shifted);
-        const R below = way == 0 ? shifted : way == 1 ? sphere : T(below)(rho2, shifted, sphere, alpha, beta);
-        const R before = way == 0 ? 1 : alpha * shifted + (1 - alpha) * sphere;
-        scale[i] = 1 / below;
-        ok[i] = ((FARTHEST * below - far) > 0) & (before > 0) & (has_xi ? distance + xi * z[i] > 0 : 1);
+/* The scale of a ray, and whether it is covered: optics' `margin` > 0 */
+INLINE R T(scale)(const T(Chart) k, const int way, R x, R y, R z, I *ok) {
+    const R rho2 = x * x + y * y, far = T(most)(T(absolute)(x), T(absolute)(y));
+    switch (way) {
+    case PERSPECTIVE:
+        *ok = FARTHEST * z - far > 0;
+        return 1 / z;
+    case EQUISOLID: {
+        const R distance = T(root)(rho2 + z * z);
+        *ok = (z > 0) | (rho2 > FLOOR / EPS);
+        return T(root)(2 / (distance * T(sum_of)(z, distance, rho2)));
+    }
+    case UNIFIED:
+    case SHIFTED:
+    case SPHERICAL:
+    case ENHANCED: {
+        const int has_xi = way == UNIFIED || way == SHIFTED;
+        const R distance = has_xi ? T(root)(rho2 + z * z) : 0, w = has_xi ? z + k.xi * distance : z;
+        const R sphere = way == SHIFTED ? 0 : T(root)(k.beta * rho2 + w * w);
+        R below = way == SHIFTED ? w : way == SPHERICAL ? sphere : w + k.alpha * (sphere - w), before = 1;
+        if (way == UNIFIED || way == ENHANCED) { /* behind, without cancellation */
+            const R sum = k.alpha * sphere - (1 - k.alpha) * w;
+            const R behind = (k.alpha * k.alpha * k.beta * rho2 + (2 * k.alpha - 1) * (w * w)) / (w > 0 ? 1 : sum);
+            below = w > 0 ? below : behind, before = k.alpha * w + (1 - k.alpha) * sphere;
+        }
+        if (way == SPHERICAL) before = w;
+        *ok = (FARTHEST * below - far > 0) & (before > 0) & (has_xi ? distance + k.xi * z > 0 : 1);
+        return 1 / below;
+    }
+    case FOV: {
+        const R w2 = k.tan2 * rho2, beyond = k.omega * k.omega * FARTHEST * FARTHEST - (R)(PI * PI);
+        /* behind the plane of the camera r is up to pi / omega */
+        *ok = (FARTHEST * z - far > 0) | ((w2 > FLOOR / EPS) & (beyond > 0));
+        return k.slope * T(angle_per_radius)(w2, z);
+    }
+    case ONE_DIVISION: {
+        const R difference = -4 * k.k * rho2, square = difference + z * z;
+        const R below = T(sum_of)(z, T(root)(square), difference);
+        *ok = (FARTHEST / 2 * below - far > 0) & (square > 0);
+        return 2 / below;
+    }
+    default: /* EQUIDISTANT, and the angle of an INVERTED chart */
+        *ok = (z > 0) | (rho2 > FLOOR / EPS);
+        return T(angle_per_radius)(rho2, z);
     }
 }
 
-/* The scale of a chart that has one, and whether a ray is covered: optics' `margin` > 0 */
-static void T(chart_scale)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y, const R *restrict z,
-                           R *restrict scale, I *restrict ok) {
-    switch (c->parts->kind) {
+/* Points on the plane; the scale of charts that have one */
+INLINE void T(to_plane)(const T(Chart) k, const int way, R x, R y, R z, R *a, R *b, R *scale, I *ok) {
+    const R across2 = x * x + z * z;
+    if (way == CYLINDER) {
+        *a = T(atan2)(x, z), *b = y / T(root)(across2), *scale = 1;
+        *ok = FARTHEST * T(most)(T(absolute)(x), T(absolute)(z)) - T(absolute)(y) > 0;
+    } else if (way == SPHERE) {
+        *a = T(atan2)(x, z), *b = T(atan2)(y, T(root)(across2)), *scale = 1;
+        *ok = across2 - FLOOR > 0;
+    } else {
+        *scale = T(scale)(k, way, x, y, z, ok);
+        *a = x * *scale, *b = y * *scale;
+    }
+}
+
+/* Twice the derivative of the scale by x^2 + y^2, and that by z. What cancels on the axis is multiplied by x^2 + y^2.
+   by_angle: how much the radius of an inverted chart grows by the angle */
+INLINE void T(scale_slopes)(const T(Chart) k, const int way, R x, R y, R z, R s, R by_angle, R *out, R *along) {
+    const R rho2 = x * x + y * y;
+    switch (way) {
     case PERSPECTIVE:
-        EACH(i) {
-            const R far = T(most)(T(absolute)(x[i]), T(absolute)(y[i]));
-            scale[i] = 1 / z[i];
-            ok[i] = FARTHEST * z[i] - far > 0;
-        }
+        *out = 0, *along = -s * s;
         break;
-    case EQUIDISTANT:
-    case INVERTED:
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i];
-            scale[i] = T(angle_per_radius)(rho2, z[i]);
-            ok[i] = (z[i] > 0) | (rho2 > FLOOR / EPS);
-        }
-        if (c->parts->kind == INVERTED) {
-            const R most2 = c->chart_most2, before = most2 * (1 - 32 * EPS);
-            ALIGNED R found[BLOCK], theta2[BLOCK];
-            EACH(i) {
-                const R angle2 = (x[i] * x[i] + y[i] * y[i]) * scale[i] * scale[i];
-                ok[i] &= before - angle2 > 0;
-                theta2[i] = ok[i] ? T(least)(angle2, most2) : 0;
-            }
-            T(chart_inverse)(c, n, theta2, found);
-            EACH(i) scale[i] *= found[i];
-        }
+    case EQUISOLID: {
+        const R distance2 = rho2 + z * z, distance = T(root)(distance2);
+        const R sum = T(sum_of)(z, distance, rho2), twice = s / (2 * distance2);
+        *along = -twice * sum;
+        /* 1 + z / (2 d) over d (d + z) */
+        *out = -twice * (2 * distance + z) / sum;
         break;
-    case EQUISOLID:
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], distance = T(root)(rho2 + z[i] * z[i]);
-            scale[i] = T(root)(2 / (distance * T(sum_of)(z[i], distance, rho2)));
-            ok[i] = (z[i] > 0) | (rho2 > FLOOR / EPS);
-        }
-        break;
-    case UNIFIED: {
-        const int fixed = !(c->parts->flags & HAS_ALPHA), has_xi = c->parts->flags & HAS_XI;
-        const int way = fixed && c->alpha == 0 ? 0 : fixed && c->alpha == 1 ? 1 : 2;
-        if (has_xi && way == 0) T(unified_scale)(c, n, x, y, z, scale, ok, 1, 0);
-        else if (has_xi) T(unified_scale)(c, n, x, y, z, scale, ok, 1, 2);
-        else if (way == 1) T(unified_scale)(c, n, x, y, z, scale, ok, 0, 1);
-        else T(unified_scale)(c, n, x, y, z, scale, ok, 0, 2);
+    }
+    case UNIFIED:
+    case SHIFTED:
+    case SPHERICAL:
+    case ENHANCED: {
+        const int has_xi = way == UNIFIED || way == SHIFTED;
+        const R distance = has_xi ? T(root)(rho2 + z * z) : 1, w = has_xi ? z + k.xi * distance : z;
+        const R by_below = -s * s, by_root = way == SHIFTED ? 0 : by_below * k.alpha / T(root)(k.beta * rho2 + w * w);
+        const R by_w = by_below * (1 - k.alpha) + by_root * w, by_distance = has_xi ? by_w * k.xi / distance : 0;
+        *out = by_root * k.beta + by_distance, *along = by_w + by_distance * z;
         break;
     }
     case FOV: {
-        const R slope = c->slope, tan2 = c->tan2, beyond = c->omega * c->omega * FARTHEST * FARTHEST - (R)(PI * PI);
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], far = T(most)(T(absolute)(x[i]), T(absolute)(y[i]));
-            scale[i] = slope * T(angle_per_radius)(tan2 * rho2, z[i]);
-            /* behind the plane of the camera r is up to pi / omega */
-            ok[i] = (FARTHEST * z[i] - far > 0) | ((tan2 * rho2 > FLOOR / EPS) & (beyond > 0));
-        }
+        const R w2 = k.tan2 * rho2;
+        *along = -k.slope / (w2 + z * z);
+        *out = -k.tan2 * (*along * z + s) / (w2 + FLOOR);
         break;
     }
     case ONE_DIVISION: {
-        const R k = c->numbers[0][0];
-        EACH(i) {
-            const R far = T(most)(T(absolute)(x[i]), T(absolute)(y[i]));
-            const R difference = -4 * k * (x[i] * x[i] + y[i] * y[i]), square = difference + z[i] * z[i];
-            const R below = T(sum_of)(z[i], T(root)(square), difference);
-            scale[i] = 2 / below;
-            ok[i] = (FARTHEST / 2 * below - far > 0) & (square > 0);
-        }
+        const R root = T(root)(z * z - 4 * k.k * rho2);
+        *along = -s / root, *out = 2 * k.k * s * s / root;
         break;
     }
+    default:
+        *along = -by_angle / (rho2 + z * z);
+        *out = -(*along * z + s) / (rho2 + FLOOR);
     }
 }
 
-/* Points on the plane, of covered rays; `scale` is that of the chart, if it has one */
-static void T(to_plane)(const T(Camera) *c, int n, const R *x, const R *y, const R *restrict z, R *a, R *b,
-                        R *restrict scale, I *restrict ok) {
-    const Part *chart = c->parts;
-    if (chart->flags & TRANSVERSE && chart->kind >= CYLINDER) {
-        const R *other = x;
-        R *plane = a;
-        x = y, y = other, a = b, b = plane;
-    }
-    {
-        const R *restrict p = x, *restrict q = y;
-        R *restrict u = a, *restrict v = b;
-        if (chart->kind == CYLINDER) {
-            EACH(i) {
-                const R far = T(most)(T(absolute)(p[i]), T(absolute)(z[i]));
-                u[i] = T(atan2)(p[i], z[i]), v[i] = q[i] / T(root)(p[i] * p[i] + z[i] * z[i]);
-                ok[i] = FARTHEST * far - T(absolute)(q[i]) > 0;
-            }
-        } else if (chart->kind == SPHERE) {
-            EACH(i) {
-                const R across2 = p[i] * p[i] + z[i] * z[i];
-                u[i] = T(atan2)(p[i], z[i]), v[i] = T(atan2)(q[i], T(root)(across2));
-                ok[i] = across2 - FLOOR > 0;
-            }
-        } else {
-            T(chart_scale)(c, n, p, q, z, scale, ok);
-            EACH(i) u[i] = p[i] * scale[i], v[i] = q[i] * scale[i];
-        }
-    }
-}
-
-/* Twice the derivative of the scale by x^2 + y^2, and that by z. What cancels on the axis is multiplied by x^2 + y^2 */
-static void T(scale_slopes)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y, const R *restrict z,
-                            const R *restrict s, R *restrict out, R *restrict along) {
-    switch (c->parts->kind) {
-    case PERSPECTIVE:
-        EACH(i) out[i] = 0, along[i] = -s[i] * s[i];
-        break;
-    case EQUIDISTANT:
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i];
-            along[i] = -1 / (rho2 + z[i] * z[i]);
-            out[i] = -(along[i] * z[i] + s[i]) / (rho2 + FLOOR);
-        }
-        break;
-    case INVERTED: {
-        ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
-        EACH(i) t[i] = (x[i] * x[i] + y[i] * y[i]) * s[i] * s[i];
-        T(radial)(c->parts, c->numbers[0], c->constants, n, t, factor, slope);
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], by_angle = 1 / (factor[i] + 2 * t[i] * slope[i]);
-            along[i] = -by_angle / (rho2 + z[i] * z[i]);
-            out[i] = -(along[i] * z[i] + s[i]) / (rho2 + FLOOR);
-        }
-        break;
-    }
-    case EQUISOLID:
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], distance2 = rho2 + z[i] * z[i], distance = T(root)(distance2);
-            const R sum = T(sum_of)(z[i], distance, rho2), twice = s[i] / (2 * distance2);
-            along[i] = -twice * sum;
-            /* 1 + z / (2 d) over d (d + z) */
-            out[i] = -twice * (2 * distance + z[i]) / sum;
-        }
-        break;
-    case UNIFIED: {
-        const R xi = c->xi, alpha = c->alpha, beta = c->beta;
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], distance = T(root)(rho2 + z[i] * z[i]);
-            const R shifted = z[i] + xi * distance, sphere = T(root)(beta * rho2 + shifted * shifted);
-            const R by_below = -s[i] * s[i], by_root = by_below * alpha / sphere;
-            const R by_shifted = by_below * (1 - alpha) + by_root * shifted, by_distance = by_shifted * xi / distance;
-            out[i] = by_root * beta + by_distance;
-            along[i] = by_shifted + by_distance * z[i];
-        }
-        break;
-    }
-    case FOV: {
-        const R slope = c->slope, tan2 = c->tan2;
-        EACH(i) {
-            const R w = tan2 * (x[i] * x[i] + y[i] * y[i]);
-            along[i] = -slope / (w + z[i] * z[i]);
-            out[i] = -tan2 * (along[i] * z[i] + s[i]) / (w + FLOOR);
-        }
-        break;
-    }
-    case ONE_DIVISION: {
-        const R k = c->numbers[0][0];
-        EACH(i) {
-            const R root = T(root)(z[i] * z[i] - 4 * k * (x[i] * x[i] + y[i] * y[i]));
-            along[i] = -s[i] / root;
-            out[i] = 2 * k * s[i] * s[i] / root;
-        }
-        break;
-    }
-    }
-}
-
-/* The cotangents of rays of that of their points (ga, gb); `s` is the chart's scale. Adds those of its numbers */
-static void T(to_plane_vjp)(const T(Camera) *c, int n, const R *x, const R *y, const R *restrict z,
-                            const R *restrict s, const R *ga, const R *gb, R *gx, R *gy, R *restrict gz, double *sums) {
-    const Part *chart = c->parts;
-    if (chart->kind >= CYLINDER) {
-        const int swapped = chart->flags & TRANSVERSE;
-        const R *restrict p = swapped ? y : x, *restrict q = swapped ? x : y;
-        const R *restrict gu = swapped ? gb : ga, *restrict gv = swapped ? ga : gb;
-        R *restrict gp = swapped ? gy : gx, *restrict gq = swapped ? gx : gy;
-        EACH(i) {
-            const R across2 = p[i] * p[i] + z[i] * z[i], across = T(root)(across2);
-            const R turn = gu[i] / across2, length2 = across2 + q[i] * q[i];
-            const R up = chart->kind == CYLINDER ? gv[i] / across : gv[i] * across / length2;
-            const R in = chart->kind == CYLINDER ? -gv[i] * q[i] / (across2 * across) : -gv[i] * q[i] / (across * length2);
-            gp[i] = turn * z[i] + in * p[i], gq[i] = up, gz[i] = in * z[i] - turn * p[i];
-        }
+/* The cotangents of rays of that of their points (ga, gb) */
+INLINE void T(to_plane_vjp)(const T(Chart) k, const int way, R x, R y, R z, R s, R by_angle, R ga, R gb, R *gx, R *gy,
+                            R *gz) {
+    if (way == CYLINDER || way == SPHERE) {
+        const R across2 = x * x + z * z, across = T(root)(across2), turn = ga / across2, length2 = across2 + y * y;
+        const R in = way == CYLINDER ? -gb * y / (across2 * across) : -gb * y / (across * length2);
+        *gx = turn * z + in * x, *gz = in * z - turn * x;
+        *gy = way == CYLINDER ? gb / across : gb * across / length2;
         return;
     }
-    ALIGNED R out[BLOCK], down[BLOCK], along[BLOCK];
-    T(scale_slopes)(c, n, x, y, z, s, out, down);
-    EACH(i) {
-        along[i] = ga[i] * x[i] + gb[i] * y[i];
-        gx[i] = ga[i] * s[i] + x[i] * along[i] * out[i];
-        gy[i] = gb[i] * s[i] + y[i] * along[i] * out[i];
-        gz[i] = along[i] * down[i];
-    }
-    if (!sums) return;
-    ALIGNED R w[BLOCK], t[BLOCK];
-    switch (chart->kind) {
+    const R along = ga * x + gb * y;
+    R out, down;
+    T(scale_slopes)(k, way, x, y, z, s, by_angle, &out, &down);
+    *gx = ga * s + x * along * out, *gy = gb * s + y * along * out, *gz = along * down;
+}
+
+/* Adds the cotangents of the chart's numbers; by_angle as of `scale_slopes` */
+static void T(to_plane_sums)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y, const R *restrict z,
+                             const R *restrict s, const R *restrict by_angle, const R *restrict ga,
+                             const R *restrict gb, double *sums) {
+    const T(Chart) k = c->chart;
+    ALIGNED R w[BLOCK], t[BLOCK], other[BLOCK];
+    switch (c->parts->kind) {
     case UNIFIED: {
-        const R xi = c->xi, alpha = c->alpha, beta = c->beta;
-        ALIGNED R of_xi[BLOCK], of_alpha[BLOCK], of_beta[BLOCK];
         EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], distance = T(root)(rho2 + z[i] * z[i]);
-            const R shifted = z[i] + xi * distance, sphere = T(root)(beta * rho2 + shifted * shifted);
-            const R by_below = -along[i] * s[i] * s[i], by_root = by_below * alpha / sphere;
-            of_xi[i] = (by_below * (1 - alpha) + by_root * shifted) * distance;
-            of_alpha[i] = by_below * (sphere - shifted);
-            of_beta[i] = by_root * rho2 / 2;
+            const R rho2 = x[i] * x[i] + y[i] * y[i], distance = T(root)(rho2 + z[i] * z[i]), along = ga[i] * x[i] + gb[i] * y[i];
+            const R shifted = z[i] + k.xi * distance, sphere = T(root)(k.beta * rho2 + shifted * shifted);
+            const R by_below = -along * s[i] * s[i], by_root = by_below * k.alpha / sphere;
+            w[i] = (by_below * (1 - k.alpha) + by_root * shifted) * distance;
+            t[i] = by_below * (sphere - shifted);
+            other[i] = by_root * rho2 / 2;
         }
-        if (chart->flags & HAS_XI) *sums++ += T(total)(n, of_xi);
-        if (chart->flags & HAS_ALPHA) *sums++ += T(total)(n, of_alpha);
-        if (chart->flags & HAS_BETA) *sums += T(total)(n, of_beta);
+        if (c->parts->flags & HAS_XI) *sums++ += T(total)(n, w);
+        if (c->parts->flags & HAS_ALPHA) *sums++ += T(total)(n, t);
+        if (c->parts->flags & HAS_BETA) *sums += T(total)(n, other);
         break;
     }
-    case FOV: {
+    case FOV:
         /* the scale is slope times a function of tan2 rho2 and z */
         EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], w2 = c->tan2 * rho2;
-            const R by_w = -(s[i] - c->slope * z[i] / (w2 + z[i] * z[i])) / (2 * (w2 + FLOOR));
-            w[i] = along[i] * (s[i] / c->slope * c->slope_by_omega + by_w * rho2 * c->tan2_by_omega);
+            const R rho2 = x[i] * x[i] + y[i] * y[i], w2 = k.tan2 * rho2;
+            const R by_w = -(s[i] - k.slope * z[i] / (w2 + z[i] * z[i])) / (2 * (w2 + FLOOR));
+            w[i] = (ga[i] * x[i] + gb[i] * y[i]) * (s[i] / k.slope * k.slope_by_omega + by_w * rho2 * k.tan2_by_omega);
         }
         *sums += T(total)(n, w);
         break;
-    }
-    case ONE_DIVISION: {
-        const R k = c->numbers[0][0];
+    case ONE_DIVISION:
         EACH(i) {
             const R rho2 = x[i] * x[i] + y[i] * y[i];
-            w[i] = along[i] * s[i] * s[i] * rho2 / T(root)(z[i] * z[i] - 4 * k * rho2);
+            w[i] = (ga[i] * x[i] + gb[i] * y[i]) * s[i] * s[i] * rho2 / T(root)(z[i] * z[i] - 4 * k.k * rho2);
         }
         *sums += T(total)(n, w);
         break;
-    }
-    case INVERTED:
-        /* d(scale) = -scale dR / (R + 2 t R'), whose denominator stands in `down` */
+    case INVERTED: /* d(scale) = -scale dR / (R + 2 t R') */
         EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i];
-            t[i] = rho2 * s[i] * s[i];
-            w[i] = along[i] * s[i] * down[i] * (rho2 + z[i] * z[i]);
+            t[i] = (x[i] * x[i] + y[i] * y[i]) * s[i] * s[i];
+            w[i] = -(ga[i] * x[i] + gb[i] * y[i]) * s[i] * by_angle[i];
         }
-        T(radial_sums)(chart, c->numbers[0], c->constants, n, t, w, sums);
+        T(radial_sums)(c->factors, n, t, w, sums);
         break;
     }
 }
@@ -326,262 +258,159 @@ INLINE R T(ahead)(R around, R alpha) {
 }
 
 /* Whether points of the plane are the image of a ray: optics' `on_plane` > 0 */
-static void T(on_plane)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
-    const R half_turn = (R)(PI * (1 - (double)EPS));
-    const int swapped = c->parts->flags & TRANSVERSE && c->parts->kind >= CYLINDER;
-    const R *restrict p = swapped ? b : a, *restrict q = swapped ? a : b;
-    switch (c->parts->kind) {
-    case PERSPECTIVE:
-        EACH(i) ok[i] = FARTHEST - T(most)(T(absolute)(a[i]), T(absolute)(b[i])) > 0;
-        break;
-    case EQUIDISTANT:
-        EACH(i) ok[i] = (R)(PI * PI) - (a[i] * a[i] + b[i] * b[i]) > 0;
-        break;
-    case EQUISOLID: {
-        const R end = 2 * (1 - 64 * EPS);
-        EACH(i) ok[i] = end * end - (a[i] * a[i] + b[i] * b[i]) > 0;
-        break;
+INLINE I T(on_plane)(const T(Chart) k, const int way, R a, R b) {
+    const R r2 = a * a + b * b, far = T(most)(T(absolute)(a), T(absolute)(b)), half_turn = (R)(PI * (1 - (double)EPS));
+    switch (way) {
+    case PERSPECTIVE: return FARTHEST - far > 0;
+    case EQUISOLID: return 4 * (1 - 64 * EPS) * (1 - 64 * EPS) - r2 > 0;
+    case UNIFIED:
+    case SHIFTED:
+    case SPHERICAL:
+    case ENHANCED: {
+        const R around = k.beta * r2, margin = 1 - 64 * EPS - (2 * k.alpha - 1) * around;
+        const I inside = (FARTHEST / 2 - far > 0) & (margin > 0);
+        if (way == SPHERICAL || way == ENHANCED) return inside;
+        const R ahead = T(ahead)(around, k.alpha), before = ahead * ahead + (1 - k.xi) * (1 + k.xi) * r2;
+        const R reach = T(root)(before > 0 ? before : 0) + k.xi * ahead;
+        return inside & (before - 64 * EPS * (r2 + ahead * ahead) > 0) & (reach - 64 * EPS * T(absolute)(ahead) > 0);
     }
-    case UNIFIED: {
-        const R xi = c->xi, alpha = c->alpha, beta = c->beta, floor = 64 * EPS;
-        const int has_xi = c->parts->flags & HAS_XI;
-        EACH(i) {
-            const R rho2 = a[i] * a[i] + b[i] * b[i], around = beta * rho2;
-            const R margin = 1 - floor - (2 * alpha - 1) * around;
-            const R ahead = T(ahead)(around, alpha);
-            const R before = ahead * ahead + (1 - xi) * (1 + xi) * rho2;
-            const R reach = T(root)(before > 0 ? before : 0) + xi * ahead;
-            ok[i] = (FARTHEST / 2 - T(most)(T(absolute)(a[i]), T(absolute)(b[i])) > 0) & (margin > 0);
-            ok[i] &= (has_xi == 0) | ((before - floor * (rho2 + ahead * ahead) > 0) & (reach - floor * T(absolute)(ahead) > 0));
-        }
-        break;
-    }
-    case FOV: {
-        const R omega2 = c->omega * c->omega;
-        EACH(i) {
-            ok[i] = ((R)(PI * PI) - omega2 * (a[i] * a[i] + b[i] * b[i]) > 0) &
-                    (FARTHEST / 2 - T(most)(T(absolute)(a[i]), T(absolute)(b[i])) > 0);
-        }
-        break;
-    }
-    case ONE_DIVISION: {
-        const R k = c->numbers[0][0];
-        EACH(i) {
-            ok[i] = (1 - 64 * EPS - k * (a[i] * a[i] + b[i] * b[i]) > 0) &
-                    (FARTHEST / 2 - T(most)(T(absolute)(a[i]), T(absolute)(b[i])) > 0);
-        }
-        break;
-    }
-    case INVERTED: {
-        const R inner2 = c->chart_inner2, limit = c->chart_most2 * (1 - 128 * EPS);
-        const R before = limit < (R)(PI * PI) ? limit : (R)(PI * PI);
-        ALIGNED R t[BLOCK], factor[BLOCK];
-        EACH(i) t[i] = T(least)(a[i] * a[i] + b[i] * b[i], inner2);
-        T(radial)(c->parts, c->numbers[0], c->constants, n, t, factor, NULL);
-        EACH(i) {
-            ok[i] = (inner2 * (1 - 64 * EPS) - (a[i] * a[i] + b[i] * b[i]) > 0) &
-                    (before - t[i] * factor[i] * factor[i] > 0);
-        }
-        break;
-    }
-    case CYLINDER:
-        EACH(i) ok[i] = (half_turn - T(absolute)(p[i]) > 0) & (FARTHEST - T(absolute)(q[i]) > 0);
-        break;
-    case SPHERE:
-        EACH(i) ok[i] = (half_turn - T(absolute)(p[i]) > 0) & ((R)(PI / 2) - T(absolute)(q[i]) > 0);
-        break;
+    case FOV: return ((R)(PI * PI) - k.omega * k.omega * r2 > 0) & (FARTHEST / 2 - far > 0);
+    case ONE_DIVISION: return (1 - 64 * EPS - k.k * r2 > 0) & (FARTHEST / 2 - far > 0);
+    case CYLINDER: return (half_turn - T(absolute)(a) > 0) & (FARTHEST - T(absolute)(b) > 0);
+    case SPHERE: return (half_turn - T(absolute)(a) > 0) & ((R)(PI / 2) - T(absolute)(b) > 0);
+    default: return (R)(PI * PI) - r2 > 0;
     }
 }
 
-/* What the rays of charts that scale are made of, with derivatives */
-typedef struct {
-    ALIGNED R s[BLOCK], c[BLOCK], twice_s[BLOCK], twice_c[BLOCK]; /* S and C, twice their derivatives by a^2 + b^2 */
-} T(Turned);
-
-static void T(turned)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, T(Turned) *to, int order) {
-    R *restrict s = to->s, *restrict z = to->c, *restrict ds = to->twice_s, *restrict dz = to->twice_c;
-    switch (c->parts->kind) {
+/* S and C of charts that scale and, if wanted, twice their derivatives by a^2 + b^2 */
+INLINE void T(turned)(const T(Chart) k, const int way, R r2, R *s, R *z, R *ds, R *dz) {
+    switch (way) {
     case PERSPECTIVE:
     case ONE_DIVISION: {
-        const R k = c->parts->kind == ONE_DIVISION ? c->numbers[0][0] : 0;
-        EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i], h = 1 + k * r2;
-            s[i] = 1 / T(root)(r2 + h * h), z[i] = h * s[i];
-            ds[i] = -s[i] * s[i] * s[i] * (1 + 2 * h * k), dz[i] = 2 * k * s[i] + h * ds[i];
-        }
+        const R division = way == ONE_DIVISION ? k.k : 0, h = 1 + division * r2;
+        *s = 1 / T(root)(r2 + h * h), *z = h * *s;
+        if (ds) *ds = -*s * *s * *s * (1 + 2 * h * division), *dz = 2 * division * *s + h * *ds;
         break;
     }
-    case EQUIDISTANT:
-    case INVERTED:
-        EACH(i) {
-            const R theta2 = a[i] * a[i] + b[i] * b[i], theta = T(root)(theta2 + FLOOR);
-            R sine, cosine;
-            T(turn)(theta, &sine, &cosine);
-            s[i] = sine / theta, z[i] = cosine;
-            ds[i] = (cosine - s[i]) / (theta2 + FLOOR), dz[i] = -s[i];
-        }
-        break;
     case EQUISOLID:
-        EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i];
-            s[i] = T(root)(1 - r2 / 4), z[i] = 1 - r2 / 2;
-            ds[i] = -1 / (4 * s[i]), dz[i] = -1;
-        }
+        *s = T(root)(1 - r2 / 4), *z = 1 - r2 / 2;
+        if (ds) *ds = -1 / (4 * *s), *dz = -1;
         break;
-    case UNIFIED: {
-        const R xi = c->xi, alpha = c->alpha, beta = c->beta, short_of = (1 - xi) * (1 + xi);
-        EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i], h = T(ahead)(beta * r2, alpha), below = r2 + h * h;
-            /* where the line from the shifted centre meets the unit sphere, on the side of the axis */
-            const R root = T(root)(h * h + short_of * r2);
-            s[i] = (xi * h + root) / below, z[i] = h * s[i] - xi;
+    case UNIFIED:
+    case SHIFTED:
+    case SPHERICAL:
+    case ENHANCED: {
+        const int has_xi = way == UNIFIED || way == SHIFTED;
+        const R h = way == SHIFTED ? 1 : T(ahead)(k.beta * r2, k.alpha), below = r2 + h * h;
+        /* where the line from the shifted centre meets the unit sphere, on the side of the axis */
+        const R short_of = (1 - k.xi) * (1 + k.xi), root = T(root)(has_xi ? h * h + short_of * r2 : below);
+        *s = has_xi ? (k.xi * h + root) / below : 1 / root, *z = h * *s - k.xi;
+        if (ds) {
+            const R by_r2 = -k.alpha * k.beta / (2 * T(root)(1 - (2 * k.alpha - 1) * k.beta * r2)); /* of h */
+            const R by_h = (k.xi + h / root - 2 * h * *s) / below;                                 /* of S */
+            *ds = (short_of / root - 2 * *s) / below + 2 * by_h * by_r2, *dz = 2 * by_r2 * *s + h * *ds;
         }
-        if (order)
-            EACH(i) {
-                const R r2 = a[i] * a[i] + b[i] * b[i], h = T(ahead)(beta * r2, alpha), below = r2 + h * h;
-                const R root = T(root)(h * h + short_of * r2);
-                const R by_r2 = -alpha * beta / (2 * T(root)(1 - (2 * alpha - 1) * beta * r2)); /* of h */
-                const R by_h = (xi + h / root - 2 * h * s[i]) / below;                         /* of S */
-                ds[i] = (short_of / root - 2 * s[i]) / below + 2 * by_h * by_r2;
-                dz[i] = 2 * by_r2 * s[i] + h * ds[i];
-            }
         break;
     }
     case FOV: {
-        const R omega2 = c->omega * c->omega, slope = c->slope;
-        EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i], angle2 = omega2 * r2, angle = T(root)(angle2 + FLOOR);
-            R sine, cosine;
-            T(turn)(angle, &sine, &cosine);
-            sine /= angle;
-            const R across = sine / slope, length = 1 / T(root)(r2 * across * across + cosine * cosine);
-            s[i] = across * length, z[i] = cosine * length;
-            const R by_across = omega2 * (cosine - sine) / (angle2 + FLOOR) / slope, by_cosine = -omega2 * sine; /* twice */
-            const R by_length = -length * length * length * (across * across + r2 * across * by_across + cosine * by_cosine);
-            ds[i] = by_across * length + across * by_length, dz[i] = by_cosine * length + cosine * by_length;
+        const R omega2 = k.omega * k.omega;
+        R sine, cosine;
+        T(turn)(omega2 * r2, &sine, &cosine);
+        const R across = sine / k.slope, length = 1 / T(root)(r2 * across * across + cosine * cosine);
+        *s = across * length, *z = cosine * length;
+        if (ds) {
+            const R by_across = omega2 * (cosine - sine) / (omega2 * r2 + FLOOR) / k.slope, by_cosine = -omega2 * sine;
+            const R by_length =
+                -length * length * length * (across * across + r2 * across * by_across + cosine * by_cosine);
+            *ds = by_across * length + across * by_length, *dz = by_cosine * length + cosine * by_length;
         }
         break;
     }
+    default:
+        T(turn)(r2, s, z);
+        if (ds) *ds = (*z - *s) / (r2 + FLOOR), *dz = -*s;
     }
 }
 
 /* The unit rays of points of the plane */
-static void T(to_ray)(const T(Camera) *c, int n, const R *a, const R *b, R *x, R *y, R *restrict z) {
-    const Part *chart = c->parts;
-    if (chart->kind >= CYLINDER) {
-        const int swapped = chart->flags & TRANSVERSE;
-        const R *restrict u = swapped ? b : a, *restrict v = swapped ? a : b;
-        R *restrict p = swapped ? y : x, *restrict q = swapped ? x : y;
-        const int is_sphere = chart->kind == SPHERE;
-        EACH(i) {
-            R sine, cosine, up, across;
-            T(turn)(u[i], &sine, &cosine);
-            if (is_sphere) T(turn)(v[i], &up, &across);
-            else across = 1 / T(root)(1 + v[i] * v[i]), up = v[i] * across;
-            p[i] = sine * across, q[i] = up, z[i] = cosine * across;
-        }
+INLINE void T(to_ray)(const T(Chart) k, const int way, R a, R b, R *x, R *y, R *z) {
+    if (way == CYLINDER || way == SPHERE) {
+        R sine, cosine, up, across;
+        T(turn)(a * a, &sine, &cosine);
+        if (way == SPHERE) T(turn)(b * b, &up, &across), up *= b;
+        else across = 1 / T(root)(1 + b * b), up = b * across;
+        *x = a * sine * across, *y = up, *z = cosine * across;
         return;
     }
-    T(Turned) to;
-    if (chart->kind == INVERTED) {
-        ALIGNED R t[BLOCK], factor[BLOCK], p[BLOCK], q[BLOCK];
-        EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-        T(radial)(chart, c->numbers[0], c->constants, n, t, factor, NULL);
-        EACH(i) p[i] = a[i] * factor[i], q[i] = b[i] * factor[i];
-        T(turned)(c, n, p, q, &to, 0);
-        EACH(i) x[i] = p[i] * to.s[i], y[i] = q[i] * to.s[i], z[i] = to.c[i];
-        return;
-    }
-    T(turned)(c, n, a, b, &to, 0);
-    EACH(i) x[i] = a[i] * to.s[i], y[i] = b[i] * to.s[i], z[i] = to.c[i];
+    R s;
+    T(turned)(k, way, a * a + b * b, &s, z, NULL, NULL);
+    *x = a * s, *y = b * s;
 }
 
-/* The cotangents of points of the plane of those of their rays. Adds those of the chart's numbers */
-static void T(to_ray_vjp)(const T(Camera) *c, int n, const R *a, const R *b, const R *gx, const R *gy,
-                          const R *restrict gz, R *ga, R *gb, double *sums) {
-    const Part *chart = c->parts;
-    if (chart->kind >= CYLINDER) {
-        const int swapped = chart->flags & TRANSVERSE, is_sphere = chart->kind == SPHERE;
-        const R *restrict u = swapped ? b : a, *restrict v = swapped ? a : b;
-        const R *restrict gp = swapped ? gy : gx, *restrict gq = swapped ? gx : gy;
-        R *restrict gu = swapped ? gb : ga, *restrict gv = swapped ? ga : gb;
-        EACH(i) {
-            R sine, cosine, up, across;
-            T(turn)(u[i], &sine, &cosine);
-            if (is_sphere) T(turn)(v[i], &up, &across);
-            else across = 1 / T(root)(1 + v[i] * v[i]), up = v[i] * across;
-            const R level = gp[i] * sine + gz[i] * cosine, slant = gq[i] * across - level * up;
-            gu[i] = (gp[i] * cosine - gz[i] * sine) * across;
-            /* the latitude of a height v moves by dv / (1 + v^2) */
-            gv[i] = is_sphere ? slant : slant * across * across;
-        }
+/* The cotangents of points of the plane of those of their rays */
+INLINE void T(to_ray_vjp)(const T(Chart) k, const int way, R a, R b, R gx, R gy, R gz, R *ga, R *gb) {
+    if (way == CYLINDER || way == SPHERE) {
+        R sine, cosine, up, across;
+        T(turn)(a * a, &sine, &cosine), sine *= a;
+        if (way == SPHERE) T(turn)(b * b, &up, &across), up *= b;
+        else across = 1 / T(root)(1 + b * b), up = b * across;
+        const R level = gx * sine + gz * cosine, slant = gy * across - level * up;
+        *ga = (gx * cosine - gz * sine) * across;
+        /* the latitude of a height b moves by db / (1 + b^2) */
+        *gb = way == SPHERE ? slant : slant * across * across;
         return;
     }
-    T(Turned) to;
-    if (chart->kind == INVERTED) {
-        ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK], p[BLOCK], q[BLOCK], w[BLOCK];
-        EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-        T(radial)(chart, c->numbers[0], c->constants, n, t, factor, slope);
-        EACH(i) p[i] = a[i] * factor[i], q[i] = b[i] * factor[i];
-        T(turned)(c, n, p, q, &to, 1);
-        EACH(i) {
-            const R out = (gx[i] * p[i] + gy[i] * q[i]) * to.twice_s[i] + gz[i] * to.twice_c[i];
-            const R gp = gx[i] * to.s[i] + p[i] * out, gq = gy[i] * to.s[i] + q[i] * out;
-            w[i] = gp * a[i] + gq * b[i];
-            ga[i] = gp * factor[i] + a[i] * 2 * slope[i] * w[i], gb[i] = gq * factor[i] + b[i] * 2 * slope[i] * w[i];
-        }
-        if (sums) T(radial_sums)(chart, c->numbers[0], c->constants, n, t, w, sums);
-        return;
-    }
-    T(turned)(c, n, a, b, &to, 1);
-    EACH(i) {
-        const R out = (gx[i] * a[i] + gy[i] * b[i]) * to.twice_s[i] + gz[i] * to.twice_c[i];
-        ga[i] = gx[i] * to.s[i] + a[i] * out, gb[i] = gy[i] * to.s[i] + b[i] * out;
-    }
-    if (!sums) return;
+    R s, z, ds, dz;
+    T(turned)(k, way, a * a + b * b, &s, &z, &ds, &dz);
+    const R out = (gx * a + gy * b) * ds + gz * dz;
+    *ga = gx * s + a * out, *gb = gy * s + b * out;
+}
+
+/* Adds the cotangents of the chart's numbers, but of an inverted chart */
+static void T(to_ray_sums)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, const R *restrict gx,
+                           const R *restrict gy, const R *restrict gz, double *sums) {
+    const T(Chart) k = c->chart;
     ALIGNED R w[BLOCK], of_alpha[BLOCK], of_beta[BLOCK];
-    switch (chart->kind) {
+    switch (c->parts->kind) {
     case UNIFIED: {
-        const R xi = c->xi, alpha = c->alpha, beta = c->beta, short_of = (1 - xi) * (1 + xi);
+        const R short_of = (1 - k.xi) * (1 + k.xi);
         EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i], h = T(ahead)(beta * r2, alpha), below = r2 + h * h;
+            const R r2 = a[i] * a[i] + b[i] * b[i], h = T(ahead)(k.beta * r2, k.alpha), below = r2 + h * h;
             const R root = T(root)(h * h + short_of * r2), along = gx[i] * a[i] + gy[i] * b[i] + gz[i] * h; /* by S */
-            const R by_h = along * (xi + h / root - 2 * h * to.s[i]) / below + gz[i] * to.s[i];
-            const R fold = T(root)(1 - (2 * alpha - 1) * beta * r2), sphere = T(root)(beta * r2 + h * h);
-            w[i] = along * (h - xi * r2 / root) / below - gz[i];
+            const R s = (k.xi * h + root) / below;
+            const R by_h = along * (k.xi + h / root - 2 * h * s) / below + gz[i] * s;
+            const R fold = T(root)(1 - (2 * k.alpha - 1) * k.beta * r2), sphere = T(root)(k.beta * r2 + h * h);
+            w[i] = along * (h - k.xi * r2 / root) / below - gz[i];
             of_alpha[i] = -by_h * (sphere - h) * sphere / fold;
-            of_beta[i] = -by_h * alpha * r2 / (2 * fold);
+            of_beta[i] = -by_h * k.alpha * r2 / (2 * fold);
         }
-        if (chart->flags & HAS_XI) *sums++ += T(total)(n, w);
-        if (chart->flags & HAS_ALPHA) *sums++ += T(total)(n, of_alpha);
-        if (chart->flags & HAS_BETA) *sums += T(total)(n, of_beta);
+        if (c->parts->flags & HAS_XI) *sums++ += T(total)(n, w);
+        if (c->parts->flags & HAS_ALPHA) *sums++ += T(total)(n, of_alpha);
+        if (c->parts->flags & HAS_BETA) *sums += T(total)(n, of_beta);
         break;
     }
-    case FOV: {
-        const R omega = c->omega, slope = c->slope;
+    case FOV:
         EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i], angle2 = omega * omega * r2, angle = T(root)(angle2 + FLOOR);
+            const R r2 = a[i] * a[i] + b[i] * b[i], angle2 = k.omega * k.omega * r2;
             R sine, cosine;
-            T(turn)(angle, &sine, &cosine);
-            sine /= angle;
-            const R across = sine / slope, length = 1 / T(root)(r2 * across * across + cosine * cosine);
-            const R by_across = (cosine - sine) / (angle2 + FLOOR) * omega * r2 / slope - across * c->slope_by_omega / slope;
-            const R by_cosine = -sine * omega * r2;
+            T(turn)(angle2, &sine, &cosine);
+            const R across = sine / k.slope, length = 1 / T(root)(r2 * across * across + cosine * cosine);
+            const R by_across =
+                (cosine - sine) / (angle2 + FLOOR) * k.omega * r2 / k.slope - across * k.slope_by_omega / k.slope;
+            const R by_cosine = -sine * k.omega * r2;
             const R by_length = -length * length * length * (r2 * across * by_across + cosine * by_cosine);
             w[i] = (gx[i] * a[i] + gy[i] * b[i]) * (by_across * length + across * by_length) +
                    gz[i] * (by_cosine * length + cosine * by_length);
         }
         *sums += T(total)(n, w);
         break;
-    }
-    case ONE_DIVISION: {
-        const R k = c->numbers[0][0];
+    case ONE_DIVISION:
         EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i], h = 1 + k * r2, by_length = -to.s[i] * to.s[i] * to.s[i] * h;
-            w[i] = r2 * ((gx[i] * a[i] + gy[i] * b[i]) * by_length + gz[i] * (to.s[i] + h * by_length));
+            const R r2 = a[i] * a[i] + b[i] * b[i], h = 1 + k.k * r2, s = 1 / T(root)(r2 + h * h);
+            const R by_length = -s * s * s * h;
+            w[i] = r2 * ((gx[i] * a[i] + gy[i] * b[i]) * by_length + gz[i] * (s + h * by_length));
         }
         *sums += T(total)(n, w);
         break;
-    }
     }
 }

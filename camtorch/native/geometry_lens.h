@@ -2,38 +2,44 @@
 
 /* -- radial factors: a point m goes to m R(t), t = |m|^2 */
 
-/* 1 + k0 t + k1 t^2 + ... and, if wanted, its derivative: Horner's scheme */
-static void T(polynomial)(const R *k, int count, int n, const R *restrict t, R *restrict value, R *restrict slope) {
-    const R last = k[count - 1];
-    EACH(i) value[i] = last;
-    if (slope) EACH(i) slope[i] = 0;
-    for (int j = count - 2; j >= -1; j--) {
-        const R c = j < 0 ? 1 : k[j];
-        if (slope) EACH(i) slope[i] = slope[i] * t[i] + value[i];
-        EACH(i) value[i] = value[i] * t[i] + c;
-    }
+/* 1 + k0 t + k1 t^2 + ... and, if wanted, its derivative */
+INLINE R T(horner)(const R *k, const int count, R t, R *slope) {
+    R value = k[count - 1], by_t = 0;
+    for (int j = count - 2; j >= 0; j--) by_t = by_t * t + value, value = value * t + k[j];
+    if (slope) *slope = by_t * t + value;
+    return value * t + 1;
 }
 
-/* The sums of weight t, weight t^2, ...; weights change */
-static void T(powers)(int count, int n, const R *restrict t, R *restrict weight, double *sums) {
-    for (int j = 0; j < count; j++) {
-        EACH(i) weight[i] *= t[i];
-        sums[j] += T(total)(n, weight);
+/* A factor of n numbers, or n + m; and, if wanted, its slope */
+INLINE R T(factor)(const R *k, const int kind, const int n, const int m, R t, R *slope) {
+    if (kind == POLYNOMIAL) return T(horner)(k, n, t, slope);
+    if (kind == RATIONAL) {
+        R bend = 0;
+        const R above = T(horner)(k, n, t, slope), one = 1 / T(horner)(k + n, m, t, slope ? &bend : NULL);
+        if (slope) *slope = (*slope - above * one * bend) * one;
+        return above * one;
     }
+    const R radius = T(root)(t + FLOOR), place = kind == ANGLE_PER_RADIUS ? t : radius;
+    R value = T(horner)(k, n, place, slope);
+    if (slope && kind != ANGLE_PER_RADIUS) *slope /= 2 * radius;
+    if (kind == RADIUS_POLYNOMIAL) return value;
+    const R ahead = value; /* of the ray (radius, 0, ahead) */
+    value = T(angle)(radius, ahead, radius);
+    if (slope) *slope = ((ahead - 2 * t * *slope) / (t + ahead * ahead) - value) / (2 * t + FLOOR);
+    return value;
 }
 
-static void T(roots)(int n, const R *restrict t, R *restrict radius) { EACH(i) radius[i] = T(root)(t[i] + FLOOR); }
-
-/* D of the ray (r, 0, D), and its derivative by t = r^2 */
-static void T(ray_ahead)(const Part *part, const R *k, int n, const R *restrict t, R *restrict ahead, R *restrict slope) {
-    if (part->factor == ANGLE_PER_RADIUS) {
-        T(polynomial)(k, part->n, n, t, ahead, slope);
-        return;
+static T(Factor) T(prepare_factor)(const Part *part, const R *numbers, const R *constants) {
+    static const int forms[] = {ANY, FEW, RATIO, ROOTS, ANGLES, ALL, ANY};
+    T(Factor) made = {part, numbers, constants, ANY, {0}};
+    const int many = part->factor == RATIONAL ? PADDED / 2 : PADDED;
+    if (part->n <= many && part->m <= many) made.form = forms[part->factor];
+    if (made.form == FEW && part->n > PADDED / 2) made.form = SOME;
+    if (made.form != ANY) {
+        memcpy(made.padded, numbers, (size_t)part->n * sizeof(R));
+        if (part->m) memcpy(made.padded + PADDED / 2, numbers + part->n, (size_t)part->m * sizeof(R));
     }
-    ALIGNED R radius[BLOCK];
-    T(roots)(n, t, radius);
-    T(polynomial)(k, part->n, n, radius, ahead, slope);
-    if (slope) EACH(i) slope[i] /= 2 * radius[i];
+    return made;
 }
 
 /* Of a table: the radius, 1 or -1 behind the end, the piece, and how far from its node the place is */
@@ -50,7 +56,12 @@ static void T(pieces)(const Part *part, const R *nodes, int n, const R *restrict
         const R mirrored = 2 * end - radius[i] > 0 ? 2 * end - radius[i] : 0;
         offset[i] = radius[i] > end ? mirrored : radius[i], piece[i] = 0;
     }
-    for (; step; step /= 2)
+    if (last < 32) /* to count them is faster than to read here and there */
+        for (int j = 1; j <= last; j++) {
+            const R node = nodes[j];
+            EACH(i) piece[i] += node <= offset[i];
+        }
+    else for (; step; step /= 2)
         EACH(i) {
             const I next = piece[i] + step, at = next < last ? next : last;
             piece[i] = (next <= last) & (nodes[at] <= offset[i]) ? next : piece[i];
@@ -58,104 +69,95 @@ static void T(pieces)(const Part *part, const R *nodes, int n, const R *restrict
     EACH(i) offset[i] -= nodes[piece[i]];
 }
 
-static void T(table_factor)(const Part *part, const R *k, const R *nodes, int n, const R *restrict t, R *restrict factor,
-                            R *restrict slope) {
+INLINE void T(table_factor)(const Part *part, const R *k, const R *nodes, int n, const R *restrict t,
+                            R *restrict factor, R *restrict slope) {
     ALIGNED R radius[BLOCK], side[BLOCK], offset[BLOCK];
     ALIGNED I piece[BLOCK];
-    const R *restrict zeroth = k, *restrict first = k + part->n, *restrict second = first + part->n,
-            *restrict third = second + part->n;
+    const int count = part->n;
     T(pieces)(part, nodes, n, t, radius, side, piece, offset);
     EACH(i) {
         const I p = piece[i];
+        const R first = k[count + p], second = k[2 * count + p], third = k[3 * count + p], one = 1 / radius[i];
         /* on the first piece neither division nor root has a part in the derivatives of the outer terms */
         const int central = (p == 0) & (side[i] > 0);
-        const R share = central ? 1 : offset[i] / radius[i], square = central ? t[i] : offset[i] * offset[i];
-        factor[i] = zeroth[p] / radius[i] + share * (first[p] + offset[i] * second[p] + square * third[p]);
-    }
-    if (slope)
-        EACH(i) {
-            const I p = piece[i];
-            const R by_place = first[p] + 2 * offset[i] * second[p] + 3 * offset[i] * offset[i] * third[p];
-            slope[i] = (side[i] * by_place - factor[i]) / (2 * radius[i] * radius[i]);
+        const R share = central ? 1 : offset[i] * one, square = central ? t[i] : offset[i] * offset[i];
+        factor[i] = k[p] * one + share * (first + offset[i] * second + square * third);
+        if (slope) {
+            const R by_place = first + offset[i] * (2 * second + 3 * offset[i] * third);
+            slope[i] = (side[i] * by_place - factor[i]) * one * one / 2;
         }
+    }
 }
 
-static void T(radial)(const Part *part, const R *k, const R *constants, int n, const R *restrict t, R *restrict factor,
-                      R *restrict slope) {
-    switch (part->factor) {
-    case POLYNOMIAL:
-        T(polynomial)(k, part->n, n, t, factor, slope);
-        break;
-    case RATIONAL: {
-        ALIGNED R below[BLOCK], bend[BLOCK];
-        T(polynomial)(k, part->n, n, t, factor, slope);
-        T(polynomial)(k + part->n, part->m, n, t, below, slope ? bend : NULL);
-        EACH(i) factor[i] /= below[i];
-        if (slope) EACH(i) slope[i] = (slope[i] - factor[i] * bend[i]) / below[i];
-        break;
-    }
-    case RADIUS_POLYNOMIAL: {
-        ALIGNED R radius[BLOCK];
-        T(roots)(n, t, radius);
-        T(polynomial)(k, part->n, n, radius, factor, slope);
-        if (slope) EACH(i) slope[i] /= 2 * radius[i];
-        break;
-    }
-    case ANGLE_PER_RADIUS:
-    case ANGLE_OF_ALL_POWERS: {
-        ALIGNED R ahead[BLOCK], bend[BLOCK];
-        T(ray_ahead)(part, k, n, t, ahead, slope ? bend : NULL);
-        EACH(i) factor[i] = T(angle_per_radius)(t[i], ahead[i]);
-        if (slope)
-            EACH(i) {
-                const R by_radius = (ahead[i] - 2 * t[i] * bend[i]) / (t[i] + ahead[i] * ahead[i]);
-                slope[i] = (by_radius - factor[i]) / (2 * t[i] + FLOOR);
-            }
-        break;
-    }
-    case RADIUS_TABLE:
-        T(table_factor)(part, k, constants, n, t, factor, slope);
-        break;
-    default:
+INLINE void T(radial_by)(const R *numbers, const int kind, const int count, const int below, int n, const R *restrict t,
+                         R *restrict factor, R *restrict slope) {
+    R k[PADDED];
+    memcpy(k, numbers, sizeof k);
+    EACH(i) factor[i] = T(factor)(k, kind, count, below, t[i], slope ? slope + i : NULL);
+}
+
+static void T(radial)(const T(Factor) *of, int n, const R *restrict t, R *restrict factor, R *restrict slope) {
+    const Part *part = of->part;
+    const R *k = of->numbers;
+    if (part->factor == NO_FACTOR) {
         EACH(i) factor[i] = 1;
         if (slope) EACH(i) slope[i] = 0;
+    } else if (part->factor == RADIUS_TABLE) {
+        if (slope) T(table_factor)(part, k, of->constants, n, t, factor, slope);
+        else T(table_factor)(part, k, of->constants, n, t, factor, NULL);
+    } else if (of->form == ANY) { /* one by one */
+        EACH(i) factor[i] = T(factor)(k, part->factor, part->n, part->m, t[i], slope ? slope + i : NULL);
+    } else if (slope) {
+        EACH_FORM(of->form, T(radial_by)(of->padded, kind, count, below, n, t, factor, slope))
+    } else {
+        EACH_FORM(of->form, T(radial_by)(of->padded, kind, count, below, n, t, factor, NULL))
+    }
+}
+
+/* The sums of weight t, weight t^2, ...; weights change */
+static void T(powers)(int count, int n, const R *restrict t, R *restrict weight, double *sums) {
+    for (int j = 0; j < count; j++) {
+        EACH(i) weight[i] *= t[i];
+        sums[j] += T(total)(n, weight);
     }
 }
 
 /* Adds the sums over the points of dR/dk weight, for each number k */
-static void T(radial_sums)(const Part *part, const R *k, const R *constants, int n, const R *restrict t,
-                           const R *restrict weight, double *sums) {
+static void T(radial_sums)(const T(Factor) *of, int n, const R *restrict t, const R *restrict weight, double *sums) {
+    const Part *part = of->part;
+    const R *k = of->numbers;
     ALIGNED R w[BLOCK], other[BLOCK], more[BLOCK];
-    EACH(i) w[i] = weight[i];
+    EACH(i) w[i] = weight[i], other[i] = part->factor == POLYNOMIAL ? 0 : T(root)(t[i] + FLOOR);
     switch (part->factor) {
     case POLYNOMIAL:
         T(powers)(part->n, n, t, w, sums);
         break;
     case RATIONAL:
-        T(radial)(part, k, constants, n, t, other, NULL);
-        T(polynomial)(k + part->n, part->m, n, t, more, NULL);
-        EACH(i) w[i] /= more[i], other[i] *= -w[i];
+        EACH(i) {
+            const R one = 1 / T(horner)(k + part->n, part->m, t[i], NULL);
+            w[i] *= one, other[i] = -w[i] * one * T(horner)(k, part->n, t[i], NULL);
+        }
         T(powers)(part->n, n, t, w, sums);
         T(powers)(part->m, n, t, other, sums + part->n);
         break;
     case RADIUS_POLYNOMIAL:
-        T(roots)(n, t, other);
         T(powers)(part->n, n, other, w, sums);
         break;
     case ANGLE_PER_RADIUS:
     case ANGLE_OF_ALL_POWERS:
-        T(ray_ahead)(part, k, n, t, other, NULL);
-        EACH(i) w[i] /= -(t[i] + other[i] * other[i]);
-        T(roots)(n, t, other);
+        EACH(i) {
+            const R ahead = T(horner)(k, part->n, part->factor == ANGLE_PER_RADIUS ? t[i] : other[i], NULL);
+            w[i] /= -(t[i] + ahead * ahead);
+        }
         T(powers)(part->n, n, part->factor == ANGLE_PER_RADIUS ? t : other, w, sums);
         break;
     case RADIUS_TABLE: {
         ALIGNED R side[BLOCK];
         ALIGNED I piece[BLOCK];
-        T(pieces)(part, constants, n, t, other, side, piece, more);
+        T(pieces)(part, of->constants, n, t, other, side, piece, more);
         EACH(i) w[i] /= other[i];
-        for (int j = 0; j < 4; j++) {
-            for (int i = 0; i < n; i++) sums[j * part->n + piece[i]] += w[i];
+        for (int q = 0; q < 4; q++) {
+            for (int i = 0; i < n; i++) sums[q * part->n + piece[i]] += w[i];
             EACH(i) w[i] *= more[i];
         }
         break;
@@ -169,69 +171,55 @@ typedef struct {
     ALIGNED R ua[BLOCK], ub[BLOCK], va[BLOCK], vb[BLOCK]; /* du/da, du/db, dv/da, dv/db */
 } T(Jacobian);
 
-/* Where a planar stage sends points: m R(t) + (p t + 2 m (p . m)) + (s0 t + s1 t^2, s2 t + s3 t^2) */
-static void T(planar)(const Part *part, const R *k, const R *constants, int n, const R *restrict a, const R *restrict b,
-                      R *restrict u, R *restrict v, T(Jacobian) *restrict to) {
-    ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
-    const R *rest = k + (part->factor == RADIUS_TABLE ? 4 * part->n : part->n + part->m);
-    const int bent = part->flags & TANGENTIAL, has_prism = part->flags & PRISM;
-    const R px = bent ? rest[0] : 0, py = bent ? rest[1] : 0, *s = rest + (bent ? 2 : 0);
-    const R s0 = has_prism ? s[0] : 0, s1 = has_prism ? s[1] : 0, s2 = has_prism ? s[2] : 0, s3 = has_prism ? s[3] : 0;
-    EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-    T(radial)(part, k, constants, n, t, factor, to ? slope : NULL);
-    if (!bent && !has_prism) {
-        EACH(i) u[i] = a[i] * factor[i], v[i] = b[i] * factor[i];
-    } else {
-        EACH(i) {
-            const R dot = 2 * (px * a[i] + py * b[i]);
-            u[i] = a[i] * (factor[i] + dot) + (px + s0 + s1 * t[i]) * t[i];
-            v[i] = b[i] * (factor[i] + dot) + (py + s2 + s3 * t[i]) * t[i];
-        }
-    }
-    if (!to) return;
-    EACH(i) {
-        const R dot = 2 * (px * a[i] + py * b[i]), twice = 2 * slope[i];
-        const R across = twice * a[i] * b[i] + 2 * (px * b[i] + py * a[i]);
-        const R gu = 2 * s0 + 4 * s1 * t[i], gv = 2 * s2 + 4 * s3 * t[i];
-        to->ua[i] = factor[i] + twice * a[i] * a[i] + dot + 4 * px * a[i] + gu * a[i];
-        to->ub[i] = across + gu * b[i], to->va[i] = across + gv * a[i];
-        to->vb[i] = factor[i] + twice * b[i] * b[i] + dot + 4 * py * b[i] + gv * b[i];
-    }
+/* Where a planar stage of that factor sends a point: m R(t) + (p t + 2 m (p . m)) + (s0 t + s1 t^2, s2 t + s3 t^2) */
+INLINE void T(planar_at)(const T(Plane) k, R a, R b, R factor, R *u, R *v) {
+    const R t = a * a + b * b, scale = factor + 2 * (k.px * a + k.py * b);
+    *u = a * scale + (k.px + k.s0 + k.s1 * t) * t, *v = b * scale + (k.py + k.s2 + k.s3 * t) * t;
 }
 
-static void T(planar_vjp)(const Part *part, const R *k, const R *constants, int n, const R *restrict a,
-                          const R *restrict b, R *restrict gu, R *restrict gv, double *sums) {
-    ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK], along[BLOCK], ga[BLOCK], gb[BLOCK];
-    const int radial = part->factor == RADIUS_TABLE ? 4 * part->n : part->n + part->m;
-    const int bent = part->flags & TANGENTIAL, has_prism = part->flags & PRISM;
-    const R *rest = k + radial, px = bent ? rest[0] : 0, py = bent ? rest[1] : 0, *s = rest + (bent ? 2 : 0);
-    const R s0 = has_prism ? s[0] : 0, s1 = has_prism ? s[1] : 0, s2 = has_prism ? s[2] : 0, s3 = has_prism ? s[3] : 0;
+INLINE void T(planar_slopes)(const T(Plane) k, R a, R b, R factor, R slope, R *ua, R *ub, R *va, R *vb) {
+    const R t = a * a + b * b, scale = factor + 2 * (k.px * a + k.py * b), twice = 2 * slope;
+    const R across = twice * a * b + 2 * (k.px * b + k.py * a);
+    const R gu = 2 * k.s0 + 4 * k.s1 * t, gv = 2 * k.s2 + 4 * k.s3 * t;
+    *ua = scale + twice * a * a + 4 * k.px * a + gu * a, *ub = across + gu * b;
+    *vb = scale + twice * b * b + 4 * k.py * b + gv * b, *va = across + gv * a;
+}
+
+static void T(planar)(const T(Camera) *c, int j, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                      R *restrict v, T(Jacobian) *restrict to) {
+    ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
+    const T(Plane) k = c->planes[j];
     EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
-    T(radial)(part, k, constants, n, t, factor, slope);
+    T(radial)(c->factors + j, n, t, factor, to ? slope : NULL);
+    EACH(i) T(planar_at)(k, a[i], b[i], factor[i], u + i, v + i);
+    if (to)
+        EACH(i) T(planar_slopes)(k, a[i], b[i], factor[i], slope[i], to->ua + i, to->ub + i, to->va + i, to->vb + i);
+}
+
+static void T(planar_vjp)(const T(Camera) *c, int j, int n, const R *restrict a, const R *restrict b, R *restrict gu,
+                          R *restrict gv, double *sums) {
+    ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK], along[BLOCK], even_u[BLOCK], even_v[BLOCK];
+    const Part *part = c->parts + j;
+    const T(Plane) k = c->planes[j];
+    EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
+    T(radial)(c->factors + j, n, t, factor, slope);
     EACH(i) {
-        const R dot = 2 * (px * a[i] + py * b[i]);
-        along[i] = gu[i] * a[i] + gv[i] * b[i];
-        const R out = 2 * (along[i] * slope[i] + gu[i] * (px + s0 + 2 * s1 * t[i]) + gv[i] * (py + s2 + 2 * s3 * t[i]));
-        ga[i] = gu[i] * (factor[i] + dot) + 2 * along[i] * px + a[i] * out;
-        gb[i] = gv[i] * (factor[i] + dot) + 2 * along[i] * py + b[i] * out;
+        const R scale = factor[i] + 2 * (k.px * a[i] + k.py * b[i]), w = gu[i] * a[i] + gv[i] * b[i];
+        const R out = 2 * (w * slope[i] + gu[i] * (k.px + k.s0 + 2 * k.s1 * t[i]) + gv[i] * (k.py + k.s2 + 2 * k.s3 * t[i]));
+        along[i] = w, even_u[i] = gu[i] * t[i], even_v[i] = gv[i] * t[i];
+        gu[i] = gu[i] * scale + 2 * w * k.px + a[i] * out, gv[i] = gv[i] * scale + 2 * w * k.py + b[i] * out;
     }
-    if (sums) {
-        if (part->factor != NO_FACTOR) T(radial_sums)(part, k, constants, n, t, along, sums);
-        sums += radial;
-        if (bent || has_prism) {
-            EACH(i) gu[i] *= t[i], gv[i] *= t[i];
-            const double even_u = T(total)(n, gu), even_v = T(total)(n, gv);
-            if (bent) {
-                *sums++ += even_u + 2 * T(dot)(n, along, a);
-                *sums++ += even_v + 2 * T(dot)(n, along, b);
-            }
-            if (has_prism) {
-                sums[0] += even_u, sums[1] += T(dot)(n, gu, t);
-                sums[2] += even_v, sums[3] += T(dot)(n, gv, t);
-            }
-        }
+    if (!sums) return;
+    if (part->factor != NO_FACTOR) T(radial_sums)(c->factors + j, n, t, along, sums);
+    sums += part->factor == RADIUS_TABLE ? 4 * part->n : part->n + part->m;
+    if (part->flags & TANGENTIAL) {
+        *sums++ += T(total)(n, even_u) + 2 * T(dot)(n, along, a);
+        *sums++ += T(total)(n, even_v) + 2 * T(dot)(n, along, b);
     }
-    EACH(i) gu[i] = ga[i], gv[i] = gb[i];
+    if (part->flags & PRISM) {
+        sums[0] += T(total)(n, even_u), sums[1] += T(dot)(n, even_u, t);
+        sums[2] += T(total)(n, even_v), sums[3] += T(dot)(n, even_v, t);
+    }
 }
 
 /* The homography of a tilted sensor, R = k row by row: ((r00 a + r01 b + r02) r22 / depth - r02, ...) */
@@ -277,15 +265,19 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     else if (part->kind == SHEAR) {
         EACH(i) u[i] = a[i] + k[1] * b[i], v[i] = b[i] + k[0] * a[i];
         if (to) EACH(i) to->ua[i] = to->vb[i] = 1, to->ub[i] = k[1], to->va[i] = k[0];
-    } else T(planar)(part, k, c->constants, n, a, b, u, v, to);
+    } else T(planar)(c, stage, n, a, b, u, v, to);
 }
 
-/* Where the stages from `first` on send points; the Jacobian of all of them; if wanted, `least`: positive where each is
+/* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive where each is
    defined, regular and not turned over */
 static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to,
                     R *least) {
     ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
     T(Jacobian) here;
+    if (first == c->stages && !least) {
+        T(stage)(c, first, n, a, b, u, v, to);
+        return;
+    }
     EACH(i) x[i] = a[i], y[i] = b[i];
     for (int j = first; j <= c->stages; j++) {
         T(Jacobian) *made = !to ? NULL : j == first ? to : &here;
@@ -295,9 +287,7 @@ static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b
             ALIGNED R margin[BLOCK];
             if (c->parts[j].kind == TILT) EACH(i) margin[i] = k[6] * x[i] + k[7] * y[i] + k[8];
             else if (c->parts[j].factor == RATIONAL) {
-                ALIGNED R t[BLOCK];
-                EACH(i) t[i] = x[i] * x[i] + y[i] * y[i];
-                T(polynomial)(k + c->parts[j].n, c->parts[j].m, n, t, margin, NULL);
+                EACH(i) margin[i] = T(horner)(k + c->parts[j].n, c->parts[j].m, x[i] * x[i] + y[i] * y[i], NULL);
             } else EACH(i) margin[i] = INFINITY;
             EACH(i) {
                 /* a turn by half a circle has a positive determinant too: the trace tells it */
@@ -334,7 +324,7 @@ static void T(lens_vjp)(const T(Camera) *c, int n, const R *restrict a, const R 
                 const R w = gu[i] + k[0] * gv[i];
                 gv[i] += k[1] * gu[i], gu[i] = w;
             }
-        } else T(planar_vjp)(c->parts + j, k, c->constants, n, x[j - 1], y[j - 1], gu, gv, part);
+        } else T(planar_vjp)(c, j, n, x[j - 1], y[j - 1], gu, gv, part);
     }
 }
 
@@ -343,40 +333,78 @@ static void T(lens_vjp)(const T(Camera) *c, int n, const R *restrict a, const R 
 /* The factor by which it scales points of squared radius r2, to about 1e-6; `InverseTable` */
 static void T(tabulated)(const R *restrict table, int n, const R *restrict r2, R *restrict scale) {
     const R reach2 = table[0], top = (reach2 + 2) / reach2, *restrict values = table + 2, *restrict steps = values + NODES;
+    ALIGNED int32_t node[BLOCK];
     EACH(i) {
-        const R x = r2[i] / (r2[i] + 2) * top, left = 1 - x;
-        R position = (1 - T(root)(left > 0 ? left : 0)) * NODES;
-        position = position >= 0 ? position : 0; /* nor what is not a number */
-        const I node = position < NODES - 1 ? (I)position : NODES - 1;
-        scale[i] = values[node] + (position - (R)node) * steps[node];
+        const R left = 1 - r2[i] / (r2[i] + 2) * top, position = (1 - T(root)(left > 0 ? left : 0)) * NODES;
+        const R place = position >= 0 ? position : 0; /* nor what is not a number */
+        node[i] = place < NODES - 1 ? (int32_t)place : NODES - 1, scale[i] = place - (R)node[i];
+    }
+    EACH(i) scale[i] = values[node[i]] + scale[i] * steps[node[i]]; /* with that above no loop of vectors */
+}
+
+/* A step of Newton's method for s R(r2 s^2) = 1; whether it was so short that the next one is nothing */
+INLINE R T(nearer)(R s, R t, R factor, R slope, I *ok) {
+    const R shortest = IS_DOUBLE ? (R)1.862645149230957e-09 : (R)4.315837287515549e-05; /* sqrt(eps) / 8 */
+    const R step = (1 - s * factor) / (factor + 2 * t * slope);
+    *ok = shortest * (s + step) - T(absolute)(step) > 0;
+    return s + step;
+}
+
+INLINE void T(solve_by)(const R *numbers, const int kind, const int count, const int below, int n,
+                        const R *restrict r2, R *restrict scale, I *restrict ok) {
+    R k[PADDED];
+    memcpy(k, numbers, sizeof k);
+    EACH(i) {
+        R s = scale[i], slope;
+        I found = 0;
+        for (int step = 0; step < INVERSE_STEPS; step++) {
+            const R t = r2[i] * s * s, factor = T(factor)(k, kind, count, below, t, &slope);
+            s = T(nearer)(s, t, factor, slope, &found);
+        }
+        scale[i] = s, ok[i] = found;
     }
 }
 
-/* Newton's method for s R(r2 s^2) = 1 from there; `ok` where the last step was so short that the next is nothing */
-static void T(solve)(const Part *part, const R *k, const R *constants, const R *table, int n, const R *restrict r2,
-                     R *restrict scale, I *restrict ok) {
-    const R shortest = IS_DOUBLE ? (R)1.862645149230957e-09 : (R)4.315837287515549e-05; /* sqrt(eps) / 8 */
-    ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
+/* How many of a block are 0, their places filled up to whole vectors with the last one */
+static int T(chosen)(int n, const I *restrict open, int *restrict places) {
+    int count = 0;
+    I all = 1;
+    EACH(i) all &= open[i] != 0;
+    if (all) return 0;
+    for (int i = 0; i < n; i++) places[count] = i, count += !open[i]; /* no branch, that nobody could foretell */
+    for (int i = count; count && i % LANES; i++) places[i] = places[count - 1];
+    return count;
+}
+
+/* The factor by which the inverse of a factor scales points, from the table; `ok` where that is found by a few steps */
+static void T(solve)(const T(Factor) *of, const R *table, int n, const R *restrict r2, R *restrict scale,
+                     I *restrict ok) {
+    int places[BLOCK], some;
     T(tabulated)(table, n, r2, scale);
     EACH(i) ok[i] = 0;
-    for (int count = 1; count <= MOST_STEPS; count++) {
-        I all = 1;
-        EACH(i) t[i] = r2[i] * scale[i] * scale[i];
-        T(radial)(part, k, constants, n, t, factor, slope);
+    EACH_FORM(of->form, T(solve_by)(of->padded, kind, count, below, n, r2, scale, ok))
+    if (!(some = T(chosen)(n, ok, places))) return;
+    ALIGNED R square[BLOCK], found[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK];
+    ALIGNED I done[BLOCK];
+    n = (some + LANES - 1) & -LANES;
+    for (int i = 0; i < n; i++) square[i] = r2[places[i]], found[i] = scale[places[i]], done[i] = 0;
+    for (int count = 0; count < MOST_STEPS; count++) {
+        EACH(i) t[i] = square[i] * found[i] * found[i];
+        T(radial)(of, n, t, factor, slope);
         EACH(i) {
-            const R step = (1 - scale[i] * factor[i]) / (factor[i] + 2 * t[i] * slope[i]);
-            /* what is converged stays, whatever else is in its block */
-            scale[i] = ok[i] ? scale[i] : scale[i] + step;
-            ok[i] |= (shortest * scale[i] - T(absolute)(step) > 0) & (count > IS_DOUBLE);
+            I is_short;
+            const R ahead = T(nearer)(found[i], t[i], factor[i], slope[i], &is_short);
+            found[i] = done[i] ? found[i] : ahead, done[i] |= is_short;
         }
-        EACH(i) all &= ok[i];
-        if (all) return;
+        I all = 1;
+        EACH(i) all &= done[i];
+        if (all) break;
     }
+    for (int i = 0; i < some; i++) scale[places[i]] = found[i], ok[places[i]] = done[i];
 }
 
 /* The same of few points in a bracket up to the fold: Newton's steps, and every other one halves the bracket */
-static void T(bracketed)(const Part *part, const R *k, const R *constants, R inner2, int n, const R *restrict r2,
-                         R *restrict scale) {
+static void T(bracketed)(const T(Factor) *of, R inner2, int n, const R *restrict r2, R *restrict scale) {
     const R end = T(root)(inner2);
     ALIGNED R rho[BLOCK], low[BLOCK], high[BLOCK], wanted[BLOCK], width[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK];
     ALIGNED I moves[BLOCK];
@@ -387,7 +415,7 @@ static void T(bracketed)(const Part *part, const R *k, const R *constants, R inn
     for (int count = 0; count < (IS_DOUBLE ? 208 : 92); count++) {
         I any = 0;
         EACH(i) t[i] = rho[i] * rho[i];
-        T(radial)(part, k, constants, n, t, factor, slope);
+        T(radial)(of, n, t, factor, slope);
         EACH(i) {
             const R error = wanted[i] - rho[i] * factor[i], ascent = factor[i] + 2 * t[i] * slope[i];
             low[i] = error > 0 ? rho[i] : low[i], high[i] = error > 0 ? high[i] : rho[i];
@@ -403,29 +431,20 @@ static void T(bracketed)(const Part *part, const R *k, const R *constants, R inn
         if (!any) break;
     }
     EACH(i) t[i] = rho[i] * rho[i];
-    T(radial)(part, k, constants, n, t, factor, NULL);
+    T(radial)(of, n, t, factor, NULL);
     EACH(i) scale[i] = 1 / factor[i];
-}
-
-/* How many of a block are 0, their places filled up to whole vectors with the last one */
-static int T(chosen)(int n, const I *open, int *places) {
-    int count = 0;
-    for (int i = 0; i < n; i++)
-        if (!open[i]) places[count++] = i;
-    for (int i = count; count && i % LANES; i++) places[i] = places[count - 1];
-    return count;
 }
 
 /* The factor by which an inverted chart scales angles, of squares of these */
 static void T(chart_inverse)(const T(Camera) *c, int n, R *restrict theta2, R *restrict found) {
     ALIGNED I ok[BLOCK];
     int places[BLOCK], count;
-    T(solve)(c->parts, c->numbers[0], c->constants, c->chart_table, n, theta2, found, ok);
+    T(solve)(c->factors, c->chart_table, n, theta2, found, ok);
     if ((count = T(chosen)(n, ok, places))) {
         ALIGNED R some[BLOCK], made[BLOCK];
         const int filled = (count + LANES - 1) & -LANES;
         for (int i = 0; i < filled; i++) some[i] = theta2[places[i]];
-        T(bracketed)(c->parts, c->numbers[0], c->constants, c->chart_inner2, filled, some, made);
+        T(bracketed)(c->factors, c->chart_inner2, filled, some, made);
         for (int i = 0; i < count; i++) found[places[i]] = made[i];
     }
 }

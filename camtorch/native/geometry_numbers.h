@@ -1,5 +1,5 @@
-/* Elementary functions of R, float or double, to about one unit in the last place, without branches. Polynomials are
- * minimax ones, made with mpmath's chebyfit to a tenth of that, on the intervals that are named.
+/* Elementary functions of R, float or double, without branches: to about two units in the last place, sine and cosine
+ * near half a turn to five of 1. Polynomials are minimax ones, made with mpmath's chebyfit to a tenth of that or better.
  */
 #undef EPS
 #undef FLOOR
@@ -47,85 +47,80 @@ INLINE R T(shrink)(R x) {
     return T(of_bits)(turned < one ? one : turned);
 }
 
-/* The angle of (x, y), in -pi .. pi. Both zero, or infinite: not a number */
-INLINE R T(atan2)(R y, R x) {
-    const R across = T(absolute)(y), ahead = T(absolute)(x);
-    const int steep = across > ahead;
-    const R larger = steep ? across : ahead, smaller = steep ? ahead : across;
-    /* atan(q) = pi/4 + atan((q - 1) / (q + 1)): what is left is at most tan(pi/8) */
-    const int wide = smaller > (R)0.41421356237309503 * larger;
-    const R t = (wide ? smaller - larger : smaller) / (wide ? smaller + larger : larger), s = t * t;
-    R sum, eighths = wide ? 1 : 0, sign = 1; /* quarters of pi */
+/* The angle of (x, y) over `by`, which is positive; y is none less than zero. Both zero, or infinite: not a number */
+INLINE R T(angle)(R y, R x, R by) {
+    const R ahead = T(absolute)(x);
+    const int steep = y > ahead;
+    const R larger = steep ? y : ahead, smaller = steep ? ahead : y;
 #if IS_DOUBLE
-    sum = 0.0162843750500433944;
+    /* atan(q) = pi/4 + atan((q - 1) / (q + 1)): what is left is at most tan(pi/8) */
+    const int wide = smaller > 0.41421356237309503 * larger;
+    const R above = wide ? smaller - larger : smaller, below = wide ? smaller + larger : larger;
+    const R one = 1 / (below * by), q = above * by * one, s = q * q;
+    R sum = 0.0162843750500433944;
     sum = sum * s - 0.0345693150633260898, sum = sum * s + 0.0455154473402216165, sum = sum * s - 0.0523044364068694771;
     sum = sum * s + 0.0587892755447380676, sum = sum * s - 0.0666642476020052014, sum = sum * s + 0.0769229636804229712;
     sum = sum * s - 0.0909090875325911294, sum = sum * s + 0.111111111051505879, sum = sum * s - 0.142857142856597778;
     sum = sum * s + 0.199999999999998043, sum = sum * s - 0.333333333333333332;
-    const R high = 0.7853981633974482789994909, low = 3.06161699786838302e-17; /* of pi/4; times 4 without rounding */
+    sum = q + q * s * sum, sum = wide ? sum + PI / 4 : sum;
 #else
-    sum = -0.0645171886935895807f;
-    sum = sum * s + 0.107436683248300981f, sum = sum * s - 0.14263949753605724f, sum = sum * s + 0.199995403149579694f;
-    sum = sum * s - 0.333333317604345559f;
-    const R high = 0.78539800643920898438f, low = 1.56958239325240661e-7f;
+    const R below = larger, one = 1 / (below * by), q = smaller * by * one, s = q * q;
+    /* in pairs, of pairs of pairs: a chain of nine steps would be waited for */
+    const R s2 = s * s, s4 = s2 * s2;
+    const R low = (-0.333333317f + s * 0.199997393f) + s2 * (-0.142785687f + s * 0.110337641f);
+    const R high = (-0.0865688043f + s * 0.0625016945f) + s2 * (-0.035871539f + s * 0.0135077714f);
+    R sum = low + s4 * (high + s4 * -0.00238699732f);
+    sum = q + q * s * sum;
 #endif
-    sum = t + t * s * sum;
-    eighths = steep ? 2 - eighths : eighths, sign = steep ? -sign : sign;
-    eighths = x < 0 ? 4 - eighths : eighths, sign = x < 0 ? -sign : sign;
-    sum = eighths * high + (eighths * low + sign * sum);
-    return y < 0 ? -sum : sum;
+    sum = steep ? (R)(PI / 2) - sum : sum;
+    sum = x < 0 ? (R)PI - sum : sum;
+    return sum * below * one;
 }
 
-/* Sine and cosine of an angle of a few turns at the most */
-INLINE void T(turn)(R angle, R *sine, R *cosine) {
+INLINE R T(atan2)(R y, R x) {
+    const R angle = T(angle)(T(absolute)(y), x, 1);
+    return y < 0 ? -angle : angle;
+}
+
+/* sin(angle) / angle and cos(angle) of the square of an angle up to pi: both are entire functions of that */
+INLINE void T(turn)(R t, R *sinc, R *cosine) {
 #if IS_DOUBLE
-    const R whole = 6755399441055744.0; /* adding it rounds to integers */
-    const R quarters = (angle * 0.63661977236758134308 + whole) - whole;
-    const R r = ((angle - quarters * 1.57079632673412561417) - quarters * 6.07710050630396597660e-11) -
-                quarters * 2.0222662487959507e-21;
-    const R s = r * r;
-    R of_sine = 1.59179899793974333e-10, of_cosine = -1.13825446453492504e-11;
-    of_sine = of_sine * s - 2.50511298964501863e-8, of_sine = of_sine * s + 2.75573160931984052e-6;
-    of_sine = of_sine * s - 0.000198412698367405321, of_sine = of_sine * s + 0.00833333333333093655;
-    of_sine = of_sine * s - 0.166666666666666646;
-    of_cosine = of_cosine * s + 2.08761450494131791e-9, of_cosine = of_cosine * s - 2.755731726587808e-7;
-    of_cosine = of_cosine * s + 0.0000248015872987544012, of_cosine = of_cosine * s - 0.00138888888888873898;
-    of_cosine = of_cosine * s + 0.0416666666666666654;
+    R s = -3.53312654446586996e-23, c = 1.47117781534902730e-24;
+    s = s * t + 1.94955401262142007e-20, c = c * t - 8.86090385547150088e-22;
+    s = s * t - 8.21961767870926162e-18, c = c * t + 4.10978734263623533e-19;
+    s = s * t + 2.81144891647976041e-15, c = c * t - 1.56191571309152628e-16;
+    s = s * t - 7.64716329247291777e-13, c = c * t + 4.77947702255812137e-14;
+    s = s * t + 1.60590438219419157e-10, c = c * t - 1.14707455848701177e-11;
+    s = s * t - 2.50521083851273934e-8, c = c * t + 2.08767569875165742e-9;
+    s = s * t + 2.75573192239820158e-6, c = c * t - 2.75573192239797973e-7;
+    s = s * t - 1.98412698412698168e-4, c = c * t + 2.48015873015872393e-5;
+    s = s * t + 8.33333333333333327e-3, c = c * t - 1.38888888888888886e-3;
+    c = c * t + 0.0416666666666666667;
 #else
-    const R whole = 12582912.0f;
-    const R quarters = (angle * 0.636619772f + whole) - whole;
-    const R r = ((angle - quarters * 1.570556640625f) - quarters * 2.396702766418457e-4f) - quarters * 1.5893254773528197e-8f;
-    const R s = r * r;
-    R of_sine = -0.000195876390987376193f, of_cosine = 0.000024547689772460029f;
-    of_sine = of_sine * s + 0.00833274710466453002f, of_sine = of_sine * s - 0.166666646563122088f;
-    of_cosine = of_cosine * s - 0.00138883018675623691f, of_cosine = of_cosine * s + 0.0416666646534887929f;
+    R s = 1.39421471e-10f, c = -9.92797824e-12f;
+    s = s * t - 2.4822229e-8f, c = c * t + 2.06720698e-9f, s = s * t + 2.75456768e-6f, c = c * t - 2.75436934e-7f;
+    s = s * t - 1.9841002e-4f, c = c * t + 2.48011194e-5f, s = s * t + 8.33333107e-3f, c = c * t - 1.38888812e-3f;
+    c = c * t + 0.0416666662f;
 #endif
-    of_sine = r + r * s * of_sine, of_cosine = 1 - s * (R)0.5 + s * s * of_cosine;
-    /* which quarter it is, by parts: 0 or 1, and 0 or 2 of quarters modulo 4 */
-    const R half = (quarters * (R)0.5 + whole) - whole;      /* quarters / 2, a tie to the even one */
-    const R odd = T(absolute)(quarters - 2 * half);          /* 0 or 1 */
-    const R even_part = (quarters - odd) * (R)0.5;           /* the quarter below, halved: its parity is the sign */
-    const R twice = (even_part * (R)0.5 + whole) - whole;
-    const int turned = T(absolute)(even_part - 2 * twice) > (R)0.25;
-    const R a = odd > (R)0.5 ? of_cosine : of_sine, b = odd > (R)0.5 ? -of_sine : of_cosine;
-    *sine = turned ? -a : a, *cosine = turned ? -b : b;
+    s = s * t - (R)(1 / 6.0), c = c * t - (R)0.5;
+    *sinc = s * t + 1, *cosine = c * t + 1;
 }
 
 /* The sum over a block of products, by lanes: alike for each compiler */
 static double T(dot)(int n, const R *restrict a, const R *restrict b) {
     R lanes[LANES] = {0};
-    double sum = 0;
     for (int i = 0; i < n; i += LANES)
         for (int j = 0; j < LANES; j++) lanes[j] += a[i + j] * b[i + j];
-    for (int j = 0; j < LANES; j++) sum += lanes[j];
-    return sum;
+    for (int half = LANES / 2; half; half /= 2)
+        for (int j = 0; j < half; j++) lanes[j] += lanes[j + half];
+    return lanes[0];
 }
 
 static double T(total)(int n, const R *restrict a) {
     R lanes[LANES] = {0};
-    double sum = 0;
     for (int i = 0; i < n; i += LANES)
         for (int j = 0; j < LANES; j++) lanes[j] += a[i + j];
-    for (int j = 0; j < LANES; j++) sum += lanes[j];
-    return sum;
+    for (int half = LANES / 2; half; half /= 2)
+        for (int j = 0; j < half; j++) lanes[j] += lanes[j + half];
+    return lanes[0];
 }

@@ -1,5 +1,15 @@
 /* Rows of points and pixels, block by block: what is invalid, and why; projection/project.py, unproject.py, solve.py. */
 
+static void T(prepare_stage)(T(Camera) *c, int j) {
+    const Part *part = c->parts + j;
+    const R *k = c->numbers[j] + (part->factor == RADIUS_TABLE ? 4 * part->n : part->n + part->m);
+    T(Plane) *plane = c->planes + j;
+    c->factors[j] = T(prepare_factor)(part, c->numbers[j], c->constants);
+    if (part->kind != PLANAR) return;
+    if (part->flags & TANGENTIAL) plane->px = k[0], plane->py = k[1], k += 2;
+    if (part->flags & PRISM) plane->s0 = k[0], plane->s1 = k[1], plane->s2 = k[2], plane->s3 = k[3];
+}
+
 static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     const R *numbers = (const R *)all->parameters + camera * all->parameter_count;
     const R *intrinsics = (const R *)all->intrinsics + 4 * camera;
@@ -9,11 +19,15 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     c->constants = (const R *)all->constants + camera * all->constant_count;
     c->fx = intrinsics[0], c->fy = intrinsics[1], c->cx = intrinsics[2], c->cy = intrinsics[3];
     c->usable = !all->usable || all->usable[camera];
+    c->inner2 = c->usable ? INFINITY : -1;
+    c->swapped = c->parts->flags & TRANSVERSE && c->parts->kind >= CYLINDER;
+    for (int j = 0; j <= c->stages; j++) T(prepare_stage)(c, j);
     if (c->stages) {
         const Part *first = c->parts + 1;
         c->is_radial = c->stages == 1 && first->kind == PLANAR && !first->flags;
         c->by_stages = all->stagewise && all->stagewise[camera];
-        c->inner2 = ((const R *)all->inner2)[camera];
+        c->follows = !c->is_radial && !c->by_stages;
+        c->inner2 = c->usable ? ((const R *)all->inner2)[camera] : -1;
         c->usual2 = all->usual2 ? ((const R *)all->usual2)[camera] : c->inner2;
         c->circle2 = all->circle2 ? ((const R *)all->circle2)[camera] : 0;
         c->limits2 = all->limits2 ? (const R *)all->limits2 + camera * AZIMUTHS : NULL;
@@ -29,41 +43,58 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
 
 /* -- memory */
 
-static void T(load)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
-    if (stride == 1) for (int i = 0; i < count; i++) to[i] = from[i];
+/* A component of a row, with `filling` behind it */
+static void T(copy)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
+    if (stride == 1) memcpy(to, from, (size_t)count * sizeof(R));
     else for (int i = 0; i < count; i++) to[i] = from[stride * i];
     for (int i = count; i < n; i++) to[i] = filling;
 }
 
-static void T(store)(R *to, int64_t stride, int count, const R *restrict from) {
-    if (stride == 1) for (int i = 0; i < count; i++) to[i] = from[i];
-    else if (stride == 2) for (int i = 0; i < count; i++) to[2 * i] = from[i];
-    else if (stride == 3) for (int i = 0; i < count; i++) to[3 * i] = from[i];
-    else for (int i = 0; i < count; i++) to[stride * i] = from[i];
+/* The same: where it lies, if vectors can be read there, else in `to` */
+static const R *T(load)(const R *from, int64_t stride, int count, int n, R *restrict to, R filling) {
+    if (stride == 1 && count == n) return from;
+    T(copy)(from, stride, count, n, to, filling);
+    return to;
 }
+
+/* Components to results, at once where they are interleaved: from the same vectors */
+static void T(store)(R *restrict to, const int64_t *strides, int components, int count, const R *restrict x,
+                     const R *restrict y, const R *restrict z) {
+    const int64_t point = strides[1], next = strides[2];
+    if (components == 3 && point == 3 && next == 1)
+        for (int i = 0; i < count; i++) to[3 * i] = x[i], to[3 * i + 1] = y[i], to[3 * i + 2] = z[i];
+    else if (components == 2 && point == 2 && next == 1)
+        for (int i = 0; i < count; i++) to[2 * i] = x[i], to[2 * i + 1] = y[i];
+    else for (int j = 0; j < components; j++) {
+        const R *from = j == 0 ? x : j == 1 ? y : z;
+        if (point == 1) memcpy(to + j * next, from, (size_t)count * sizeof(R));
+        else for (int i = 0; i < count; i++) to[point * i + j * next] = from[i];
+    }
+}
+
+/* Where results go: at once where they belong, if vectors can be written there, else to a buffer that is stored then */
+static int T(is_plane)(const int64_t *strides, int count, int n) { return strides[1] == 1 && count == n; }
 
 /* The points of a row; those that fill up a block lie on the axis */
 static void T(load_points)(const R *from, const int64_t *strides, int count, int n, R *restrict x, R *restrict y,
                            R *restrict z) {
-    if (strides[1] == 3 && strides[2] == 1) { /* at once, from the same vectors */
-        for (int i = 0; i < count; i++) x[i] = from[3 * i], y[i] = from[3 * i + 1], z[i] = from[3 * i + 2];
-        for (int i = count; i < n; i++) x[i] = y[i] = 0, z[i] = 1;
+    if (strides[1] == 3 && strides[2] == 1 && count == n) { /* at once, from the same vectors */
+        EACH(i) x[i] = from[3 * i], y[i] = from[3 * i + 1], z[i] = from[3 * i + 2];
         return;
     }
-    T(load)(from, strides[1], count, n, x, 0);
-    T(load)(from + strides[2], strides[1], count, n, y, 0);
-    T(load)(from + 2 * strides[2], strides[1], count, n, z, 1);
+    T(copy)(from, strides[1], count, n, x, 0);
+    T(copy)(from + strides[2], strides[1], count, n, y, 0);
+    T(copy)(from + 2 * strides[2], strides[1], count, n, z, 1);
 }
 
 static void T(load_pixels)(const R *from, const int64_t *strides, int count, int n, R *restrict u, R *restrict v, R cx,
                            R cy) {
-    if (strides[1] == 2 && strides[2] == 1) {
-        for (int i = 0; i < count; i++) u[i] = from[2 * i], v[i] = from[2 * i + 1];
-        for (int i = count; i < n; i++) u[i] = cx, v[i] = cy;
+    if (strides[1] == 2 && strides[2] == 1 && count == n) {
+        EACH(i) u[i] = from[2 * i], v[i] = from[2 * i + 1];
         return;
     }
-    T(load)(from, strides[1], count, n, u, cx);
-    T(load)(from + strides[2], strides[1], count, n, v, cy);
+    T(copy)(from, strides[1], count, n, u, cx);
+    T(copy)(from + strides[2], strides[1], count, n, v, cy);
 }
 
 /* -- rays to pixels */
@@ -76,70 +107,97 @@ static int T(azimuth)(R a, R b) {
     return (index + AZIMUTHS) % AZIMUTHS;
 }
 
-/* Of covered points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that
-   count wait for limits */
-static int T(beyond)(const T(Camera) *c, int count, int n, const R *restrict a, const R *restrict b, const I *covered,
-                     I *ok) {
-    ALIGNED R x[BLOCK], y[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
-    T(Jacobian) jacobian;
-    int places[BLOCK], some = 0;
-    for (int i = 0; i < n; i++)
-        if (covered[i] && !ok[i] && i < count) places[some++] = i;
-    if (!some || !c->limits2) return some;
-    for (int i = some; i % LANES; i++) places[i] = places[some - 1];
-    const int filled = (some + LANES - 1) & -LANES;
-    for (int i = 0; i < filled; i++) x[i] = a[places[i]], y[i] = b[places[i]];
-    T(lens)(c, 1, filled, x, y, u, v, &jacobian, least);
-    for (int i = 0; i < some; i++) {
-        const R limit2 = c->limits2[T(azimuth)(x[i], y[i])];
-        ok[places[i]] = (limit2 - (x[i] * x[i] + y[i] * y[i]) > 0) & (least[i] > TINY);
-    }
-    return 0;
-}
-
-/* Rays of which the largest component is from 1 to 2: points times `shrink`, a power of two. The axis where a point is
-   none: not finite, or the origin, next to which a derivative would leave the range of numbers */
-static void T(normalise)(int n, R *restrict x, R *restrict y, R *restrict z, R *restrict shrink, I *restrict ok) {
-    EACH(i) {
-        const R p = T(absolute)(x[i]), q = T(absolute)(y[i]), r = T(absolute)(z[i]);
-        const R larger = p > q ? p : q, size = larger > r ? larger : r;
-        const I is_ray = (size > FLOOR) & (p < INFINITY) & (q < INFINITY) & (r < INFINITY);
-        const R factor = T(shrink)(is_ray ? size : 1);
-        x[i] = is_ray ? x[i] * factor : 0, y[i] = is_ray ? y[i] * factor : 0, z[i] = is_ray ? z[i] * factor : 1;
-        shrink[i] = factor, ok[i] = is_ray;
-    }
-}
-
 typedef struct {
     ALIGNED R x[BLOCK], y[BLOCK], z[BLOCK], shrink[BLOCK], scale[BLOCK], a[BLOCK], b[BLOCK];
     ALIGNED I ok[BLOCK];
 } T(Seen);
 
-/* Where points are seen on the chart's plane, the centre where they are not. How many wait for limits */
-static int T(see)(const T(Camera) *c, int count, int n, T(Seen) *s) {
-    ALIGNED I covered[BLOCK];
-    int waiting = 0;
-    T(normalise)(n, s->x, s->y, s->z, s->shrink, s->ok);
-    T(to_plane)(c, n, s->x, s->y, s->z, s->a, s->b, s->scale, covered);
-    I *restrict ok = s->ok;
-    R *restrict a = s->a, *restrict b = s->b;
-    const I usable = c->usable;
-    if (!c->stages) {
-        EACH(i) {
-            ok[i] &= covered[i] & usable;
-            a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
-        }
-        return 0;
+/* Of points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that count
+   wait for limits */
+static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
+    ALIGNED R x[BLOCK], y[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
+    T(Jacobian) jacobian;
+    int places[BLOCK], some = 0;
+    for (int i = 0; i < n; i++)
+        if (s->ok[i] == 2) places[some++] = i;
+    for (int i = some; i % LANES; i++) places[i] = places[some - 1];
+    const int filled = (some + LANES - 1) & -LANES;
+    for (int i = 0; i < filled; i++) x[i] = s->a[places[i]], y[i] = s->b[places[i]];
+    if (c->limits2) T(lens)(c, 1, filled, x, y, u, v, &jacobian, least);
+    for (int i = 0; i < some; i++) {
+        const R limit2 = c->limits2 ? c->limits2[T(azimuth)(x[i], y[i])] : 0;
+        s->ok[places[i]] = (limit2 - (x[i] * x[i] + y[i] * y[i]) > 0) && least[i] > TINY;
     }
-    const R inner2 = c->inner2;
-    I all = 1;
+    return c->limits2 ? 0 : some && places[0] < count ? some : 0;
+}
+
+/* Points of covered rays on the chart's plane, the centre elsewhere; keeps: rays, the axis elsewhere, and their scale too.
+
+   Rays are points times `shrink`, a power of two, with their largest component from 1 to 2. No ray are those that are
+   not finite, and the origin, next to which a derivative would leave the range of numbers. */
+INLINE void T(see_by)(const T(Camera) *c, const int way, const int keeps, R inner2, int n, R *restrict x, R *restrict y,
+                      R *restrict z, R *restrict shrink, R *restrict scale, R *restrict a, R *restrict b, I *restrict ok) {
+    const T(Chart) k = c->chart;
     EACH(i) {
-        covered[i] &= ok[i] & usable;
-        ok[i] = covered[i] & (inner2 - (a[i] * a[i] + b[i] * b[i]) > 0);
-        all &= ok[i];
+        const R size = T(most)(T(most)(T(absolute)(x[i]), T(absolute)(y[i])), T(absolute)(z[i]));
+        const R factor = T(shrink)(size), p = x[i] * factor, q = y[i] * factor, r = z[i] * factor;
+        R u, v, by;
+        I is_seen;
+        T(to_plane)(k, way, p, q, r, &u, &v, &by, &is_seen);
+        is_seen &= (size > FLOOR) & (p * p + q * q + r * r < 16) & (inner2 - (u * u + v * v) > 0);
+        a[i] = is_seen ? u : 0, b[i] = is_seen ? v : 0, ok[i] = is_seen;
+        if (keeps) {
+            shrink[i] = factor, scale[i] = is_seen ? by : 1;
+            x[i] = is_seen ? p : 0, y[i] = is_seen ? q : 0, z[i] = is_seen ? r : 1;
+        }
     }
-    if (!all && !c->is_radial && !c->by_stages) waiting = T(beyond)(c, count, n, a, b, covered, ok);
-    EACH(i) a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
+}
+
+static NOT_INLINE void T(see_all)(const T(Camera) *c, int keeps, R inner2, int n, R *restrict x, R *restrict y,
+                                  R *restrict z, R *restrict shrink, R *restrict scale, R *restrict a, R *restrict b,
+                                  I *restrict ok) {
+    if (keeps) EACH_WAY(c->way, T(see_by)(c, way, 1, inner2, n, x, y, z, shrink, scale, a, b, ok))
+    else EACH_WAY(c->way, T(see_by)(c, way, 0, inner2, n, x, y, z, shrink, scale, a, b, ok))
+}
+
+/* An inverted chart's angles to radii */
+static void T(see_inverted)(const T(Camera) *c, int keeps, int n, T(Seen) *s) {
+    const R most2 = c->chart_most2, before = most2 * (1 - 32 * EPS);
+    ALIGNED R found[BLOCK], theta2[BLOCK];
+    EACH(i) {
+        const R angle2 = s->a[i] * s->a[i] + s->b[i] * s->b[i];
+        s->ok[i] &= before - angle2 > 0;
+        theta2[i] = s->ok[i] ? T(least)(angle2, most2) : 0;
+    }
+    T(chart_inverse)(c, n, theta2, found);
+    EACH(i) s->a[i] *= found[i], s->b[i] *= found[i];
+    if (keeps) EACH(i) s->scale[i] *= found[i];
+}
+
+/* Where points are seen on the chart's plane in the lens's domain, the centre elsewhere. How many wait for limits */
+static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
+    const int swapped = c->swapped, later = c->way == INVERTED || c->follows;
+    const R inner2 = c->inner2;
+    I outside = 0;
+    int waiting = 0;
+    T(see_all)(c, keeps, later ? c->usable ? INFINITY : -1 : inner2, n, swapped ? s->y : s->x, swapped ? s->x : s->y,
+               s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
+    if (!later) return 0;
+    if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
+    EACH(i) {
+        s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
+        outside |= s->ok[i];
+    }
+    if (outside & 2 && c->follows) waiting = T(beyond)(c, count, n, s);
+    EACH(i) {
+        s->ok[i] = s->ok[i] == 1;
+        s->a[i] = s->ok[i] ? s->a[i] : 0, s->b[i] = s->ok[i] ? s->b[i] : 0;
+    }
+    if (keeps)
+        EACH(i) {
+            s->x[i] = s->ok[i] ? s->x[i] : 0, s->y[i] = s->ok[i] ? s->y[i] : 0, s->z[i] = s->ok[i] ? s->z[i] : 1;
+            s->scale[i] = s->ok[i] ? s->scale[i] : 1;
+        }
     return waiting;
 }
 
@@ -150,20 +208,49 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     R *pixels = (R *)rows->results + camera * to[0] + first * to[1];
     uint8_t *valid = rows->valid + camera * rows->count + first;
     T(Seen) s;
-    ALIGNED R u[BLOCK], v[BLOCK];
+    ALIGNED R p[BLOCK], q[BLOCK];
+    const int direct = T(is_plane)(to, count, n);
+    R *restrict u = direct ? pixels : p, *restrict v = direct ? pixels + to[2] : q;
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
-    const int waiting = T(see)(c, count, n, &s);
-    if (c->stages) T(lens)(c, 1, n, s.a, s.b, u, v, NULL, NULL);
-    else EACH(i) u[i] = s.a[i], v[i] = s.b[i];
+    const int waiting = T(see)(c, 0, count, n, &s);
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
-    EACH(i) {
-        u[i] = s.ok[i] ? fx * u[i] + cx : -1;
-        v[i] = s.ok[i] ? fy * v[i] + cy : -1;
+    if (c->is_radial) { /* most often */
+        EACH(i) s.x[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
+        T(radial)(c->factors + 1, n, s.x, s.scale, NULL);
+        EACH(i) {
+            const R x = fx * (s.a[i] * s.scale[i]) + cx, y = fy * (s.b[i] * s.scale[i]) + cy;
+            u[i] = s.ok[i] ? x : -1, v[i] = s.ok[i] ? y : -1;
+        }
+    } else {
+        const R *restrict a = c->stages ? s.x : s.a, *restrict b = c->stages ? s.y : s.b;
+        if (c->stages) T(lens)(c, 1, n, s.a, s.b, s.x, s.y, NULL, NULL);
+        EACH(i) {
+            const R x = fx * a[i] + cx, y = fy * b[i] + cy;
+            u[i] = s.ok[i] ? x : -1, v[i] = s.ok[i] ? y : -1;
+        }
     }
-    T(store)(pixels, to[1], count, u);
-    T(store)(pixels + to[2], to[1], count, v);
+    if (!direct) T(store)(pixels, to, 2, count, u, v, NULL);
     for (int i = 0; i < count; i++) valid[i] = (uint8_t)s.ok[i];
     return waiting;
+}
+
+INLINE void T(unsee_by)(const T(Camera) *c, const int way, int n, const R *restrict x, const R *restrict y,
+                        const R *restrict z, const R *restrict shrink, const R *restrict scale,
+                        const R *restrict by_angle, const R *restrict ga, const R *restrict gb, R *restrict gx,
+                        R *restrict gy, R *restrict gz) {
+    const T(Chart) k = c->chart;
+    EACH(i) {
+        R p, q, r;
+        T(to_plane_vjp)(k, way, x[i], y[i], z[i], scale[i], way == INVERTED ? by_angle[i] : 1, ga[i], gb[i], &p, &q, &r);
+        gx[i] = p * shrink[i], gy[i] = q * shrink[i], gz[i] = r * shrink[i];
+    }
+}
+
+static NOT_INLINE void T(unsee)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y,
+                                const R *restrict z, const R *restrict shrink, const R *restrict scale,
+                                const R *restrict by_angle, const R *restrict ga, const R *restrict gb, R *restrict gx,
+                                R *restrict gy, R *restrict gz) {
+    EACH_WAY(c->way, T(unsee_by)(c, way, n, x, y, z, shrink, scale, by_angle, ga, gb, gx, gy, gz))
 }
 
 /* The cotangents of points and numbers of those of pixels; `sums`: of intrinsics, then of the parts */
@@ -172,41 +259,139 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     const int64_t *from = rows->row_strides, *to = rows->result_strides, *by = rows->cotangent_strides;
     const R *points = (const R *)rows->rows + camera * from[0] + first * from[1];
     const R *cotangents = (const R *)rows->cotangents + camera * by[0] + first * by[1];
+    const R fx = c->fx, fy = c->fy;
     T(Seen) s;
-    ALIGNED R gu[BLOCK], gv[BLOCK], u[BLOCK], v[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK];
+    ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
-    T(see)(c, count, n, &s);
-    T(load)(cotangents, by[1], count, n, gu, 0);
-    T(load)(cotangents + by[2], by[1], count, n, gv, 0);
+    T(see)(c, 1, count, n, &s);
+    const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0), *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
     EACH(i) {
-        /* what comes back of an invalid point need not be finite */
-        gu[i] = s.ok[i] ? gu[i] : 0, gv[i] = s.ok[i] ? gv[i] : 0;
-        s.x[i] = s.ok[i] ? s.x[i] : 0, s.y[i] = s.ok[i] ? s.y[i] : 0, s.z[i] = s.ok[i] ? s.z[i] : 1;
-        s.scale[i] = s.ok[i] ? s.scale[i] : 1;
+        const R p = fx * to_u[i], q = fy * to_v[i];
+        gu[i] = s.ok[i] ? p : 0, gv[i] = s.ok[i] ? q : 0;
     }
     if (sums) {
-        if (c->stages) T(lens)(c, 1, n, s.a, s.b, u, v, NULL, NULL);
-        else EACH(i) u[i] = s.a[i], v[i] = s.b[i];
-        sums[0] += T(dot)(n, gu, u), sums[1] += T(dot)(n, gv, v);
-        sums[2] += T(total)(n, gu), sums[3] += T(total)(n, gv);
+        const R *restrict u = s.a, *restrict v = s.b;
+        if (c->stages) T(lens)(c, 1, n, s.a, s.b, gx, gy, NULL, NULL), u = gx, v = gy;
+        sums[0] += T(dot)(n, gu, u) / fx, sums[1] += T(dot)(n, gv, v) / fy;
+        sums[2] += T(total)(n, gu) / fx, sums[3] += T(total)(n, gv) / fy;
         sums += 4;
     }
-    EACH(i) gu[i] *= c->fx, gv[i] *= c->fy;
     T(lens_vjp)(c, n, s.a, s.b, gu, gv, sums);
-    T(to_plane_vjp)(c, n, s.x, s.y, s.z, s.scale, gu, gv, gx, gy, gz, sums);
+    if (c->way == INVERTED) {
+        EACH(i) gx[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
+        T(radial)(c->factors, n, gx, gy, gz);
+        EACH(i) by_angle[i] = 1 / (gy[i] + 2 * gx[i] * gz[i]);
+    }
+    if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums);
     if (!rows->results) return;
-    EACH(i) gx[i] *= s.shrink[i], gy[i] *= s.shrink[i], gz[i] *= s.shrink[i];
-    R *results = (R *)rows->results + camera * to[0] + first * to[1];
-    T(store)(results, to[1], count, gx);
-    T(store)(results + to[2], to[1], count, gy);
-    T(store)(results + 2 * to[2], to[1], count, gz);
+    const int swapped = c->swapped;
+    T(unsee)(c, n, swapped ? s.y : s.x, swapped ? s.x : s.y, s.z, s.shrink, s.scale, by_angle, swapped ? gv : gu,
+             swapped ? gu : gv, swapped ? gy : gx, swapped ? gx : gy, gz);
+    T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 3, count, gx, gy, gz);
 }
 
 /* -- pixels to rays */
 
+/* An inverted chart's angles, as points of a plane on which the radius is the angle */
+static void T(angles)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict p, R *restrict q,
+                      R *restrict factor, R *restrict slope) {
+    ALIGNED R t[BLOCK];
+    EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
+    T(radial)(c->factors, n, t, factor, slope);
+    EACH(i) p[i] = a[i] * factor[i], q[i] = b[i] * factor[i];
+}
+
+INLINE void T(rays_by)(const T(Camera) *c, const int way, int n, const R *restrict a, const R *restrict b,
+                       const I *restrict ok, R *restrict x, R *restrict y, R *restrict z) {
+    const T(Chart) k = c->chart;
+    EACH(i) {
+        R p, q, r;
+        T(to_ray)(k, way, a[i], b[i], &p, &q, &r);
+        x[i] = ok[i] ? p : 0, y[i] = ok[i] ? q : 0, z[i] = ok[i] ? r : 1;
+    }
+}
+
+/* The unit rays of points of the plane, the axis where they are not `ok` */
+static NOT_INLINE void T(rays_of)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b,
+                                  const I *restrict ok, R *restrict x, R *restrict y, R *restrict z) {
+    EACH_WAY(c->way, T(rays_by)(c, way, n, a, b, ok, x, y, z))
+}
+
+static void T(rays)(const T(Camera) *c, int n, const R *a, const R *b, const I *ok, R *x, R *y, R *z) {
+    ALIGNED R p[BLOCK], q[BLOCK], factor[BLOCK];
+    if (c->way == INVERTED) T(angles)(c, n, a, b, p, q, factor, NULL), a = p, b = q;
+    if (c->swapped) T(rays_of)(c, n, b, a, ok, y, x, z);
+    else T(rays_of)(c, n, a, b, ok, x, y, z);
+}
+
+INLINE void T(unrays_by)(const T(Camera) *c, const int way, int n, const R *restrict a, const R *restrict b,
+                         const R *restrict gx, const R *restrict gy, const R *restrict gz, R *restrict ga, R *restrict gb) {
+    const T(Chart) k = c->chart;
+    EACH(i) T(to_ray_vjp)(k, way, a[i], b[i], gx[i], gy[i], gz[i], ga + i, gb + i);
+}
+
+static NOT_INLINE void T(unrays_of)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b,
+                                    const R *restrict gx, const R *restrict gy, const R *restrict gz, R *restrict ga,
+                                    R *restrict gb) {
+    EACH_WAY(c->way, T(unrays_by)(c, way, n, a, b, gx, gy, gz, ga, gb))
+}
+
+/* The cotangents of points of the plane of those of their rays. Adds those of the chart's numbers */
+static void T(rays_vjp)(const T(Camera) *c, int n, const R *a, const R *b, const R *gx, const R *gy, const R *gz,
+                        R *ga, R *gb, double *sums) {
+    if (c->way != INVERTED) {
+        if (c->swapped) T(unrays_of)(c, n, b, a, gy, gx, gz, gb, ga);
+        else T(unrays_of)(c, n, a, b, gx, gy, gz, ga, gb);
+        if (sums) T(to_ray_sums)(c, n, a, b, gx, gy, gz, sums);
+        return;
+    }
+    ALIGNED R p[BLOCK], q[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK], gp[BLOCK], gq[BLOCK];
+    T(angles)(c, n, a, b, p, q, factor, slope);
+    T(unrays_of)(c, n, p, q, gx, gy, gz, gp, gq);
+    EACH(i) {
+        const R along = gp[i] * a[i] + gq[i] * b[i];
+        t[i] = a[i] * a[i] + b[i] * b[i];
+        ga[i] = gp[i] * factor[i] + a[i] * 2 * slope[i] * along, gb[i] = gq[i] * factor[i] + b[i] * 2 * slope[i] * along;
+        gp[i] = along;
+    }
+    if (sums) T(radial_sums)(c->factors, n, t, gp, sums);
+}
+
+INLINE void T(cover_by)(const T(Camera) *c, const int way, int n, R *restrict a, R *restrict b, const I *restrict known,
+                        I *restrict ok) {
+    const T(Chart) k = c->chart;
+    EACH(i) {
+        const I is_on = known[i] & T(on_plane)(k, way, a[i], b[i]);
+        ok[i] = is_on, a[i] = is_on ? a[i] : 0, b[i] = is_on ? b[i] : 0;
+    }
+}
+
+static NOT_INLINE void T(cover_of)(const T(Camera) *c, int n, R *restrict a, R *restrict b, const I *restrict known,
+                                   I *restrict ok) {
+    EACH_WAY(c->way, T(cover_by)(c, way, n, a, b, known, ok))
+}
+
+/* Of points of the plane, `ok` where they are known to be the image of a ray; the centre elsewhere */
+static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *ok) {
+    T(cover_of)(c, n, c->swapped ? b : a, c->swapped ? a : b, known, ok);
+    if (c->way != INVERTED) return;
+    const R inner2 = c->chart_inner2 * (1 - 64 * EPS), limit = c->chart_most2 * (1 - 128 * EPS);
+    const R before = limit < (R)(PI * PI) ? limit : (R)(PI * PI);
+    ALIGNED R p[BLOCK], q[BLOCK], factor[BLOCK];
+    EACH(i) {
+        ok[i] &= inner2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+        a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
+    }
+    T(angles)(c, n, a, b, p, q, factor, NULL);
+    EACH(i) {
+        ok[i] &= before - (p[i] * p[i] + q[i] * q[i]) > 0;
+        a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
+    }
+}
+
 /* The step that a Jacobian sends to (du, dv), some finite one where it is singular; one over its determinant */
 INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
-    const R determinant = ua * vb - ub * va, one = 1 / (determinant + FLOOR / determinant);
+    const R determinant = ua * vb - ub * va, one = determinant / (determinant * determinant + FLOOR);
     *da = (vb * du - ub * dv) * one, *db = (ua * dv - va * du) * one;
     return one;
 }
@@ -236,28 +421,59 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
     }
 }
 
+INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, I ok) {
+    R da, db;
+    const R one = T(step)(ua, ub, va, vb, du, dv, &da, &db), p = *a + da, q = *b + db;
+    const I is_short = (EPS / 64 * (p * p + q * q + (R)0.01) - (da * da + db * db) > 0) & (T(absolute)(one) > 0);
+    *a = ok ? *a : p, *b = ok ? *b : q;
+    return ok | is_short;
+}
+
+/* A step of Newton's method for the stages from `first` on, of points that are not `ok`: are they now? */
+static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v,
+                           R *restrict a, R *restrict b, I *restrict ok) {
+    ALIGNED R x[BLOCK], y[BLOCK];
+    T(Jacobian) to;
+    if (first == c->stages && c->parts[first].kind == PLANAR) { /* most often */
+        ALIGNED R t[BLOCK];
+        const T(Plane) k = c->planes[first];
+        EACH(i) t[i] = a[i] * a[i] + b[i] * b[i];
+        T(radial)(c->factors + first, n, t, x, y);
+        EACH(i) {
+            R p, q, ua, ub, va, vb;
+            T(planar_at)(k, a[i], b[i], x[i], &p, &q);
+            T(planar_slopes)(k, a[i], b[i], x[i], y[i], &ua, &ub, &va, &vb);
+            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, ok[i]);
+        }
+        return;
+    }
+    T(lens)(c, first, n, a, b, x, y, &to, NULL);
+    EACH(i)
+        ok[i] = T(step_of)(a + i, b + i, u[i] - x[i], v[i] - y[i], to.ua[i], to.ub[i], to.va[i], to.vb[i], ok[i]);
+}
+
 /* Newton's method for the stages from `first` on, wherever that leads; `ok` where the next step would be nothing */
 static void T(newton)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v, R *restrict a,
                       R *restrict b, I *restrict ok, int fewest) {
-    ALIGNED R x[BLOCK], y[BLOCK];
-    ALIGNED I regular[BLOCK];
-    T(Jacobian) to;
-    EACH(i) ok[i] = 0, regular[i] = 0;
-    for (int count = 1; count <= MOST_STEPS; count++) {
+    int places[BLOCK], some = n, count = 0;
+    while (count < MOST_STEPS && some > n / 4) { /* few are left to a block of their own */
+        if (count < fewest) EACH(i) ok[i] = 0;
+        T(newton_step)(c, first, n, u, v, a, b, ok);
+        if (++count >= fewest) some = T(chosen)(n, ok, places);
+    }
+    if (!some || count == MOST_STEPS) return;
+    ALIGNED R p[BLOCK], q[BLOCK], x[BLOCK], y[BLOCK];
+    ALIGNED I done[BLOCK];
+    const int filled = (some + LANES - 1) & -LANES;
+    for (int i = 0; i < filled; i++)
+        p[i] = u[places[i]], q[i] = v[places[i]], x[i] = a[places[i]], y[i] = b[places[i]], done[i] = 0;
+    while (count++ < MOST_STEPS) {
         I all = 1;
-        T(lens)(c, first, n, a, b, x, y, &to, NULL);
-        EACH(i) {
-            R da, db;
-            const R one = T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], u[i] - x[i], v[i] - y[i], &da, &db);
-            a[i] = ok[i] ? a[i] : a[i] + da, b[i] = ok[i] ? b[i] : b[i] + db;
-            const R t = a[i] * a[i] + b[i] * b[i];
-            ok[i] |= (EPS / 64 * (t + (R)0.01) - (da * da + db * db) > 0) & (count >= fewest);
-            regular[i] = T(absolute)(one) > 0;
-        }
-        EACH(i) all &= ok[i];
+        T(newton_step)(c, first, filled, p, q, x, y, done);
+        for (int i = 0; i < filled; i++) all &= done[i];
         if (all) break;
     }
-    EACH(i) ok[i] &= regular[i];
+    for (int i = 0; i < some; i++) a[places[i]] = x[i], b[places[i]] = y[i], ok[places[i]] = done[i];
 }
 
 /* By the radial factor of the first stage alone: where it sends points to (p, q); `possible` within the fold's image */
@@ -271,7 +487,7 @@ static void T(invert_radial)(const T(Camera) *c, int n, const R *restrict p, con
         /* what is beyond the fold would never settle */
         r2[i] = possible[i] ? square < most2 ? square : most2 : 0;
     }
-    T(solve)(c->parts + 1, c->numbers[1], c->constants, c->table, n, r2, scale, ok);
+    T(solve)(c->factors + 1, c->table, n, r2, scale, ok);
     /* a ray's rounding must not carry it across the fold */
     const R inside2 = c->inner2 * (1 - 32 * EPS);
     EACH(i) {
@@ -303,11 +519,11 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             possible[i] = within[i] & (possible[i] | !known[i]);
         }
     } else {
-        ALIGNED R r2[BLOCK], scale[BLOCK];
         const int has_table = c->table != NULL;
         const R usual2 = c->usual2;
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
+            ALIGNED R r2[BLOCK], scale[BLOCK];
             EACH(i) r2[i] = a[i] * a[i] + b[i] * b[i] < INFINITY ? a[i] * a[i] + b[i] * b[i] : 0;
             T(tabulated)(c->table, n, r2, scale);
             EACH(i) a[i] *= scale[i], b[i] *= scale[i];
@@ -321,8 +537,8 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
 static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
                       I *restrict ok) {
     const R fold2 = c->inner2 * (1 - 64 * EPS), inner2 = c->inner2, most2 = c->table[1] * (1 + 64 * EPS);
-    ALIGNED R p[BLOCK], q[BLOCK], r2[BLOCK], scale[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK], stretch[BLOCK];
-    ALIGNED I covered[BLOCK];
+    ALIGNED R p[BLOCK], q[BLOCK], r2[BLOCK], scale[BLOCK], x[BLOCK], y[BLOCK], stretch[BLOCK];
+    T(Seen) s;
     T(Jacobian) to;
     EACH(i) p[i] = u[i], q[i] = v[i], ok[i] = 1;
     if (!c->is_radial) {
@@ -341,7 +557,7 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
         }
     }
     EACH(i) r2[i] = p[i] * p[i] + q[i] * q[i];
-    T(bracketed)(c->parts + 1, c->numbers[1], c->constants, fold2, n, r2, scale);
+    T(bracketed)(c->factors + 1, fold2, n, r2, scale);
     EACH(i) a[i] = p[i] * scale[i], b[i] = q[i] * scale[i], ok[i] &= a[i] * a[i] + b[i] * b[i] < inner2;
     T(lens)(c, 1, n, a, b, x, y, &to, NULL);
     EACH(i) {
@@ -358,13 +574,10 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
         T(lens)(c, 1, n, a, b, x, y, NULL, NULL);
     }
     /* next to a fold the polished solution may lie on its other side: what counts is where its ray is seen */
-    T(to_ray)(c, n, a, b, x, y, z);
-    T(to_plane)(c, n, x, y, z, p, q, scale, covered);
-    EACH(i) {
-        ok[i] &= covered[i] & (p[i] * p[i] + q[i] * q[i] < inner2);
-        p[i] = ok[i] ? p[i] : 0, q[i] = ok[i] ? q[i] : 0;
-    }
-    T(lens)(c, 1, n, p, q, x, y, NULL, NULL);
+    T(rays)(c, n, a, b, ok, s.x, s.y, s.z);
+    T(see)(c, 0, n, n, &s);
+    EACH(i) ok[i] &= s.ok[i] == 1;
+    T(lens)(c, 1, n, s.a, s.b, x, y, NULL, NULL);
     EACH(i) {
         const R du = T(absolute)(x[i] - u[i]), dv = T(absolute)(y[i] - v[i]);
         const R far = T(absolute)(u[i]) > T(absolute)(v[i]) ? T(absolute)(u[i]) : T(absolute)(v[i]);
@@ -375,7 +588,7 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
 
 /* How many are left OPEN */
 static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
-    const int n = (count + LANES - 1) & -LANES;
+    const int n = (count + LANES - 1) & -LANES, follows = c->follows;
     const int64_t *from = rows->row_strides, *to = rows->result_strides;
     const R *pixels = (const R *)rows->rows + camera * from[0] + first * from[1];
     R *rays = (R *)rows->results + camera * to[0] + first * to[1];
@@ -384,50 +597,44 @@ static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, in
     ALIGNED I ok[BLOCK], known[BLOCK], possible[BLOCK];
     int left = 0;
     T(load_pixels)(pixels, from, count, n, u, v, c->cx, c->cy);
-    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
+    const R by_fx = 1 / c->fx, by_fy = 1 / c->fy, cx = c->cx, cy = c->cy;
     const I usable = c->usable;
     EACH(i) {
-        const R p = (u[i] - cx) / fx, q = (v[i] - cy) / fy;
+        const R p = (u[i] - cx) * by_fx, q = (v[i] - cy) * by_fy;
         known[i] = (T(absolute)(p) < SQUARABLE) & (T(absolute)(q) < SQUARABLE) & usable;
         u[i] = known[i] ? p : 0, v[i] = known[i] ? q : 0;
     }
-    if (!c->stages) {
-        T(on_plane)(c, n, u, v, ok);
-        EACH(i) a[i] = u[i], b[i] = v[i], possible[i] = ok[i];
-    } else {
+    if (c->stages) {
+        int places[BLOCK], some;
         T(invert)(c, n, u, v, a, b, ok, possible);
-        if (c->is_radial || c->by_stages) {
-            int places[BLOCK], some;
-            EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
-            if ((some = T(chosen)(n, possible, places))) {
-                ALIGNED R p[BLOCK], q[BLOCK], found_a[BLOCK], found_b[BLOCK];
-                ALIGNED I found[BLOCK];
-                const int filled = (some + LANES - 1) & -LANES;
-                for (int i = 0; i < filled; i++) p[i] = u[places[i]], q[i] = v[places[i]];
-                T(search)(c, filled, p, q, found_a, found_b, found);
-                for (int i = 0; i < some; i++)
-                    a[places[i]] = found_a[i], b[places[i]] = found_b[i], ok[places[i]] = found[i];
-            }
-            EACH(i) possible[i] = ok[i];
+        if (!follows) EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
+        if (!follows && (some = T(chosen)(n, possible, places))) {
+            ALIGNED R found_a[BLOCK], found_b[BLOCK];
+            ALIGNED I found[BLOCK];
+            const int filled = (some + LANES - 1) & -LANES;
+            for (int i = 0; i < filled; i++) x[i] = u[places[i]], y[i] = v[places[i]];
+            T(search)(c, filled, x, y, found_a, found_b, found);
+            for (int i = 0; i < some; i++)
+                a[places[i]] = found_a[i], b[places[i]] = found_b[i], ok[places[i]] = found[i];
         }
-    }
-    EACH(i) {
-        ok[i] &= known[i];
-        a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
-    }
-    T(to_ray)(c, n, a, b, x, y, z);
-    EACH(i) x[i] = ok[i] ? x[i] : 0, y[i] = ok[i] ? y[i] : 0, z[i] = ok[i] ? z[i] : 1;
-    T(store)(rays, to[1], count, x);
-    T(store)(rays + to[2], to[1], count, y);
-    T(store)(rays + 2 * to[2], to[1], count, z);
-    for (int i = 0; i < count; i++) {
-        const int open = !ok[i] & (possible[i] != 0) & (known[i] != 0);
-        valid[i] = ok[i] ? VALID : open ? OPEN : 0, left += open;
-    }
+        EACH(i) {
+            ok[i] &= known[i];
+            u[i] = ok[i] ? a[i] : 0, v[i] = ok[i] ? b[i] : 0;
+        }
+    } else T(cover)(c, n, u, v, known, ok);
+    const int direct = T(is_plane)(to, count, n);
+    R *p = direct ? rays : x, *q = direct ? rays + to[2] : y, *r = direct ? rays + 2 * to[2] : z;
+    T(rays)(c, n, u, v, ok, p, q, r);
+    if (!direct) T(store)(rays, to, 3, count, p, q, r);
+    if (follows)
+        for (int i = 0; i < count; i++) {
+            const int open = !ok[i] & (known[i] != 0);
+            valid[i] = ok[i] ? VALID : open ? OPEN : 0, left += open;
+        }
+    else for (int i = 0; i < count; i++) valid[i] = (uint8_t)ok[i];
     if (rows->solution) {
-        R *solution = (R *)rows->solution + camera * rows->count + first;
-        T(store)(solution, 1, count, a);
-        T(store)(solution + rows->cameras->cameras * rows->count, 1, count, b);
+        const int64_t planes[3] = {0, 1, rows->cameras->cameras * rows->count};
+        T(store)((R *)rows->solution + camera * rows->count + first, planes, 2, count, u, v, NULL);
     }
     return left;
 }
@@ -440,19 +647,20 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     const R *cotangents = (const R *)rows->cotangents + camera * by[0] + first * by[1];
     const R *solution = (const R *)rows->solution + camera * rows->count + first;
     const uint8_t *valid = rows->valid + camera * rows->count + first;
-    ALIGNED R a[BLOCK], b[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], ga[BLOCK], gb[BLOCK], u[BLOCK], v[BLOCK];
-    T(load)(solution, 1, count, n, a, 0);
-    T(load)(solution + rows->cameras->cameras * rows->count, 1, count, n, b, 0);
-    T(load)(cotangents, by[1], count, n, gx, 0);
-    T(load)(cotangents + by[2], by[1], count, n, gy, 0);
-    T(load)(cotangents + 2 * by[2], by[1], count, n, gz, 0);
-    for (int i = 0; i < count; i++)
-        if (valid[i] != VALID) gx[i] = gy[i] = gz[i] = 0;
-    T(to_ray_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 : NULL);
-    EACH(i) u[i] = a[i], v[i] = b[i];
+    ALIGNED R p[BLOCK], q[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], ga[BLOCK], gb[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
+    const R *a = T(load)(solution, 1, count, n, p, 0), *u = a;
+    const R *b = T(load)(solution + rows->cameras->cameras * rows->count, 1, count, n, q, 0), *v = b;
+    const R *to_x = T(load)(cotangents, by[1], count, n, x, 0), *to_y = T(load)(cotangents + by[2], by[1], count, n, y, 0);
+    const R *to_z = T(load)(cotangents + 2 * by[2], by[1], count, n, z, 0);
+    for (int i = 0; i < count; i++) {
+        const int is_known = valid[i] == VALID;
+        gx[i] = is_known ? to_x[i] : 0, gy[i] = is_known ? to_y[i] : 0, gz[i] = is_known ? to_z[i] : 0;
+    }
+    for (int i = count; i < n; i++) gx[i] = gy[i] = gz[i] = 0;
+    T(rays_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 : NULL);
     if (c->stages) {
         T(Jacobian) jacobian;
-        T(lens)(c, 1, n, a, b, u, v, &jacobian, NULL);
+        T(lens)(c, 1, n, a, b, x, y, &jacobian, NULL), u = x, v = y;
         EACH(i) {
             R da, db;
             T(step)(jacobian.ua[i], jacobian.va[i], jacobian.ub[i], jacobian.vb[i], ga[i], gb[i], &da, &db);
@@ -461,29 +669,44 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
         }
         if (sums) T(lens_vjp)(c, n, a, b, gx, gy, sums + 4);
     }
-    const R fx = c->fx, fy = c->fy;
-    EACH(i) ga[i] /= fx, gb[i] /= fy;
+    const R by_fx = 1 / c->fx, by_fy = 1 / c->fy;
+    EACH(i) ga[i] *= by_fx, gb[i] *= by_fy;
     if (sums) {
         sums[0] -= T(dot)(n, ga, u), sums[1] -= T(dot)(n, gb, v);
         sums[2] -= T(total)(n, ga), sums[3] -= T(total)(n, gb);
     }
-    if (!rows->results) return;
-    R *results = (R *)rows->results + camera * to[0] + first * to[1];
-    T(store)(results, to[1], count, ga);
-    T(store)(results + to[2], to[1], count, gb);
+    if (rows->results) T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 2, count, ga, gb, NULL);
 }
 
-static int64_t T(rows)(Rows *rows) {
+/* Asks for the memory of rows that come next, while others are computed */
+static void T(fetch)(const void *memory, const int64_t *strides, int components, int64_t camera, int64_t first, int64_t count) {
+#if defined(__GNUC__)
+    const int64_t bytes = count * strides[1] * (int64_t)sizeof(R);
+    if (!memory || strides[1] < 1 || strides[1] > 16) return;
+    const char *from = (const char *)((const R *)memory + camera * strides[0] + first * strides[1]);
+    for (int j = 0; j < (strides[2] == 1 ? 1 : components); j++)
+        for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(from + j * strides[2] * (int64_t)sizeof(R) + i);
+#else
+    (void)memory, (void)strides, (void)components, (void)camera, (void)first, (void)count;
+#endif
+}
+
+static int64_t T(rows)(const Rows *rows) {
     const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
-    int64_t left = 0, last = -1, at;
+    int64_t left = 0, last = -1, own = 0, at;
     T(Camera) camera;
-    while ((at = taken(rows)) < tiles * rows->cameras->cameras) {
+    while ((at = taken(rows, &own)) < tiles * rows->cameras->cameras) {
         const int64_t index = at / tiles, first = at % tiles * rows->tile;
         const int64_t end = first + rows->tile < rows->count ? first + rows->tile : rows->count;
         double *sums = rows->sums ? rows->sums + at * width : NULL;
         if (index != last) T(prepare)(rows->cameras, last = index, &camera);
         for (int64_t i = first; i < end; i += BLOCK) {
             const int count = (int)(end - i < BLOCK ? end - i : BLOCK);
+            const int64_t next = i + BLOCK, after = end - next < BLOCK ? end - next : BLOCK;
+            if (after > 0) {
+                T(fetch)(rows->rows, rows->row_strides, 3 - rows->direction % 2, index, next, after);
+                T(fetch)(rows->cotangents, rows->cotangent_strides, 2 + rows->direction % 2, index, next, after);
+            }
             switch (rows->direction) {
             case PROJECT: left += T(project)(&camera, rows, index, i, count); break;
             case UNPROJECT: left += T(unproject)(&camera, rows, index, i, count); break;

@@ -9,11 +9,9 @@ from contextlib import nullcontext
 import torch
 from torch import Tensor
 
-from camtorch._arguments import holds
 from camtorch._portable import is_portable_export, times
-from camtorch._tracing import has_tangent, is_fake, may_look, set_aside
-from camtorch.optics.charts import Chart, Equidistant, Planes2, Planes3, even_steps_and_ratios
-from camtorch.optics.lens import Planar
+from camtorch._tracing import is_fake, set_aside
+from camtorch.optics.charts import Chart, Equidistant, Planes3, even_steps_and_ratios
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse
 
@@ -54,17 +52,10 @@ class Inverted(Chart):
         before = times(self._inverse.most2, 1 - 32 * torch.finfo(z.dtype).eps) - theta2
         return torch.minimum(Equidistant().margin(x, y, z), before)
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        most2 = self._inverse.most2
-        return holds(most2 > (math.pi / 2) ** 2)
-
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         angle = Equidistant().scale(x, y, z, order)
         theta2 = torch.minimum(torch.addcmul(x * x, y, y) * angle * angle, self._inverse.most2)
-        found = self._inverse(theta2.detach())
-        if torch.is_grad_enabled() or not may_look(x) or any(map(has_tangent, (x, y, z, *self.parameters))):
-            found = self._attached(found, theta2, order)
-        return angle * found
+        return angle * self._attached(self._inverse(theta2.detach()), theta2, order)
 
     def _attached(self, scale: Tensor, theta2: Tensor, order: int) -> Tensor:
         """The solution of s R(theta2 s^2) = 1 with its derivatives, as `solve.attach` does it."""
@@ -76,21 +67,6 @@ class Inverted(Chart):
         for _ in range(max(order, 1)):
             scale = scale + (1 - scale * radial(theta2 * scale * scale)) * step
         return scale
-
-    def to_plane_vjp(
-        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
-    ) -> tuple[Planes3, list[Tensor]]:
-        assert scale is not None  # this chart has one
-        rho2 = torch.addcmul(x * x, y, y)
-        t = rho2 * scale * scale
-        factor, slope = self._radial.derivatives(t, 1)
-        by_angle = torch.addcmul(factor, t, slope, value=2).reciprocal()
-        along = torch.addcmul(ga * x, gb, y)
-        gz = -along * by_angle / torch.addcmul(rho2, z, z)
-        # along times twice the derivative of the scale by rho2; what cancels at the axis is multiplied by rho2
-        outwards = torch.addcmul(gz * z, along, scale) / -(rho2 + torch.finfo(z.dtype).tiny ** 0.5)
-        ray = torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz
-        return ray, self._radial.vjp(t, -along * scale * by_angle) if want_parameters else []
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         t = torch.addcmul(a * a, b, b)
@@ -104,13 +80,6 @@ class Inverted(Chart):
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         factor = self._radial(torch.addcmul(a * a, b, b))
         return Equidistant().to_ray(a * factor, b * factor, order)
-
-    def to_ray_vjp(
-        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
-    ) -> tuple[Planes2, list[Tensor]]:
-        at = Planar(self._radial).at(a, b)
-        (ga, gb), _ = Equidistant().to_ray_vjp(*at.value, gx, gy, gz, False)
-        return at.vjp(ga, gb, want_parameters)
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
         inverse = self._inverse

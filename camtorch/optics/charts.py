@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from camtorch._portable import plus
-from camtorch.optics.derivatives import vjp_of
 from camtorch.optics.special import angle_per_radius, atan2, cos_root, sinc_root, tanc_root
 
 Planes2 = tuple[Tensor, Tensor]
@@ -38,15 +37,14 @@ class Chart:
 
     The axis (0, 0, 1) is covered by every chart and lies at (0, 0).
 
-    Margins are positive where something holds. Methods named `vjp` turn the cotangents of a result into those of
-    what it was made from, to first order, with less work than autograd has.
+    Margins are positive where something holds.
     """
 
     has_scale = True
     """Whether the plane point is (x, y) times a `scale`."""
 
     parameters: tuple[Tensor, ...] = ()
-    """What the formulas learn: columns that broadcast against planes, in the order of their cotangents.
+    """What the formulas learn: columns that broadcast against planes.
 
     The formulas read them here, and nothing else that depends on the coefficients.
     """
@@ -55,29 +53,15 @@ class Chart:
         """Positive for the rays that this chart has a point for."""
         raise NotImplementedError
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        """Whether rays with z >= nearest > 0 and no component larger than `extent` are certainly covered."""
-        raise NotImplementedError
-
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor | None:
         """The factor by which (x, y) become the plane point, where that is all the chart does; see `to_plane`."""
         return None
 
-    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
-        """The plane point of covered rays; the derivatives of that order shall be exact, on the axis too.
-
-        scale: that of these rays, where there is one and it is known already.
-        """
-        scale = self.scale(x, y, z, order) if scale is None else scale
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
+        """The plane point of covered rays; the derivatives of that order shall be exact, on the axis too."""
+        scale = self.scale(x, y, z, order)
         assert scale is not None  # a chart that has none has a `to_plane` of its own
         return x * scale, y * scale
-
-    def to_plane_vjp(
-        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
-    ) -> tuple[Planes3, list[Tensor]]:
-        """The cotangents of a covered ray and of the parameters, these summed over the rays, of that of its point."""
-        (gx, gy, gz), sums = vjp_of(self, _to_plane, (x, y, z), (ga, gb), want_parameters)
-        return (gx, gy, gz), sums
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         """Positive for the points of the plane that are the image of a ray."""
@@ -86,13 +70,6 @@ class Chart:
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         """The unit ray of points on the plane; see `to_plane`."""
         raise NotImplementedError
-
-    def to_ray_vjp(
-        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
-    ) -> tuple[Planes2, list[Tensor]]:
-        """The cotangents of a point on the plane and of the parameters, these summed, of the cotangent of its ray."""
-        (ga, gb), sums = vjp_of(self, _to_ray, (a, b), (gx, gy, gz), want_parameters)
-        return (ga, gb), sums
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
         """The radius on the plane at which the chart ends, one or (C, 1). Only charts that a lens follows need it."""
@@ -108,14 +85,6 @@ class Chart:
         Half of them in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree.
         """
         raise NotImplementedError
-
-
-def _to_plane(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> Planes2:
-    return chart.to_plane(x, y, z, order=1)
-
-
-def _to_ray(chart: Chart, a: Tensor, b: Tensor) -> Planes3:
-    return chart.to_ray(a, b, order=1)
 
 
 def even_steps_and_ratios(
@@ -144,18 +113,8 @@ class Perspective(Chart):
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return self.end(z.dtype) * z - torch.maximum(x.abs(), y.abs())
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return self.end(dtype) * nearest > extent
-
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         return z.reciprocal()
-
-    def to_plane_vjp(
-        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
-    ) -> tuple[Planes3, list[Tensor]]:
-        assert scale is not None  # this chart has one
-        gx, gy = ga * scale, gb * scale
-        return (gx, gy, torch.addcmul(gx * x, gy, y) * -scale), []
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return self.end(a.dtype) - torch.maximum(a.abs(), b.abs())
@@ -163,13 +122,6 @@ class Perspective(Chart):
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         z = torch.addcmul(a * a + 1, b, b).rsqrt()
         return a * z, b * z, z
-
-    def to_ray_vjp(
-        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
-    ) -> tuple[Planes2, list[Tensor]]:
-        z = torch.addcmul(a * a + 1, b, b).rsqrt()
-        along = z * z * torch.addcmul(torch.addcmul(gz, gx, a), gy, b)
-        return (z * (gx - along * a), z * (gy - along * b)), []
 
     def radii(self, count: int, like: Tensor) -> Tensor:
         return even_steps_and_ratios(count, math.radians(88), self.end(like.dtype), like, torch.tan)
@@ -183,26 +135,12 @@ class Equidistant(Chart):
         floor = floor_of(z.dtype) / torch.finfo(z.dtype).eps
         return torch.maximum(z, torch.addcmul(plus(x * x, -floor), y, y))
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return True
-
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         rho2 = torch.addcmul(x * x, y, y)
         if order > 1:
             return angle_per_radius(rho2, z)
         rho = plus(rho2, floor_of(z.dtype)).sqrt()
         return atan2(rho, z) / rho
-
-    def to_plane_vjp(
-        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
-    ) -> tuple[Planes3, list[Tensor]]:
-        assert scale is not None  # this chart has one
-        rho2 = torch.addcmul(x * x, y, y)
-        along = torch.addcmul(ga * x, gb, y)
-        gz = -along / torch.addcmul(rho2, z, z)
-        # along times twice the derivative of the scale by rho2; what cancels at the axis is multiplied by rho2
-        outwards = torch.addcmul(gz * z, along, scale) / -(rho2 + floor_of(z.dtype))
-        return (torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz), []
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return math.pi**2 - torch.addcmul(a * a, b, b)
@@ -211,14 +149,6 @@ class Equidistant(Chart):
         theta2 = torch.addcmul(a * a, b, b)
         sinc, cos = self._turned(theta2, order)
         return a * sinc, b * sinc, cos
-
-    def to_ray_vjp(
-        self, a: Tensor, b: Tensor, gx: Tensor, gy: Tensor, gz: Tensor, want_parameters: bool
-    ) -> tuple[Planes2, list[Tensor]]:
-        theta2 = torch.addcmul(a * a, b, b)
-        sinc, cos = self._turned(theta2, 1)
-        along = torch.addcmul(gx * a, gy, b) * (cos - sinc) / (theta2 + floor_of(a.dtype)) - gz * sinc
-        return (torch.addcmul(gx * sinc, a, along), torch.addcmul(gy * sinc, b, along)), []
 
     @staticmethod
     def _turned(theta2: Tensor, order: int) -> Planes2:
@@ -260,10 +190,7 @@ class CylinderChart(Chart):
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return Perspective().end(y.dtype) * torch.maximum(x.abs(), z.abs()) - y.abs()
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return Perspective().end(dtype) * nearest > extent
-
-    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
         return atan2(x, z), y * (x * x + z * z).rsqrt()
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
@@ -281,10 +208,7 @@ class SphereChart(Chart):
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return plus(x * x + z * z, -floor_of(y.dtype))
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return True
-
-    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
         return atan2(x, z), atan2(y, (x * x + z * z).sqrt())
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
@@ -306,10 +230,7 @@ class Transverse(Chart):
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return self.chart.margin(y, x, z)
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return self.chart.covers_all(nearest, extent, dtype)
-
-    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2, scale: Tensor | None = None) -> Planes2:
+    def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
         b, a = self.chart.to_plane(y, x, z, order)
         return a, b
 
@@ -337,9 +258,6 @@ class Equisolid(Chart):
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return Equidistant().margin(x, y, z)
-
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return True
 
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         rho2, distance = _length(x, y, z)
@@ -384,9 +302,6 @@ class Fov(Chart):
         # behind the plane of the camera r is up to pi / omega
         return torch.maximum(ahead, torch.minimum(around, omega * omega * most**2 - math.pi**2))
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return Perspective().end(dtype) * nearest > extent
-
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         slope, tan2 = self._slope()
         return slope * angle_per_radius(tan2 * torch.addcmul(x * x, y, y), z, order)
@@ -419,9 +334,6 @@ class OneDivision(Chart):
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         below, square = self._below(x, y, z)
         return torch.minimum(Perspective().end(z.dtype) / 2 * below - torch.maximum(x.abs(), y.abs()), square)
-
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return False
 
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         return 2 / self._below(x, y, z)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
@@ -11,32 +11,6 @@ import torch
 from torch import Tensor
 
 from camtorch._tracing import in_transform, is_concrete
-
-
-def vjp_of(
-    part: Any,
-    formula: Callable[..., Tensor | tuple[Tensor, ...]],
-    inputs: Sequence[Tensor],
-    cotangents: Sequence[Tensor],
-    want_parameters: bool,
-) -> tuple[tuple[Tensor, ...], list[Tensor]]:
-    """The cotangents of planes and of the parameters of a chart, a stage or a factor, these summed over the points.
-
-    Args:
-        part: it reads what it learns from its `parameters` alone.
-        formula: called with a copy of the part and the planes.
-        inputs: the planes.
-        cotangents: of what the formula returns.
-        want_parameters: whether theirs are asked for.
-    """
-    with _recorded():
-        learning = copy.copy(part)
-        learning.parameters = tuple(w.detach().requires_grad_(want_parameters) for w in part.parameters)
-        leaves = [w.detach().requires_grad_() for w in inputs]
-        wanted = leaves + (list(learning.parameters) if want_parameters else [])
-        results = formula(learning, *leaves)
-        gradients = torch.autograd.grad(results, wanted, cotangents, materialize_grads=True)
-    return gradients[: len(leaves)], list(gradients[len(leaves) :])
 
 
 def goes_forward(tensor: Tensor) -> bool:

@@ -2,7 +2,7 @@
 
 A stage is built from coefficient columns that broadcast against planes of points. `Planar` holds everything that is
 polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor. `stage.at(points)` has the value, the
-Jacobian, the orientation and the vjp, and computes once what they share.
+Jacobian and the orientation, and computes once what they share.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from camtorch._portable import hypot, running_max
-from camtorch.optics.derivatives import jacobian_of, vjp_of
-from camtorch.optics.radial import RadialFactor, total
+from camtorch.optics.derivatives import jacobian_of
+from camtorch.optics.radial import RadialFactor
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
@@ -46,7 +46,7 @@ class Stage:
     """
 
     parameters: tuple[Tensor, ...] = ()
-    """What the formula learns: columns that broadcast against planes, in the order of their cotangents.
+    """What the formula learns: columns that broadcast against planes.
 
     The formula reads them here, and nothing else that depends on the coefficients.
     """
@@ -126,20 +126,11 @@ class StageAt:
         orientation, margin = _orientation(self.jacobian), self.margin
         return orientation if margin is None else torch.minimum(orientation, margin)
 
-    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
-        """The cotangents of the point and of the parameters, these summed over the points."""
-        point, sums = vjp_of(self.stage, _value, (self.a, self.b), (gu, gv), want_parameters)
-        return (point[0], point[1]), sums
-
 
 def _orientation(jacobian: Jacobian) -> Tensor:
     ua, ub, va, vb = jacobian
     # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
     return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
-
-
-def _value(stage: Stage, a: Tensor, b: Tensor) -> Planes2:
-    return stage(a, b)
 
 
 @dataclass
@@ -257,35 +248,6 @@ class PlanarAt(StageAt):
     def margin(self) -> Tensor | None:
         return self.stage.radial.margin(self.t) if self.stage.radial else None
 
-    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
-        """The cotangents of the point and of the parameters, these summed over the points."""
-        stage, a, b, t = self.stage, self.a, self.b, self.t
-        along = torch.addcmul(gu * a, gv, b)
-        ga, gb = (gu * self.factor, gv * self.factor) if stage.radial else (gu, gv)
-        # what goes along m
-        outwards = along * self.slope * 2 if stage.radial else torch.zeros_like(t)
-        if stage.tangential:
-            px, py = (2 * p for p in stage.tangential)
-            outwards = torch.addcmul(torch.addcmul(outwards, gu, px), gv, py)
-            ga = torch.addcmul(torch.addcmul(ga, gu, self.twice_dot), along, px)
-            gb = torch.addcmul(torch.addcmul(gb, gv, self.twice_dot), along, py)
-        if stage.prism:
-            s0, s1, s2, s3 = stage.prism
-            outwards = torch.addcmul(outwards, gu, (4 * s1) * t + 2 * s0)
-            outwards = torch.addcmul(outwards, gv, (4 * s3) * t + 2 * s2)
-        point = torch.addcmul(ga, a, outwards), torch.addcmul(gb, b, outwards)
-        if not want_parameters:
-            return point, []
-        sums = stage.radial.vjp(t, along) if stage.radial else []
-        if stage.tangential or stage.prism:
-            gu, gv = gu * t, gv * t
-            even = total(gu), total(gv)
-        if stage.tangential:
-            sums += [even[0] + 2 * total(along * a), even[1] + 2 * total(along * b)]
-        if stage.prism:
-            sums += [even[0], total(gu * t), even[1], total(gv * t)]
-        return point, sums
-
 
 class Tilt(Stage):
     """The homography of a sensor tilted by (tau_x, tau_y) radians.
@@ -368,20 +330,6 @@ class TiltAt(StageAt):
         # before the horizon
         return self.depth
 
-    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
-        """The cotangents of the point and of the nine entries of R, these summed over the points."""
-        ua, ub, va, vb = self.jacobian
-        point = torch.addcmul(ua * gu, va, gv), torch.addcmul(ub * gu, vb, gv)
-        if not want_parameters:
-            return point, []
-        r22 = self.stage.parameters[-1]
-        gx, gy = gu * self.reciprocal, gv * self.reciprocal
-        by_depth = -(gx * self.u + gy * self.v)
-        sums = [total(w * c) for w in (r22 * gx, r22 * gy, by_depth) for c in (self.a, self.b, torch.ones_like(self.a))]
-        sums[2], sums[5] = sums[2] - total(gu), sums[5] - total(gv)
-        sums[8] = sums[8] + total(gu * self.u + gv * self.v) / r22
-        return point, sums
-
 
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
@@ -401,7 +349,7 @@ class Lens:
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
-        """Those of all stages, in the order in which `vjp` gives their cotangents."""
+        """Those of all stages."""
         return tuple(p for stage in self.stages for p in stage.parameters)
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
@@ -466,11 +414,3 @@ class LensAt:
         for stage in self.stages[1:]:
             least = torch.minimum(least, stage.orientation)
         return least
-
-    def vjp(self, gu: Tensor, gv: Tensor, want_parameters: bool = True) -> tuple[Planes2, list[Tensor]]:
-        """The cotangents of the point and of the parameters, these summed over the points."""
-        sums: list[Tensor] = []
-        for stage in reversed(self.stages):
-            (gu, gv), here = stage.vjp(gu, gv, want_parameters)
-            sums = here + sums
-        return (gu, gv), sums

@@ -11,13 +11,8 @@ from torch import Tensor
 
 from camtorch._portable import leading, pick, piece_of, plus, solve_tridiagonal, unbound
 from camtorch._registry import register
-from camtorch.optics.derivatives import derivatives_of, vjp_of
+from camtorch.optics.derivatives import derivatives_of
 from camtorch.optics.special import angle_per_radius, first_root, root
-
-
-def total(plane: Tensor) -> Tensor:
-    """(*B, N) -> (*B, 1)."""
-    return plane.sum(-1, keepdim=True)
 
 
 class RadialFactor:
@@ -29,7 +24,7 @@ class RadialFactor:
     name: str
     """That of the class in the registry."""
     parameters: tuple[Tensor, ...]
-    """What the formula learns, in the order in which `vjp` gives the cotangents."""
+    """What the formula learns."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -46,10 +41,6 @@ class RadialFactor:
         """R and its first `order` derivatives by t, up to two."""
         # each camera's own derivatives, also by points that all share
         return derivatives_of(self, torch.broadcast_tensors(t, *self.parameters)[0], order)
-
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each parameter c."""
-        return vjp_of(self, lambda factor, t: factor(t), (t,), (weight,), True)[1]
 
     def margin(self, t: Tensor) -> Tensor | None:
         """Positive where the factor is defined; None where it is so everywhere."""
@@ -107,14 +98,6 @@ class Polynomial(RadialFactor):
         """The first root of d(radius R)/d(radius)."""
         return first_root(*((2 * i + 3) * c for i, c in enumerate(self.parameters))).sqrt()
 
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient c."""
-        sums = []
-        for _ in self.parameters:
-            weight = weight * t
-            sums.append(total(weight))
-        return sums
-
 
 class Rational(RadialFactor):
     """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
@@ -153,12 +136,6 @@ class Rational(RadialFactor):
                 products[i + j] = products[i + j] + (1 + 2 * (i - j)) * above * below
         return torch.minimum(first_root(*products[1:]), first_root(*self.denominator.parameters)).sqrt()
 
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient."""
-        weight = weight / self.denominator(t)
-        above = self.numerator.vjp(t, weight)
-        return above + self.denominator.vjp(t, -weight * self(t))
-
 
 class RadiusPolynomial(RadialFactor):
     """The radial factor R(t) = 1 + c0 s + c1 s^2 + ... of s = radius = sqrt(t).
@@ -191,10 +168,6 @@ class RadiusPolynomial(RadialFactor):
         """The first root of d(radius R)/d(radius)."""
         return first_root(*((i + 2) * c for i, c in enumerate(self.parameters)))
 
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient c."""
-        return self.of_radius.vjp(root(t), weight)
-
 
 class AnglePerRadius(RadialFactor):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + c0 t + c1 t^2 + ... of t = r^2."""
@@ -223,11 +196,6 @@ class AnglePerRadius(RadialFactor):
     def closed_fold(self) -> Tensor:
         """The first root of D - 2 t D', to which d(theta)/d(radius) is in proportion."""
         return first_root(*(-(2 * i + 1) * c for i, c in enumerate(self.parameters))).sqrt()
-
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient c."""
-        ahead = self.ahead(t)
-        return self.ahead.vjp(t, -weight / torch.addcmul(t, ahead, ahead))
 
 
 class RadiusTable(RadialFactor):
@@ -296,16 +264,6 @@ class RadiusTable(RadialFactor):
             return factor, slope
         twice = (2 * second + 6 * offset * third - 2 * by_radius) / radius
         return factor, slope, (twice - 2 * slope) / (4 * radius * radius)
-
-    def vjp(self, t: Tensor, weight: Tensor) -> list[Tensor]:
-        """The sums over the points of dR/dc weight, for each coefficient c."""
-        radius, _, piece, offset = self._at(t)
-        weight, sums = weight / radius, []
-        for _ in self.cubics:
-            table = weight.new_zeros(*weight.shape[:-1], len(self.nodes)).scatter_add(-1, piece, weight)
-            sums += table.split(1, -1)
-            weight = weight * offset
-        return sums
 
 
 def _slopes(steps: Tensor, secants: Tensor) -> Tensor:

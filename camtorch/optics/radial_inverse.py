@@ -32,7 +32,7 @@ RADII = 1024
 """At how many radii a factor is followed to its fold."""
 _PARTS = 256  # of the interval in which a fold is looked for; twice, then the secant
 _NODES = 1024  # of the table of an inverse
-_LIMITING = 4  # steps of Newton's method towards the radius of the largest image, as at most nearly all need
+_LIMITING = 16  # roots of a radius, to one whose image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 MOST_STEPS = 5
 """Of Newton's method; what then still moves is left to slower methods."""
@@ -87,15 +87,20 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
     known = k.dtype == torch.float64 and not k.is_meta and not is_portable_export()
     if known and (fold := radial.closed_fold()) is not None:
         fold = fold.clamp(max=end)
+
+        def is_number(radius: Tensor) -> Tensor:
+            return radius * radial(radius * radius) <= most
+
+        if bool((good := is_number(fold)).all()):
+            return fold
+        low, high = fold, fold
         for _ in range(_LIMITING):
-            # the image ascends, so that its largest is the last; on logarithmic axes it is nearly straight out there
-            factor, slope = radial.derivatives(fold * fold, 1)
-            excess = fold * factor / most
-            if bool((excess <= 1).all()):
-                break
-            degree = 1 + 2 * fold * fold * slope / factor
-            fold = torch.where(excess > 1, fold * excess ** (-1 / degree), fold)
-        return fold
+            low = torch.where(good | is_number(low), low, torch.where(low > 2, low.sqrt(), low / 2))
+        for _ in range(64):
+            middle = low.sqrt() * high.sqrt()
+            inside = is_number(middle)
+            low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
+        return torch.where(good, fold, low)
 
     radii = sampled()
 

@@ -15,9 +15,7 @@ import torch
 from torch import Tensor
 
 from camtorch._portable import exported_atan2, is_portable_export, plus
-from camtorch._threads import ALONE, EVEN
 
-_PAIR = 32  # numbers of two vectors of 64 bytes, or a multiple
 # Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
 # them still has a first derivative good to 1e-13 of the function's own scale.
 _SMALL_ANGLE2 = 1e-2
@@ -75,22 +73,8 @@ def cosc_root(t: Tensor) -> Tensor:
 
 
 def atan2(y: Tensor, x: Tensor) -> Tensor:
-    """torch.atan2 of planes of one shape; outside of compiled code a number is rounded alike wherever it stands.
-
-    torch takes the last elements of each thread's part, fewer than two vectors, one by one, and rounds them otherwise.
-    """
-    if is_portable_export():
-        return exported_atan2(y, x)
-    count = y.numel()
-    if torch.compiler.is_compiling() or not y.is_cpu or count % (EVEN if count > ALONE else _PAIR) == 0:
-        return torch.atan2(y, x)
-    y, x, shape = y.reshape(-1), x.reshape(-1), y.shape
-    even = count // EVEN * EVEN if count > ALONE else 0
-    more = y.new_ones(-count % _PAIR)
-    if not even:
-        return torch.atan2(torch.cat((y, more)), torch.cat((x, more)))[:count].view(shape)
-    tail = torch.atan2(torch.cat((y[even:], more)), torch.cat((x[even:], more)))[: count - even]
-    return torch.cat((torch.atan2(y[:even], x[:even]), tail)).view(shape)
+    """torch.atan2, also for ONNX."""
+    return exported_atan2(y, x) if is_portable_export() else torch.atan2(y, x)
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:

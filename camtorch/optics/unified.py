@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from camtorch._arguments import holds
 from camtorch.optics.charts import Chart, Perspective, Planes3, even_steps_and_ratios, unit
-from camtorch.optics.radial import total
 
 
 class Unified(Chart):
@@ -37,13 +34,6 @@ class Unified(Chart):
         xi = parts.pop(0) if self.has_xi else None
         alpha = parts.pop(0) if self.fixed_alpha is None else self.fixed_alpha
         return xi, alpha, parts[0] if self.has_beta else None
-
-    @cached_property
-    def _is_tame(self) -> bool:
-        """Whether a look at the parameters shows that every ray with z > 0 is covered but for the largest angles."""
-        xi, alpha, _ = self._parts()
-        inside = 0 <= alpha <= 1 if isinstance(alpha, float) else holds((alpha >= 0) & (alpha <= 1))
-        return inside and (xi is None or holds(xi >= 0))
 
     def _shifted(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """x^2 + y^2, z', d' and d, that one only if it is needed."""
@@ -78,34 +68,9 @@ class Unified(Chart):
         margin = torch.minimum(margin, alpha * shifted + (1 - alpha) * sphere)
         return margin if xi is None or distance is None else torch.minimum(margin, torch.addcmul(distance, xi, z))
 
-    def covers_all(self, nearest: float, extent: float, dtype: torch.dtype) -> bool:
-        return self._is_tame and self._most(dtype) * nearest > extent
-
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         rho2, shifted, sphere, _ = self._shifted(x, y, z)
         return self._below(rho2, shifted, sphere).reciprocal()
-
-    def to_plane_vjp(
-        self, x: Tensor, y: Tensor, z: Tensor, ga: Tensor, gb: Tensor, scale: Tensor | None, want_parameters: bool
-    ) -> tuple[Planes3, list[Tensor]]:
-        assert scale is not None  # this chart has one
-        xi, alpha, beta = self._parts()
-        rho2, shifted, sphere, distance = self._shifted(x, y, z)
-        by_below = torch.addcmul(ga * x, gb, y) * -(scale * scale)
-        by_root = by_below * alpha / sphere
-        by_shifted = torch.addcmul(by_below * (1 - alpha), by_root, shifted)
-        outwards = by_root if beta is None else by_root * beta
-        gz = by_shifted
-        if xi is not None and distance is not None:
-            by_distance = by_shifted * xi / distance
-            outwards, gz = outwards + by_distance, torch.addcmul(by_shifted, by_distance, z)
-        ray = torch.addcmul(ga * scale, x, outwards), torch.addcmul(gb * scale, y, outwards), gz
-        sums: list[Tensor] = []
-        if want_parameters:
-            sums += [] if distance is None else [total(by_shifted * distance)]
-            sums += [total(by_below * (sphere - shifted))] if self.fixed_alpha is None else []
-            sums += [total(by_root * rho2) / 2] if self.has_beta else []
-        return ray, sums
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         xi, alpha, beta = self._parts()

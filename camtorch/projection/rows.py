@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,8 +19,6 @@ from camtorch.projection.ops import tables
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
-    from camtorch.optics.charts import Chart
-    from camtorch.optics.lens import Lens
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
@@ -34,24 +33,29 @@ class Cameras:
 
     given: tuple[Tensor, Tensor]
     intrinsics: Tensor
-    domain: Domain
+    k: Tensor
     usable: Tensor | None
 
     def __init__(self, model: type[Camera], intrinsics: Tensor, distortion: Tensor):
         """Of concrete values (C, 4), (C, n)."""
+        # what learns will not be seen again
+        self._model, self._learns = model, distortion.requires_grad
         with torch.no_grad():
             self.given = intrinsics.detach().clone(), distortion.detach().clone()
-            usable, values, self.usable = _usable(model, *self.given), self.given, None
-            if not holds(usable):
+            values, self.usable = self.given, None
+            if not (_are_plain(model, *self.given) or holds(usable := _usable(model, *self.given))):
                 ideal = _ideal(model, *self.given)
                 values = torch.where(usable, self.given[0], ideal[0]), torch.where(usable, self.given[1], ideal[1])
                 self.usable = usable.to(intrinsics.dtype)  # (C, 1)
-            self.intrinsics = values[0]
-            # what learns will not be seen again
-            learns = distortion.requires_grad
-            self.domain = (
-                Domain(model.optics, values[1]) if learns else domain_of(model._model, values[1], model.optics)
-            )
+            self.intrinsics, self.k = values
+
+    @cached_property
+    def domain(self) -> Domain:
+        """That of the lenses."""
+        if self.native is not None:
+            return self.native.domain
+        model = self._model
+        return Domain(model.optics, self.k) if self._learns else domain_of(model._model, self.k, model.optics)
 
     def are(self, intrinsics: Tensor, distortion: Tensor) -> bool:
         """Whether they are those of these values."""
@@ -69,7 +73,7 @@ class Cameras:
     @cached_property
     def native(self) -> geometry.Native | None:
         """For the compiled geometry, None where it has not got this model, or is not there."""
-        return geometry.native_of(self)
+        return geometry.native_of(self._model.optics, self.intrinsics, self.k, self.usable)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
         """Those of intrinsics and distortion, of which the compiled geometry gives those of the formula's parameters.
@@ -80,15 +84,31 @@ class Cameras:
         """
         if sums is None:
             return None, None
-        by_distortion = None
-        if wanted[1]:
-            # whose part in chart and lens is whatever the model says
-            with torch.enable_grad():
-                k = self.domain.k.detach().requires_grad_()
-                pairs = zip(_parameters(*self.domain.optics(columns(k))), sums[:, 4:].split(1, -1), strict=True)
-                outputs, of_outputs = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
-                (by_distortion,) = torch.autograd.grad(outputs, k, of_outputs, materialize_grads=True)
-        return sums[:, :4] if wanted[0] else None, by_distortion
+        return sums[:, :4] if wanted[0] else None, self._of_coefficients(sums[:, 4:]) if wanted[1] else None
+
+    def _of_coefficients(self, sums: Tensor) -> Tensor:
+        assert self.native is not None  # which gave the sums
+        plan = self.native.plan
+        if plan.places is not None:
+            return sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
+        with torch.enable_grad():
+            k = self.k.detach().requires_grad_()
+            chart, lens = self._model.optics(columns(k))
+            pairs = zip((*chart.parameters, *lens.parameters), sums.split(1, -1), strict=True)
+            outputs, of_outputs = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
+            (by_coefficients,) = torch.autograd.grad(outputs, k, of_outputs, materialize_grads=True)
+        return by_coefficients
+
+
+def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> bool:
+    """Whether a short look says that all are usable."""
+    if (
+        not intrinsics.is_cpu
+        or 0 in intrinsics.shape
+        or (distortion.numel() and model.defined(distortion.unbind(-1)) is not None)
+    ):
+        return False
+    return math.isfinite(float(intrinsics.sum()) + float(distortion.sum())) and float(intrinsics[:, :2].amin()) > 0
 
 
 def _usable(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Tensor:
@@ -152,7 +172,3 @@ def both(*masks: Tensor | None) -> Tensor | None:
 def to_mask(margin: Tensor) -> Tensor:
     """1 where a margin is positive, else 0."""
     return (margin.detach() > 0).to(margin.dtype)
-
-
-def _parameters(chart: Chart, lens: Lens) -> tuple[Tensor, ...]:
-    return *chart.parameters, *lens.parameters

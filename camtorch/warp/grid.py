@@ -28,8 +28,6 @@ _MARGIN = 0.05  # of half an image: what lies beyond is not sampled
 _MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
 _OVERSHOOT = 0.5  # of the range of its nodes by which a cubic may leave it: 0.27 along each axis
 _CUBIC = 3 / 128  # a cubic through four even nodes misses its middle by this part of their fourth difference
-_QUINTIC = 5 / 1024  # and a polynomial through six by this part of their sixth one
-_CARE = 12.0  # times what sixth differences say is assumed: towards a fold up to 7.7 of it was measured
 _SAFETY = 3.0  # times that is assumed: at steps of the curvature, fourth differences tell less; 0.9 of it is then used
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -295,10 +293,9 @@ def on_lattice(
 ) -> Lattice | None:
     """Positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
-    Where fourth differences say that cubics miss by more than the tolerance, polynomials through six nodes along each
-    axis give a cell's pixels one by one. Where they would miss as well, as sixth differences say, and at the limit of
-    what is mapped and beside it, the cameras do. None if that would be most of the image. What is mapped, or is not,
-    between four nodes alone and away from that limit is not seen.
+    Where fourth differences say that cubics miss by more than the tolerance, and at the limit of what is mapped and
+    beside it, the cameras give a cell's pixels one by one. None if that would be most of the image. What is mapped, or
+    is not, between four nodes alone and away from that limit is not seen.
 
     Args:
         source: the camera of the images.
@@ -328,19 +325,9 @@ def on_lattice(
     if not most:
         return Lattice(lattice, cells, like.new_empty(2, 0, STEP, STEP), (height, width), seam_of(source))
     todo = cells == TODO
-    smooth = todo & _smooth(lattice, mapped_nodes, size, tolerance)
-    if not bool(rim.all()):  # at the rim of the target the nodes do not tell all
-        smooth[:, [0, -1]], smooth[:, :, [0, -1]] = False, False
-    todo = todo & ~smooth
     if bool((todo.sum((1, 2)) > n * m / 2).any()):
         return None
-    known = _compute(exact, rows.start, cells, todo, like)
-    camera, i, j = (smooth & (cells == TODO)).nonzero(as_tuple=True)
-    if len(camera):
-        first = known.shape[1]
-        cells[camera, i, j] = torch.arange(first, first + len(camera), dtype=cells.dtype, device=cells.device)
-        known = torch.cat((known, _quintic(lattice, camera, i, j)), 1)
-    return Lattice(lattice, cells, known, (height, width), seam_of(source))
+    return Lattice(lattice, cells, _compute(exact, rows.start, cells, todo, like), (height, width), seam_of(source))
 
 
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:
@@ -470,59 +457,6 @@ def _over_windows(values: Tensor, dim: int, width: int, pick: Callable[[Tensor, 
         n = values.shape[dim] - step
         values = pick(values.narrow(dim, 0, n), values.narrow(dim, step, n))
     return values
-
-
-def _smooth(nodes: Tensor, mapped: Tensor, source: tuple[int, int], tolerance: float) -> Tensor:
-    """Bool (B, n, m): polynomials through six nodes along each axis keep a cell within the tolerance.
-
-    Args:
-        nodes: (B, 2, n + 5, m + 5), positions.
-        mapped: (B, n + 5, m + 5) bool.
-        source: (height, width) of the source.
-        tolerance: in its pixels.
-    """
-    half = nodes.new_tensor([source[1] / 2, source[0] / 2])[:, None, None]
-    missed = _CARE * _QUINTIC * half * (_sixth_difference(nodes, -1) + _sixth_difference(nodes, -2))
-    every = _over_six(_over_six(mapped, -1, torch.logical_and), -2, torch.logical_and)
-    return every & (torch.hypot(*missed.unbind(1)) <= tolerance)
-
-
-def _sixth_difference(nodes: Tensor, dim: int) -> Tensor:
-    """(B, 2, n, m): the largest absolute sixth difference along an axis, of the nodes that a cell takes and one more.
-
-    On all six lines of them: a leap beside the cell shows on some of them alone. At the ends of the lattice, where
-    there are no seven nodes, that of the next cell.
-    """
-    d = nodes.diff(6, dim=dim).abs()
-    d = torch.cat((d.narrow(dim, 0, 1), d, d.narrow(dim, d.shape[dim] - 1, 1)), dim)
-    return _over_six(_over_windows(d, dim, 2, torch.maximum), -3 - dim, torch.maximum)
-
-
-def _over_six(values: Tensor, dim: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """`_over_windows` of 6."""
-    four = _over_windows(values, dim, 4, pick)
-    n = four.shape[dim] - 2
-    return pick(four.narrow(dim, 0, n), four.narrow(dim, 2, n))
-
-
-def _quintic(nodes: Tensor, camera: Tensor, i: Tensor, j: Tensor) -> Tensor:
-    """(2, K, 8, 8): positions in cells (i, j) of lattices (B, 2, n + 5, m + 5), by polynomials through six nodes."""
-    wide = torch.float32 if torch.get_float32_matmul_precision() == "highest" else torch.float64
-    height, width = nodes.shape[2:]
-    step = torch.arange(6, device=nodes.device)
-    first = (camera * 2 * height + i) * width + j
-    place = (first[:, None] + (step[:, None] * width + step).flatten()).flatten()
-    flat = nodes.contiguous().flatten()
-    windows = torch.stack([flat.index_select(0, place + axis * height * width) for axis in (0, 1)])
-    windows = windows.to(torch.promote_types(nodes.dtype, wide)).unflatten(1, (-1, 36))
-    t = torch.arange(STEP, dtype=torch.float64, device=nodes.device)[:, None] / STEP
-    at = range(-2, 4)
-    terms = [reduce(torch.mul, [(t - b) / (a - b) for b in at if b != a]) for a in at]
-    weights = torch.cat(terms, 1)  # (8, 6)
-    with torch.autocast(nodes.device.type, enabled=False):
-        planes = windows @ torch.kron(weights, weights).T.to(windows)
-    cells: Tensor = planes.to(nodes.dtype).unflatten(-1, (STEP, STEP))
-    return cells
 
 
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:

@@ -92,7 +92,6 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
 
 def positions(warp: Warp, inputs: list[Tensor], route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
     """Where all pixels of the target sample the source's image, by the route "graph" or "kept"."""
-    every = range(warp.target._size_for("Warp")[0])
     if route == "graph":
         if in_jit_trace():
             raise RuntimeError(
@@ -100,26 +99,29 @@ def positions(warp: Warp, inputs: list[Tensor], route: Route, padding: PaddingMo
                 "torch.onnx.export(dynamo=True) and torch.export can. Or warp.requires_grad_(False), and one call "
                 "before, make its map a constant"
             )
-        return warp._locate(every, padding, 0.0)
+        return warp._locate(range(warp.target._size_for("Warp")[0]), padding, 0.0)
     if is_exporting() and not torch.compiler.is_dynamo_compiling() and (constant := _constant(warp, padding)):
         return constant
     reach = _reach(warp, padding)
     if warp._pinned is not None and (reach == warp.padding_mode or isinstance(warp._pinned, Sampling)):
         return warp._pinned
 
-    def computed() -> Sampling | Lattice:
-        if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
-            return warp._locate(every, reach, warp.tolerance)
-        grid, mapped = compiled.positions(warp.source, warp.target, warp.rotation, warp.tolerance, reach)
-        if warp.antialias:
-            return scaled(warp.source, grid, mapped)
-        return Sampling(grid, mapped, None, seam_of(warp.source))
-
     forms = [None if shutter is None else shutter.form for shutter in (warp.shutter, warp.target_shutter)]
     options = warp.source._form, warp.target._form, *forms, warp.rotation is None, warp.antialias, warp.tolerance
     kept: Sampling | Lattice
-    kept = warp._memos[reach if warp.tolerance else "zeros"](inputs, options, computed)  # what is exact serves all
+    memo = warp._memos[reach if warp.tolerance else "zeros"]  # what is exact serves all
+    kept = memo(inputs, options, lambda: _computed(warp, reach))
     return kept
+
+
+def _computed(warp: Warp, reach: PaddingMode) -> Sampling | Lattice:
+    """The positions of all pixels, without a graph, which serve a padding."""
+    if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
+        return warp._locate(range(warp.target._size_for("Warp")[0]), reach, warp.tolerance)
+    grid, mapped = compiled.positions(warp.source, warp.target, warp.rotation, warp.tolerance, reach)
+    if warp.antialias:
+        return scaled(warp.source, grid, mapped)
+    return Sampling(grid, mapped, None, seam_of(warp.source))
 
 
 def strips(
@@ -170,10 +172,12 @@ def pinned(warp: Warp) -> Sampling | Lattice | None:
     # of compiled code keeps its own
     inputs = warp._inputs()
     if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), inputs):
-        return warp._pinned
+        return None
     if in_transform() or torch.is_inference_mode_enabled():
-        return warp._pinned
-    return positions(warp, inputs, "graph" if warp._pinned is None and keeps_graph(*inputs) else "kept")
+        return None
+    if keeps_graph(*inputs):
+        return positions(warp, inputs, "graph")
+    return positions(warp, inputs, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
 
 
 def _reach(warp: Warp, padding: PaddingMode) -> PaddingMode:

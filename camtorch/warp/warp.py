@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from camtorch._arguments import Numbers, as_coordinates, as_whole, broadcast_shapes, check_devices, no_camera
 from camtorch._module import GeometryModule, Memo, typed_as
@@ -92,6 +92,11 @@ class Warp(GeometryModule):
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
     rotation: Tensor | None
     batch_shape: torch.Size
+    mode: Mode
+    padding_mode: PaddingMode
+    _tolerance: float | None
+    _memos: dict[PaddingMode, Memo]
+    _constants: Memo
     _pinned: Sampling | Lattice | None
     source: Camera
     target: Camera
@@ -114,32 +119,42 @@ class Warp(GeometryModule):
         shutter: RollingShutter | None = None,
         target_shutter: RollingShutter | None = None,
     ):
-        super().__init__()
-        self.source, self.target = as_sized(source, "source", "Warp"), as_sized(target, "target", "Warp")
+        source, target = as_sized(source, "source", "Warp"), as_sized(target, "target", "Warp")
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
-        self.mode, self.padding_mode, self.fill = options["mode"], options["padding_mode"], options["fill"]
-        self.antialias, self._tolerance = options["antialias"], options["tolerance"]
         if target is not source:
             check_devices("Warp", source=source.intrinsics, target=target.intrinsics)
-        self._set_rotation(as_rotation(rotation, "Warp"))
-        self.shutter, self.target_shutter = shutter, target_shutter
-        for name, each in self.shutters.items():
+        rotation = as_rotation(rotation, "Warp")
+        for name, each in (("shutter", shutter), ("target_shutter", target_shutter)):
             if not (each is None or isinstance(each, RollingShutter)):
                 hint = "ct.RollingShutter(readout, rates) makes one, of seconds and radians per second"
                 raise TypeError(f"Warp: {name} must be a RollingShutter; got {type(each).__name__}. {hint}")
         shapes = [tuple(part.batch_shape) for part in (source, target, shutter, target_shutter) if part is not None]
-        shapes += [] if self.rotation is None else [tuple(self.rotation.shape[:-2])]
+        shapes += [] if rotation is None else [tuple(rotation.shape[:-2])]
         try:
-            self.batch_shape = torch.Size(broadcast_shapes(*shapes))
+            batch = broadcast_shapes(*shapes)
         except ValueError:
-            self.batch_shape = torch.Size((0, 0))  # none
-        if len(self.batch_shape) > 1:
+            batch = torch.Size((0, 0))  # none
+        if len(batch) > 1:
             raise ValueError(
                 "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
                 f"got {', '.join(map(str, shapes))}"
             )
-        self._memos, self._pinned = {padding: Memo() for padding in PADDINGS}, None
-        self._constants = Memo()
+        super().__init__(
+            source=source,
+            target=target,
+            mode=options["mode"],
+            padding_mode=options["padding_mode"],
+            fill=options["fill"],
+            antialias=options["antialias"],
+            _tolerance=options["tolerance"],
+            shutter=shutter,
+            target_shutter=target_shutter,
+            batch_shape=batch,
+            _memos={padding: Memo() for padding in PADDINGS},
+            _pinned=None,
+            _constants=Memo(),
+        )
+        self._set_rotation(rotation)
         seam_of(source)  # while its values may be looked at: traced code asks for it too
 
     @property
@@ -151,15 +166,12 @@ class Warp(GeometryModule):
         return _SINGLE if single else 0.0
 
     def _set_rotation(self, rotation: Tensor | None) -> None:
-        if isinstance(rotation, nn.Parameter):
-            self.register_parameter("rotation", rotation)
-        else:
-            self.register_buffer("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
+        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
 
     def turned_by(self, rotation: Tensor | None) -> Self:
         """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
         self._set_rotation(rotation)
-        if rotation is not None:
+        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
             self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
         return self
 
@@ -243,7 +255,8 @@ class Warp(GeometryModule):
 
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
-        self._pinned = routes.pinned(self)
+        if self._pinned is None:
+            self._pinned = routes.pinned(self)
         return self
 
     # -- what its positions follow from

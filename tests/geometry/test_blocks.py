@@ -49,6 +49,7 @@ def test_planes_and_triples_are_the_same(key, method):
         torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
 
 
+@pytest.mark.skipif(not ct.native_available(), reason="autograd keeps more of the formula")
 @each_kind
 @pytest.mark.parametrize(("method", "limit"), [("project", 32), ("unproject", 40)])
 def test_bytes_kept_for_backward(key, method, limit):

@@ -10,7 +10,7 @@
 
 #include "geometry.h"
 
-int64_t geometry_fuzzed(Rows *);
+int64_t geometry_fuzzed(const Rows *);
 
 static uint64_t state; /* of chance: splitmix64 */
 

@@ -37,7 +37,7 @@ def native(camera):
     """A camera's, or a batch's (C,)."""
     intrinsics = camera.intrinsics.detach().reshape(-1, 4)
     distortion = camera.distortion.detach().reshape(len(intrinsics), -1)
-    found = geometry.native_of(Cameras(type(camera), intrinsics, distortion))
+    found = Cameras(type(camera), intrinsics, distortion).native
     assert found is not None
     return found
 
@@ -247,7 +247,7 @@ def test_an_unusable_camera_has_invalid_rows_alone():
     intrinsics[1, 0] = math.nan
     distortion = camera.distortion.detach().repeat(3, 1)
     distortion[2, 1] = math.inf
-    made = geometry.native_of(Cameras(type(camera), intrinsics, distortion))
+    made = Cameras(type(camera), intrinsics, distortion).native
     p = fan(60, 5, 4).float().expand(3, -1, -1)
     out, valid = geometry.project(made, p)
     assert valid.all(-1).tolist() == [True, False, False]

@@ -353,7 +353,7 @@ def kept(warp):
 
 
 def test_lattices_of_a_batch_of_cameras_and_images():
-    rotations = ct.augment.mount_rotation(torch.tensor([0.0, 20.0, 70.0]), torch.tensor(0.0), torch.tensor(5.0))
+    rotations = ct.augment.mount_rotation(torch.tensor([0.0, 10.0, 40.0]), torch.tensor(0.0), torch.tensor(5.0))
     source = ct.KannalaBrandt([100.0, 100, 80, 60], [0.02, -0.01, 0.004, -0.001], image_size=(120, 160))
     target = ct.Pinhole([80.0, 80, 80, 60], image_size=(101, 163))
     source, target = (camera.requires_grad_(False) for camera in (source, target))
