@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 class AngleOfAllPowers(AnglePerRadius):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + a1 r + a2 r^2 + ..."""
 
+    code = 5
+
     def __init__(self, coefficients: Sequence[Tensor]):
         super().__init__(coefficients)
         self.ahead: RadialFactor = RadiusPolynomial(coefficients)
@@ -34,6 +36,8 @@ class AngleOfAllPowers(AnglePerRadius):
 
 class Shear(Stage):
     """(x + e y, d x + y): a sensor out of line with the lens."""
+
+    code = 18
 
     def __init__(self, d: Tensor, e: Tensor):
         self.parameters: tuple[Tensor, ...] = (d, e)

@@ -23,6 +23,7 @@ from camtorch.projection.domain import Domain
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens, Stage
+    from camtorch.optics.radial import RadialFactor
     from camtorch.projection.domain import Optics
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
@@ -33,20 +34,7 @@ _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII = 512
 
-_CHARTS: dict[type[Chart], int] = {
-    optics.Perspective: 0,
-    optics.Equidistant: 1,
-    optics.EquidistantUpTo: 1,
-    optics.Equisolid: 2,
-    optics.Unified: 3,
-    optics.Fov: 4,
-    optics.OneDivision: 5,
-    optics.Inverted: 6,
-    optics.CylinderChart: 7,
-    optics.SphereChart: 8,
-}
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
-_PLANAR, _TILT, _SHEAR = 16, 17, 18
 _TANGENTIAL, _PRISM = 1, 2
 
 
@@ -305,11 +293,17 @@ def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
     return known if len(known) == len(parts) <= _MOST_PARTS else None
 
 
+def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None:
+    # a subclass may have another formula
+    code: int | None = vars(part if isinstance(part, type) else type(part)).get("code")
+    return code
+
+
 def _chart(chart: Chart) -> _Part | None:
     flags = 0
     if type(chart) is optics.Transverse:
         chart, flags = chart.chart, _TRANSVERSE
-    kind = _CHARTS.get(type(chart))
+    kind = _code(chart)
     if kind is None:
         return None
     part = _Part(kind, flags)
@@ -318,22 +312,19 @@ def _chart(chart: Chart) -> _Part | None:
         part.flags |= _HAS_ALPHA * (chart.fixed_alpha is None)
         part.constant = chart.fixed_alpha or 0.0
     if isinstance(chart, optics.Inverted):
-        part.factor, part.n = _factors().get(chart.factor, 0), len(chart.parameters)
+        part.factor, part.n = _code(chart.factor) or 0, len(chart.parameters)
         return part if part.factor else None
     return part
 
 
 def _stage(stage: Stage) -> _Part | None:
-    if type(stage) is optics.Tilt:
-        return _Part(_TILT)
-    if type(stage) is _shear():
-        return _Part(_SHEAR)
-    if type(stage) is not optics.Planar:
-        return None
-    part, radial = _Part(_PLANAR, _TANGENTIAL * bool(stage.tangential) | _PRISM * bool(stage.prism)), stage.radial
+    kind = _code(stage)
+    if kind is None or not isinstance(stage, optics.Planar):
+        return None if kind is None else _Part(kind)
+    part, radial = _Part(kind, _TANGENTIAL * bool(stage.tangential) | _PRISM * bool(stage.prism)), stage.radial
     if radial is None:
         return part
-    part.factor, part.n = _factors().get(type(radial), 0), len(radial.parameters)
+    part.factor, part.n = _code(radial) or 0, len(radial.parameters)
     if isinstance(radial, optics.Rational):
         part.n, part.m = len(radial.numerator.parameters), len(radial.denominator.parameters)
         if part.n + part.m > _MOST_DEGREE:
@@ -346,22 +337,6 @@ def _stage(stage: Stage) -> _Part | None:
 def _constants(lens: Lens) -> Sequence[Tensor]:
     radial = lens.radial
     return (*radial.nodes, radial.end) if isinstance(radial, optics.RadiusTable) else ()
-
-
-@functools.cache
-def _factors() -> dict[type, int]:
-    from camtorch.models.ocamcalib import AngleOfAllPowers
-
-    factors: list[type] = [optics.Polynomial, optics.Rational, optics.RadiusPolynomial, optics.AnglePerRadius]
-    factors += [AngleOfAllPowers, optics.RadiusTable]
-    return {factor: i for i, factor in enumerate(factors, 1)}
-
-
-@functools.cache
-def _shear() -> type[Stage]:
-    from camtorch.models.ocamcalib import Shear
-
-    return Shear
 
 
 # -- calls

@@ -278,6 +278,7 @@ INLINE I T(on_plane)(const T(Chart) k, const int way, R a, R b) {
     case ONE_DIVISION: return (1 - 64 * EPS - k.k * r2 > 0) & (FARTHEST / 2 - far > 0);
     case CYLINDER: return (half_turn - T(absolute)(a) > 0) & (FARTHEST - T(absolute)(b) > 0);
     case SPHERE: return (half_turn - T(absolute)(a) > 0) & ((R)(PI / 2) - T(absolute)(b) > 0);
+    case INVERTED: return 1; /* see `cover` */
     default: return (R)(PI * PI) - r2 > 0;
     }
 }

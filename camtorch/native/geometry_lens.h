@@ -89,13 +89,6 @@ INLINE void T(table_factor)(const Part *part, const R *k, const R *nodes, int n,
     }
 }
 
-INLINE void T(radial_by)(const R *numbers, const int kind, const int count, const int below, int n, const R *restrict t,
-                         R *restrict factor, R *restrict slope) {
-    R k[PADDED];
-    memcpy(k, numbers, sizeof k);
-    EACH(i) factor[i] = T(factor)(k, kind, count, below, t[i], slope ? slope + i : NULL);
-}
-
 static void T(radial)(const T(Factor) *of, int n, const R *restrict t, R *restrict factor, R *restrict slope) {
     const Part *part = of->part;
     const R *k = of->numbers;
@@ -107,10 +100,11 @@ static void T(radial)(const T(Factor) *of, int n, const R *restrict t, R *restri
         else T(table_factor)(part, k, of->constants, n, t, factor, NULL);
     } else if (of->form == ANY) { /* one by one */
         EACH(i) factor[i] = T(factor)(k, part->factor, part->n, part->m, t[i], slope ? slope + i : NULL);
-    } else if (slope) {
-        EACH_FORM(of->form, T(radial_by)(of->padded, kind, count, below, n, t, factor, slope))
     } else {
-        EACH_FORM(of->form, T(radial_by)(of->padded, kind, count, below, n, t, factor, NULL))
+        R padded[PADDED];
+        memcpy(padded, of->padded, sizeof padded);
+        if (slope) EACH_FORM(of->form, EACH(i) factor[i] = T(factor)(padded, kind, count, below, t[i], slope + i);)
+        else EACH_FORM(of->form, EACH(i) factor[i] = T(factor)(padded, kind, count, below, t[i], NULL);)
     }
 }
 
@@ -350,21 +344,6 @@ INLINE R T(nearer)(R s, R t, R factor, R slope, I *ok) {
     return s + step;
 }
 
-INLINE void T(solve_by)(const R *numbers, const int kind, const int count, const int below, int n,
-                        const R *restrict r2, R *restrict scale, I *restrict ok) {
-    R k[PADDED];
-    memcpy(k, numbers, sizeof k);
-    EACH(i) {
-        R s = scale[i], slope;
-        I found = 0;
-        for (int step = 0; step < INVERSE_STEPS; step++) {
-            const R t = r2[i] * s * s, factor = T(factor)(k, kind, count, below, t, &slope);
-            s = T(nearer)(s, t, factor, slope, &found);
-        }
-        scale[i] = s, ok[i] = found;
-    }
-}
-
 /* How many of a block are 0, their places filled up to whole vectors with the last one */
 static int T(chosen)(int n, const I *restrict open, int *restrict places) {
     int count = 0;
@@ -382,7 +361,17 @@ static void T(solve)(const T(Factor) *of, const R *table, int n, const R *restri
     int places[BLOCK], some;
     T(tabulated)(table, n, r2, scale);
     EACH(i) ok[i] = 0;
-    EACH_FORM(of->form, T(solve_by)(of->padded, kind, count, below, n, r2, scale, ok))
+    R k[PADDED];
+    memcpy(k, of->padded, sizeof k);
+    EACH_FORM(of->form, EACH(i) {
+        R s = scale[i], slope;
+        I found = 0;
+        for (int step = 0; step < INVERSE_STEPS; step++) {
+            const R t = r2[i] * s * s, factor = T(factor)(k, kind, count, below, t, &slope);
+            s = T(nearer)(s, t, factor, slope, &found);
+        }
+        scale[i] = s, ok[i] = found;
+    })
     if (!(some = T(chosen)(n, ok, places))) return;
     ALIGNED R square[BLOCK], found[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK];
     ALIGNED I done[BLOCK];

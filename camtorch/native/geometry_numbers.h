@@ -106,21 +106,23 @@ INLINE void T(turn)(R t, R *sinc, R *cosine) {
     *sinc = s * t + 1, *cosine = c * t + 1;
 }
 
+INLINE R T(folded)(R *lanes) {
+    for (int j = 0; j < 8; j++) lanes[j] += lanes[j + 8];
+    for (int j = 0; j < 4; j++) lanes[j] += lanes[j + 4];
+    return (lanes[0] + lanes[2]) + (lanes[1] + lanes[3]);
+}
+
 /* The sum over a block of products, by lanes: alike for each compiler */
 static double T(dot)(int n, const R *restrict a, const R *restrict b) {
     R lanes[LANES] = {0};
     for (int i = 0; i < n; i += LANES)
         for (int j = 0; j < LANES; j++) lanes[j] += a[i + j] * b[i + j];
-    for (int half = LANES / 2; half; half /= 2)
-        for (int j = 0; j < half; j++) lanes[j] += lanes[j + half];
-    return lanes[0];
+    return T(folded)(lanes);
 }
 
 static double T(total)(int n, const R *restrict a) {
     R lanes[LANES] = {0};
     for (int i = 0; i < n; i += LANES)
         for (int j = 0; j < LANES; j++) lanes[j] += a[i + j];
-    for (int half = LANES / 2; half; half /= 2)
-        for (int j = 0; j < half; j++) lanes[j] += lanes[j + half];
-    return lanes[0];
+    return T(folded)(lanes);
 }

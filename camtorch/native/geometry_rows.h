@@ -234,23 +234,16 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     return waiting;
 }
 
-INLINE void T(unsee_by)(const T(Camera) *c, const int way, int n, const R *restrict x, const R *restrict y,
-                        const R *restrict z, const R *restrict shrink, const R *restrict scale,
-                        const R *restrict by_angle, const R *restrict ga, const R *restrict gb, R *restrict gx,
-                        R *restrict gy, R *restrict gz) {
-    const T(Chart) k = c->chart;
-    EACH(i) {
-        R p, q, r;
-        T(to_plane_vjp)(k, way, x[i], y[i], z[i], scale[i], way == INVERTED ? by_angle[i] : 1, ga[i], gb[i], &p, &q, &r);
-        gx[i] = p * shrink[i], gy[i] = q * shrink[i], gz[i] = r * shrink[i];
-    }
-}
-
 static NOT_INLINE void T(unsee)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y,
                                 const R *restrict z, const R *restrict shrink, const R *restrict scale,
                                 const R *restrict by_angle, const R *restrict ga, const R *restrict gb, R *restrict gx,
                                 R *restrict gy, R *restrict gz) {
-    EACH_WAY(c->way, T(unsee_by)(c, way, n, x, y, z, shrink, scale, by_angle, ga, gb, gx, gy, gz))
+    const T(Chart) k = c->chart;
+    EACH_WAY(c->way, EACH(i) {
+        R p, q, r;
+        T(to_plane_vjp)(k, way, x[i], y[i], z[i], scale[i], way == INVERTED ? by_angle[i] : 1, ga[i], gb[i], &p, &q, &r);
+        gx[i] = p * shrink[i], gy[i] = q * shrink[i], gz[i] = r * shrink[i];
+    })
 }
 
 /* The cotangents of points and numbers of those of pixels; `sums`: of intrinsics, then of the parts */
@@ -301,20 +294,15 @@ static void T(angles)(const T(Camera) *c, int n, const R *restrict a, const R *r
     EACH(i) p[i] = a[i] * factor[i], q[i] = b[i] * factor[i];
 }
 
-INLINE void T(rays_by)(const T(Camera) *c, const int way, int n, const R *restrict a, const R *restrict b,
-                       const I *restrict ok, R *restrict x, R *restrict y, R *restrict z) {
-    const T(Chart) k = c->chart;
-    EACH(i) {
-        R p, q, r;
-        T(to_ray)(k, way, a[i], b[i], &p, &q, &r);
-        x[i] = ok[i] ? p : 0, y[i] = ok[i] ? q : 0, z[i] = ok[i] ? r : 1;
-    }
-}
-
 /* The unit rays of points of the plane, the axis where they are not `ok` */
 static NOT_INLINE void T(rays_of)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b,
                                   const I *restrict ok, R *restrict x, R *restrict y, R *restrict z) {
-    EACH_WAY(c->way, T(rays_by)(c, way, n, a, b, ok, x, y, z))
+    const T(Chart) k = c->chart;
+    EACH_WAY(c->way, EACH(i) {
+        R p, q, r;
+        T(to_ray)(k, way, a[i], b[i], &p, &q, &r);
+        x[i] = ok[i] ? p : 0, y[i] = ok[i] ? q : 0, z[i] = ok[i] ? r : 1;
+    })
 }
 
 static void T(rays)(const T(Camera) *c, int n, const R *a, const R *b, const I *ok, R *x, R *y, R *z) {
@@ -324,16 +312,11 @@ static void T(rays)(const T(Camera) *c, int n, const R *a, const R *b, const I *
     else T(rays_of)(c, n, a, b, ok, x, y, z);
 }
 
-INLINE void T(unrays_by)(const T(Camera) *c, const int way, int n, const R *restrict a, const R *restrict b,
-                         const R *restrict gx, const R *restrict gy, const R *restrict gz, R *restrict ga, R *restrict gb) {
-    const T(Chart) k = c->chart;
-    EACH(i) T(to_ray_vjp)(k, way, a[i], b[i], gx[i], gy[i], gz[i], ga + i, gb + i);
-}
-
 static NOT_INLINE void T(unrays_of)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b,
                                     const R *restrict gx, const R *restrict gy, const R *restrict gz, R *restrict ga,
                                     R *restrict gb) {
-    EACH_WAY(c->way, T(unrays_by)(c, way, n, a, b, gx, gy, gz, ga, gb))
+    const T(Chart) k = c->chart;
+    EACH_WAY(c->way, EACH(i) T(to_ray_vjp)(k, way, a[i], b[i], gx[i], gy[i], gz[i], ga + i, gb + i);)
 }
 
 /* The cotangents of points of the plane of those of their rays. Adds those of the chart's numbers */
@@ -357,18 +340,13 @@ static void T(rays_vjp)(const T(Camera) *c, int n, const R *a, const R *b, const
     if (sums) T(radial_sums)(c->factors, n, t, gp, sums);
 }
 
-INLINE void T(cover_by)(const T(Camera) *c, const int way, int n, R *restrict a, R *restrict b, const I *restrict known,
-                        I *restrict ok) {
-    const T(Chart) k = c->chart;
-    EACH(i) {
-        const I is_on = known[i] & T(on_plane)(k, way, a[i], b[i]);
-        ok[i] = is_on, a[i] = is_on ? a[i] : 0, b[i] = is_on ? b[i] : 0;
-    }
-}
-
 static NOT_INLINE void T(cover_of)(const T(Camera) *c, int n, R *restrict a, R *restrict b, const I *restrict known,
                                    I *restrict ok) {
-    EACH_WAY(c->way, T(cover_by)(c, way, n, a, b, known, ok))
+    const T(Chart) k = c->chart;
+    EACH_WAY(c->way, EACH(i) {
+        const I is_on = known[i] & T(on_plane)(k, way, a[i], b[i]);
+        ok[i] = is_on, a[i] = is_on ? a[i] : 0, b[i] = is_on ? b[i] : 0;
+    })
 }
 
 /* Of points of the plane, `ok` where they are known to be the image of a ray; the centre elsewhere */

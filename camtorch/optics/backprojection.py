@@ -25,6 +25,8 @@ class Inverted(Chart):
     Rays are covered before theta ceases to ascend, and up to `FURTHEST`.
     """
 
+    code = 6
+
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor]):
         """factor: the class of R, whose instances are made of the parameters."""
         self.factor = factor

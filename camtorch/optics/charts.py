@@ -40,6 +40,8 @@ class Chart:
     Margins are positive where something holds.
     """
 
+    code: int | None = None
+    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
     has_scale = True
     """Whether the plane point is (x, y) times a `scale`."""
 
@@ -104,6 +106,8 @@ class Perspective(Chart):
     distortion polynomials reach, leaves the floating-point range.
     """
 
+    code = 0
+
     def end(self, dtype: torch.dtype) -> float:
         return min(1e9, math.pow(torch.finfo(dtype).max, 1 / 9))
 
@@ -129,6 +133,8 @@ class Perspective(Chart):
 
 class Equidistant(Chart):
     """theta (cos phi, sin phi), theta = atan2(hypot(x, y), z): every ray but the exact backward one."""
+
+    code = 1
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         # closer to the backward direction the derivative pi / rho leaves the floating-point range
@@ -168,6 +174,8 @@ class Equidistant(Chart):
 class EquidistantUpTo(Equidistant):
     """The equidistant chart of a lens that is known up to some angle."""
 
+    code = 1
+
     last: Tensor
 
     def __init__(self, last: Tensor):
@@ -184,6 +192,8 @@ def _half_turn(dtype: torch.dtype) -> float:
 
 class CylinderChart(Chart):
     """(longitude, height) = (atan2(x, z), y / hypot(x, z)). Every ray but straight up and down."""
+
+    code = 7
 
     has_scale = False
 
@@ -202,6 +212,8 @@ class CylinderChart(Chart):
 
 class SphereChart(Chart):
     """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))). Every ray but straight up and down."""
+
+    code = 8
 
     has_scale = False
 
@@ -256,6 +268,8 @@ def _sum(z: Tensor, root: Tensor, difference: Tensor) -> Tensor:
 class Equisolid(Chart):
     """2 sin(theta / 2) (cos phi, sin phi): every ray but the exact backward one."""
 
+    code = 2
+
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return Equidistant().margin(x, y, z)
 
@@ -284,6 +298,8 @@ class Fov(Chart):
 
     Even and analytic in omega, which lies between -pi and pi.
     """
+
+    code = 4
 
     def __init__(self, omega: Tensor):
         self.parameters: tuple[Tensor, ...] = (omega,)
@@ -320,6 +336,8 @@ class Fov(Chart):
 
 class OneDivision(Chart):
     """The rays (a, b, 1 + coefficient r^2): all but the exact backward one for a negative coefficient."""
+
+    code = 5
 
     def __init__(self, coefficient: Tensor):
         self.parameters: tuple[Tensor, ...] = (coefficient,)

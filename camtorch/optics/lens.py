@@ -50,6 +50,8 @@ class Stage:
 
     The formula reads them here, and nothing else that depends on the coefficients.
     """
+    code: int | None = None
+    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
     radial: RadialFactor | None = None
     """What of a first stage is tabulated, to start the inverse from."""
     is_radial = False
@@ -141,6 +143,8 @@ class Planar(Stage):
     tangential: p = (px, py); the decentering term is the gradient of (p . m) t, so its Jacobian is symmetric.
     prism: (s0, s1, s2, s3), the thin-prism coefficients.
     """
+
+    code = 16
 
     radial: RadialFactor | None = None
     tangential: Sequence[Tensor] = ()
@@ -255,6 +259,8 @@ class Tilt(Stage):
     Source: OpenCV `computeTiltProjectionMatrix`: the plane point is turned by R = R_y(tau_y) R_x(tau_x) and
     projected back along the optical axis. It fixes the origin; OpenCV's R_x, R_y turn clockwise.
     """
+
+    code = 17
 
     def __init__(self, tau_x: Tensor, tau_y: Tensor):
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)

@@ -21,6 +21,8 @@ class RadialFactor:
     Made of its coefficients, columns that broadcast against planes.
     """
 
+    code: int | None = None
+    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
     name: str
     """That of the class in the registry."""
     parameters: tuple[Tensor, ...]
@@ -70,6 +72,8 @@ class RadialFactor:
 class Polynomial(RadialFactor):
     """The radial factor R(t) = 1 + c0 t + c1 t^2 + ... of t = radius^2; radius R(t) is the distorted radius."""
 
+    code = 1
+
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
 
@@ -101,6 +105,8 @@ class Polynomial(RadialFactor):
 
 class Rational(RadialFactor):
     """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
+
+    code = 2
 
     numerator: Polynomial
     denominator: Polynomial
@@ -144,6 +150,8 @@ class RadiusPolynomial(RadialFactor):
     on the direction from which the centre is approached. The one given there is zero, their mean.
     """
 
+    code = 3
+
     of_radius: Polynomial
 
     def __init__(self, coefficients: Sequence[Tensor]):
@@ -171,6 +179,8 @@ class RadiusPolynomial(RadialFactor):
 
 class AnglePerRadius(RadialFactor):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + c0 t + c1 t^2 + ... of t = r^2."""
+
+    code = 4
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.ahead: RadialFactor = Polynomial(coefficients)
@@ -205,6 +215,8 @@ class RadiusTable(RadialFactor):
     monotonicity preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983). Behind its last node r turns back,
     so that the lens folds there.
     """
+
+    code = 6
 
     nodes: tuple[Tensor, ...]
     end: Tensor

@@ -20,6 +20,8 @@ class Unified(Chart):
     out is 0, 0 and 1, that is the perspective chart; a number is a part that does not learn.
     """
 
+    code = 3
+
     fixed_alpha: float | None
     has_xi: bool
     has_beta: bool

@@ -14,7 +14,7 @@ import camtorch as ct
 pytestmark = pytest.mark.skipif(not ct.native_available(), reason="needs the compiled library")
 
 # files, functions
-MOST = {"project": (6, 22), "unproject": (6, 22)}
+MOST = {"project": (7, 22), "unproject": (7, 22)}
 ROOT = Path(ct.__file__).parent
 
 
