@@ -349,7 +349,7 @@ def test_the_model_is_taken_that_predicts_best():
 def test_models_that_the_file_cannot_hold_are_not_tried(capsys, monkeypatch):
     from camtorch.calibration import selection
 
-    monkeypatch.setattr(selection, "CANDIDATES", (("kannala_brandt", 1), ("double_sphere", 2)))
+    monkeypatch.setattr(selection, "CANDIDATES", (("pinhole", 0), ("kannala_brandt", 1), ("double_sphere", 2)))
     write_corners(corners_of(count=5), "corners.json")
     calibrate("--corners", "corners.json", "-o", "camera.yml")
     captured = capsys.readouterr()
