@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch.native import geometry
 from camtorch.optics.charts import Planes3, floor_of
+from camtorch.projection import compiled
 from camtorch.projection.ops import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.projection.rows import Cameras, Traced, both, replace, to_mask
 
@@ -84,9 +84,9 @@ class Project:
 
     @staticmethod
     def native(
-        cameras: Cameras, made: geometry.Native, points: Tensor, keeps: bool = False
+        cameras: Cameras, made: compiled.Native, points: Tensor, keeps: bool = False
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """The same by the compiled geometry, without a graph, and what `native_vjp` needs: the points."""
-        return *geometry.project(made, points), (points,)
+        return *compiled.project(made, points), (points,)
 
-    native_vjp = staticmethod(geometry.project_vjp)
+    native_vjp = staticmethod(compiled.project_vjp)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch._arguments import columns, holds
 from camtorch._portable import is_portable_export
-from camtorch.native import geometry
+from camtorch.projection import compiled
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
 
@@ -71,9 +71,9 @@ class Cameras:
         return made
 
     @cached_property
-    def native(self) -> geometry.Native | None:
+    def native(self) -> compiled.Native | None:
         """For the compiled geometry, None where it has not got this model, or is not there."""
-        return geometry.native_of(self._model.optics, self.intrinsics, self.k, self.usable)
+        return compiled.native_of(self._model.optics, self.intrinsics, self.k, self.usable)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
         """Those of intrinsics and distortion, of which the compiled geometry gives those of the formula's parameters.

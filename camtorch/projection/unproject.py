@@ -9,9 +9,9 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._portable import is_portable_export, times
-from camtorch.native import geometry
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
+from camtorch.projection import compiled
 from camtorch.projection.ops import order_of, positive, search_in_place, search_open, to_planes, without_keeping
 from camtorch.projection.rows import Cameras, Planes2, Traced, replace, to_mask
 from camtorch.projection.solve import search
@@ -194,16 +194,16 @@ class Unproject:
 
     @staticmethod
     def native(
-        cameras: Cameras, made: geometry.Native, pixels: Tensor, keeps: bool = False
+        cameras: Cameras, made: compiled.Native, pixels: Tensor, keeps: bool = False
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """The same by the compiled geometry, without a graph, and what `native_vjp` needs of it, if it is kept."""
-        rays, valid, solution, left = geometry.unproject(made, pixels, keeps)
+        rays, valid, solution, left = compiled.unproject(made, pixels, keeps)
         if left is not None:
             _search(cameras, pixels, left, rays, solution, valid)
         # a copy: what is handed out belongs to the caller
         return rays, valid, (valid.clone(), solution) if solution is not None else ()
 
-    native_vjp = staticmethod(geometry.unproject_vjp)
+    native_vjp = staticmethod(compiled.unproject_vjp)
 
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:

@@ -13,9 +13,9 @@ from cameras import KEYS, every_model, fan, make, one, pixel_lattice, real, spre
 import camtorch as ct
 from camtorch._arguments import columns
 from camtorch.native import build as building
-from camtorch.native import geometry
 from camtorch.native.library import library
 from camtorch.optics import Equidistant, Lens, Stage
+from camtorch.projection import compiled as geometry
 from camtorch.projection.project import Project
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
