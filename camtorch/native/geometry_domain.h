@@ -35,25 +35,24 @@ static double polynomial_at(int degree, const double *c, double t, double *slope
     return value;
 }
 
-/* The root between two places at which the sign differs: Newton's method, and halves where that leaves the bracket */
+/* The root between two places at which the sign differs: Newton's method, and halves of the bracket where that leaves it
+   or does not halve its step */
 static double root_between(int degree, const double *c, double low, double high) {
-    double slope;
-    const double below = polynomial_at(degree, c, low, &slope);
-    double t = low + (high - low) / 2;
-    for (int count = 0; count < 200 && high - low > 0; count++) {
-        const double value = polynomial_at(degree, c, t, &slope), step = value / slope;
-        if (value == 0) return t;
-        if ((value < 0) == (below < 0)) low = t;
+    double slope, t = low + (high - low) / 2, last = high - low;
+    const int below = polynomial_at(degree, c, low, &slope) < 0;
+    for (int count = 0; count < 400; count++) {
+        const double value = polynomial_at(degree, c, t, &slope), step = value / slope, ahead = t - step;
+        if (value == 0 || fabs(step) <= 2 * DBL_EPSILON * fabs(t)) return ahead >= low && ahead <= high ? ahead : t;
+        if ((value < 0) == below) low = t;
         else high = t;
-        const double ahead = t - step;
-        if (ahead > low && ahead < high) {
-            if (fabs(step) <= 2 * DBL_EPSILON * fabs(t)) return ahead;
-            t = ahead;
-        } else {
+        if (ahead > low && ahead < high && 2 * fabs(step) < last) last = fabs(step), t = ahead;
+        else {
             /* of ends far apart the mean of their exponents */
-            const double middle = low > 0 && high > 4 * low ? sqrt(low) * sqrt(high) : low + (high - low) / 2;
+            const double middle = low > 0 && high > 4 * low ? sqrt(low) * sqrt(high)
+                                  : low > 0                 ? low + (high - low) / 2
+                                                            : high / 1024;
             if (middle <= low || middle >= high) return middle;
-            t = middle;
+            last = high - low, t = middle;
         }
     }
     return t;

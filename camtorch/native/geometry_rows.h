@@ -494,7 +494,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         }
     } else {
         const int has_table = c->table != NULL;
-        const R usual2 = c->usual2;
+        const R usual2 = c->usual2 * (1 - 32 * EPS);
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
             ALIGNED R r2[BLOCK], scale[BLOCK];

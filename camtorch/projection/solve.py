@@ -152,7 +152,10 @@ class _Search:
         seen = self.chart.to_plane(dx, dy, dz, order=1)
         x, y = self.lens(*seen)
         miss = torch.maximum((x - u).abs(), (y - v).abs())
-        valid = valid & covered & self.contains(*seen) & (miss <= rounding(u, v, stretch))
+        # away from it, where another processor's rounding would carry the ray across
+        further = 1 + 32 * torch.finfo(u.dtype).eps
+        beyond = [times(w, further) for w in seen]
+        valid = valid & covered & self.contains(*beyond) & (miss <= rounding(u, v, stretch))
         return torch.where(valid, a, 0.0), torch.where(valid, b, 0.0), valid
 
     def contains(self, a: Tensor, b: Tensor) -> Tensor:

@@ -58,7 +58,9 @@ def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
         a, b = a * scale, b * scale
     found = _newton(domain.lens, u, v, a, b)
     # further out than images reach a determinant may overflow, and a step seem short
-    inside = domain.usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
+    # nor must a ray's rounding carry it across the fold
+    usual2 = times(domain.usual2, 1 - 32 * torch.finfo(u.dtype).eps)
+    inside = usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
     return found._replace(solved=torch.minimum(found.solved, inside))
 
 
