@@ -88,6 +88,7 @@ static double first_root(int degree, const double *c, double end) {
 static double closed_fold(const Part *part, const double *k, double end) {
     double c[MOST_DEGREE + 1] = {1};
     const int n = part->n;
+    if (n + part->m > MOST_DEGREE || part->factor == RADIUS_TABLE) return end; /* whoever calls gives the fold of those */
     switch (part->factor) {
     case POLYNOMIAL:
     case RADIUS_POLYNOMIAL:
@@ -127,7 +128,7 @@ static double fold_of(const Lens *lens, double given, double end, double most) {
     double high = given == given ? given : closed_fold(lens->part, lens->numbers, end);
     high = high < end ? high : end;
     if (lens->part->factor == RADIUS_TABLE || is_number(lens, high, most)) return high;
-    double low = high;
+    double low = high < 1e12 ? high : 1e12;
     do low = low > 2 ? sqrt(low) : low / 2;
     while (low > 0 && !is_number(lens, low, most));
     for (int count = 0; count < 64; count++) {
@@ -338,7 +339,7 @@ void THIS(domain)(const Domain *d) {
             put(d->inner2, c, inner2, is_double);
             if (d->usual2) put(d->usual2, c, inner2 < usual2 ? inner2 : usual2, is_double);
         }
-        if (d->table) {
+        if (d->table && has_factor) {
             tabulate(&lens, fold, usual_end, table);
             for (int i = 0; i < 2 + 2 * NODES; i++) put(d->table, c * (2 + 2 * NODES) + i, table[i], is_double);
         }

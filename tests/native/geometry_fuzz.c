@@ -11,6 +11,7 @@
 #include "geometry.h"
 
 int64_t geometry_fuzzed(const Rows *);
+void domain_fuzzed(const Domain *);
 
 static uint64_t state; /* of chance: splitmix64 */
 
@@ -66,7 +67,7 @@ static int fuzz(uint64_t job) {
     Cameras cameras = {0};
     Rows rows = {0};
     int64_t numbers = 0, i;
-    void *kept[24];
+    void *kept[40];
     int used = 0, fine = 1;
     memset(parts, 0, sizeof parts);
     state = job * 0x2545f4914f6cdd1du;
@@ -109,6 +110,21 @@ static int fuzz(uint64_t job) {
         cameras.chart_inner2 = KEPT(filled(d, c, 2, 2)), cameras.chart_most2 = KEPT(filled(d, c, 2, 2));
         cameras.chart_table = KEPT(filled(d, c * (2 + 2 * NODES), 1, 1));
     }
+    const int has_factor = has_table && parts[1].factor != NO_FACTOR, many = cameras.part_count > 2;
+    Domain domain = {0};
+    domain.parts = parts, domain.part_count = cameras.part_count, domain.is_double = d, domain.cameras = c;
+    domain.parameters = KEPT(filled(1, numbers * c, share(), 0)), domain.parameter_count = numbers;
+    domain.constants = KEPT(filled(1, nodes * c, 1, 1)), domain.constant_count = nodes;
+    domain.ends = KEPT(filled(1, c, 2, 2)), domain.usual_ends = KEPT(filled(1, c, 2, 2)), domain.most = 1e30;
+    if (below(2) || (has_table && parts[1].factor == RADIUS_TABLE)) domain.folds = KEPT(filled(1, c, 2, 2));
+    domain.radii = KEPT(filled(1, MOST_RADII, 3, 3));
+    domain.is_chart = parts[0].kind == INVERTED && below(2);
+    domain.is_radial = has_factor && !many && !(parts[1].flags & (TANGENTIAL | PRISM));
+    domain.inner2 = KEPT(filled(d, c, 0, 0)), domain.usual2 = KEPT(filled(d, c, 0, 0));
+    domain.table = KEPT(filled(d, c * (2 + 2 * NODES), 0, 0));
+    if (has_factor && many && !domain.is_chart)
+        domain.circle2 = KEPT(filled(d, c, 0, 0)), domain.stagewise = KEPT(malloc((size_t)c));
+    if (cameras.part_count > 1 || domain.is_chart) domain_fuzzed(&domain);
     const int64_t size_in = direction % 2 ? 2 : 3, size_out = 5 - size_in;
     rows.cameras = &cameras, rows.count = n, rows.tile = 1 + below(600), rows.direction = direction;
     rows.rows = KEPT(rows_of(d, c, n, size_in, rows.row_strides, below(2) ? 0 : 300));
