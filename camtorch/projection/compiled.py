@@ -18,13 +18,12 @@ from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
 from camtorch.optics.backprojection import FURTHEST
-from camtorch.projection.domain import Domain
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens, Stage
     from camtorch.optics.radial import RadialFactor
-    from camtorch.projection.domain import Optics
+    from camtorch.projection.domain import Domain, Optics
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
 _OPEN = 2  # of geometry.h
@@ -165,8 +164,18 @@ class Native:
 
     _kept: list[Any]
 
-    def __init__(self, plan: Plan, optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None):
+    def __init__(
+        self,
+        plan: Plan,
+        optics_of: Optics,
+        intrinsics: Tensor,
+        k: Tensor,
+        usable: Tensor | None,
+        domain: Callable[[], Domain],
+    ):
+        """See `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, []
+        self._slow_domain = domain
         self.struct = struct = _Cameras()
         struct.parts, struct.part_count = addressof(plan.parts), plan.count
         self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
@@ -218,30 +227,26 @@ class Native:
 
     def _ask(self, wanted: dict[str, int]) -> None:
         """Fill in what of the domain is wanted: names and where it goes."""
-        domain = self._domain
+        asked = _Domain.from_buffer_copy(self._domain)  # several threads may ask at once
         for name, place in wanted.items():
-            setattr(domain, name, place)
-        _entry("camtorch_domain", None)(byref(domain))
-        for name in wanted:
-            setattr(domain, name, None)
+            setattr(asked, name, place)
+        _entry("camtorch_domain", None)(byref(asked))
 
     def _new(self, columns: int, dtype: torch.dtype | None = None) -> int:
         return self._keep(torch.empty(self.cameras, columns, dtype=dtype or self.dtype, device="cpu"))
 
     def _add_chart(self) -> None:
         """The fold and the inverse of a chart that is given the other way round."""
-        self._domain.is_chart = True
-        struct, table = self.struct, self._new(_TABLE)
-        struct.chart_inner2, struct.chart_table = self._new(1), table
-        self._ask({"inner2": struct.chart_inner2, "table": table})
-        struct.chart_most2 = self._keep(self._kept[-2][:, 1])
-        self._domain.is_chart = False
+        struct, table = self.struct, torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu")
+        struct.chart_inner2, struct.chart_table = self._new(1), self._keep(table)
+        self._ask({"inner2": struct.chart_inner2, "table": struct.chart_table, "is_chart": True})
+        struct.chart_most2 = self._keep(table[:, 1])
 
     def _add_domain(self) -> None:
         struct, plan = self.struct, self.plan
         struct.inner2, struct.usual2 = self._new(1), self._new(1)
         if plan.is_chart:  # whose end is that of a search
-            domain = self.domain
+            domain = self._slow_domain()
             struct.inner2, struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
             return
         wanted = {"inner2": struct.inner2, "usual2": struct.usual2}
@@ -254,17 +259,13 @@ class Native:
 
     def add_table(self) -> None:
         """Make what the inverse of the radial factor starts from."""
-        self.struct.table = self._new(_TABLE)
-        self._ask({"table": self.struct.table})
+        table = self._new(_TABLE)
+        self._ask({"table": table})
+        self.struct.table = table  # when it is whole, for another thread may be looking
 
     def add_limits(self) -> None:
         """Make the limits of each azimuth, which take a while, and are asked for only when a point lies far out."""
-        self.struct.limits2 = self._keep(self.domain.limits2)
-
-    @functools.cached_property
-    def domain(self) -> Domain:
-        """For what the compiled geometry does not do."""
-        return Domain(self._optics_of, self._k)
+        self.struct.limits2 = self._keep(self._slow_domain().limits2)
 
     def _keep(self, tensor: Tensor) -> int:
         tensor = tensor.contiguous()
@@ -275,15 +276,24 @@ class Native:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
 
 
-def native_of(optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None) -> Native | None:
-    """Cameras of intrinsics (C, 4), coefficients (C, n) and the mask (C, 1) of those that are usable.
+def native_of(
+    optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, domain: Callable[[], Domain]
+) -> Native | None:
+    """Cameras as the compiled geometry takes them.
 
     None where there is no library, on another device, and where a part of the optics has no code: a user's own.
+
+    Args:
+        optics_of: of the model.
+        intrinsics: (C, 4).
+        k: (C, n), coefficients.
+        usable: the mask (C, 1) of the cameras that are usable, None if all are.
+        domain: makes that of the lenses, for what the compiled geometry does not do.
     """
     if library() is None or not intrinsics.is_cpu or not len(k):
         return None
     plan = _plan(optics_of, k)
-    return None if plan is None else Native(plan, optics_of, intrinsics, k, usable)
+    return None if plan is None else Native(plan, optics_of, intrinsics, k, usable, domain)
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:

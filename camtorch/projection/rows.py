@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -38,7 +38,6 @@ class Cameras:
 
     def __init__(self, model: type[Camera], intrinsics: Tensor, distortion: Tensor):
         """Of concrete values (C, 4), (C, n)."""
-        # what learns will not be seen again
         self._model, self._learns = model, distortion.requires_grad
         with torch.no_grad():
             self.given = intrinsics.detach().clone(), distortion.detach().clone()
@@ -52,10 +51,7 @@ class Cameras:
     @cached_property
     def domain(self) -> Domain:
         """That of the lenses."""
-        if self.native is not None:
-            return self.native.domain
-        model = self._model
-        return Domain(model.optics, self.k) if self._learns else domain_of(model._model, self.k, model.optics)
+        return _domain(self._model, self.k, self._learns)
 
     def are(self, intrinsics: Tensor, distortion: Tensor) -> bool:
         """Whether they are those of these values."""
@@ -73,7 +69,13 @@ class Cameras:
     @cached_property
     def native(self) -> compiled.Native | None:
         """For the compiled geometry, None where it has not got this model, or is not there."""
-        return compiled.native_of(self._model.optics, self.intrinsics, self.k, self.usable)
+        return compiled.native_of(
+            self._model.optics,
+            self.intrinsics,
+            self.k,
+            self.usable,
+            partial(_domain, self._model, self.k, self._learns),
+        )
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
         """Those of intrinsics and distortion, of which the compiled geometry gives those of the formula's parameters.
@@ -98,6 +100,11 @@ class Cameras:
             outputs, of_outputs = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
             (by_coefficients,) = torch.autograd.grad(outputs, k, of_outputs, materialize_grads=True)
         return by_coefficients
+
+
+def _domain(model: type[Camera], k: Tensor, learns: bool) -> Domain:
+    # what learns will not be seen again
+    return Domain(model.optics, k) if learns else domain_of(model._model, k, model.optics)
 
 
 def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> bool:
