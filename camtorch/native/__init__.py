@@ -1,1 +1,1 @@
-"""Images sampled by compiled code: its C sources, how they are built, found and called."""
+"""Compiled code: the sampler of images and the geometry of cameras, how they are built and found."""
