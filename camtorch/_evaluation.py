@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 def mapped(
     camera: Camera, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
 ) -> tuple[Tensor, Tensor]:
-    """Values (*B, *N, size) by blocks, or traced: by a compiler, or by a transform of torch.func."""
+    """Values (*B, *N, size) by compiled code, or by the recorded formula: see `evaluated`."""
     batch, tensors = camera.batch_shape, camera._tensors
     lead, dims = batch, len(batch)
     if (
@@ -67,6 +67,9 @@ def evaluated(
     cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
+
+    The one place that decides the regime: the compiled geometry on a CPU, where torch neither traces nor transforms, and
+    else the formula, recorded by torch.
 
     Args:
         camera: of the model.
