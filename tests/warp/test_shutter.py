@@ -196,7 +196,8 @@ def test_a_batch_of_shutters_is_each_of_them():
         for i in range(3):
             alone = ct.Warp(camera, camera, **{name: ct.RollingShutter(readout[i], rates[i])})
             assert torch.equal(result[i : i + 1], alone(images[i : i + 1]))
-            assert torch.equal(moved[i], alone.transform_points(pixels[i])[0])
+            # without the compiled library torch rounds the last points of a batch otherwise
+            torch.testing.assert_close(moved[i], alone.transform_points(pixels[i])[0], rtol=0, atol=1e-4)
             assert torch.equal(valid[i], alone.transform_points(pixels[i])[1])
 
 
