@@ -68,7 +68,7 @@ def evaluated(
 ) -> tuple[Tensor, Tensor]:
     """Planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
 
-    The one place that decides the regime: the compiled geometry on a CPU, where torch neither traces nor transforms, and
+    The one place that decides the regime: the compiled geometry on a CPU where torch neither traces nor transforms,
     else the formula, recorded by torch.
 
     Args:
