@@ -103,7 +103,9 @@ class RandomCamera(Augmentation):
         **dict.fromkeys(("preset", "model", "lens"), "like"),
         **{"center": "centre", "size": "image_size"},
     }
-    beside_the_camera = frozenset({"chromatic", "vignetting", "cos4", "rates", "readout", "exposure"})
+    beside_the_camera: ClassVar[frozenset[str]] = frozenset(
+        {"chromatic", "vignetting", "cos4", "rates", "readout", "exposure"}
+    )
     like: Camera | None
 
     def __init__(

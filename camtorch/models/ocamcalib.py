@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class AngleOfAllPowers(AnglePerRadius):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + a1 r + a2 r^2 + ..."""
 
-    code = 5
+    code: ClassVar[int | None] = 5
 
     def __init__(self, coefficients: Sequence[Tensor]):
         super().__init__(coefficients)
@@ -37,7 +37,7 @@ class AngleOfAllPowers(AnglePerRadius):
 class Shear(Stage):
     """(x + e y, d x + y): a sensor out of line with the lens."""
 
-    code = 18
+    code: ClassVar[int | None] = 18
 
     def __init__(self, d: Tensor, e: Tensor):
         self.parameters: tuple[Tensor, ...] = (d, e)

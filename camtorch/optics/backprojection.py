@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ class Inverted(Chart):
     Rays are covered before theta ceases to ascend, and up to `FURTHEST`.
     """
 
-    code = 6
+    code: ClassVar[int | None] = 6
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor]):
         """factor: the class of R, whose instances are made of the parameters."""

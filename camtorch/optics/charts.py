@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -40,7 +41,7 @@ class Chart:
     Margins are positive where something holds.
     """
 
-    code: int | None = None
+    code: ClassVar[int | None] = None
     """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
     has_scale = True
     """Whether the plane point is (x, y) times a `scale`."""
@@ -106,7 +107,7 @@ class Perspective(Chart):
     distortion polynomials reach, leaves the floating-point range.
     """
 
-    code = 0
+    code: ClassVar[int | None] = 0
 
     def end(self, dtype: torch.dtype) -> float:
         return min(1e9, math.pow(torch.finfo(dtype).max, 1 / 9))
@@ -134,7 +135,7 @@ class Perspective(Chart):
 class Equidistant(Chart):
     """theta (cos phi, sin phi), theta = atan2(hypot(x, y), z): every ray but the exact backward one."""
 
-    code = 1
+    code: ClassVar[int | None] = 1
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         # closer to the backward direction the derivative pi / rho leaves the floating-point range
@@ -174,7 +175,7 @@ class Equidistant(Chart):
 class EquidistantUpTo(Equidistant):
     """The equidistant chart of a lens that is known up to some angle."""
 
-    code = 1
+    code: ClassVar[int | None] = 1
 
     last: Tensor
 
@@ -193,7 +194,7 @@ def _half_turn(dtype: torch.dtype) -> float:
 class CylinderChart(Chart):
     """(longitude, height) = (atan2(x, z), y / hypot(x, z)). Every ray but straight up and down."""
 
-    code = 7
+    code: ClassVar[int | None] = 7
 
     has_scale = False
 
@@ -213,7 +214,7 @@ class CylinderChart(Chart):
 class SphereChart(Chart):
     """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))). Every ray but straight up and down."""
 
-    code = 8
+    code: ClassVar[int | None] = 8
 
     has_scale = False
 
@@ -268,7 +269,7 @@ def _sum(z: Tensor, root: Tensor, difference: Tensor) -> Tensor:
 class Equisolid(Chart):
     """2 sin(theta / 2) (cos phi, sin phi): every ray but the exact backward one."""
 
-    code = 2
+    code: ClassVar[int | None] = 2
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return Equidistant().margin(x, y, z)
@@ -299,7 +300,7 @@ class Fov(Chart):
     Even and analytic in omega, which lies between -pi and pi.
     """
 
-    code = 4
+    code: ClassVar[int | None] = 4
 
     def __init__(self, omega: Tensor):
         self.parameters: tuple[Tensor, ...] = (omega,)
@@ -337,7 +338,7 @@ class Fov(Chart):
 class OneDivision(Chart):
     """The rays (a, b, 1 + coefficient r^2): all but the exact backward one for a negative coefficient."""
 
-    code = 5
+    code: ClassVar[int | None] = 5
 
     def __init__(self, coefficient: Tensor):
         self.parameters: tuple[Tensor, ...] = (coefficient,)

@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -50,7 +50,7 @@ class Stage:
 
     The formula reads them here, and nothing else that depends on the coefficients.
     """
-    code: int | None = None
+    code: ClassVar[int | None] = None
     """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
     radial: RadialFactor | None = None
     """What of a first stage is tabulated, to start the inverse from."""
@@ -144,7 +144,7 @@ class Planar(Stage):
     prism: (s0, s1, s2, s3), the thin-prism coefficients.
     """
 
-    code = 16
+    code: ClassVar[int | None] = 16
 
     radial: RadialFactor | None = None
     tangential: Sequence[Tensor] = ()
@@ -260,7 +260,7 @@ class Tilt(Stage):
     projected back along the optical axis. It fixes the origin; OpenCV's R_x, R_y turn clockwise.
     """
 
-    code = 17
+    code: ClassVar[int | None] = 17
 
     def __init__(self, tau_x: Tensor, tau_y: Tensor):
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ class RadialFactor:
     Made of its coefficients, columns that broadcast against planes.
     """
 
-    code: int | None = None
+    code: ClassVar[int | None] = None
     """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
     name: str
     """That of the class in the registry."""
@@ -72,7 +72,7 @@ class RadialFactor:
 class Polynomial(RadialFactor):
     """The radial factor R(t) = 1 + c0 t + c1 t^2 + ... of t = radius^2; radius R(t) is the distorted radius."""
 
-    code = 1
+    code: ClassVar[int | None] = 1
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
@@ -106,7 +106,7 @@ class Polynomial(RadialFactor):
 class Rational(RadialFactor):
     """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
 
-    code = 2
+    code: ClassVar[int | None] = 2
 
     numerator: Polynomial
     denominator: Polynomial
@@ -150,7 +150,7 @@ class RadiusPolynomial(RadialFactor):
     on the direction from which the centre is approached. The one given there is zero, their mean.
     """
 
-    code = 3
+    code: ClassVar[int | None] = 3
 
     of_radius: Polynomial
 
@@ -180,7 +180,7 @@ class RadiusPolynomial(RadialFactor):
 class AnglePerRadius(RadialFactor):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + c0 t + c1 t^2 + ... of t = r^2."""
 
-    code = 4
+    code: ClassVar[int | None] = 4
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.ahead: RadialFactor = Polynomial(coefficients)
@@ -216,7 +216,7 @@ class RadiusTable(RadialFactor):
     so that the lens folds there.
     """
 
-    code = 6
+    code: ClassVar[int | None] = 6
 
     nodes: tuple[Tensor, ...]
     end: Tensor

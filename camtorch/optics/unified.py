@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ class Unified(Chart):
     out is 0, 0 and 1, that is the perspective chart; a number is a part that does not learn.
     """
 
-    code = 3
+    code: ClassVar[int | None] = 3
 
     fixed_alpha: float | None
     has_xi: bool

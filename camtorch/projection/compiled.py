@@ -110,6 +110,17 @@ class _Domain(ctypes.Structure):
 class Plan:
     """What all cameras of a model and a number of coefficients have in common."""
 
+    parts: ctypes.Array[_Part]
+    count: int
+    parameters: int
+    places: Tensor | None
+    is_all: bool
+    is_chart: bool
+    has_stages: bool
+    is_radial: bool
+    has_factor: bool
+    has_rest: bool
+
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
         """Of the optics of coefficients, columns, whatever their values."""
         self.parts, self.count = (_Part * len(parts))(*parts), len(parts)
@@ -162,6 +173,12 @@ def _plan(optics_of: Optics, k: Tensor) -> Plan | None:
 class Native:
     """Cameras (C,) of one model as the compiled geometry takes them."""
 
+    plan: Plan
+    struct: _Cameras
+    cameras: int
+    dtype: torch.dtype
+    parameters: int
+    pointer: int
     _kept: list[Any]
 
     def __init__(

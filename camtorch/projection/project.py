@@ -89,4 +89,9 @@ class Project:
         """The same by the compiled geometry, without a graph, and what `native_vjp` needs: the points."""
         return *compiled.project(made, points), (points,)
 
-    native_vjp = staticmethod(compiled.project_vjp)
+    @staticmethod
+    def native_vjp(
+        made: compiled.Native, points: Tensor, by_pixels: Tensor, want_points: bool, want_parameters: bool
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """The cotangents of points and of the formula's parameters."""
+        return compiled.project_vjp(made, points, by_pixels, want_points, want_parameters)

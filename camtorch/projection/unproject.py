@@ -205,7 +205,17 @@ class Unproject:
         # a copy: what is handed out belongs to the caller
         return rays, valid, (valid.clone(), solution) if solution is not None else ()
 
-    native_vjp = staticmethod(compiled.unproject_vjp)
+    @staticmethod
+    def native_vjp(
+        made: compiled.Native,
+        valid: Tensor,
+        solution: Tensor,
+        by_rays: Tensor,
+        want_pixels: bool,
+        want_parameters: bool,
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """The cotangents of pixels and of the formula's parameters."""
+        return compiled.unproject_vjp(made, valid, solution, by_rays, want_pixels, want_parameters)
 
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:
