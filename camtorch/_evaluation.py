@@ -34,6 +34,7 @@ from camtorch.projection.unproject import Unproject
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
+    from camtorch.projection.compiled import Native
 
 
 def mapped(
@@ -109,6 +110,25 @@ def evaluated(
     if is_portable_export() and not keeps_graph(*inputs):
         inputs = rows, intrinsics.detach(), distortion.detach()
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
+
+
+def compiled_of(camera: Camera, *values: Tensor) -> Native | None:
+    """The compiled geometry of cameras (B,), or of one, for values of the dtype of the first of them.
+
+    None where `evaluated` would take another regime, where the result would have a graph, and of cameras that are more
+    than one model, or behind a shutter.
+    """
+    if not isinstance(camera, nn.Module) or camera.is_mixed:
+        return None
+    tensors, dtype = camera._tensors, values[0].dtype
+    inputs = *values, *tensors
+    if not _is_plain(inputs) or is_recorded() or keeps_graph(*inputs) or not all(map(in_memory, inputs)):
+        return None
+    if not dtype.is_floating_point or any(t.dtype != dtype for t in tensors) or len(camera.batch_shape) > 1:
+        return None
+    lead = camera.batch_shape or (1,)
+    intrinsics, distortion = (t.expand(*lead, t.shape[-1]) for t in tensors)
+    return rows_of(camera, intrinsics, distortion).native
 
 
 class _Native(Function):

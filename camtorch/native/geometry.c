@@ -5,6 +5,7 @@
  * The templates are included for float and for double.
  */
 #include "geometry.h"
+#include "sampler.h"
 
 #include <float.h>
 #include <math.h>
@@ -29,6 +30,7 @@
 
 enum { LANES = 16 };      /* that a block is filled up to a multiple of */
 enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */
+enum { SQUARE = 64 };     /* pixels of a cell of a lattice */
 enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
 #define PI 3.14159265358979323846
 
@@ -73,12 +75,12 @@ static int numbers_of(const Part *part) {
 }
 
 /* The tile that whoever is free takes */
-static int64_t taken(const Rows *rows, int64_t *own) {
-    if (!rows->next) return (*own)++;
+static int64_t taken(int64_t *next, int64_t *own) {
+    if (!next) return (*own)++;
 #if defined(_MSC_VER)
-    return _InterlockedExchangeAdd64(rows->next, 1);
+    return _InterlockedExchangeAdd64(next, 1);
 #else
-    return __atomic_fetch_add(rows->next, 1, __ATOMIC_RELAXED);
+    return __atomic_fetch_add(next, 1, __ATOMIC_RELAXED);
 #endif
 }
 
@@ -92,6 +94,7 @@ static int64_t taken(const Rows *rows, int64_t *own) {
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_moves.h"
 #undef R
 #undef I
 #undef T
@@ -109,9 +112,13 @@ static int64_t taken(const Rows *rows, int64_t *own) {
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_moves.h"
 #include "geometry_domain.h"
 
 /* Makes tiles until none is left that nobody has taken; how many points wait for `limits2` */
 int64_t THIS(geometry)(const Rows *rows) {
     return rows->cameras->is_double ? rows_double(rows) : rows_float(rows);
 }
+
+/* The same of pixels that are moved; flags of what is left */
+int64_t THIS(moves)(const Move *move) { return move->from->is_double ? moves_double(move) : moves_float(move); }

@@ -90,6 +90,38 @@ typedef struct {
     int64_t *next; /* the tile that whoever is free takes; NULL: one caller takes all */
 } Rows;
 
+/* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there */
+enum { POSITIONS, PIXELS };
+/* What is left to do: pixels are OPEN, or points wait for `limits2` */
+enum { LEFT_OPEN = 1, LEFT_WAITING = 2 };
+#define OUTSIDE (-9)
+#define FAR 100 /* beyond, positions are drawn in */
+
+/* Pixels of cameras `from`, by rays that are turned, to those of `to`; each as many as `cameras`, or one for all. All
+   numbers are of the type of both */
+typedef struct {
+    const Cameras *from, *to;
+    const void *turns; /* (c, 3, 3), or NULL */
+    int64_t turn_stride; /* 0: one for all */
+    int64_t cameras, form;
+    double height, width; /* of the image of `to` */
+    /* Rows of pixels (c, n), */
+    const void *rows;
+    int64_t row_strides[3];
+    /* or squares (n, 3) of 8x8 pixels, those of one camera side by side: camera, row and column of `cells` (c,
+       cell_rows, cell_columns), of which the first lies at `first_row`. Each gets its number, from `number` on, and
+       where what is mapped ends in it, those around it become CELL_NEXT */
+    const int64_t *places;
+    int64_t first_row;
+    int32_t *cells;
+    int64_t cell_rows, cell_columns, number;
+    void *results; /* strides as of `Rows`; or (2, n, 8, 8), NaN where there is none, the last stride alone counts */
+    int64_t result_strides[3];
+    uint8_t *valid; /* (c, n) without gaps, of rows */
+    int64_t count, tile; /* pixels of a camera, or squares; of a tile */
+    int64_t *next;       /* as of `Rows` */
+} Move;
+
 /* OPEN: a pixel that may have a ray, which steps of Newton's method have not found */
 enum { VALID = 1, OPEN = 2 };
 

@@ -201,6 +201,23 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
     return waiting;
 }
 
+/* Points `s` to pixels, -1 where they are not `ok`. How many wait for limits */
+static int T(pixels_of)(const T(Camera) *c, int count, int n, T(Seen) *s, R *restrict u, R *restrict v) {
+    const int waiting = T(see)(c, 0, count, n, s);
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
+    if (c->is_radial) { /* most often */
+        EACH(i) s->x[i] = s->a[i] * s->a[i] + s->b[i] * s->b[i];
+        T(radial)(c->factors + 1, n, s->x, s->scale, NULL);
+        EACH(i) s->x[i] = fx * (s->a[i] * s->scale[i]), s->y[i] = fy * (s->b[i] * s->scale[i]);
+    } else if (c->stages) {
+        T(lens)(c, 1, n, s->a, s->b, s->x, s->y, NULL, NULL);
+        EACH(i) s->x[i] *= fx, s->y[i] *= fy;
+    } else EACH(i) s->x[i] = fx * s->a[i], s->y[i] = fy * s->b[i];
+    /* in a loop of its own, so that no processor does both at once: edges of images lie where round numbers put them */
+    EACH(i) u[i] = s->ok[i] ? s->x[i] + cx : -1, v[i] = s->ok[i] ? s->y[i] + cy : -1;
+    return waiting;
+}
+
 static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
     const int n = (count + LANES - 1) & -LANES;
     const int64_t *from = rows->row_strides, *to = rows->result_strides;
@@ -210,20 +227,9 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     T(Seen) s;
     ALIGNED R p[BLOCK], q[BLOCK];
     const int direct = T(is_plane)(to, count, n);
-    R *restrict u = direct ? pixels : p, *restrict v = direct ? pixels + to[2] : q;
+    R *u = direct ? pixels : p, *v = direct ? pixels + to[2] : q;
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
-    const int waiting = T(see)(c, 0, count, n, &s);
-    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
-    if (c->is_radial) { /* most often */
-        EACH(i) s.x[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
-        T(radial)(c->factors + 1, n, s.x, s.scale, NULL);
-        EACH(i) s.x[i] = fx * (s.a[i] * s.scale[i]), s.y[i] = fy * (s.b[i] * s.scale[i]);
-    } else if (c->stages) {
-        T(lens)(c, 1, n, s.a, s.b, s.x, s.y, NULL, NULL);
-        EACH(i) s.x[i] *= fx, s.y[i] *= fy;
-    } else EACH(i) s.x[i] = fx * s.a[i], s.y[i] = fy * s.b[i];
-    /* in a loop of its own, so that no processor does both at once: edges of images lie where round numbers put them */
-    EACH(i) u[i] = s.ok[i] ? s.x[i] + cx : -1, v[i] = s.ok[i] ? s.y[i] + cy : -1;
+    const int waiting = T(pixels_of)(c, count, n, &s, u, v);
     if (!direct) T(store)(pixels, to, 2, count, u, v, NULL);
     for (int i = 0; i < count; i++) valid[i] = (uint8_t)s.ok[i];
     return waiting;
@@ -560,17 +566,12 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
     }
 }
 
-/* How many are left OPEN */
-static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
-    const int n = (count + LANES - 1) & -LANES, follows = c->follows;
-    const int64_t *from = rows->row_strides, *to = rows->result_strides;
-    const R *pixels = (const R *)rows->rows + camera * from[0] + first * from[1];
-    R *rays = (R *)rows->results + camera * to[0] + first * to[1];
-    uint8_t *valid = rows->valid + camera * rows->count + first;
-    ALIGNED R u[BLOCK], v[BLOCK], a[BLOCK], b[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
-    ALIGNED I ok[BLOCK], known[BLOCK], possible[BLOCK];
-    int left = 0;
-    T(load_pixels)(pixels, from, count, n, u, v, c->cx, c->cy);
+/* Pixels (u, v) to points (u, v) of the chart's plane and rays, the axis where there is none. `known` are numbers to
+   calculate with; where one is not `ok`, a lens that `follows` leaves OPEN whether it has a ray */
+static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v, I *restrict known, I *restrict ok,
+                         R *x, R *y, R *z) {
+    ALIGNED R a[BLOCK], b[BLOCK];
+    ALIGNED I possible[BLOCK];
     const R by_fx = 1 / c->fx, by_fy = 1 / c->fy, cx = c->cx, cy = c->cy;
     const I usable = c->usable;
     EACH(i) {
@@ -579,28 +580,44 @@ static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, in
         u[i] = known[i] ? p : 0, v[i] = known[i] ? q : 0;
     }
     if (c->stages) {
-        int places[BLOCK], some;
         T(invert)(c, n, u, v, a, b, ok, possible);
-        if (!follows) EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
-        if (!follows && (some = T(chosen)(n, possible, places))) {
-            ALIGNED R found_a[BLOCK], found_b[BLOCK];
-            ALIGNED I found[BLOCK];
-            const int filled = (some + LANES - 1) & -LANES;
-            for (int i = 0; i < filled; i++) x[i] = u[places[i]], y[i] = v[places[i]];
-            T(search)(c, filled, x, y, found_a, found_b, found);
-            for (int i = 0; i < some; i++)
-                a[places[i]] = found_a[i], b[places[i]] = found_b[i], ok[places[i]] = found[i];
+        if (!c->follows) {
+            int places[BLOCK], some;
+            EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
+            if ((some = T(chosen)(n, possible, places))) {
+                ALIGNED R p[BLOCK], q[BLOCK], found_a[BLOCK], found_b[BLOCK];
+                ALIGNED I found[BLOCK];
+                const int filled = (some + LANES - 1) & -LANES;
+                for (int i = 0; i < filled; i++) p[i] = u[places[i]], q[i] = v[places[i]];
+                T(search)(c, filled, p, q, found_a, found_b, found);
+                for (int i = 0; i < some; i++)
+                    a[places[i]] = found_a[i], b[places[i]] = found_b[i], ok[places[i]] = found[i];
+            }
         }
         EACH(i) {
             ok[i] &= known[i];
             u[i] = ok[i] ? a[i] : 0, v[i] = ok[i] ? b[i] : 0;
         }
     } else T(cover)(c, n, u, v, known, ok);
+    T(rays)(c, n, u, v, ok, x, y, z);
+}
+
+/* How many are left OPEN */
+static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
+    const int n = (count + LANES - 1) & -LANES;
+    const int64_t *from = rows->row_strides, *to = rows->result_strides;
+    const R *pixels = (const R *)rows->rows + camera * from[0] + first * from[1];
+    R *rays = (R *)rows->results + camera * to[0] + first * to[1];
+    uint8_t *valid = rows->valid + camera * rows->count + first;
+    ALIGNED R u[BLOCK], v[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
+    ALIGNED I ok[BLOCK], known[BLOCK];
+    int left = 0;
     const int direct = T(is_plane)(to, count, n);
     R *p = direct ? rays : x, *q = direct ? rays + to[2] : y, *r = direct ? rays + 2 * to[2] : z;
-    T(rays)(c, n, u, v, ok, p, q, r);
+    T(load_pixels)(pixels, from, count, n, u, v, c->cx, c->cy);
+    T(solutions)(c, n, u, v, known, ok, p, q, r);
     if (!direct) T(store)(rays, to, 3, count, p, q, r);
-    if (follows)
+    if (c->follows)
         for (int i = 0; i < count; i++) {
             const int open = !ok[i] & (known[i] != 0);
             valid[i] = ok[i] ? VALID : open ? OPEN : 0, left += open;
@@ -671,7 +688,7 @@ static int64_t T(rows)(const Rows *rows) {
     const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
     int64_t left = 0, last = -1, own = 0, at;
     T(Camera) camera;
-    while ((at = taken(rows, &own)) < tiles * rows->cameras->cameras) {
+    while ((at = taken(rows->next, &own)) < tiles * rows->cameras->cameras) {
         const int64_t index = at / tiles, first = at % tiles * rows->tile;
         const int64_t end = first + rows->tile < rows->count ? first + rows->tile : rows->count;
         double *sums = rows->sums ? rows->sums + at * width : NULL;

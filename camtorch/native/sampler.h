@@ -15,8 +15,8 @@ enum { UINT8, BOOL, UINT16, FLOAT32, BYTES1, BYTES2, BYTES4, BYTES8, TYPES };
 enum { NEAREST, BILINEAR, BICUBIC };
 enum { ZEROS, BORDER, REFLECTION };
 
-enum { STEP = 8 };                      /* pixels between the nodes of a lattice */
-enum { CELL_EMPTY = -2, CELL_CUBIC = -1 }; /* cells that are neither: the index of their exact positions */
+enum { STEP = 8 }; /* pixels between the nodes of a lattice */
+enum { CELL_NEXT = -3, CELL_EMPTY, CELL_CUBIC }; /* to be computed next, and others that have no place in `exact` */
 
 typedef struct {
     /* images (b, c, y, x) and results, in elements; a source image may serve all results (stride 0) */

@@ -15,7 +15,7 @@ from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
 
-EMPTY, CUBIC, TODO = -2, -1, 0
+NEXT, EMPTY, CUBIC, TODO = -3, -2, -1, 0
 """Cells of a lattice: one that shows nothing, one between whose nodes lie cubics, one that wants exact positions."""
 
 _MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
@@ -222,16 +222,15 @@ class Probed(NamedTuple):
     """"zeros", "border" or "reflection", of what is to be sampled."""
 
 
-def classify(probed: Probed) -> tuple[Tensor, int] | None:
-    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`, or None without a library. Nodes are of float32.
+def classify(probed: Probed) -> tuple[Tensor, int]:
+    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`. Nodes are of float32. There is a library.
 
     Returns:
         (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
     """
     nodes, mapped, rim = probed[:3]
     native = library()
-    if native is None:
-        return None
+    assert native is not None  # who calls has looked
     rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(nodes.shape[0], rows, columns, dtype=torch.int32, device="cpu")
     scratch = (c_float * (25 * (columns + 8)))()

@@ -77,6 +77,9 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
+_Move = struct.Struct("6q2d18q").pack  # `Move` of geometry.h
+POSITIONS, PIXELS = range(2)
+_LEFT_OPEN, _LEFT_WAITING = 1, 2
 _NO_ROWS = (0, 0, 0, 0)
 
 
@@ -437,6 +440,75 @@ def unproject_vjp(
     rows = *_NO_ROWS, *_points(results), valid.data_ptr(), solution.data_ptr()
     _call(native, cameras, count, UNPROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
+
+
+class Between:
+    """Cameras, and others that see their rays after a turn: pixels of the first as pixels of the others."""
+
+    cameras: int
+    """Of each as many, or one for all."""
+    is_batch: bool
+    """Whether pixels have a batch dim."""
+
+    def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
+        """turns: (3, 3) or (C, 3, 3), of their dtype. size: (height, width) of the others' image."""
+        turns, self.is_batch = None if turns is None else turns.contiguous(), is_batch
+        self._start, self._end, self._turns = start, end, turns
+        count = 1 if turns is None or turns.ndim == 2 else len(turns)
+        self.cameras = max(start.cameras, end.cameras, count)
+        if start.plan.has_factor and start.struct.table is None:
+            start.add_table()
+        self._given = start.pointer, end.pointer, _address(turns), 9 * (count > 1), self.cameras
+        self._size = float(size[0]), float(size[1])
+
+    def rows(self, pixels: Tensor, form: int, is_planar: bool = False) -> tuple[Tensor, Tensor] | None:
+        """Pixels (C or 1, N, 2) to (C, N, 2), or to planes (C, 2, N), and valid (C, N); None where a search is needed.
+
+        form: `POSITIONS` as of `grid_sample`, -9 where there is none; or `PIXELS`, -1 where there is none.
+        """
+        cameras, count, dtype = self.cameras, pixels.shape[1], self._start.dtype
+        camera, point, component = pixels.stride()
+        shape = (cameras, 2, count) if is_planar else (cameras, count, 2)
+        result = torch.empty(shape, dtype=dtype, device="cpu")
+        valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+        steps = (2 * count, 1, count) if is_planar else (2 * count, 2, 1)
+        given = pixels.data_ptr(), camera if len(pixels) > 1 else 0, point, component, *(0,) * 6
+        if not self._call(form, (*given, result.data_ptr(), *steps, valid.data_ptr()), count, _TILE, cameras):
+            return None
+        return result, valid
+
+    def squares(self, places: Tensor, first_row: int, cells: Tensor, number: int) -> Tensor | None:
+        """Positions (2, N, 8, 8) of all pixels of cells, NaN where there is none; None as of `rows`.
+
+        Args:
+            places: (N, 3): camera, row and column of each, those of one camera side by side.
+            first_row: of the target where cells begin.
+            cells: (C, n, m) int32: where a place among the positions goes, from `number` on, and `NEXT` to those around
+                a cell in which what is mapped ends.
+            number: of the first one.
+        """
+        places, count = places.contiguous(), len(places)
+        result = torch.empty(2, count, 8, 8, dtype=self._start.dtype, device="cpu")
+        given = 0, 0, 0, 0, places.data_ptr(), first_row, cells.data_ptr(), *cells.shape[1:], number
+        done = self._call(POSITIONS, (*given, result.data_ptr(), 0, 0, 64 * count, 0), count, _TILE // 64, 1)
+        return result if done else None
+
+    def _call(self, form: int, rows: tuple[int, ...], count: int, tile: int, times: int) -> bool:
+        run, following = _entry("camtorch_moves", c_int64), c_int64(0)
+        tiles = -(-count // tile) * times
+        shared = thread_count() if tiles > 2 else 1
+        place = addressof(following) if shared > 1 else 0
+        for _ in range(2):
+            left: list[int] = []
+            call = _Move(*self._given, form, *self._size, *rows, count, tile, place)
+            spread(lambda call=call, left=left: left.append(run(call)), min(shared, tiles))  # type: ignore[misc]
+            if any(flags & _LEFT_OPEN for flags in left):
+                return False
+            if self._end.struct.limits2 is not None or not any(flags & _LEFT_WAITING for flags in left):
+                return True
+            self._end.add_limits()
+            following.value = 0
+        return True
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
