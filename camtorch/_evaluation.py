@@ -112,23 +112,31 @@ def evaluated(
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
 
 
-def compiled_of(camera: Camera, *values: Tensor) -> Native | None:
-    """The compiled geometry of cameras (B,), or of one, for values of the dtype of the first of them.
+def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> list[Native] | None:
+    """The compiled geometry of cameras (B,), or of one, each, for values of the dtype of the first of them.
 
     None where `evaluated` would take another regime, where the result would have a graph, and of cameras that are more
     than one model, or behind a shutter.
     """
-    if not isinstance(camera, nn.Module) or camera.is_mixed:
+    inputs, dtype = [*values], values[0].dtype
+    for camera in cameras:
+        if not isinstance(camera, nn.Module) or camera.is_mixed or len(camera.batch_shape) > 1:
+            return None
+        inputs += camera._tensors
+    if not _is_plain(inputs) or is_recorded() or not all(map(in_memory, inputs)):
         return None
-    tensors, dtype = camera._tensors, values[0].dtype
-    inputs = *values, *tensors
-    if not _is_plain(inputs) or is_recorded() or keeps_graph(*inputs) or not all(map(in_memory, inputs)):
+    if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         return None
-    if not dtype.is_floating_point or any(t.dtype != dtype for t in tensors) or len(camera.batch_shape) > 1:
+    if not dtype.is_floating_point or any(t.dtype != dtype for t in inputs[len(values) :]):
         return None
-    lead = camera.batch_shape or (1,)
-    intrinsics, distortion = (t.expand(*lead, t.shape[-1]) for t in tensors)
-    return rows_of(camera, intrinsics, distortion).native
+    made = []
+    for camera in cameras:
+        lead = camera.batch_shape or (1,)
+        native = rows_of(camera, *(t.expand(*lead, t.shape[-1]) for t in camera._tensors)).native
+        if native is None:
+            return None
+        made.append(native)
+    return made
 
 
 class _Native(Function):

@@ -7,7 +7,7 @@ import functools
 import struct
 from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -173,46 +173,30 @@ def _plan(optics_of: Optics, k: Tensor) -> Plan | None:
     return _plans[key]
 
 
-class Native:
-    """Cameras (C,) of one model as the compiled geometry takes them."""
+class Lenses:
+    """Those of cameras (C,) as the compiled geometry takes them: numbers, and what was found of their domains."""
 
     plan: Plan
-    struct: _Cameras
     cameras: int
     dtype: torch.dtype
-    parameters: int
-    pointer: int
-    _kept: list[Any]
+    fields: dict[str, int]
+    """Where what `Cameras` of geometry.h has of them lies."""
+    table: int | None
+    limits2: int | None
 
-    def __init__(
-        self,
-        plan: Plan,
-        optics_of: Optics,
-        intrinsics: Tensor,
-        k: Tensor,
-        usable: Tensor | None,
-        domain: Callable[[], Domain],
-    ):
+    def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
         """See `native_of`."""
-        self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, []
-        self._slow_domain = domain
-        self.struct = struct = _Cameras()
-        struct.parts, struct.part_count = addressof(plan.parts), plan.count
-        self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
-        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
-        struct.intrinsics = self._keep(intrinsics)
-        self.parameters = struct.parameter_count = plan.parameters
+        self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
+        self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
+        self.fields, self.table, self.limits2 = {}, None, None
         if plan.parameters:
-            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
+            self.fields["parameters"] = self._keep(plan.parameters_of(optics_of, k))
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
-            struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
-        if usable is not None:
-            struct.usable = self._keep(usable > 0)
+            self.fields |= {"constants": self._keep_columns(constants), "constant_count": len(constants)}
         if plan.is_chart:
             self._add_chart()
         if plan.has_stages:
             self._add_domain()
-        self.pointer = addressof(struct)
 
     def _optics(self) -> tuple[Chart, Lens]:
         """In double precision."""
@@ -223,7 +207,7 @@ class Native:
         """What it is asked with; its optics are of double precision."""
         made, plan, k = _Domain(), self.plan, self._k.double()
         made.parts, made.part_count = addressof(plan.parts), plan.count
-        made.is_double, made.cameras, made.is_radial = self.struct.is_double, self.cameras, plan.is_radial
+        made.is_double, made.cameras, made.is_radial = self.dtype == torch.float64, self.cameras, plan.is_radial
         made.parameters, made.parameter_count = self._keep(plan.parameters_of(self._optics_of, k)), plan.parameters
         made.most = torch.finfo(self.dtype).max ** 0.25
         made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
@@ -257,35 +241,37 @@ class Native:
 
     def _add_chart(self) -> None:
         """The fold and the inverse of a chart that is given the other way round."""
-        struct, table = self.struct, torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu")
-        struct.chart_inner2, struct.chart_table = self._new(1), self._keep(table)
-        self._ask({"inner2": struct.chart_inner2, "table": struct.chart_table, "is_chart": True})
-        struct.chart_most2 = self._keep(table[:, 1])
+        table, inner2 = torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu"), self._new(1)
+        place = self._keep(table)
+        self._ask({"inner2": inner2, "table": place, "is_chart": True})
+        self.fields |= {"chart_inner2": inner2, "chart_table": place, "chart_most2": self._keep(table[:, 1])}
 
     def _add_domain(self) -> None:
-        struct, plan = self.struct, self.plan
-        struct.inner2, struct.usual2 = self._new(1), self._new(1)
+        plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
-            struct.inner2, struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
+            self.fields |= {"inner2": self._keep(domain.inner2), "usual2": self._keep(domain.usual2)}
             return
-        wanted = {"inner2": struct.inner2, "usual2": struct.usual2}
+        wanted = {"inner2": self._new(1), "usual2": self._new(1)}
         if plan.has_rest:
-            struct.circle2, struct.stagewise = self._new(1), self._new(1, torch.bool)
-            wanted |= {"circle2": struct.circle2, "stagewise": struct.stagewise}
-        if not plan.is_radial:
-            wanted["radii"] = self._keep(self._optics()[0].radii(_RADII, self._k).double())
-        self._ask(wanted)
+            wanted |= {"circle2": self._new(1), "stagewise": self._new(1, torch.bool)}
+        self.fields |= wanted
+        radii = {} if plan.is_radial else {"radii": self._keep(self._optics()[0].radii(_RADII, self._k).double())}
+        self._ask(wanted | radii)
 
-    def add_table(self) -> None:
-        """Make what the inverse of the radial factor starts from."""
-        table = self._new(_TABLE)
-        self._ask({"table": table})
-        self.struct.table = table  # when it is whole, for another thread may be looking
+    def inverse_table(self) -> int:
+        """What the inverse of the radial factor starts from; it is made when it is first asked for."""
+        if self.table is None:
+            table = self._new(_TABLE)
+            self._ask({"table": table})
+            self.table = table  # when it is whole, for another thread may be looking
+        return self.table
 
-    def add_limits(self) -> None:
-        """Make the limits of each azimuth, which take a while, and are asked for only when a point lies far out."""
-        self.struct.limits2 = self._keep(self._slow_domain().limits2)
+    def limits(self) -> int:
+        """The limits of each azimuth, which take a while, and are asked for only when a point lies far out."""
+        if self.limits2 is None:
+            self.limits2 = self._keep(self._slow_domain().limits2)
+        return self.limits2
 
     def _keep(self, tensor: Tensor) -> int:
         tensor = tensor.contiguous()
@@ -294,6 +280,56 @@ class Native:
 
     def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
+
+
+_MOST_LENSES, _LONGEST = 24, 512
+_lenses: dict[tuple[object, ...], Lenses] = {}
+
+
+def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]) -> Lenses:
+    """Those of these values: of the last ones that were asked for, or new ones."""
+    if k.numel() > _LONGEST:
+        return Lenses(plan, optics_of, k, domain)
+    key = plan, k.dtype, k.shape, k.numpy().tobytes()
+    found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain)
+    _lenses[key] = found  # the last one
+    while len(_lenses) > _MOST_LENSES:
+        _lenses.pop(next(iter(_lenses)), None)
+    return found
+
+
+class Native:
+    """Cameras (C,) of one model as the compiled geometry takes them."""
+
+    plan: Plan
+    struct: _Cameras
+    cameras: int
+    dtype: torch.dtype
+    parameters: int
+    pointer: int
+
+    def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
+        """See `native_of`."""
+        self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras()
+        self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
+        struct, plan = self.struct, self.plan
+        struct.parts, struct.part_count = addressof(plan.parts), plan.count
+        self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
+        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
+        self.parameters = struct.parameter_count = plan.parameters
+        struct.intrinsics, struct.usable = map(_address, self._kept)
+        struct.table, struct.limits2 = lenses.table, lenses.limits2
+        for name, value in lenses.fields.items():
+            setattr(struct, name, value)
+        self.pointer = addressof(struct)
+
+    def add_table(self) -> None:
+        """Have what the inverse starts from."""
+        self.struct.table = self._lenses.inverse_table()
+
+    def add_limits(self) -> None:
+        """Have the limits of each azimuth."""
+        self.struct.limits2 = self._lenses.limits()
 
 
 def native_of(
@@ -313,7 +349,7 @@ def native_of(
     if library() is None or not intrinsics.is_cpu or not len(k):
         return None
     plan = _plan(optics_of, k)
-    return None if plan is None else Native(plan, optics_of, intrinsics, k, usable, domain)
+    return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain), intrinsics, usable)
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:

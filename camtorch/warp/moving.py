@@ -22,16 +22,14 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
         rotation: (3, 3) or (B, 3, 3), `ray_end = R ray_start`, or None.
         like: the pixels, or others of their dtype.
     """
-    values = (like,) if rotation is None else (like, rotation)
-    one = compiled_of(start, *values)
-    if one is None or seam_of(start) is not None or seam_of(end) is not None:
+    if seam_of(start) is not None or seam_of(end) is not None:
         return None
-    other = compiled_of(end, *values)
-    if other is None:
+    made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
+    if made is None:
         return None
     rotation = None if rotation is None else rotation.detach().to(like.dtype)
     is_batch = bool(start.batch_shape or end.batch_shape or (rotation is not None and rotation.ndim == 3))
-    return Between(one, other, rotation, end._size_for("Warp"), is_batch)
+    return Between(*made, rotation, end._size_for("Warp"), is_batch)
 
 
 def moved_pixels(start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers) -> tuple[Tensor, Tensor]:
