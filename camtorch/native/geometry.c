@@ -5,7 +5,6 @@
  * The templates are included for float and for double.
  */
 #include "geometry.h"
-#include "sampler.h"
 
 #include <float.h>
 #include <math.h>
@@ -61,6 +60,8 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         FORM(ALL, ANGLE_OF_ALL_POWERS, PADDED, 0, __VA_ARGS__)                                                         \
     }
 
+int32_t THIS(classify)(const Classification *);
+
 /* How many numbers a part has: the `parameters` of its chart or stage */
 static int numbers_of(const Part *part) {
     int count = 0;
@@ -74,15 +75,17 @@ static int numbers_of(const Part *part) {
     return part->factor == NO_FACTOR ? count : count + part->n + (part->factor == RATIONAL ? part->m : 0);
 }
 
-/* The tile that whoever is free takes */
-static int64_t taken(int64_t *next, int64_t *own) {
-    if (!next) return (*own)++;
+/* What a number was that several callers add to */
+static int64_t added(int64_t *number, int64_t count) {
 #if defined(_MSC_VER)
-    return _InterlockedExchangeAdd64(next, 1);
+    return _InterlockedExchangeAdd64(number, count);
 #else
-    return __atomic_fetch_add(next, 1, __ATOMIC_RELAXED);
+    return __atomic_fetch_add(number, count, __ATOMIC_RELAXED);
 #endif
 }
+
+/* The tile that whoever is free takes */
+static int64_t taken(int64_t *next, int64_t *own) { return next ? added(next, 1) : (*own)++; }
 
 #define R float
 #define I int32_t
@@ -120,5 +123,9 @@ int64_t THIS(geometry)(const Rows *rows) {
     return rows->cameras->is_double ? rows_double(rows) : rows_float(rows);
 }
 
-/* The same of pixels that are moved; flags of what is left */
+/* The same of pixels that are moved, and of lattices; flags of what is left */
 int64_t THIS(moves)(const Move *move) { return move->from->is_double ? moves_double(move) : moves_float(move); }
+
+int64_t THIS(lattices)(const Lattices *given) {
+    return given->move.from->is_double ? lattices_double(given) : lattices_float(given);
+}

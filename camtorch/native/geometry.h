@@ -7,6 +7,8 @@
 
 #include <stdint.h>
 
+#include "sampler.h"
+
 /* Charts: rays to a plane; the numbers of each are its `parameters` */
 enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED, CYLINDER, SPHERE };
 /* Flags of charts: which of xi, alpha, beta are numbers, and whether x and y change places */
@@ -92,8 +94,8 @@ typedef struct {
 
 /* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there */
 enum { POSITIONS, PIXELS };
-/* What is left to do: pixels are OPEN, or points wait for `limits2` */
-enum { LEFT_OPEN = 1, LEFT_WAITING = 2 };
+/* What is left to do: pixels are OPEN, or points wait for `limits2`; most cells of a lattice want exact positions */
+enum { LEFT_OPEN = 1, LEFT_WAITING = 2, LEFT_MOST = 4 };
 #define OUTSIDE (-9)
 #define FAR 100 /* beyond, positions are drawn in */
 
@@ -101,26 +103,31 @@ enum { LEFT_OPEN = 1, LEFT_WAITING = 2 };
    numbers are of the type of both */
 typedef struct {
     const Cameras *from, *to;
-    const void *turns; /* (c, 3, 3), or NULL */
+    const void *turns;   /* (c, 3, 3), or NULL */
     int64_t turn_stride; /* 0: one for all */
     int64_t cameras, form;
     double height, width; /* of the image of `to` */
-    /* Rows of pixels (c, n), */
-    const void *rows;
+    const void *rows;     /* pixels (c, n) and results, strides as of `Rows` */
     int64_t row_strides[3];
-    /* or squares (n, 3) of 8x8 pixels, those of one camera side by side: camera, row and column of `cells` (c,
-       cell_rows, cell_columns), of which the first lies at `first_row`. Each gets its number, from `number` on, and
-       where what is mapped ends in it, those around it become CELL_NEXT */
-    const int64_t *places;
-    int64_t first_row;
-    int32_t *cells;
-    int64_t cell_rows, cell_columns, number;
-    void *results; /* strides as of `Rows`; or (2, n, 8, 8), NaN where there is none, the last stride alone counts */
+    void *results;
     int64_t result_strides[3];
-    uint8_t *valid; /* (c, n) without gaps, of rows */
-    int64_t count, tile; /* pixels of a camera, or squares; of a tile */
-    int64_t *next;       /* as of `Rows` */
+    uint8_t *valid;      /* (c, n) without gaps */
+    int64_t count, tile; /* pixels of a camera; of a tile */
+    int64_t *next;       /* the tile, or of lattices the camera, that whoever is free takes */
 } Move;
+
+/* Lattices (c): `move` is of their nodes and of the pixels at the rim, in planes, and `cells` what is asked of them; both
+   are those of the first camera */
+typedef struct {
+    Move move;
+    const Classification *cells;
+    int64_t first_row; /* of the target, where cells begin */
+    float *narrow;     /* (c, 2, nodes), the nodes in float, or NULL: they are */
+    /* (2, c rows columns, 8, 8): positions of all pixels of the cells that `classify` leaves, NaN where there is none,
+       and of those around a cell in which what is mapped ends. Each cell gets the number of its place there */
+    void *exact;
+    int64_t *used; /* how many places there are */
+} Lattices;
 
 /* OPEN: a pixel that may have a ray, which steps of Newton's method have not found */
 enum { VALID = 1, OPEN = 2 };

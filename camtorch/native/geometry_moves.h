@@ -65,58 +65,95 @@ static int T(move_row)(const Move *move, const T(Between) *b, int64_t first, int
     return left;
 }
 
-/* Gives a cell its place; where what is mapped ends in it, those around it are next */
-static void T(settle)(const Move *move, const int64_t *place, int64_t number, int known) {
-    const int64_t rows = move->cell_rows, columns = move->cell_columns, i = place[1], j = place[2];
-    int32_t *cells = move->cells + place[0] * rows * columns;
-    cells[i * columns + j] = (int32_t)number;
-    if (known == 0 || known == SQUARE) return;
-    for (int64_t y = i > 0 ? i - 1 : 0; y <= i + 1 && y < rows; y++)
-        for (int64_t x = j > 0 ? j - 1 : 0; x <= j + 1 && x < columns; x++) {
-            int32_t *at = cells + y * columns + x;
-            if (*at == CELL_EMPTY || *at == CELL_CUBIC) *at = CELL_NEXT;
-        }
-}
-
-/* Some squares of 8x8 pixels of one camera; how many */
-static int T(move_squares)(const Move *move, T(Between) *b, int64_t first, int64_t end, int *left) {
-    const int64_t *place = move->places + 3 * first;
-    ALIGNED R u[BLOCK], v[BLOCK];
-    ALIGNED I ok[BLOCK];
-    int squares = 0;
-    for (; squares < BLOCK / SQUARE && first + squares < end && place[3 * squares] == place[0]; squares++)
-        for (int i = 0; i < SQUARE; i++) {
-            u[squares * SQUARE + i] = (R)(8 * place[3 * squares + 2] + i % 8);
-            v[squares * SQUARE + i] = (R)(8 * place[3 * squares + 1] + i / 8 + move->first_row);
-        }
-    T(between)(move, place[0], b);
-    *left |= T(moved)(move, b, squares * SQUARE, squares * SQUARE, u, v, ok);
-    R *across = (R *)move->results + first * SQUARE, *down = across + move->result_strides[2];
-    for (int i = 0; i < squares * SQUARE; i++) across[i] = ok[i] ? u[i] : NAN, down[i] = ok[i] ? v[i] : NAN;
-    for (int k = 0; k < squares; k++) {
-        int known = 0;
-        for (int i = 0; i < SQUARE; i++) known += ok[k * SQUARE + i] != 0;
-        T(settle)(move, place + 3 * k, move->number + first + k, known);
-    }
-    return squares;
-}
-
 static int64_t T(moves)(const Move *move) {
     const int64_t tiles = (move->count + move->tile - 1) / move->tile;
     int64_t own = 0, at;
     int left = 0;
     T(Between) b;
     b.index = -1;
-    while ((at = taken(move->next, &own)) < tiles * (move->places ? 1 : move->cameras)) {
+    while ((at = taken(move->next, &own)) < tiles * move->cameras) {
         const int64_t first = at % tiles * move->tile;
         const int64_t end = first + move->tile < move->count ? first + move->tile : move->count;
-        if (move->places) {
-            for (int64_t i = first; i < end;) i += T(move_squares)(move, &b, i, end, &left);
-            continue;
-        }
         T(between)(move, at / tiles, &b);
         for (int64_t i = first; i < end; i += BLOCK)
             left |= T(move_row)(move, &b, i, (int)(end - i < BLOCK ? end - i : BLOCK));
     }
+    return left;
+}
+
+/* -- lattices */
+
+/* All pixels of some cells, `number` of the first one; where what is mapped ends in one, those around it are next */
+static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells, const int64_t *places, int count,
+                      int64_t number) {
+    const int64_t rows = given->cells->rows, columns = given->cells->columns;
+    const int n = count * SQUARE;
+    ALIGNED R u[BLOCK], v[BLOCK];
+    ALIGNED I ok[BLOCK];
+    for (int k = 0; k < count; k++)
+        for (int i = 0; i < SQUARE; i++) {
+            u[k * SQUARE + i] = (R)(STEP * (places[k] % columns) + i % STEP);
+            v[k * SQUARE + i] = (R)(STEP * (places[k] / columns) + i / STEP + given->first_row);
+        }
+    const int left = T(moved)(&given->move, b, n, n, u, v, ok);
+    R *across = (R *)given->exact + number * SQUARE, *down = across + given->move.cameras * rows * columns * SQUARE;
+    for (int i = 0; i < n; i++) across[i] = ok[i] ? u[i] : NAN, down[i] = ok[i] ? v[i] : NAN;
+    for (int k = 0; k < count; k++) {
+        const int64_t i = places[k] / columns, j = places[k] % columns;
+        int known = 0;
+        for (int at = 0; at < SQUARE; at++) known += ok[k * SQUARE + at] != 0;
+        cells[places[k]] = (int32_t)(number + k);
+        if (known == 0 || known == SQUARE) continue;
+        for (int64_t y = i > 0 ? i - 1 : 0; y <= i + 1 && y < rows; y++)
+            for (int64_t x = j > 0 ? j - 1 : 0; x <= j + 1 && x < columns; x++) {
+                int32_t *at = cells + y * columns + x;
+                if (*at == CELL_EMPTY || *at == CELL_CUBIC) *at = CELL_NEXT;
+            }
+    }
+    return left;
+}
+
+static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
+    const Move *move = &given->move;
+    Classification asked = *given->cells;
+    const int64_t cells = asked.rows * asked.columns, nodes = (asked.rows + 5) * (asked.columns + 5);
+    const R *at = (const R *)move->results + camera * move->result_strides[0];
+    int left = 0;
+    T(between)(move, camera, b);
+    for (int64_t i = 0; i < move->count; i += BLOCK)
+        left |= T(move_row)(move, b, i, (int)(move->count - i < BLOCK ? move->count - i : BLOCK));
+    if (left) return left;
+    asked.count = 1, asked.cells += camera * cells, asked.mapped = move->valid + camera * move->count;
+    asked.rim = asked.mapped + nodes, asked.nodes = (const float *)at;
+    asked.scratch += camera * SCRATCH * (asked.columns + 8);
+    if (given->narrow) {
+        float *to = given->narrow + 2 * camera * nodes;
+        for (int64_t i = 0; i < nodes; i++) to[i] = (float)at[i], to[nodes + i] = (float)at[move->result_strides[2] + i];
+        asked.nodes = to, asked.node_strides[1] = nodes;
+    }
+    if (2 * THIS(classify)(&asked) > cells) return LEFT_MOST;
+    static const int32_t wanted[2] = {0, CELL_NEXT};
+    for (int turn = 0; turn < 2; turn++) {
+        int64_t places[BLOCK / SQUARE], found;
+        do { /* those that are next turn up ahead, and behind */
+            int count = 0;
+            found = 0;
+            for (int64_t i = 0; i < cells || count; i++) {
+                if (i < cells && asked.cells[i] == wanted[turn]) places[count++] = i;
+                if (count < BLOCK / SQUARE && (i < cells || !count)) continue;
+                left |= T(squares)(given, b, asked.cells, places, count, added(given->used, count));
+                found += count, count = 0;
+            }
+        } while (found && turn);
+    }
+    return left;
+}
+
+static int64_t T(lattices)(const Lattices *given) {
+    int64_t own = 0, at;
+    int left = 0;
+    T(Between) b;
+    b.index = -1;
+    while ((at = taken(given->move.next, &own)) < given->move.cameras && !left) left |= T(lattice)(given, at, &b);
     return left;
 }

@@ -15,6 +15,7 @@ enum { UINT8, BOOL, UINT16, FLOAT32, BYTES1, BYTES2, BYTES4, BYTES8, TYPES };
 enum { NEAREST, BILINEAR, BICUBIC };
 enum { ZEROS, BORDER, REFLECTION };
 
+enum { SCRATCH = 25 };
 enum { STEP = 8 }; /* pixels between the nodes of a lattice */
 enum { CELL_NEXT = -3, CELL_EMPTY, CELL_CUBIC }; /* to be computed next, and others that have no place in `exact` */
 
@@ -58,7 +59,7 @@ typedef struct {
     double source_height, source_width, tolerance;
     int32_t padding; /* that is to be sampled with: what lies off the image then matters, or does not */
     int32_t *cells; /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, or 0 where positions are to be exact */
-    float *scratch; /* 25 (columns + 8) */
+    float *scratch; /* SCRATCH (columns + 8), and of lattices as often as there are */
 } Classification;
 
 #endif

@@ -15,7 +15,7 @@ from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
 
-NEXT, EMPTY, CUBIC, TODO = -3, -2, -1, 0
+EMPTY, CUBIC, TODO = -2, -1, 0
 """Cells of a lattice: one that shows nothing, one between whose nodes lie cubics, one that wants exact positions."""
 
 _MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
@@ -65,6 +65,9 @@ class _Job(ctypes.Structure):
 
 class _Classification(ctypes.Structure):
     """`Classification` of sampler.h."""
+
+    memory: Tensor
+    """That of its scratch."""
 
     _fields_ = (
         ("nodes", c_void_p),
@@ -228,20 +231,26 @@ def classify(probed: Probed) -> tuple[Tensor, int]:
     Returns:
         (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
     """
-    nodes, mapped, rim = probed[:3]
     native = library()
     assert native is not None  # who calls has looked
-    rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
-    cells = torch.empty(nodes.shape[0], rows, columns, dtype=torch.int32, device="cpu")
-    scratch = (c_float * (25 * (columns + 8)))()
-    given = _Classification(
+    cells, asked = classification(probed)
+    return cells, native.camtorch_classify(byref(asked))
+
+
+def classification(probed: Probed) -> tuple[Tensor, _Classification]:
+    """The cells (B, n, m) int32, and what the compiled code is asked of them."""
+    nodes, mapped, rim = probed[:3]
+    count, rows, columns = nodes.shape[0], nodes.shape[2] - 5, nodes.shape[3] - 5
+    cells = torch.empty(count, rows, columns, dtype=torch.int32, device="cpu")
+    scratch = torch.empty(count, 25 * (columns + 8), dtype=torch.float32, device="cpu")
+    asked = _Classification(
         nodes.data_ptr(),
         nodes.stride()[:2],
         mapped.data_ptr(),
         mapped.stride(0),
         rim.data_ptr(),
         rim.stride(0),
-        nodes.shape[0],
+        count,
         rows,
         columns,
         *probed.size,
@@ -249,6 +258,7 @@ def classify(probed: Probed) -> tuple[Tensor, int]:
         probed.tolerance,
         _PADDINGS[probed.padding],
         cells.data_ptr(),
-        addressof(scratch),
+        scratch.data_ptr(),
     )
-    return cells, native.camtorch_classify(byref(given))
+    asked.memory = scratch
+    return cells, asked

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import operator
 import struct
 from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
@@ -17,6 +18,7 @@ from camtorch._arguments import columns
 from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
+from camtorch.native.sampler import Probed, classification
 from camtorch.optics.backprojection import FURTHEST
 
 if TYPE_CHECKING:
@@ -77,9 +79,10 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
-_Move = struct.Struct("6q2d18q").pack  # `Move` of geometry.h
+_Move = struct.Struct("6q2d12q").pack  # `Move` of geometry.h
+_Lattices = struct.Struct("6q2d17q").pack  # `Lattices`
 POSITIONS, PIXELS = range(2)
-_LEFT_OPEN, _LEFT_WAITING = 1, 2
+LEFT_OPEN, _LEFT_WAITING, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 
@@ -183,6 +186,7 @@ class Lenses:
     """Where what `Cameras` of geometry.h has of them lies."""
     table: int | None
     limits2: int | None
+    _kept: list[object]
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
         """See `native_of`."""
@@ -478,6 +482,17 @@ def unproject_vjp(
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
+class Lattices(NamedTuple):
+    """What `sampler.sample` takes of the positions of cameras (C,)."""
+
+    nodes: Tensor
+    """(C, 2, n + 5, m + 5)."""
+    cells: Tensor
+    """(C, n, m) int32."""
+    exact: Tensor
+    """(2, K, 8, 8), NaN where there is none."""
+
+
 class Between:
     """Cameras, and others that see their rays after a turn: pixels of the first as pixels of the others."""
 
@@ -494,57 +509,79 @@ class Between:
         self.cameras = max(start.cameras, end.cameras, count)
         if start.plan.has_factor and start.struct.table is None:
             start.add_table()
+        self._size = size
         self._given = start.pointer, end.pointer, _address(turns), 9 * (count > 1), self.cameras
-        self._size = float(size[0]), float(size[1])
 
-    def rows(self, pixels: Tensor, form: int, is_planar: bool = False) -> tuple[Tensor, Tensor] | None:
-        """Pixels (C or 1, N, 2) to (C, N, 2), or to planes (C, 2, N), and valid (C, N); None where a search is needed.
+    def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor] | None:
+        """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N); None where a search is needed.
 
         form: `POSITIONS` as of `grid_sample`, -9 where there is none; or `PIXELS`, -1 where there is none.
         """
-        cameras, count, dtype = self.cameras, pixels.shape[1], self._start.dtype
-        camera, point, component = pixels.stride()
-        shape = (cameras, 2, count) if is_planar else (cameras, count, 2)
-        result = torch.empty(shape, dtype=dtype, device="cpu")
-        valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-        steps = (2 * count, 1, count) if is_planar else (2 * count, 2, 1)
-        given = pixels.data_ptr(), camera if len(pixels) > 1 else 0, point, component, *(0,) * 6
-        if not self._call(form, (*given, result.data_ptr(), *steps, valid.data_ptr()), count, _TILE, cameras):
-            return None
-        return result, valid
+        count = pixels.shape[1]
+        result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
+        valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
+        rows = *_rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
+        run, tiles = _entry("camtorch_moves", c_int64), -(-count // _TILE) * self.cameras
 
-    def squares(self, places: Tensor, first_row: int, cells: Tensor, number: int) -> Tensor | None:
-        """Positions (2, N, 8, 8) of all pixels of cells, NaN where there is none; None as of `rows`.
+        def call(following: int) -> int:
+            left: int = run(_Move(*self._given, form, *self._size, *rows, following))
+            return left
+
+        return None if self._left(call, tiles if self.cameras * count >= _SHARED else 1) else (result, valid)
+
+    def lattices(
+        self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
+    ) -> Lattices | int:
+        """Positions from nodes and from pixels at the rim: see `warp.grid.on_lattice`.
+
+        Else `LEFT_OPEN` where a search is needed, `LEFT_MOST` where most cells would have positions of their own.
 
         Args:
-            places: (N, 3): camera, row and column of each, those of one camera side by side.
-            first_row: of the target where cells begin.
-            cells: (C, n, m) int32: where a place among the positions goes, from `number` on, and `NEXT` to those around
-                a cell in which what is mapped ends.
-            number: of the first one.
+            probes: (1, N, 2): of the nodes, then of the rim.
+            size: (h, w) of the target.
+            first_row: of the target.
+            tolerance: in pixels of the source.
+            padding: that positions are for.
         """
-        places, count = places.contiguous(), len(places)
-        result = torch.empty(2, count, 8, 8, dtype=self._start.dtype, device="cpu")
-        given = 0, 0, 0, 0, places.data_ptr(), first_row, cells.data_ptr(), *cells.shape[1:], number
-        done = self._call(POSITIONS, (*given, result.data_ptr(), 0, 0, 64 * count, 0), count, _TILE // 64, 1)
-        return result if done else None
+        cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
+        n, m = (-(-side // 8) for side in size)
+        nodes, shape = (n + 5) * (m + 5), (cameras, 2, n + 5, m + 5)
+        result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
+        valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+        exact = torch.empty(2, cameras * n * m, 8, 8, dtype=dtype, device="cpu")  # of which parts are written
+        narrow = None if dtype == torch.float32 else torch.empty(shape, dtype=torch.float32, device="cpu")
+        made = result.as_strided(shape, (2 * count, count, m + 5, 1))
+        mapped, rim = valid.as_strided((cameras, n + 5, m + 5), (count, m + 5, 1)), valid[:, nodes:]
+        cells, asked = classification(Probed(made, mapped, rim, size, self._size, tolerance, padding))
+        rows = *_rows_of(probes), result.data_ptr(), 2 * count, 1, count, valid.data_ptr(), count, count
+        run, used = _entry("camtorch_lattices", c_int64), c_int64(0)
 
-    def _call(self, form: int, rows: tuple[int, ...], count: int, tile: int, times: int) -> bool:
-        run, following = _entry("camtorch_moves", c_int64), c_int64(0)
-        tiles = -(-count // tile) * times
-        shared = thread_count() if tiles > 2 else 1
-        place = addressof(following) if shared > 1 else 0
+        def call(following: int) -> int:
+            more = addressof(asked), first_row, _address(narrow), exact.data_ptr(), addressof(used)
+            left: int = run(_Lattices(*self._given, POSITIONS, *self._size, *rows, following, *more))
+            return left
+
+        return self._left(call, cameras, used) or Lattices(made, cells, exact[:, : used.value])
+
+    def _left(self, call: Callable[[int], int], tiles: int, used: c_int64 | None = None) -> int:
+        """Flags of what the compiled geometry does not do; call: with where the next tile stands."""
+        shared = thread_count() if tiles > 1 else 1
         for _ in range(2):
-            left: list[int] = []
-            call = _Move(*self._given, form, *self._size, *rows, count, tile, place)
-            spread(lambda call=call, left=left: left.append(run(call)), min(shared, tiles))  # type: ignore[misc]
-            if any(flags & _LEFT_OPEN for flags in left):
-                return False
-            if self._end.struct.limits2 is not None or not any(flags & _LEFT_WAITING for flags in left):
-                return True
+            following, left = c_int64(0), list[int]()
+            place = addressof(following)
+            if used is not None:
+                used.value = 0
+            spread(lambda: left.append(call(place)), min(shared, tiles))  # noqa: B023 (which is called at once)
+            if not any(flags & _LEFT_WAITING for flags in left) or self._end.struct.limits2:
+                return functools.reduce(operator.or_, left) & ~_LEFT_WAITING
             self._end.add_limits()
-            following.value = 0
-        return True
+        return 0
+
+
+def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
+    """Where pixels (C or 1, N, 2) lie, and their strides."""
+    camera, point, component = pixels.stride()
+    return pixels.data_ptr(), camera if len(pixels) > 1 else 0, point, component
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:

@@ -15,8 +15,8 @@ from camtorch._threads import on_one_thread
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
 from camtorch.native.library import native_available
-from camtorch.native.sampler import CUBIC, EMPTY, NEXT, TODO, Probed, classify
-from camtorch.projection.compiled import POSITIONS, Between
+from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
+from camtorch.projection.compiled import LEFT_MOST, POSITIONS, Between, Lattices
 from camtorch.rotations import turn
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import Seam, rays_of, seam_of, seen_by
@@ -324,35 +324,26 @@ def on_lattice(
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
     if min(n, m) < _FEWEST or not native_available() or not in_memory(like) or is_recorded():
         return None
-    count, shape = (n + 5) * (m + 5), (n + 5, m + 5)
-    pixels = _kept_probes(rows, width, like.dtype) if count <= _MOST_KEPT else _probes(rows, width, like)
+    nodes, seam, size = (n + 5) * (m + 5), seam_of(source), source._size_for("Warp")
+    pixels = _kept_probes(rows, width, like.dtype) if nodes <= _MOST_KEPT else _probes(rows, width, like)
     native = _native(source, target, rotation, like)
-    found = None if native is None else native.rows(pixels, POSITIONS, is_planar=True)
+    if native is not None:
+        made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
+        if isinstance(made, Lattices):
+            return Lattice(*made, (height, width), seam)
+        if made & LEFT_MOST:
+            return None
     exact = partial(_positions, source, target, rotation, None)
-    if found is None:
-        native, (positions, mapped) = None, exact(pixels)  # (B, 1, N, 2)
-        found = positions[:, 0].movedim(-1, 1).contiguous(), mapped[:, 0]
-    lattice, mapped = found[0][:, :, :count].unflatten(2, shape), found[1]
-    size, nodes = source._size_for("Warp"), lattice if lattice.dtype == torch.float32 else lattice.float()
-    mapped_nodes, rim = mapped[:, :count].unflatten(1, shape), mapped[:, count:]
-    cells, most = classify(Probed(nodes, mapped_nodes, rim, (height, width), size, tolerance, padding))
+    positions, mapped = exact(pixels)  # (B, 1, N, 2)
+    lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
+    mapped, rim = mapped[:, 0, :nodes].unflatten(1, (n + 5, m + 5)), mapped[:, 0, nodes:]
+    cells, most = classify(Probed(lattice.float(), mapped, rim, (height, width), size, tolerance, padding))
     if most > n * m / 2:
         return None
-    parts, number, todo = [like.new_empty(2, 0, STEP, STEP)], 0, TODO
-    while most and native is not None:
-        places = (cells == todo).nonzero()
-        if not len(places):
-            break
-        part = native.squares(places, rows.start, cells, number)
-        if part is None:
-            return None
-        parts.append(part)
-        number, todo = number + len(places), NEXT
-    if most and native is None:
-        parts = [_compute(exact, rows.start, cells, cells == TODO, like)]
-    return Lattice(
-        lattice, cells, torch.cat(parts, 1) if len(parts) > 1 else parts[0], (height, width), seam_of(source)
-    )
+    computed = like.new_empty(2, 0, STEP, STEP)
+    if most:
+        computed = _compute(exact, rows.start, cells, cells == TODO, like)
+    return Lattice(lattice, cells, computed, (height, width), seam)
 
 
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:

@@ -29,7 +29,8 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
         return None
     rotation = None if rotation is None else rotation.detach().to(like.dtype)
     is_batch = bool(start.batch_shape or end.batch_shape or (rotation is not None and rotation.ndim == 3))
-    return Between(*made, rotation, end._size_for("Warp"), is_batch)
+    one, other = made
+    return Between(one, other, rotation, end._size_for("Warp"), is_batch)
 
 
 def moved_pixels(start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers) -> tuple[Tensor, Tensor]:
