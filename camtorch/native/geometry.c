@@ -9,6 +9,7 @@
 #include <float.h>
 #include <math.h>
 #include <stddef.h>
+#include <stdlib.h>
 #include <string.h>
 
 #if defined(_MSC_VER)
@@ -29,6 +30,7 @@
 
 enum { LANES = 16 };      /* that a block is filled up to a multiple of */
 enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */
+enum { START_ROUNDS = 6, DAMPED_STEPS = 60 }; /* of a search */
 enum { SQUARE = 64 };     /* pixels of a cell of a lattice */
 enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
 #define PI 3.14159265358979323846
@@ -97,6 +99,7 @@ static int64_t taken(int64_t *next, int64_t *own) { return next ? added(next, 1)
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_search.h"
 #include "geometry_moves.h"
 #undef R
 #undef I
@@ -115,6 +118,7 @@ static int64_t taken(int64_t *next, int64_t *own) { return next ? added(next, 1)
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_search.h"
 #include "geometry_moves.h"
 #include "geometry_domain.h"
 

@@ -23,8 +23,8 @@ static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *
     T(Seen) s;
     int left = 0;
     T(solutions)(&b->from, n, u, v, known, ok, s.x, s.y, s.z);
-    if (b->from.follows)
-        for (int i = 0; i < count; i++) left |= !ok[i] & (known[i] != 0) ? LEFT_OPEN : 0;
+    if (b->from.waits)
+        for (int i = 0; i < count; i++) left |= !ok[i] & (known[i] != 0) ? LEFT_FROM : 0;
     if (move->turns) {
         const R *t = b->turn;
         EACH(i) {
@@ -34,7 +34,7 @@ static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *
             s.z[i] = t[6] * x + t[7] * y + t[8] * z;
         }
     }
-    left |= T(pixels_of)(&b->to, count, n, &s, u, v) ? LEFT_WAITING : 0;
+    left |= T(pixels_of)(&b->to, count, n, &s, u, v) ? LEFT_TO : 0;
     EACH(i) ok[i] &= s.ok[i];
     if (move->form == POSITIONS) {
         const R across = (R)(2 / move->width), down = (R)(2 / move->height), far = FAR;

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from camtorch.projection.domain import Domain, Optics
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
-_OPEN = 2  # of geometry.h
 _TILE = 1 << 14  # points of a tile, some 30 us
 _SHARED = 1 << 15  # points that threads are woken for
 _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
-_RADII = 512
+_RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
+_EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
 _TANGENTIAL, _PRISM = 1, 2
@@ -69,6 +69,7 @@ class _Cameras(ctypes.Structure):
         ("inner2", c_void_p),
         ("usual2", c_void_p),
         ("limits2", c_void_p),
+        ("extent", c_void_p),
         ("table", c_void_p),
         ("stagewise", c_void_p),
         ("circle2", c_void_p),
@@ -82,7 +83,7 @@ _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
 _Move = struct.Struct("6q2d12q").pack  # `Move` of geometry.h
 _Lattices = struct.Struct("6q2d17q").pack  # `Lattices`
 POSITIONS, PIXELS = range(2)
-LEFT_OPEN, _LEFT_WAITING, LEFT_MOST = 1, 2, 4
+_LEFT_FROM, _LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 
@@ -105,10 +106,14 @@ class _Domain(ctypes.Structure):
         ("folds", c_void_p),
         ("most", c_double),
         ("radii", c_void_p),
+        ("coarse", c_void_p),
+        ("even", c_void_p),
         ("inner2", c_void_p),
         ("usual2", c_void_p),
         ("circle2", c_void_p),
         ("table", c_void_p),
+        ("limits2", c_void_p),
+        ("extent", c_void_p),
         ("stagewise", c_void_p),
     )
 
@@ -185,14 +190,14 @@ class Lenses:
     fields: dict[str, int]
     """Where what `Cameras` of geometry.h has of them lies."""
     table: int | None
-    limits2: int | None
+    azimuths: tuple[int, int] | None
     _kept: list[object]
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
         """See `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
-        self.fields, self.table, self.limits2 = {}, None, None
+        self.fields, self.table, self.azimuths = {}, None, None
         if plan.parameters:
             self.fields["parameters"] = self._keep(plan.parameters_of(optics_of, k))
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
@@ -271,11 +276,20 @@ class Lenses:
             self.table = table  # when it is whole, for another thread may be looking
         return self.table
 
-    def limits(self) -> int:
-        """The limits of each azimuth, which take a while, and are asked for only when a point lies far out."""
-        if self.limits2 is None:
-            self.limits2 = self._keep(self._slow_domain().limits2)
-        return self.limits2
+    def followed(self) -> tuple[int, int]:
+        """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
+        if self.azimuths is None:
+            chart, like = self._optics()[0], self._k.double()
+            wanted = {"limits2": self._new(_AZIMUTHS), "extent": self._new(_EXTENT)}
+            wanted |= {name: place for name, place in self.fields.items() if name in ("circle2", "stagewise")}
+            wanted |= {"radii": self._keep(chart.radii(_RADII, like)), "even": self._keep(chart.radii(_FOLLOWED, like))}
+            wanted |= {"coarse": self._keep(chart.radii(_FOLLOWED // 2, like))}
+            if self.plan.is_chart:
+                end = chart.end(self.dtype)
+                wanted["ends"] = self._keep_ends(end)
+            self._ask(wanted)
+            self.azimuths = wanted["limits2"], wanted["extent"]
+        return self.azimuths
 
     def _keep(self, tensor: Tensor) -> int:
         tensor = tensor.contiguous()
@@ -322,7 +336,9 @@ class Native:
         struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
         self.parameters = struct.parameter_count = plan.parameters
         struct.intrinsics, struct.usable = map(_address, self._kept)
-        struct.table, struct.limits2 = lenses.table, lenses.limits2
+        struct.table = lenses.table
+        if lenses.azimuths is not None:
+            struct.limits2, struct.extent = lenses.azimuths
         for name, value in lenses.fields.items():
             setattr(struct, name, value)
         self.pointer = addressof(struct)
@@ -331,9 +347,9 @@ class Native:
         """Have what the inverse starts from."""
         self.struct.table = self._lenses.inverse_table()
 
-    def add_limits(self) -> None:
-        """Have the limits of each azimuth."""
-        self.struct.limits2 = self._lenses.limits()
+    def follow(self) -> None:
+        """Have the limits of each azimuth, and where it is sent."""
+        self.struct.limits2, self.struct.extent = self._lenses.followed()
 
 
 def native_of(
@@ -412,31 +428,28 @@ def _constants(lens: Lens) -> Sequence[Tensor]:
 # -- calls
 
 
-class Unprojected(NamedTuple):
-    """Rays (3, C, N); whether there is one (C, N); points on the chart's plane (2, C, N), if they were asked for; which
-    pixels are left open, where a ray may be that only a search finds, None where none is.
-    """
-
-    rays: Tensor
-    valid: Tensor
-    solution: Tensor | None
-    open: Tensor | None
-
-
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
     cameras, count, _ = points.shape
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     rows = points.data_ptr(), *points.stride(), *_planes(pixels, cameras, count), valid.data_ptr(), 0, *_NO_ROWS, 0
-    if _call(native, cameras, count, PROJECT, rows) and native.struct.limits2 is None:
-        native.add_limits()
+    if _call(native, cameras, count, PROJECT, rows):
+        native.follow()
         _call(native, cameras, count, PROJECT, rows)
     return pixels, valid
 
 
+class Unprojected(NamedTuple):
+    """Unit rays (3, C, N), whether there is one (C, N), and points on the chart's plane (2, C, N), if asked for."""
+
+    rays: Tensor
+    valid: Tensor
+    solution: Tensor | None
+
+
 def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
-    """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
+    """Pixels (C, N, 2) to rays. keeps: whether `unproject_vjp` is to follow."""
     cameras, count, _ = pixels.shape
     rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
@@ -444,11 +457,11 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     if native.plan.has_factor and native.struct.table is None:
         native.add_table()
     rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
-    kept = 0 if solution is None else solution.data_ptr()
-    if not _call(native, cameras, count, UNPROJECT, (*rows, kept, *_NO_ROWS, 0)):
-        return Unprojected(rays, valid, solution, None)
-    states = valid.view(torch.uint8)
-    return Unprojected(rays, states == 1, solution, states == _OPEN)
+    given = *rows, _address(solution), *_NO_ROWS, 0
+    if _call(native, cameras, count, UNPROJECT, given):
+        native.follow()
+        _call(native, cameras, count, UNPROJECT, given)
+    return Unprojected(rays, valid, solution)
 
 
 def project_vjp(
@@ -512,8 +525,8 @@ class Between:
         self._size = size
         self._given = start.pointer, end.pointer, _address(turns), 9 * (count > 1), self.cameras
 
-    def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor] | None:
-        """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N); None where a search is needed.
+    def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
+        """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).
 
         form: `POSITIONS` as of `grid_sample`, -9 where there is none; or `PIXELS`, -1 where there is none.
         """
@@ -527,14 +540,15 @@ class Between:
             left: int = run(_Move(*self._given, form, *self._size, *rows, following))
             return left
 
-        return None if self._left(call, tiles if self.cameras * count >= _SHARED else 1) else (result, valid)
+        self._left(call, tiles if self.cameras * count >= _SHARED else 1)
+        return result, valid
 
     def lattices(
         self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
-    ) -> Lattices | int:
+    ) -> Lattices | None:
         """Positions from nodes and from pixels at the rim: see `warp.grid.on_lattice`.
 
-        Else `LEFT_OPEN` where a search is needed, `LEFT_MOST` where most cells would have positions of their own.
+        None where most cells would have positions of their own.
 
         Args:
             probes: (1, N, 2): of the nodes, then of the rim.
@@ -561,21 +575,26 @@ class Between:
             left: int = run(_Lattices(*self._given, POSITIONS, *self._size, *rows, following, *more))
             return left
 
-        return self._left(call, cameras, used) or Lattices(made, cells, exact[:, : used.value])
+        if self._left(call, cameras, used):
+            return None
+        return Lattices(made, cells, exact[:, : used.value])
 
     def _left(self, call: Callable[[int], int], tiles: int, used: c_int64 | None = None) -> int:
-        """Flags of what the compiled geometry does not do; call: with where the next tile stands."""
+        """Flags of what is not made. call: with where the next tile stands."""
         shared = thread_count() if tiles > 1 else 1
-        for _ in range(2):
+        while True:
             following, left = c_int64(0), list[int]()
             place = addressof(following)
             if used is not None:
                 used.value = 0
             spread(lambda: left.append(call(place)), min(shared, tiles))  # noqa: B023 (which is called at once)
-            if not any(flags & _LEFT_WAITING for flags in left) or self._end.struct.limits2:
-                return functools.reduce(operator.or_, left) & ~_LEFT_WAITING
-            self._end.add_limits()
-        return 0
+            flags = functools.reduce(operator.or_, left)
+            if not flags & (_LEFT_FROM | _LEFT_TO):
+                break
+            for flag, native in ((_LEFT_FROM, self._start), (_LEFT_TO, self._end)):
+                if flags & flag:
+                    native.follow()
+        return flags
 
 
 def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:

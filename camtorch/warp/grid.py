@@ -16,7 +16,7 @@ from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is
 from camtorch.camera import Camera
 from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
-from camtorch.projection.compiled import LEFT_MOST, POSITIONS, Between, Lattices
+from camtorch.projection.compiled import POSITIONS, Between
 from camtorch.rotations import turn
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import Seam, rays_of, seam_of, seen_by
@@ -246,9 +246,8 @@ def _positions(
     """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `Exact`."""
     if native is not None:
         rows = (pixels if pixels.ndim == 4 else pixels[None]).flatten(1, 2)
-        found = native.rows(rows, POSITIONS)
-        if found is not None:
-            return found[0].unflatten(1, pixels.shape[-3:-1]), found[1].unflatten(1, pixels.shape[-3:-1])
+        found, mapped = native.rows(rows, POSITIONS)
+        return found.unflatten(1, pixels.shape[-3:-1]), mapped.unflatten(1, pixels.shape[-3:-1])
     if pixels.ndim == 3 and target.batch_shape:
         pixels = pixels.expand(*target.batch_shape, *pixels.shape)
     rays, has_ray = rays_of(target, pixels)
@@ -329,10 +328,7 @@ def on_lattice(
     native = _native(source, target, rotation, like)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
-        if isinstance(made, Lattices):
-            return Lattice(*made, (height, width), seam)
-        if made & LEFT_MOST:
-            return None
+        return None if made is None else Lattice(*made, (height, width), seam)
     exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
     lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))

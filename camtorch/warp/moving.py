@@ -41,9 +41,8 @@ def moved_pixels(start: Camera, end: Camera, rotation: Tensor | None, pixels: Nu
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
         ready = between(start, end, rotation, pixels)
         if ready is not None and ((pixels.ndim > 1 and len(pixels) == ready.cameras) or not ready.is_batch):
-            found = ready.rows(pixels.detach().reshape(ready.cameras, -1, 2), PIXELS)
-            if found is not None:
-                return found[0].reshape(pixels.shape), found[1].reshape(pixels.shape[:-1])
+            moved, valid = ready.rows(pixels.detach().reshape(ready.cameras, -1, 2), PIXELS)
+            return moved.reshape(pixels.shape), valid.reshape(pixels.shape[:-1])
     rays, has_ray = rays_of(start, pixels)
     moved, mapped = seen_by(end, turn(rotation, rays, "pixels"))
     valid = mapped & has_ray
