@@ -106,7 +106,7 @@ static void T(load_pixels)(const R *from, const int64_t *strides, int count, int
 static int T(azimuth)(R a, R b, double offset) {
     const R size = T(absolute)(a) + T(absolute)(b), across = b / (size > 0 ? size : 1);
     const double turn = floor((a < 0 ? 2 - across : across) * (AZIMUTHS / 4) + offset);
-    const int index = turn == turn ? (int)turn : 0; /* infinite points have none */
+    const int index = fabs(turn) <= AZIMUTHS ? (int)turn : 0; /* infinite points have none */
     return (index + AZIMUTHS) % AZIMUTHS;
 }
 
