@@ -146,6 +146,7 @@ class Plan:
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
+        self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
     def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
         """The radii at which the chart of some cameras ends, and beyond which there are no images."""
@@ -158,6 +159,17 @@ class Plan:
         if not (made.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
             self._ends[dtype] = end, usual_end
         return end, usual_end
+
+    def radii(self, chart: Callable[[], Chart], count: int, like: Tensor) -> Tensor:
+        """The radii of the chart of some cameras, as `Chart.radii` has them, in double precision."""
+        key = like.dtype, count
+        if key not in self._radii:
+            made = chart()
+            radii = made.radii(count, like).double()
+            if made.parameters:
+                return radii
+            self._radii[key] = radii
+        return self._radii[key]
 
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """(C, parameters) of coefficients (C, n)."""
@@ -265,7 +277,7 @@ class Lenses:
         if plan.has_rest:
             wanted |= {"circle2": self._new(1), "stagewise": self._new(1, torch.bool)}
         self.fields |= wanted
-        radii = {} if plan.is_radial else {"radii": self._keep(self._optics()[0].radii(_RADII, self._k).double())}
+        radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
 
     def inverse_table(self) -> int:
@@ -282,8 +294,8 @@ class Lenses:
             chart, like = self._optics()[0], self._k.double()
             wanted = {"limits2": self._new(_AZIMUTHS), "extent": self._new(_EXTENT)}
             wanted |= {name: place for name, place in self.fields.items() if name in ("circle2", "stagewise")}
-            wanted |= {"radii": self._keep(chart.radii(_RADII, like)), "even": self._keep(chart.radii(_FOLLOWED, like))}
-            wanted |= {"coarse": self._keep(chart.radii(_FOLLOWED // 2, like))}
+            for name, count in (("radii", _RADII), ("even", _FOLLOWED), ("coarse", _FOLLOWED // 2)):
+                wanted[name] = self._keep(self.plan.radii(lambda: chart, count, like))
             if self.plan.is_chart:
                 end = chart.end(self.dtype)
                 wanted["ends"] = self._keep_ends(end)
