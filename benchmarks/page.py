@@ -1,7 +1,7 @@
 """The tables of the page on performance, from the figures of one run: `python -m benchmarks.page RUN.json`.
 
-A run is what `python -m benchmarks points images augment calibration stereo --json RUN.json` writes. The figures that
-the page shows are kept beside it, so that every number on it can be looked up.
+A run is what `python -m benchmarks points images samples augment loader calibration stereo --json RUN.json` writes. The
+figures that the page shows are kept beside it, so that every number on it can be looked up.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ def tables(run: Run) -> dict[str, str]:
         "machine": _machine(run),
         "points": _points(run),
         "images": _images(run),
+        "samples": _samples(run),
         "augment": _augment(run),
         "loader": _loader(run),
         "calibration": _calibration(run),
@@ -70,7 +71,7 @@ def shown(run: Run) -> dict[str, Any]:
         subject: [{**r, "value": float(f"{r['value']:.4g}")} for r in found] for subject, found in results.items()
     }
     results["points"] = [record for record in results["points"] if record["case"] in _POINTS]
-    results["augment"] = [r for r in results["augment"] if r["quantity"] != "seconds" or _LOADER not in r["case"]]
+    results["loader"] = [record for record in results["loader"] if record["quantity"] == "per second"]
     results["images"] = [record for record in results["images"] if _is_shown(record["case"], record["operation"])]
     arguments = {name: value for name, value in run["arguments"].items() if name != "json"}  # where it was written
     return {"machine": run["machine"], "arguments": arguments, "results": results}
@@ -185,11 +186,21 @@ def _augment(run: Run) -> str:
     return _table("8 images, ms", rows, columns)
 
 
+def _samples(run: Run) -> str:
+    columns = {
+        OURS: (OURS,),
+        "albumentations": ("albumentations Affine", "OpticalDistortion, no landmarks"),
+        "OpenCV": ("OpenCV",),
+    }
+    rows = [(_named(f"{case}, {operation}"), times) for (case, operation), times in _figures(run, "samples").items()]
+    return _table("one image, ms", rows, columns)
+
+
 def _loader(run: Run) -> str:
     columns = {name: (name,) for name in (OURS, "OpenCV", "kornia RandomAffine", "albumentations Affine")}
     rows = [
         (_named(f"{case.removeprefix(_LOADER)}, {operation}"), rates)
-        for (case, operation), rates in _figures(run, "augment", "per second").items()
+        for (case, operation), rates in _figures(run, "loader", "per second").items()
     ]
     return _table("samples a second", rows, columns, scale=1, alone=tuple(columns))
 

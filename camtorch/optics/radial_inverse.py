@@ -23,6 +23,7 @@ from camtorch._portable import (
     times,
 )
 from camtorch._registry import CLASSES
+from camtorch._tracing import is_concrete
 from camtorch.optics.charts import even_steps_and_ratios
 
 if TYPE_CHECKING:
@@ -298,7 +299,7 @@ class RadialInverse:
         else:
             if self.of_points and len(k) > 1:
                 k, rows = k.unique(dim=0, return_inverse=True)
-            _, inner2, most2 = _radial_inverse(factor.name, k, end, k.new_empty(len(k), 0))
+            _, inner2, most2 = _inverse_of(factor.name, k, end, k.new_empty(len(k), 0))
         of_each = [w if rows is None else w[rows] for w in (inner2, most2)]
         self.inner2, self.most2 = (w.reshape(parameters[0].shape).clone() for w in of_each)
 
@@ -310,7 +311,7 @@ class RadialInverse:
         if is_portable_export():
             inner2 = self.inner2.reshape(-1, 1)
             return _scale(self.factor.name, self.k, inner2, self._table, rows).view_as(r2)
-        found: Tensor = _radial_inverse(self.factor.name, self.k, self.end, rows)[0]
+        found = _inverse_of(self.factor.name, self.k, self.end, rows)[0]
         return found.view_as(r2)
 
 
@@ -340,8 +341,20 @@ def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor
     return scale
 
 
+def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    # the first call of an operator of our own imports torch's compiler, which takes seconds
+    of = _found_inverse if is_concrete(k) and is_concrete(r2) else _radial_inverse
+    found: tuple[Tensor, Tensor, Tensor] = of(name, k, end, r2)
+    return found
+
+
 @torch.library.custom_op("camtorch::radial_inverse", mutates_args=())
 def _radial_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`_found_inverse`, in graphs and transforms."""
+    return _found_inverse(name, k, end, r2)
+
+
+def _found_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The factors of coefficients (C, n) and squared radii (C, N), and `RadialInverse.inner2` and `most2`."""
     inner2, table = _tables((k,), (name, end), lambda: _made_tables(name, k.detach(), end))
     inverse = InverseTable(table)
