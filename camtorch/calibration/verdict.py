@@ -15,7 +15,7 @@ from camtorch._arguments import columns
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Sight, State
 from camtorch.calibration.observations import named
 from camtorch.calibration.uncertainty import spread, worst
-from camtorch.projection.rays import angles_from_axis, image_edges
+from camtorch.projection.rays import angles_from_axis, image_edges, image_lattice
 
 if TYPE_CHECKING:
     from camtorch.calibration.calibrate import Calibration
@@ -71,12 +71,8 @@ class Survey:
         self.calibration = calibration
         cell = max(calibration.image_size) / _CELLS
         rows, columns = self.shape = tuple(max(1, round(side / cell)) for side in calibration.image_size)
-        low, high = image_edges(calibration.image_size, self.parameters)
-        steps = [
-            (torch.arange(count, device=low.device).to(low) + 0.5) / count * (high[i] - low[i]) + low[i]
-            for i, count in ((1, rows), (0, columns))
-        ]
-        self.pixels = torch.stack(torch.meshgrid(*steps, indexing="ij")[::-1], -1)
+        # with the edges of the cells every second is a middle
+        self.pixels = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
         """(rows, columns, 2) the middle of each cell."""
 
     @property
