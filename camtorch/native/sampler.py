@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 from collections.abc import Sequence
 from ctypes import addressof, byref, c_double, c_float, c_int32, c_int64, c_void_p
@@ -149,7 +150,7 @@ def sample(
     job.count, job.channels, job.height, job.width = count, channels, height, width
     job.source_height, job.source_width = images.shape[-2:]
     values = (c_float * channels)(*fill)
-    elements = None if images.dtype == torch.float32 else _elements(fill, images.dtype)
+    elements = None if images.dtype == torch.float32 else _elements(tuple(fill), images.dtype)
     job.fill = addressof(values)
     job.fill_elements = job.fill if elements is None else elements.data_ptr()
     if grid is not None:
@@ -177,13 +178,14 @@ def _shared(tensor: Tensor) -> int:
     return 0 if tensor.shape[0] == 1 else tensor.stride(0)
 
 
-def _elements(fill: Sequence[float], dtype: torch.dtype) -> Tensor:
+@functools.lru_cache(maxsize=64)
+def _elements(fill: tuple[float, ...], dtype: torch.dtype) -> Tensor:
     """The values as pixels, (C,): rounded and in range, true from one half on."""
     if dtype == torch.bool:
         return torch.tensor([value >= 0.5 for value in fill], device="cpu")
     if not dtype.is_floating_point:
         low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
-        fill = [min(max(round(value), low), high) for value in fill]
+        fill = tuple(min(max(round(value), low), high) for value in fill)
     return torch.tensor(fill, dtype=dtype, device="cpu")
 
 

@@ -6,6 +6,7 @@ import ctypes
 import functools
 import operator
 import struct
+import threading
 from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
 from typing import TYPE_CHECKING, NamedTuple
@@ -574,7 +575,7 @@ class Between:
         nodes, shape = (n + 5) * (m + 5), (cameras, 2, n + 5, m + 5)
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
         valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-        exact = torch.empty(2, cameras * n * m, 8, 8, dtype=dtype, device="cpu")  # of which parts are written
+        exact = _kept_memory(2 * cameras * n * m * 64, dtype)  # of which parts are written
         narrow = None if dtype == torch.float32 else torch.empty(shape, dtype=torch.float32, device="cpu")
         made = result.as_strided(shape, (2 * count, count, m + 5, 1))
         mapped, rim = valid.as_strided((cameras, n + 5, m + 5), (count, m + 5, 1)), valid[:, nodes:]
@@ -589,7 +590,8 @@ class Between:
 
         if self._left(call, cameras, used):
             return None
-        return Lattices(made, cells, exact[:, : used.value])
+        parts = exact[: 2 * cameras * n * m * 64].view(2, -1, 8, 8)[:, : used.value]
+        return Lattices(made, cells, parts.clone())
 
     def _left(self, call: Callable[[int], int], tiles: int, used: c_int64 | None = None) -> int:
         """Flags of what is not made. call: with where the next tile stands."""
@@ -607,6 +609,24 @@ class Between:
                 if flags & flag:
                     native.follow()
         return flags
+
+
+class _Kept(threading.local):
+    memory: Tensor | None = None
+
+
+_kept = _Kept()
+_MOST_KEPT = 1 << 22  # bytes
+
+
+def _kept_memory(count: int, dtype: torch.dtype) -> Tensor:
+    """At least so many numbers, for this call of this thread: the same memory as before, unless they are many."""
+    if count * dtype.itemsize > _MOST_KEPT:
+        return torch.empty(count, dtype=dtype, device="cpu")
+    if _kept.memory is None or len(_kept.memory) < count * dtype.itemsize:
+        with torch.inference_mode(False):
+            _kept.memory = torch.empty(count * dtype.itemsize, dtype=torch.uint8, device="cpu")
+    return _kept.memory[: count * dtype.itemsize].view(dtype)
 
 
 def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
