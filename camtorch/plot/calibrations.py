@@ -238,8 +238,7 @@ def view(calibration: Calibration, number: int, ax: Axes | None = None, *, image
             f"plot: no view {number} with corners; of {len(calibration.image_points)} {len(shots.numbers)} have"
         )
     index = shots.numbers.index(number)
-    draw_frame(ax, height, width)
-    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    edges = draw_frame(ax, height, width)
     if image is not None:
         image = np.asarray(image)
         if image.shape[:2] != (height, width):
