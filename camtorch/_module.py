@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 R = TypeVar("R")
 
-FORWARDS = ". Slices go forwards; a list of rows, as [2, 1, 0], need not"
-
 
 def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
     """For type checkers, of a `__call__`: it is called as `forward` is, which nn.Module's does not say."""
@@ -40,11 +38,9 @@ _BARE = nn.Module().__dict__
 _CONTAINERS = [(name, type(value)) for name, value in _BARE.items() if isinstance(value, (dict, set))]
 
 
-def _bare() -> dict[str, Any]:
-    """What `nn.Module.__init__` puts into the `__dict__` of a module."""
-    state = _BARE.copy()
-    for name, make in _CONTAINERS:
-        state[name] = make()
+def _containers() -> dict[str, Any]:
+    """The empty dicts and sets of a module, each its own."""
+    state: dict[str, Any] = {name: make() for name, make in _CONTAINERS}
     state["_own"] = {}
     return state
 
@@ -62,7 +58,8 @@ class GeometryModule(nn.Module):
                 setattr(self, name, value)
         else:
             state = self.__dict__
-            state.update(_bare())
+            state.update(_BARE)
+            state.update(_containers())
             modules = state["_modules"]
             for name, value in attributes.items():
                 (modules if isinstance(value, nn.Module) else state)[name] = value
@@ -237,14 +234,8 @@ class BatchedModule(GeometryModule):
             tensor = getattr(self, name)
             try:
                 rows = tensor.expand(*self.batch_shape, tensor.shape[-1])[key]
-            except IndexError as error:
-                shape = tuple(self.batch_shape)
-                raise IndexError(f"{type(self).__name__}: {index!r} of a batch {shape}: {error}") from None
-            except (TypeError, ValueError, RuntimeError):
-                raise TypeError(
-                    f"{type(self).__name__}: a batch is indexed by whole numbers, slices and masks; got {shown(index)}"
-                    + (FORWARDS if isinstance(index, slice) else "")
-                ) from None
+            except (IndexError, TypeError, ValueError, RuntimeError) as error:
+                raise refused_index(self, index, error) from None
             tensors[name] = rows
         return remade(self, **tensors)
 
@@ -326,9 +317,8 @@ def remade(module: Made, **changes: Any) -> Made:
         return model(*numbers, image_size=changes.get("image_size", module.image_size))
     made = model.__new__(model)
     state = made.__dict__
-    state.update(module.__dict__, _is_full_backward_hook=None, _own={}, **changes)
-    for name, make in _CONTAINERS:
-        state[name] = make()
+    state.update(module.__dict__, _is_full_backward_hook=None, **changes)
+    state.update(_containers())
     for name in module.memo_names:
         state[name] = Memo()
     for name, tensor in tensors.items():
@@ -338,6 +328,15 @@ def remade(module: Made, **changes: Any) -> Made:
         else:
             made.put(name, tensor.detach() if tensor.requires_grad else tensor)
     return made
+
+
+def refused_index(module: BatchedModule, index: Any, error: Exception) -> Exception:
+    """The error of an index that a batch does not take."""
+    name = type(module).__name__
+    if isinstance(error, IndexError):
+        return IndexError(f"{name}: {index!r} of a batch {tuple(module.batch_shape)}: {error}")
+    hint = ". Slices go forwards; a list of rows, as [2, 1, 0], need not" if isinstance(index, slice) else ""
+    return TypeError(f"{name}: a batch is indexed by whole numbers, slices and masks; got {shown(index)}{hint}")
 
 
 def _widened(value: Tensor) -> Tensor:
@@ -356,8 +355,14 @@ def learning_as(made: Made, source: BatchedModule) -> Made:
 
 def fixed(tensor: Tensor) -> Tensor:
     """A Parameter or a tensor of a graph as it is, and any other as a Parameter that does not learn, without a copy."""
-    if is_parameter(tensor) or (in_graph(tensor) and not _is_cut_off(tensor)):
+    if is_parameter(tensor):
         return tensor
+    if in_graph(tensor):
+        if torch.compiler.is_compiling() or not tensor.is_leaf or tensor._base is None:
+            return tensor
+        if not tensor._base.requires_grad:
+            return tensor
+        # a view, taken without a graph, of what learns: torch says that it learns, and it does not
     return nn.Parameter(tensor, requires_grad=False)
 
 
@@ -365,13 +370,6 @@ def is_parameter(tensor: Tensor) -> bool:
     """Whether it is an `nn.Parameter`, which torch asks a metaclass."""
     kind = type(tensor)
     return kind is nn.Parameter or (kind is not Tensor and isinstance(tensor, nn.Parameter))
-
-
-def _is_cut_off(tensor: Tensor) -> bool:
-    """Whether it is a view, taken without a graph, of what learns: torch says that it learns, and it does not."""
-    if torch.compiler.is_compiling() or not tensor.is_leaf or tensor._base is None:
-        return False
-    return tensor._base.requires_grad
 
 
 class Memo:

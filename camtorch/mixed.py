@@ -16,7 +16,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch._arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch._evaluation import new_cameras, per_row
 from camtorch._evaluation import rows_of as camera_rows
-from camtorch._module import FORWARDS, Memo, remade
+from camtorch._module import Memo, refused_index, remade
 from camtorch._numbers import as_numbers_of
 from camtorch.camera import Camera
 from camtorch.projection.project import Project
@@ -296,13 +296,8 @@ class Mixed(Camera):
         """
         try:
             taken = torch.arange(len(self._places))[index]
-        except IndexError as error:
-            raise IndexError(f"Mixed: {index!r} of a batch ({len(self._places)},): {error}") from None
-        except (TypeError, ValueError, RuntimeError):
-            raise TypeError(
-                f"Mixed: it is indexed by whole numbers, slices and masks; got {shown(index)}"
-                + (FORWARDS if isinstance(index, slice) else "")
-            ) from None
+        except (IndexError, TypeError, ValueError, RuntimeError) as error:
+            raise refused_index(self, index, error) from None
         if taken.ndim == 0:
             i, row = self._places[int(taken)]
             camera = self._member(i)
@@ -401,20 +396,7 @@ def _members(cameras: Any, owner: str = "Mixed") -> list[Camera]:
     for i, camera in enumerate(given):
         if not isinstance(camera, Camera):
             raise TypeError(f"{owner}: cameras[{i}] must be a Camera; got {no_camera(camera)}")
-    return _checked([one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))], owner)
-
-
-def _as_order(order: Sequence[int], count: int) -> list[int]:
-    try:
-        places = [operator.index(place) for place in order]
-    except TypeError:
-        raise TypeError(f"Mixed: order must be places among {count} cameras, from 0; got {shown(order)}") from None
-    if not places or min(places) < 0 or max(places) >= count:
-        raise ValueError(f"Mixed: order must be places among {count} cameras, from 0; got {places}")
-    return places
-
-
-def _checked(members: list[Camera], owner: str) -> list[Camera]:
+    members = [one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))]
     if not any(map(_count, members)):
         raise ValueError(f"{owner}: an empty list of cameras; it must hold at least one")
     for i, camera in enumerate(members):
@@ -425,6 +407,16 @@ def _checked(members: list[Camera], owner: str) -> list[Camera]:
     if len(devices) > 1:
         raise ValueError(f"{owner}: the cameras are on {' and '.join(devices)}; camera.to(device) brings them together")
     return members
+
+
+def _as_order(order: Sequence[int], count: int) -> list[int]:
+    try:
+        places = [operator.index(place) for place in order]
+    except TypeError:
+        raise TypeError(f"Mixed: order must be places among {count} cameras, from 0; got {shown(order)}") from None
+    if not places or min(places) < 0 or max(places) >= count:
+        raise ValueError(f"Mixed: order must be places among {count} cameras, from 0; got {places}")
+    return places
 
 
 def _check_sizes(members: list[Camera], owner: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import ItemsView, Iterator, KeysView, Mapping, MutableMapping, Sequence, ValuesView
+from collections.abc import Collection, ItemsView, Iterator, KeysView, Mapping, MutableMapping, Sequence, ValuesView
 from itertools import islice
 from typing import TypeVar, cast
 
@@ -71,8 +71,7 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
     def __getitem__(self, name: str) -> M:
         place = self._places.get(name) if isinstance(name, str) else None
         if place is None:
-            there = ", ".join(map(repr, islice(self, _SHOWN))) or "none"
-            raise KeyError(f"no {self._kind.__name__} is called {name!r}; there are {there}")
+            raise KeyError(f"no {self._kind.__name__} is called {name!r}; there are {_some(self)}")
         return cast(M, self._modules[place] if isinstance(place, str) else cast(M, self.batch)[place])
 
     def __setitem__(self, name: str, module: M) -> None:
@@ -186,10 +185,8 @@ class Rig(nn.Module):
         """
         found = self.cameras.get(self.images.get(name, name)) if isinstance(name, str) else None
         if found is None:
-            names = [*self.cameras, *self.images]
-            more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-            shown = ", ".join(map(repr, names[:_SHOWN])) + more
-            raise ValueError(f"Rig: no camera and no image is called {name!r}; there are {shown}")
+            there = _some([*self.cameras, *self.images])
+            raise ValueError(f"Rig: no camera and no image is called {name!r}; there are {there}")
         return found
 
     def between(self, left: str, right: str) -> Extrinsics:
@@ -209,17 +206,14 @@ class Rig(nn.Module):
         for name in (left, right):
             self.camera_of(name)
             if name not in self.extrinsics:
-                posed = ", ".join(map(repr, list(self.extrinsics)[:_SHOWN])) or "none"
-                raise ValueError(f"Rig: {name!r} has no pose in rig.extrinsics; there is {posed}")
+                raise ValueError(f"Rig: {name!r} has no pose in rig.extrinsics; there is {_some(self.extrinsics)}")
         return self.extrinsics[right].compose(self.extrinsics[left].inverse())
 
     def _way_to_cameras(self) -> str:
         """Where they are, for errors about what only a camera can."""
         if len(self.cameras) == 1:
             return "whose only camera is its .camera"
-        some = ", ".join(f"rig[{name!r}]" for name in islice(self.cameras, _SHOWN))
-        more = f" and {len(self.cameras) - _SHOWN} more" if len(self.cameras) > _SHOWN else ""
-        return f"whose cameras are {some}{more}" if some else "which has no camera"
+        return f"whose cameras are {_some(self.cameras, 'rig[{!r}]')}" if self.cameras else "which has no camera"
 
     def __getattr__(self, name: str) -> Tensor | nn.Module:
         try:
@@ -271,6 +265,12 @@ class Rig(nn.Module):
             shown = ", ".join(images[:3]) + (", ..." if len(images) > 3 else "")
             lines.append(f"  {len(images)} posed image{'s' * (len(images) > 1)}: {shown}")
         return "\n".join((f"Rig({self.format or ''})", *lines))
+
+
+def _some(names: Collection[str], form: str = "{!r}") -> str:
+    """Names in words, the first few of many."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return (", ".join(map(form.format, islice(names, _SHOWN))) or "none") + more
 
 
 def _line(name: str, camera: Camera, extrinsics: Extrinsics | None) -> str:

@@ -38,12 +38,15 @@ class Summary:
         fx, fy, cx, cy = camera.intrinsics.tolist()
         size = "not stated" if camera.image_size is None else "{1} x {0}".format(*camera.image_size)
         named = zip(camera.distortion_names, camera.distortion.tolist(), strict=True)
+        texts = [f"{name} {value:.8g}" for name, value in named]
+        if len(texts) > _MOST_COEFFICIENTS:
+            texts = [*texts[:4], f"... {texts[-1]} ({len(texts)} in all)"]
         rows = [
             ("model", f"{type_before_parametrizations(camera).__name__} ({camera.key})"),
             ("image", size),
             ("focal length", f"fx {fx:.8g}, fy {fy:.8g} px"),
             ("principal point", f"cx {cx:.8g}, cy {cy:.8g} px"),
-            ("coefficients", _shortened([f"{name} {value:.8g}" for name, value in named])),
+            ("coefficients", ", ".join(texts) or "none"),
         ]
         low, high = (math.degrees(angle) for angle in self.valid_angle)
         rows.append(
@@ -59,12 +62,6 @@ class Summary:
         return [f"{label:<16} {text}" for label, text in rows]
 
 
-def _shortened(texts: list[str]) -> str:
-    if len(texts) > _MOST_COEFFICIENTS:
-        return f"{', '.join(texts[:4])}, ... {texts[-1]} ({len(texts)} in all)"
-    return ", ".join(texts) or "none"
-
-
 @torch.no_grad()
 def summarise(camera: Camera) -> Summary:
     """The summary of a camera.
@@ -74,19 +71,15 @@ def summarise(camera: Camera) -> Summary:
     """
     if camera.batch_shape:
         raise ValueError(f"summary: camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
-    result = Summary(camera, _valid_angle(camera))
+    angles = torch.linspace(0, math.pi, _ANGLES).to(camera.intrinsics)
+    counts = followed(camera, angles, _AZIMUTHS)[1].sum(0)
+    least, most = (float(angles[(count - 1).clamp(min=0)]) for count in counts.aminmax())
+    result = Summary(camera, (least, most))
     if camera.image_size is not None:
         result.fov = tuple(camera.fov.tolist())
         result.seen = float(camera.unproject(image_lattice(camera, _SIDE, _SIDE))[1].double().mean())
         result.corners = _corners(camera)
     return result
-
-
-def _valid_angle(camera: Camera) -> tuple[float, float]:
-    angles = torch.linspace(0, math.pi, _ANGLES).to(camera.intrinsics)
-    valid = followed(camera, angles, _AZIMUTHS)[1].sum(0)
-    least, most = (float(angles[(count - 1).clamp(min=0)]) for count in (valid.amin(), valid.amax()))
-    return least, most
 
 
 def _corners(camera: Camera) -> tuple[tuple[float, float] | str, ...]:

@@ -290,9 +290,8 @@ def _consistent(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int
         """How far the middle of b is from where a's corners put it, in sides of b."""
         found = []
         for a, b in pairs:
-            plane = cv2.getPerspectiveTransform(
-                places[a].astype(np.float32), np.roll(tags[a], -turn, 0).astype(np.float32)
-            )
+            corners = np.roll(tags[a], -turn, 0).astype(np.float32)
+            plane = cv2.getPerspectiveTransform(places[a].astype(np.float32), corners)
             at = plane @ [*places[b].mean(0), 1.0]
             side = np.linalg.norm(tags[b] - np.roll(tags[b], 1, 0), axis=1).mean()
             found.append(float(np.linalg.norm(at[:2] / at[2] - tags[b].mean(0)) / side) if at[2] > 0 else math.inf)

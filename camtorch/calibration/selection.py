@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,14 +101,19 @@ def select(
         ValueError: bad points; no model can be fitted.
     """
     seen, layout = as_observations(object_points, image_points, image_size, "select")
+    points = seen.points.cpu().numpy()
     pixels = np.where(seen.seen[..., None].cpu(), seen.pixels.cpu(), np.nan)
-    views = _Views(seen.points.cpu().numpy(), pixels, layout.image_size)
+
+    def calibrated(rows: Array, model: str | Camera, **options: Any) -> Calibration:
+        return calibrate(model, points[rows], pixels[rows], image_size=layout.image_size, **options)
+
+    weights = np.isfinite(pixels[..., 0]).sum(1)
     tried, trials = list(candidates), []
     for number, (model, count) in enumerate(tried, 1):
         names = [name for name in fixed if name in (*INTRINSICS, *(MODELS[model].names_of(count) or ()))]
         options = {"fixed": names, "loss": loss, "loss_scale": loss_scale}
         try:
-            trials.append(_tried(model, count, views, options))
+            trials.append(_tried(model, count, calibrated, weights, options))
         except ValueError as error:
             nothing = np.full(len(pixels), np.nan)
             trials.append(Trial(model, count, None, math.nan, math.nan, nothing, str(error)))
@@ -120,32 +125,22 @@ def select(
     return _chosen(trials, fitted)
 
 
-class _Views(NamedTuple):
-    """Points (V, N, 3) and where they are seen, (V, N, 2), NaN where not."""
-
-    points: Array
-    pixels: Array
-    image_size: tuple[int, int]
-
-    def calibrated(self, rows: Array, model: str | Camera, **options: Any) -> Calibration:
-        """By some of the views."""
-        return calibrate(model, self.points[rows], self.pixels[rows], image_size=self.image_size, **options)
-
-
-def _tried(model: str, count: int, views: _Views, options: dict[str, Any]) -> Trial:
-    numbers = np.arange(len(views.points))
+def _tried(
+    model: str, count: int, calibrated: Callable[..., Calibration], weights: Array, options: dict[str, Any]
+) -> Trial:
+    """calibrated: by some of the views. weights: (V,) the corners of each."""
+    numbers = np.arange(len(weights))
     errors = np.full(len(numbers), np.nan)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
-        whole = views.calibrated(numbers, model, count=count, **options)
+        whole = calibrated(numbers, model, count=count, **options)
         if not whole.converged:
             raise ValueError("no optimum was found")
         for fold in range(min(_FOLDS, len(numbers))):
             out = numbers % min(_FOLDS, len(numbers)) == fold
-            part = views.calibrated(np.flatnonzero(~out), whole.camera, **options)
-            posed = views.calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
+            part = calibrated(np.flatnonzero(~out), whole.camera, **options)
+            posed = calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
             errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
-    weights = np.isfinite(views.pixels[..., 0]).sum(1)
     held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
     if not math.isfinite(held_out):
         raise ValueError("views that it was not fitted to are lost")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -14,7 +15,7 @@ from camtorch._arguments import columns
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Sight, State
 from camtorch.calibration.observations import named
 from camtorch.calibration.uncertainty import spread, worst
-from camtorch.projection.rays import angles_from_axis, image_edges
+from camtorch.projection.rays import angles_from_axis, image_edges, image_lattice
 
 if TYPE_CHECKING:
     from camtorch.calibration.calibrate import Calibration
@@ -40,6 +41,7 @@ _OPEN_COEFFICIENT = 0.1  # standard deviation
 _MISFIT = 3.0  # px, the median residual of views that no camera fits
 _MOST_OF_A_VIEW = 0.8  # of its corners
 
+_TILTED = "Tilt the board by 30 to 45 degrees to all sides"
 _ROWS, _COLUMNS = ("top", "", "bottom"), ("left", "", "right")
 _OTHERS = {"pinhole": "brown_conrady", "brown_conrady": "", "kannala_brandt": "fisheye624", "fisheye62": "fisheye624"}
 _OTHERS |= dict.fromkeys(("fisheye624", "thin_prism_fisheye"), "")
@@ -69,12 +71,8 @@ class Survey:
         self.calibration = calibration
         cell = max(calibration.image_size) / _CELLS
         rows, columns = self.shape = tuple(max(1, round(side / cell)) for side in calibration.image_size)
-        low, high = image_edges(calibration.image_size, self.parameters)
-        steps = [
-            (torch.arange(count, device=low.device).to(low) + 0.5) / count * (high[i] - low[i]) + low[i]
-            for i, count in ((1, rows), (0, columns))
-        ]
-        self.pixels = torch.stack(torch.meshgrid(*steps, indexing="ij")[::-1], -1)
+        # with the edges of the cells every second is a middle
+        self.pixels = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
         """(rows, columns, 2) the middle of each cell."""
 
     @property
@@ -172,18 +170,13 @@ class Survey:
     def zones(self) -> list[Zone]:
         """Nine, by rows."""
         result = []
-        for i, band in enumerate(torch.arange(self.shape[0], device="cpu").tensor_split(3)):
-            for j, part in enumerate(torch.arange(self.shape[1], device="cpu").tensor_split(3)):
-                here = self.uncertainty[band][:, part]
-                known = here[~here.isnan()]
-                result.append(
-                    Zone(
-                        " ".join(filter(None, (_ROWS[i], _COLUMNS[j]))) or "middle",
-                        float(self.covered[band][:, part].double().mean()),
-                        len(known) / here.numel(),
-                        float(known.amax()) if len(known) else math.nan,
-                    )
-                )
+        bands, parts = (torch.arange(count, device="cpu").tensor_split(3) for count in self.shape)
+        for (i, band), (j, part) in itertools.product(enumerate(bands), enumerate(parts)):
+            here = self.uncertainty[band][:, part]
+            known = here[~here.isnan()]
+            name = " ".join(filter(None, (_ROWS[i], _COLUMNS[j]))) or "middle"
+            share = float(self.covered[band][:, part].double().mean())
+            result.append(Zone(name, share, len(known) / here.numel(), float(known.amax()) if len(known) else math.nan))
         return result
 
     @property
@@ -257,8 +250,10 @@ class Survey:
             step, gain = _more(Bundle([sight], state, free, None, 1.0), state, 2)
             bend = (*step.tolist(), gain / cost)
         count = len(self.parameters) - 4
+        names = model.names_of(count)
         counts = [n for n in (*model.fit_counts, count + 1, count + 2, count + 3, count + 4) if n > count]
-        more = next((n for n in counts if _extends(model, count, n)), None)
+        longer = ((n, model.names_of(n) or ()) for n in counts)
+        more = next((n for n, its in longer if its and its[:count] == names and not any(model.ideal(n)[count:])), None)
         if more is None or not bool(self.learns[4:].all()):
             return bend, None
         free = Free((torch.cat((self.learns, self.learns.new_ones(more - count))),), (False,))
@@ -297,14 +292,6 @@ class Survey:
         return learns
 
 
-def _extends(model: type[Camera], count: int, more: int) -> bool:
-    """Whether with coefficients at zero the model of more is the same camera."""
-    names, others = model.names_of(count), model.names_of(more)
-    if names is None or others is None or others[:count] != names:
-        return False
-    return not any(model.ideal(more)[count:])
-
-
 def _more(bundle: Bundle, state: State, count: int) -> tuple[Tensor, float]:
     """The step of the last unknowns, and how much the sum of squares would fall by them, were the problem linear."""
     shared = bundle.equations(bundle.flat(state)).shared[0, :-1]
@@ -330,8 +317,8 @@ def warnings(calibration: Calibration) -> list[str]:
 def _search(survey: Survey) -> Iterator[str]:
     if not survey.calibration.converged:
         yield (
-            "The search did not end at an optimum: do not use this camera. See whether the numbers of corners along "
-            "the board's sides, the image size and the model are right, try another model first, or give start=a camera"
+            "The search did not end at an optimum: do not use this camera. See whether the board's size, the image "
+            "size and the model are right, try another model first, or give start=a camera"
         )
 
 
@@ -339,9 +326,8 @@ def _noise(survey: Survey) -> Iterator[str]:
     sigma = survey.calibration.sigma
     if sigma > _CORNER_NOISE * max(1.0, max(survey.calibration.image_size) / 2000):
         yield (
-            f"What is left is {_px(sigma)} per coordinate, far more than corners are wrong by: see whether "
-            "the board is flat and as described, and look at the worst views; images out of focus or smeared by motion "
-            "do it too, and so does a model that is not that of the lens"
+            f"What is left is {_px(sigma)} per coordinate, far more than corners are wrong by: the board may be bent "
+            "or not as described, images out of focus or smeared, or the model not that of the lens"
         )
 
 
@@ -363,9 +349,8 @@ def _outliers(survey: Survey) -> Iterator[str]:
     (lost,) = (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero(as_tuple=True)
     if len(lost) and calibration.loss:
         yield (
-            f"Nearly all corners of {_numbered(survey, lost)} are outliers, as where they are "
-            "numbered in another order: a robust loss bears corners that are wrong here and there, and such a view "
-            f"makes all parameters look less certain than they are. Leave {'them' if len(lost) > 1 else 'it'} out"
+            f"Nearly all corners of {_numbered(survey, lost)} are outliers, as where they are numbered in another "
+            f"order. Leave {'them' if len(lost) > 1 else 'it'} out: such views make all parameters look less certain"
         )
 
 
@@ -375,9 +360,8 @@ def _bad_views(survey: Survey) -> Iterator[str]:
     (bad,) = (rms > max(_WORSE_VIEW * usual, survey.rounding)).nonzero(as_tuple=True)
     if len(bad) and len(rms) >= _FEW_VIEWS:
         yield (
-            f"{_numbered(survey, bad).capitalize()} fit{'s' * (len(bad) == 1)} worse than the others, "
-            f"up to {_px(float(rms[bad].amax()))} where {_px(usual)} is usual: look at the corners there, or leave "
-            f"{'them' if len(bad) > 1 else 'it'} out"
+            f"{_numbered(survey, bad).capitalize()} fit{'s' * (len(bad) == 1)} worse than the others, up to "
+            f"{_px(float(rms[bad].amax()))} where {_px(usual)} is usual: look at their corners, or leave them out"
         )
 
 
@@ -386,15 +370,13 @@ def _views(survey: Survey) -> Iterator[str]:
     if calibration.copies:
         yield (
             f"{named(calibration.copies).capitalize()} show{'s' * (len(calibration.copies) == 1)} another view again, "
-            "its errors too, as a copy of a file does: they count once. Take new photographs instead"
+            "as a copy of a file does: they count once. Take new photographs instead"
         )
     copies = [calibration.views.index(view) for view in calibration.copies if view in calibration.views]
     count = int(survey.seen.any(-1).sum()) - int(survey.seen[copies].any(-1).sum())
     if count < _FEW_VIEWS:
-        yield (
-            f"Only {count} view{'s' * (count != 1)}: a bad one has nothing to be told by. Take 10 to 20, with the "
-            "board tilted by 30 to 45 degrees to all sides"
-        )
+        plural = "s" * (count != 1)
+        yield f"Only {count} view{plural}: a bad one has nothing to be told by. Take 10 to 20. {_TILTED}"
 
 
 def _loose(survey: Survey) -> Iterator[str]:
@@ -403,17 +385,14 @@ def _loose(survey: Survey) -> Iterator[str]:
     if loose > _LOOSE_FOCAL and len(survey.seen) > 1 and survey.tilt < _ALIKE:
         yield (
             f"All boards are parallel to within {_degrees(survey.tilt)}, so that a longer focal length looks like a "
-            f"greater distance: it is {known}. Tilt the board by 30 to 45 degrees to all sides"
+            f"greater distance: it is {known}. {_TILTED}"
         )
     elif loose > _LOOSE_FOCAL:
         yield f"The focal length is {known}. Take views in which the board is near and tilted, and fills the image"
     std, longer = max(survey.calibration.std[2:4].tolist()), max(survey.calibration.image_size)
     if std > _LOOSE_CENTRE * longer:
         known = f"known to {_px(std)} only" if std < longer else "as good as unknown"
-        yield (
-            f"The principal point is {known}. Tilt the board to all sides, turn it by 90 degrees in "
-            'its plane, or hold it in the middle of the image with fixed=("cx", "cy")'
-        )
+        yield f'The principal point is {known}. {_TILTED}, or hold it in the middle with fixed=("cx", "cy")'
 
 
 def _twins(survey: Survey) -> Iterator[str]:
@@ -426,8 +405,7 @@ def _twins(survey: Survey) -> Iterator[str]:
         )
         yield (
             f"The parameters are not known, though projections are where corners were seen: {'; '.join(others)} "
-            f"fit{'s' * (len(others) == 1)} as well as {found}. Use the camera as a whole and compare no parameters, "
-            "or take a model without this ambiguity, as eucm or kannala_brandt"
+            f"fit{'s' * (len(others) == 1)} as well as {found}. Compare no parameters, or take eucm or kannala_brandt"
         )
 
 
@@ -436,10 +414,7 @@ def _coverage(survey: Survey) -> Iterator[str]:
     if missing:
         known = max((zone.uncertainty for zone in missing if zone.rays >= 0.5), default=math.nan)
         where = f", where projections are uncertain by up to {_px(known)}" if math.isfinite(known) else ""
-        yield (
-            f"Few corners or none in {_places(missing)} of the image{where}. Hold the board there, so near that its "
-            "corners reach the edges"
-        )
+        yield f"Few corners or none in {_places(missing)} of the image{where}. Hold the board there, near to the edges"
 
 
 def _angles(survey: Survey) -> Iterator[str]:
@@ -448,8 +423,8 @@ def _angles(survey: Survey) -> Iterator[str]:
     if lost > 0.001 and not survey.ends_in_the_dark:
         yield (
             f"The fitted lens ends inside the image: {_percent(lost)} of the pixels have no ray, beyond {_degrees(end)}"
-            f" from the axis, where corners reach {_degrees(reach)}. If the image goes on there, take views with "
-            "corners as far out as it shows anything, or a model with fewer coefficients or of a wider lens"
+            f" from the axis, where corners reach {_degrees(reach)}. Take views with corners further out, or a model "
+            "with fewer coefficients or of a wider lens"
         )
     if end > reach + _BEYOND and survey.good_within(ROUGH)[0] < end:
         yield (
@@ -483,10 +458,9 @@ def _pattern(survey: Survey) -> Iterator[str]:
         key, wide = calibration.spread.model.key, survey.reach > math.radians(40)
         other = (_WIDER if wide else _OTHERS).get(key, _OTHERS.get(key, "kannala_brandt or fisheye624"))
         tries = " or ".join(filter(None, (other, "" if any(calibration.bend) or is_bent else "bend=True")))
-        instead = f"Try {tries}" if tries else "See whether the board is flat and as described, and the corners sharp"
         yield (
             f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
-            f"the lens, or the board is not as described. {instead}"
+            f"the lens, or the board is not as described. {f'Try {tries}' if tries else 'See whether it is flat'}"
         )
 
 
@@ -541,17 +515,14 @@ def verdict(calibration: Calibration) -> str:
             f"known to {_px(middle)} in the middle and to {_px(largest)} at worst ({usual})."
         )
     elif fine_share > 0:
-        there = survey.uncertainty[survey.angles <= fine].amax()
+        there = float(survey.uncertainty[survey.angles <= fine].amax())
+        rest = f"Up to {_degrees(rough)}, {_percent(rough_share)}, it is good for looking at, and the rest a guess."
+        if rough_share > 0.99 * rays:
+            rest = "The rest of its rays is good for looking at."
         good = (
             f"Good for measuring up to {_degrees(fine)} from the optical axis, {_percent(fine_share)} of the image: "
-            f"projections are known to {_px(middle)} in the middle and to {_px(float(there))} at that angle ({usual})."
+            f"projections are known to {_px(middle)} in the middle and to {_px(there)} at that angle ({usual}). {rest}"
         )
-        if rough_share > 0.99 * rays:
-            good += " The rest of its rays is good for looking at."
-        else:
-            good += (
-                f" Up to {_degrees(rough)}, {_percent(rough_share)}, it is good for looking at, and the rest a guess."
-            )
     elif rough_share > 0:
         good = (
             f"Not for measuring: projections are known to {_px(middle)} in the middle ({usual}). Good for looking at "
@@ -568,7 +539,7 @@ def _next(survey: Survey) -> str:
     middle = survey.zones[4].uncertainty
     loose = [zone for zone in survey.zones if zone.rays >= 0.5 and zone.uncertainty > max(FINE, 2 * middle)]
     wanted = survey.missing or sorted(loose, key=lambda zone: -zone.uncertainty)[:3]
-    tilt = " Tilt the board by 30 to 45 degrees to all sides." if survey.tilt < _ALIKE else ""
+    tilt = f" {_TILTED}." if survey.tilt < _ALIKE else ""
     if wanted:
         return (
             f"Next, hold the board in {_places(wanted)} of the image, so near that its corners reach the edges.{tilt}"
@@ -614,8 +585,8 @@ def check_determined(
     what = "a single view of this board leaves" if views == 1 else f"these {views} views leave"
     why = "" if views == 1 else ", as boards that are all nearly parallel do"
     raise ValueError(
-        f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 "
-        f"views in which the board is tilted by 30 to 45 degrees to all sides, or hold parameters: {_fixed(hold)}"
+        f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 views. {_TILTED}, or hold "
+        f"parameters: {_fixed(hold)}"
     )
 
 

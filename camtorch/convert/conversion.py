@@ -148,7 +148,7 @@ class _Result(NamedTuple):
     def replaced(self, rows: Tensor, other: _Result) -> _Result:
         """With other results in the place of these rows."""
         if len(rows) == 0:
-            return self
+            return self  # and as narrow as it was
         width = max(self.parameters.shape[-1], other.parameters.shape[-1])
         results = _Result(*(t.clone() for t in self.padded(width)))
         for result, new in zip(results, other.padded(width), strict=True):
@@ -161,8 +161,8 @@ class _Result(NamedTuple):
 
     def padded(self, width: int) -> _Result:
         """With parameters (C, width), zeros after those that there are."""
-        parameters = torch.nn.functional.pad(self.parameters, (0, width - self.parameters.shape[-1]))
-        return self._replace(parameters=parameters)
+        more = width - self.parameters.shape[-1]
+        return self._replace(parameters=torch.nn.functional.pad(self.parameters, (0, more)))
 
 
 def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
@@ -174,9 +174,7 @@ def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
             break
         other = _converted(task.of(rows), count)
         enough = (_WORTH_IT * result.max_error[rows]).clamp(min=task.tolerance)
-        (good,) = ((other.max_error <= enough) & _reaches_as_far(other.max_angle, result.max_angle[rows])).nonzero(
-            as_tuple=True
-        )
+        good = (other.max_error <= enough) & _reaches_as_far(other.max_angle, result.max_angle[rows])
         result = result.replaced(rows[good], other.of(good))
     return result
 
@@ -209,9 +207,8 @@ def _converted(task: _Task, count: int) -> _Result:
         these = task.of(rows)
         observations = views.sample_with_rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit).observations
         minimax = _measured(these, refine_minimax(build(parameters), observations, parameters[rows]), exact[rows])
-        (better,) = (
-            (minimax.max_error < result.max_error[rows]) & _reaches_as_far(minimax.max_angle, result.max_angle[rows])
-        ).nonzero(as_tuple=True)
+        better = minimax.max_error < result.max_error[rows]
+        better &= _reaches_as_far(minimax.max_angle, result.max_angle[rows])
         result = result.replaced(rows[better], minimax.of(better))
     return result
 

@@ -66,8 +66,8 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
         raise ValueError(f"lenses.find: words must name a camera or a lens, as 'GoPro HERO9 wide'; got {words!r}")
     found = search(words)
     if not found:
-        near = _most_alike(terms)
-        what = f"; the nearest are {_listed(near)}" if near else ""
+        near = list(dict.fromkeys(repr(lens.name) for lens in _most_alike(terms)))
+        what = f"; the nearest are {', '.join(near[:_SHOWN])}{' ...' * (len(near) > _SHOWN)}" if near else ""
         raise ValueError(f"lenses.find: no lens is called {words!r}{what}. {GUESS_CAMERA}")
     size = as_image_size(image_size, "lenses.find")
     if size is None:
@@ -81,11 +81,6 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
         )
     camera = fitting[0].camera()
     return camera if camera.image_size == size else camera.resize(*size)
-
-
-def _listed(lenses: list[Lens]) -> str:
-    names = list(dict.fromkeys(repr(lens.name) for lens in lenses))
-    return ", ".join(names[:_SHOWN]) + (" ..." if len(names) > _SHOWN else "")
 
 
 def _words_of(text: str) -> list[str]:

@@ -66,6 +66,13 @@ class CameraHead(GeometryModule):
     shared_focal: bool
     names: tuple[str, ...]
     linear: nn.Linear
+    _discs: Tensor
+    _scales: Tensor
+    _start: Tensor
+    _far: Tensor
+    _ratio: Tensor
+    _middle: Tensor
+    _lens: Tensor
 
     def __init__(
         self,
@@ -129,15 +136,6 @@ class CameraHead(GeometryModule):
         nn.init.zeros_(self.linear.weight)
         nn.init.zeros_(self.linear.bias)
 
-    if TYPE_CHECKING:
-        _discs: Tensor
-        _scales: Tensor
-        _start: Tensor
-        _far: Tensor
-        _ratio: Tensor
-        _middle: Tensor
-        _lens: Tensor
-
     @property
     def prior(self) -> Camera:
         """The camera of numbers that are all zero."""
@@ -189,7 +187,8 @@ class CameraHead(GeometryModule):
         if self._centres:
             reach = rows.new_tensor([width, height])[self._centres] * self.centre
             moved = reach * _bounded(given[:, first - len(self._centres) :])
-            centre = centre + (moved if len(self._centres) == 2 else _placed(moved, self._centres[0]))
+            index = torch.tensor(self._centres, device=rows.device)
+            centre = centre + torch.zeros_like(centre).index_copy(1, index, moved)
         intrinsics = torch.cat((focal * (-half).exp(), focal * half.exp(), centre), -1).to(dtype)
         lead = numbers.shape[:-1]
         parts = [intrinsics.reshape(*lead, 4), k.to(dtype).reshape(*lead, len(lens))][: 2 if len(lens) else 1]
@@ -223,9 +222,3 @@ class CameraHead(GeometryModule):
 def _bounded(x: Tensor) -> Tensor:
     """From -1 to 1: like x near zero, with gradients that fade with the third power."""
     return x * torch.rsqrt(1 + x * x)
-
-
-def _placed(values: Tensor, index: int) -> Tensor:
-    """(R, 1) as the x or the y of (R, 2)."""
-    zero = torch.zeros_like(values)
-    return torch.cat((values, zero) if index == 0 else (zero, values), -1)

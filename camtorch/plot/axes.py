@@ -61,14 +61,15 @@ def size_of(camera: Camera) -> tuple[int, int]:
     return camera._size_for("a plot")
 
 
-def draw_frame(ax: Axes, height: int, width: int) -> None:
-    """The outer edges of an image, rows downwards."""
+def draw_frame(ax: Axes, height: int, width: int) -> tuple[float, float, float, float]:
+    """The outer edges of an image, rows downwards; returned as the `extent` of what `imshow` puts into them."""
     margin = 0.02 * max(height, width)
     ax.set_xlim(-0.5 - margin, width - 0.5 + margin)
     ax.set_ylim(height - 0.5 + margin, -0.5 - margin)
     ax.set_aspect("equal")
     ax.spines[:].set_visible(False)
     ax.plot([-0.5, width - 0.5, width - 0.5, -0.5, -0.5], [-0.5, -0.5, height - 0.5, height - 0.5, -0.5], color=INK)
+    return -0.5, width - 0.5, height - 0.5, -0.5
 
 
 def magnification(most: float) -> int:

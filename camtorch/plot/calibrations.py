@@ -68,7 +68,7 @@ class Sightings(NamedTuple):
     @property
     def lengths(self) -> np.ndarray:
         """(V, N) px, of the residuals."""
-        return np.asarray(np.hypot(self.errors[..., 0], self.errors[..., 1]))
+        return np.asarray(np.linalg.norm(self.errors, axis=-1))
 
     @property
     def angles(self) -> np.ndarray:
@@ -123,7 +123,9 @@ def coverage(calibration: Calibration, ax: Axes | None = None) -> Axes:
     cells = np.ma.masked_equal(counts, 0)
     cmap, norm = levels("counts").with_extremes(bad=PALE), PowerNorm(0.5, 0, max(counts.max(), 1))
     ax.pcolormesh(edges[1], edges[0], cells, cmap=cmap, norm=norm, zorder=0.5, edgecolors="#ffffff", linewidth=0.6)
-    _dots(ax, pixels[_evenly(len(pixels), _ARROWS)], INK, 0.9 if len(pixels) > _DENSE else 1.6)
+    _strokes(
+        ax, np.repeat(pixels[_evenly(len(pixels), _ARROWS)][:, None], 2, 1), INK, 0.9 if len(pixels) > _DENSE else 1.6
+    )
     _crosses(ax, shots)
     lattice = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
     with torch.no_grad():
@@ -158,7 +160,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None) -> Axes:
     for i, colour in enumerate(cmap(np.arange(cmap.N))):
         start, along = pixels[place == i], longer * errors[place == i]
         _strokes(ax, np.stack((start, start + along), 1), colour, 0.6 if dense else 0.9, 2 + i / 10)
-        _dots(ax, start, colour, 1.2 if dense else 2.0, 2 + i / 10)
+        _strokes(ax, np.repeat(start[:, None], 2, 1), colour, 1.2 if dense else 2.0, 2 + i / 10)
     _crosses(ax, shots)
     extend = "max" if (lengths > bounds[-1]).any() else "neither"
     _bar(ax, ScalarMappable(BoundaryNorm(bounds, cmap.N), cmap), "px", extend=extend)
@@ -236,8 +238,7 @@ def view(calibration: Calibration, number: int, ax: Axes | None = None, *, image
             f"plot: no view {number} with corners; of {len(calibration.image_points)} {len(shots.numbers)} have"
         )
     index = shots.numbers.index(number)
-    draw_frame(ax, height, width)
-    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    edges = draw_frame(ax, height, width)
     if image is not None:
         image = np.asarray(image)
         if image.shape[:2] != (height, width):
@@ -376,12 +377,8 @@ def _evenly(count: int, most: int) -> np.ndarray:
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
-def _dots(ax: Axes, places: np.ndarray, colour: Any, size: float, zorder: float = 2.0) -> None:
-    _strokes(ax, np.stack((places, places), 1), colour, size, zorder)
-
-
-def _strokes(ax: Axes, ends: np.ndarray, colour: Any, width: float, zorder: float) -> None:
-    """(K, 2, 2) lines with round ends, as one path: thousands of them make a small file."""
+def _strokes(ax: Axes, ends: np.ndarray, colour: Any, width: float, zorder: float = 2.0) -> None:
+    """(K, 2, 2) lines with round ends, of no length dots, as one path: thousands of them make a small file."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -425,26 +422,21 @@ def _hull(points: np.ndarray) -> np.ndarray:
     return np.array([*around, around[0]]) if around else ordered
 
 
-_TURN, _TILT = math.radians(58), math.radians(24)
-
-
 def _oblique(points: np.ndarray) -> np.ndarray:
     """(..., 3) of the camera's frame to (..., 2), right and up, as seen from its right, behind and above."""
+    turn, tilt = math.radians(58), math.radians(24)
     x, y, z = np.moveaxis(np.asarray(points, float), -1, 0)
-    across = z * math.sin(_TURN) + x * math.cos(_TURN)
-    away = z * math.cos(_TURN) - x * math.sin(_TURN)
-    return np.stack((across, -y * math.cos(_TILT) + away * math.sin(_TILT)), -1)
+    away = z * math.cos(turn) - x * math.sin(turn)
+    return np.stack((z * math.sin(turn) + x * math.cos(turn), away * math.sin(tilt) - y * math.cos(tilt)), -1)
 
 
 def _draw_camera(ax: Axes, size: float) -> None:
     """A frustum at the origin, and its axis."""
-    around = _oblique(
-        size * np.array([(x, y, 1.0) for x, y in ((-0.6, -0.45), (0.6, -0.45), (0.6, 0.45), (-0.6, 0.45))])
-    )
-    centre = _oblique(np.zeros(3))
+    sides = [(-0.6, -0.45, 1), (0.6, -0.45, 1), (0.6, 0.45, 1), (-0.6, 0.45, 1)]
+    centre, *around, ahead = _oblique(size * np.array([(0, 0, 0), *sides, (0, 0, 2.2)]))
     for corner, following in zip(around, np.roll(around, -1, 0), strict=True):
         ax.plot(*np.stack((centre, corner, following)).T, color=INK, linewidth=1.2, zorder=5)
-    ax.plot(*_oblique(np.array([(0, 0, 0), (0, 0, 2.2 * size)])).T, color=GREY, linewidth=0.9, linestyle="--", zorder=4)
+    ax.plot(*np.stack((centre, ahead)).T, color=GREY, linewidth=0.9, linestyle="--", zorder=4)
 
 
 def _ruler(ax: Axes, size: float) -> None:

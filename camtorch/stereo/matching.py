@@ -41,7 +41,7 @@ def match(
         most: the greatest.
     """
     cv2 = opencv()
-    images = [_arranged(image, rectification.vertical) for image in _of_bytes(left, right)]
+    images = _of_bytes(left, right, rectification.vertical)
     start = math.floor(least + _ROUNDING)
     count = _STEP * max(1, math.ceil((math.ceil(most - _ROUNDING) - start + 1) / _STEP))
     # the matcher leaves out columns from where it could look past the image
@@ -67,19 +67,14 @@ def match(
     return torch.where(known, disparity, torch.nan), known
 
 
-def _of_bytes(*images: Tensor) -> list[NDArray[np.uint8]]:
-    """(H, W, C) of images of one scale."""
-    arrays = [image[: 3 if len(image) > 2 else 1].permute(1, 2, 0).numpy() for image in images]
-    if all(array.dtype == np.uint8 for array in arrays):
-        return arrays
-    most = max(float(array.max()) for array in arrays)
-    return [np.rint(array * (255 / max(most, 1.0))).astype(np.uint8) for array in arrays]
-
-
-def _arranged(image: NDArray[np.uint8], vertical: bool) -> NDArray[np.uint8]:
-    """With rows that correspond, one channel as (H, W)."""
-    turned = image.transpose(1, 0, 2) if vertical else image
-    return np.ascontiguousarray(turned[..., 0] if turned.shape[2] == 1 else turned)
+def _of_bytes(left: Tensor, right: Tensor, vertical: bool) -> list[NDArray[np.uint8]]:
+    """(H, W, C), or (H, W) of one channel, of images of one scale, with rows that correspond."""
+    order = (2, 1, 0) if vertical else (1, 2, 0)
+    arrays = [image[: 3 if len(image) > 2 else 1].permute(order).numpy() for image in (left, right)]
+    if any(array.dtype != np.uint8 for array in arrays):
+        scale = 255 / max(1.0, *(float(array.max()) for array in arrays))
+        arrays = [np.rint(array * scale).astype(np.uint8) for array in arrays]
+    return [np.ascontiguousarray(array[..., 0] if array.shape[2] == 1 else array) for array in arrays]
 
 
 def _seen(mask: Tensor, disparity: Tensor, vertical: bool) -> Tensor:

@@ -142,12 +142,11 @@ class Rectification(GeometryModule):
         return warps
 
     def _made(self) -> tuple[Warp, Warp]:
-        frame = self.frame
-        of_left, of_right = (
-            Warp(source, self.camera_left, rotation.to(source.intrinsics.dtype))
-            for source, rotation in ((self.source_left, frame.left), (self.source_right, frame.right))
+        frame, target, left, right = self.frame, self.camera_left, self.source_left, self.source_right
+        return (
+            Warp(left, target, frame.left.to(left.intrinsics.dtype)),
+            Warp(right, target, frame.right.to(right.intrinsics.dtype)),
         )
-        return of_left, of_right
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """Both images, (B, C, H, W) each, rectified."""

@@ -55,7 +55,7 @@ WRONG = [
     (lambda: CAMERA.convert("mei", tolerance=None), TypeError, r"convert: tolerance must be a number; got None"),
     (lambda: ct.KannalaBrandt.from_matrix(np.eye(3), ignore_skew="no"), TypeError, r"ignore_skew must be True or"),
     (lambda: BATCH["a"], TypeError, r"Pinhole: a batch is indexed by whole numbers, slices and masks; got 'a'"),
-    (lambda: MIXED["a"], TypeError, r"Mixed: it is indexed by whole numbers, slices and masks; got 'a'"),
+    (lambda: MIXED["a"], TypeError, r"Mixed: a batch is indexed by whole numbers, slices and masks; got 'a'"),
     (lambda: ct.Mixed([CAMERA], order="first"), TypeError, r"Mixed: order must be places among 1 cameras.*'first'"),
     (lambda: ct.Mixed.of_groups([CAMERA]), TypeError, r"Mixed: groups must be pairs \(rows, cameras\)"),
     (lambda: MIXED.by_groups("mei"), TypeError, r"Mixed: change must be a function of a camera.*got 'mei'"),
