@@ -332,8 +332,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
 
 def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]]:
     """The smallest model whose camera has these values and this many coefficients, and its parameters."""
-    key = lossy.model(name, camera, {values[1] for values in _MODELS.values()})
-    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, {values[1] for values in _MODELS.values()})
     if key == "equirectangular":
         height, width = lossy.size(name, camera)
         if [fx, fy, cx, cy] != panorama((height, width)):
