@@ -13,7 +13,20 @@ try:
     import cv2
     import torch
 
-    from benchmarks import augment, calibration, cameras, folders, images, load, machine, points, scaling, stereo
+    from benchmarks import (
+        augment,
+        calibration,
+        cameras,
+        folders,
+        images,
+        load,
+        loader,
+        machine,
+        points,
+        samples,
+        scaling,
+        stereo,
+    )
     from benchmarks.options import Options, progress
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
@@ -21,7 +34,9 @@ except ModuleNotFoundError as error:
 SUBJECTS = {
     "points": points,
     "images": images,
+    "samples": samples,
     "augment": augment,
+    "loader": loader,
     "calibration": calibration,
     "stereo": stereo,
     "folders": folders,

@@ -1,4 +1,4 @@
-"""Augmentation: a random camera for every image of a batch, with its mask and its landmarks; and in a DataLoader.
+"""Augmentation: a random camera for every image of a batch, with its mask and its landmarks.
 
 Every call draws anew and moves the image, a mask and 68 keypoints of each sample. OpenCV goes sample by sample, from
 a lens that it knows to a turned pinhole camera, and cannot do the other cases. kornia's RandomAffine moves the same
@@ -25,7 +25,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 import camtorch as ct
-from benchmarks import cameras, loader
+from benchmarks import cameras
 from benchmarks.options import Options
 from benchmarks.point_peers import COMPILED, OPENCV, OURS
 from benchmarks.tables import Record, only, table
@@ -73,7 +73,6 @@ def run(options: Options) -> tuple[list[Record], list[str]]:
             runs = contestants(case, size, data_of(operation, size, options), options, compiled=i < _COMPILED)
             records += measure(case.name, operation, runs, options)
     chain = measure(CHAIN, BYTE, chains(size, options), options)
-    loaded = loader.measured(options)
     shape = f"{BATCH}x1x{size[0]}x{size[1]}"
     tables = [
         table(
@@ -88,10 +87,9 @@ def run(options: Options) -> tuple[list[Record], list[str]]:
             scale=1e3,
             beside=OURS,
         ),
-        table(loader.title(options), only(loaded, "per second"), beside=OURS),
-        verdict(requirements([*records, *chain, *loaded])),
+        verdict(requirements([*records, *chain])),
     ]
-    return [*records, *chain, *loaded], tables
+    return [*records, *chain], tables
 
 
 def requirements(records: Sequence[Record]) -> list[Requirement]:
@@ -113,7 +111,7 @@ def requirements(records: Sequence[Record]) -> list[Requirement]:
         if {(wider, operation), (wide, operation)} <= rows.keys()
     }
     found.append(Requirement("to aria: at most 2 times dms130", 2.0, ratios, at_most=True))
-    return [*found, *loader.requirements(records)]
+    return found
 
 
 def data_of(dtype: str, size: tuple[int, int], options: Options) -> Data:

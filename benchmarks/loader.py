@@ -18,9 +18,9 @@ import camtorch.augment.numpy
 from benchmarks import augment, cameras
 from benchmarks.options import Options
 from benchmarks.point_peers import OPENCV, OURS
-from benchmarks.tables import Record
+from benchmarks.tables import Record, only, table
 from benchmarks.timing import Run, measure, threads
-from benchmarks.verdict import Requirement, figures
+from benchmarks.verdict import Requirement, figures, verdict
 from camtorch.augment import RandomCamera
 
 NOTHING, ALBUMENTATIONS = "nothing done", "albumentations Affine"
@@ -52,10 +52,12 @@ class Samples(Dataset):
         return self.move({"image": self.images[i], "mask": self.masks[i], "keypoints": self.keypoints[i]})
 
 
-def title(options: Options) -> str:
-    """Of the table."""
+def run(options: Options) -> tuple[list[Record], list[str]]:
+    """Measure; the records and the tables."""
+    records = measured(options)
     height, width = augment.QUICK_SIZE if options.quick else augment.SIZE
-    return f"DataLoader: samples per second, {height}x{width}x{_CHANNELS} uint8, mask, {augment.LANDMARKS} landmarks"
+    title = f"DataLoader: samples per second, {height}x{width}x{_CHANNELS} uint8, mask, {augment.LANDMARKS} landmarks"
+    return records, [table(title, only(records, "per second"), beside=OURS), verdict(requirements(records))]
 
 
 def measured(options: Options) -> list[Record]:
@@ -82,10 +84,16 @@ def measured(options: Options) -> list[Record]:
 
 
 def requirements(records: Sequence[Record]) -> list[Requirement]:
-    """A worker gives more samples than one that has OpenCV do it."""
-    rows = {row: found for row, found in figures(records, "per second").items() if {OURS, OPENCV} <= found.keys()}
-    ratios = {f"{case}, {operation}": found[OURS] / found[OPENCV] for (case, operation), found in rows.items()}
-    return [Requirement("DataLoader: as many samples as with OpenCV", 1.0, ratios)]
+    """A worker gives more samples than one that has another library do it."""
+    rows, found = figures(records, "per second"), []
+    for who, bound in ((OPENCV, 2.0), (ALBUMENTATIONS, 1.3)):
+        ratios = {
+            f"{case}, {operation}": speeds[OURS] / speeds[who]
+            for (case, operation), speeds in rows.items()
+            if {OURS, who} <= speeds.keys()
+        }
+        found.append(Requirement(f"DataLoader: {bound:g} times as many samples as with {who}", bound, ratios))
+    return found
 
 
 def epochs(samples: Samples, workers: int) -> Run:

@@ -34,6 +34,7 @@ from camtorch.projection.unproject import Unproject
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
+    from camtorch.projection.compiled import Native
 
 
 def mapped(
@@ -109,6 +110,33 @@ def evaluated(
     if is_portable_export() and not keeps_graph(*inputs):
         inputs = rows, intrinsics.detach(), distortion.detach()
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
+
+
+def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> list[Native] | None:
+    """The compiled geometry of cameras (B,), or of one, each, for values of the dtype of the first of them.
+
+    None where `evaluated` would take another regime, where the result would have a graph, and of cameras that are more
+    than one model, or behind a shutter.
+    """
+    inputs, dtype = [*values], values[0].dtype
+    for camera in cameras:
+        if not isinstance(camera, nn.Module) or camera.is_mixed or len(camera.batch_shape) > 1:
+            return None
+        inputs += camera._tensors
+    if not _is_plain(inputs) or is_recorded() or not all(map(in_memory, inputs)):
+        return None
+    if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+        return None
+    if not dtype.is_floating_point or any(t.dtype != dtype for t in inputs[len(values) :]):
+        return None
+    made = []
+    for camera in cameras:
+        lead = camera.batch_shape or (1,)
+        native = rows_of(camera, *(t.expand(*lead, t.shape[-1]) for t in camera._tensors)).native
+        if native is None:
+            return None
+        made.append(native)
+    return made
 
 
 class _Native(Function):

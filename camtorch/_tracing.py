@@ -15,6 +15,7 @@ FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE
 """The key of a FakeTensorMode among the modes that are under way."""
 
 _DENSE = torch._C._dispatch_keys(torch.empty(0, device="cpu"))
+_PLAIN: int = _DENSE.raw_repr()
 
 
 def has_tangent(tensor: Tensor) -> bool:
@@ -60,8 +61,9 @@ def in_memory(tensor: Tensor) -> bool:
 
     Nor are they to be negated first, or compressed, or zero by declaration.
     """
-    mine: int = (torch._C._dispatch_keys(tensor) | _DENSE).raw_repr()
-    return mine == _DENSE.raw_repr()
+    keys = torch._C._dispatch_keys(tensor)
+    mine: int = keys.raw_repr()
+    return mine == _PLAIN or (keys | _DENSE).raw_repr() == _PLAIN
 
 
 def is_recorded() -> bool:

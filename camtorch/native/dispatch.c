@@ -6,6 +6,8 @@
     int32_t sample_##variant(Job *);                                                                                      \
     int32_t classify_##variant(const Classification *);                                                                \
     int64_t geometry_##variant(const Rows *);                                                                          \
+    int64_t moves_##variant(const Move *);                                                                             \
+    int64_t lattices_##variant(const Lattices *);                                                                      \
     void domain_##variant(const Domain *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
@@ -61,5 +63,9 @@ EXPORTED int32_t camtorch_sample(Job *job) { CALLED(sample, job) }
 EXPORTED int32_t camtorch_classify(const Classification *given) { CALLED(classify, given) }
 
 EXPORTED int64_t camtorch_geometry(const Rows *rows) { CALLED(geometry, rows) }
+
+EXPORTED int64_t camtorch_moves(const Move *move) { CALLED(moves, move) }
+
+EXPORTED int64_t camtorch_lattices(const Lattices *given) { CALLED(lattices, given) }
 
 EXPORTED void camtorch_domain(const Domain *domain) { CALLED(domain, domain) }

@@ -9,6 +9,7 @@
 #include <float.h>
 #include <math.h>
 #include <stddef.h>
+#include <stdlib.h>
 #include <string.h>
 
 #if defined(_MSC_VER)
@@ -29,6 +30,8 @@
 
 enum { LANES = 16 };      /* that a block is filled up to a multiple of */
 enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */
+enum { START_ROUNDS = 6, DAMPED_STEPS = 60 }; /* of a search */
+enum { SQUARE = 64 };     /* pixels of a cell of a lattice */
 enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
 #define PI 3.14159265358979323846
 
@@ -59,6 +62,8 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         FORM(ALL, ANGLE_OF_ALL_POWERS, PADDED, 0, __VA_ARGS__)                                                         \
     }
 
+int32_t THIS(classify)(const Classification *);
+
 /* How many numbers a part has: the `parameters` of its chart or stage */
 static int numbers_of(const Part *part) {
     int count = 0;
@@ -72,15 +77,17 @@ static int numbers_of(const Part *part) {
     return part->factor == NO_FACTOR ? count : count + part->n + (part->factor == RATIONAL ? part->m : 0);
 }
 
-/* The tile that whoever is free takes */
-static int64_t taken(const Rows *rows, int64_t *own) {
-    if (!rows->next) return (*own)++;
+/* What a number was that several callers add to */
+static int64_t added(int64_t *number, int64_t count) {
 #if defined(_MSC_VER)
-    return _InterlockedExchangeAdd64(rows->next, 1);
+    return _InterlockedExchangeAdd64(number, count);
 #else
-    return __atomic_fetch_add(rows->next, 1, __ATOMIC_RELAXED);
+    return __atomic_fetch_add(number, count, __ATOMIC_RELAXED);
 #endif
 }
+
+/* The tile that whoever is free takes */
+static int64_t taken(int64_t *next, int64_t *own) { return next ? added(next, 1) : (*own)++; }
 
 #define R float
 #define I int32_t
@@ -92,6 +99,8 @@ static int64_t taken(const Rows *rows, int64_t *own) {
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_search.h"
+#include "geometry_moves.h"
 #undef R
 #undef I
 #undef T
@@ -109,9 +118,18 @@ static int64_t taken(const Rows *rows, int64_t *own) {
 #include "geometry_charts.h"
 #include "geometry_lens.h"
 #include "geometry_rows.h"
+#include "geometry_search.h"
+#include "geometry_moves.h"
 #include "geometry_domain.h"
 
 /* Makes tiles until none is left that nobody has taken; how many points wait for `limits2` */
 int64_t THIS(geometry)(const Rows *rows) {
     return rows->cameras->is_double ? rows_double(rows) : rows_float(rows);
+}
+
+/* The same of pixels that are moved, and of lattices; flags of what is left */
+int64_t THIS(moves)(const Move *move) { return move->from->is_double ? moves_double(move) : moves_float(move); }
+
+int64_t THIS(lattices)(const Lattices *given) {
+    return given->move.from->is_double ? lattices_double(given) : lattices_float(given);
 }

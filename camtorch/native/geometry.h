@@ -7,6 +7,8 @@
 
 #include <stdint.h>
 
+#include "sampler.h"
+
 /* Charts: rays to a plane; the numbers of each are its `parameters` */
 enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED, CYLINDER, SPHERE };
 /* Flags of charts: which of xi, alpha, beta are numbers, and whether x and y change places */
@@ -25,6 +27,10 @@ enum { MOST_DEGREE = 64 }; /* of a polynomial whose root is asked for, and of a 
 enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabulate` */
 enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of its stages */
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.Azimuths` */
+enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
+/* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
+   direction (AZIMUTHS) */
+enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };
 
 /* A chart or a stage */
 typedef struct {
@@ -43,9 +49,9 @@ typedef struct {
     int64_t constant_count;
     const uint8_t *usable; /* (c), or NULL: all are. The numbers of one that is not are those of any that is */
     /* of a lens: squared radii up to which it is regular, and no further out than images reach; squared limits (c,
-       AZIMUTHS), or NULL; tables of the inverse (c, 2 + 2 NODES), or NULL; whether it goes stage by stage (c), or NULL:
+       AZIMUTHS) and where it sends azimuths (c, EXTENT), or NULL: not yet known; tables of the inverse (c, 2 + 2 NODES), or NULL; whether it goes stage by stage (c), or NULL:
        none; the squared radius (c) of the circle that its image lies in then */
-    const void *inner2, *usual2, *limits2, *table;
+    const void *inner2, *usual2, *limits2, *extent, *table;
     const uint8_t *stagewise;
     const void *circle2;
     /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */
@@ -66,7 +72,9 @@ typedef struct {
     const double *folds;             /* (c): of factors whose fold is not the root of a polynomial, or NULL */
     double most;                     /* the largest image that is a number to calculate with */
     const double *radii;             /* (MOST_RADII): from the centre to the end of the chart */
+    const double *coarse, *even;     /* (RADII / 2), (RADII): the same, of `limits2` and `extent` */
     void *inner2, *usual2, *circle2, *table; /* (c), (c), (c), (c, 2 + 2 NODES); see `Cameras` */
+    void *limits2, *extent;                  /* (c, AZIMUTHS), (c, EXTENT): both or none */
     uint8_t *stagewise;                      /* (c); with circle2 */
 } Domain;
 
@@ -79,7 +87,7 @@ typedef struct {
     int64_t row_strides[3];
     void *results; /* pixels or rays; of a vjp, the cotangents of points or pixels */
     int64_t result_strides[3];
-    uint8_t *valid; /* (c, n) without gaps: VALID, OPEN or 0; the vjp of unproject reads it */
+    uint8_t *valid; /* (c, n) without gaps; the vjp of unproject reads it */
     void *solution; /* (2, c, n) without gaps: points on the chart's plane, which the vjp of unproject reads */
     const void *cotangents; /* of pixels or rays */
     int64_t cotangent_strides[3];
@@ -90,7 +98,42 @@ typedef struct {
     int64_t *next; /* the tile that whoever is free takes; NULL: one caller takes all */
 } Rows;
 
-/* OPEN: a pixel that may have a ray, which steps of Newton's method have not found */
-enum { VALID = 1, OPEN = 2 };
+/* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there */
+enum { POSITIONS, PIXELS };
+/* What is left to do: pixels wait for the extent of `from`, points for the limits of `to`; most cells of a lattice want
+   exact positions */
+enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4 };
+#define OUTSIDE (-9)
+#define FAR 100 /* beyond, positions are drawn in */
+
+/* Pixels of cameras `from`, by rays that are turned, to those of `to`; each as many as `cameras`, or one for all. All
+   numbers are of the type of both */
+typedef struct {
+    const Cameras *from, *to;
+    const void *turns;   /* (c, 3, 3), or NULL */
+    int64_t turn_stride; /* 0: one for all */
+    int64_t cameras, form;
+    double height, width; /* of the image of `to` */
+    const void *rows;     /* pixels (c, n) and results, strides as of `Rows` */
+    int64_t row_strides[3];
+    void *results;
+    int64_t result_strides[3];
+    uint8_t *valid;      /* (c, n) without gaps */
+    int64_t count, tile; /* pixels of a camera; of a tile */
+    int64_t *next;       /* the tile, or of lattices the camera, that whoever is free takes */
+} Move;
+
+/* Lattices (c): `move` is of their nodes and of the pixels at the rim, in planes, and `cells` what is asked of them; both
+   are those of the first camera */
+typedef struct {
+    Move move;
+    const Classification *cells;
+    int64_t first_row; /* of the target, where cells begin */
+    float *narrow;     /* (c, 2, nodes), the nodes in float, or NULL: they are */
+    /* (2, c rows columns, 8, 8): positions of all pixels of the cells that `classify` leaves, NaN where there is none,
+       and of those around a cell in which what is mapped ends. Each cell gets the number of its place there */
+    void *exact;
+    int64_t *used; /* how many places there are */
+} Lattices;
 
 #endif

@@ -28,12 +28,12 @@ typedef struct {
 typedef struct {
     const Part *parts;
     int stages, way, swapped, is_radial, by_stages, usable;
-    int follows; /* whether the lens is to be followed along each azimuth */
+    int follows, waits; /* whether the lens is to be followed along each azimuth, and yet has to be */
     const R *numbers[MOST_PARTS], *constants;
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
-    const R *limits2, *table;
+    const R *limits2, *extent, *table;
     R chart_inner2, chart_most2;
     const R *chart_table;
     T(Chart) chart;

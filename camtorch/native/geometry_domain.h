@@ -254,8 +254,9 @@ static void bound_lens(const Lens *lens, int first, int n, double *radius, doubl
     }
 }
 
-/* The node, with a fraction at a dip, where an orientation is first lost; n where it never is */
-static double first_loss(int n, const double *orientation) {
+/* The node, with a fraction at a dip, where an orientation is first lost; n where it never is. No dip is assumed next to
+   nodes that are `spared` */
+static double first_loss(int n, const double *orientation, const uint8_t *spared) {
     double first = n;
     for (int i = 0; i < n; i++) {
         double lost = orientation[i] > 0 ? INFINITY : i;
@@ -263,7 +264,7 @@ static double first_loss(int n, const double *orientation) {
             const double bend = orientation[i - 1] - 2 * orientation[i] + orientation[i + 1];
             const double tilt = orientation[i - 1] - orientation[i + 1];
             const int dips = bend > 0 && fabs(tilt) <= bend && orientation[i] - tilt * tilt / (8 * bend) <= 0;
-            if (dips) lost = i + (orientation[i] > 0 ? tilt / (2 * bend) : 0);
+            if (dips && !(spared && spared[i])) lost = i + (orientation[i] > 0 ? tilt / (2 * bend) : 0);
         }
         first = lost < first ? lost : first;
     }
@@ -301,6 +302,8 @@ static void put(void *to, int64_t at, double value, int is_double) {
     else ((float *)to)[at] = (float)value;
 }
 
+#include "geometry_azimuths.h"
+
 /* Fills in what of a `Domain` is wanted */
 void THIS(domain)(const Domain *d) {
     const int is_double = (int)d->is_double;
@@ -331,13 +334,19 @@ void THIS(domain)(const Domain *d) {
                 double radius[MOST_RADII], least[MOST_RADII];
                 memcpy(radius, d->radii, sizeof radius);
                 bound_lens(&lens, 1, MOST_RADII, radius, least);
-                double node = floor(first_loss(MOST_RADII, least) - 1);
+                double node = floor(first_loss(MOST_RADII, least, NULL) - 1);
                 node = node > 0 ? node < MOST_RADII - 1 ? node : MOST_RADII - 1 : 0;
                 inner = d->radii[(int)node];
             }
             const double inner2 = within(inner, end, is_double), usual2 = usual_end * usual_end;
             put(d->inner2, c, inner2, is_double);
             if (d->usual2) put(d->usual2, c, inner2 < usual2 ? inner2 : usual2, is_double);
+        }
+        if (d->limits2 && goes_by_stages) follow_nothing(d, c);
+        else if (d->limits2) {
+            Camera_double camera;
+            lens_of(d, c, &camera);
+            follow(d, c, &camera, has_factor ? fold : NAN, end);
         }
         if (d->table && has_factor) {
             tabulate(&lens, fold, usual_end, table);

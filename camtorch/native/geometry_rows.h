@@ -31,6 +31,8 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         c->usual2 = all->usual2 ? ((const R *)all->usual2)[camera] : c->inner2;
         c->circle2 = all->circle2 ? ((const R *)all->circle2)[camera] : 0;
         c->limits2 = all->limits2 ? (const R *)all->limits2 + camera * AZIMUTHS : NULL;
+        c->extent = all->extent ? (const R *)all->extent + camera * EXTENT : NULL;
+        c->waits = c->follows && !c->extent;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
     }
     if (c->parts->kind == INVERTED) {
@@ -99,11 +101,12 @@ static void T(load_pixels)(const R *from, const int64_t *strides, int count, int
 
 /* -- rays to pixels */
 
-/* The azimuth at or below that of a point, in even steps along the rim of the diamond |a| + |b| = 1 */
-static int T(azimuth)(R a, R b) {
+/* The azimuth at or below that of a point, in even steps along the rim of the diamond |a| + |b| = 1; `offset` 0.5: the
+   nearest one */
+static int T(azimuth)(R a, R b, double offset) {
     const R size = T(absolute)(a) + T(absolute)(b), across = b / (size > 0 ? size : 1);
-    const double turn = floor((a < 0 ? 2 - across : across) * (AZIMUTHS / 4));
-    const int index = turn == turn ? (int)turn : 0; /* infinite points have none */
+    const double turn = floor((a < 0 ? 2 - across : across) * (AZIMUTHS / 4) + offset);
+    const int index = fabs(turn) <= AZIMUTHS ? (int)turn : 0; /* infinite points have none */
     return (index + AZIMUTHS) % AZIMUTHS;
 }
 
@@ -125,7 +128,7 @@ static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
     for (int i = 0; i < filled; i++) x[i] = s->a[places[i]], y[i] = s->b[places[i]];
     if (c->limits2) T(lens)(c, 1, filled, x, y, u, v, &jacobian, least);
     for (int i = 0; i < some; i++) {
-        const R limit2 = c->limits2 ? c->limits2[T(azimuth)(x[i], y[i])] : 0;
+        const R limit2 = c->limits2 ? c->limits2[T(azimuth)(x[i], y[i], 0)] : 0;
         s->ok[places[i]] = (limit2 - (x[i] * x[i] + y[i] * y[i]) > 0) && least[i] > TINY;
     }
     return c->limits2 ? 0 : some && places[0] < count ? some : 0;
@@ -201,6 +204,23 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
     return waiting;
 }
 
+/* Points `s` to pixels, -1 where they are not `ok`. How many wait for limits */
+static int T(pixels_of)(const T(Camera) *c, int count, int n, T(Seen) *s, R *restrict u, R *restrict v) {
+    const int waiting = T(see)(c, 0, count, n, s);
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
+    if (c->is_radial) { /* most often */
+        EACH(i) s->x[i] = s->a[i] * s->a[i] + s->b[i] * s->b[i];
+        T(radial)(c->factors + 1, n, s->x, s->scale, NULL);
+        EACH(i) s->x[i] = fx * (s->a[i] * s->scale[i]), s->y[i] = fy * (s->b[i] * s->scale[i]);
+    } else if (c->stages) {
+        T(lens)(c, 1, n, s->a, s->b, s->x, s->y, NULL, NULL);
+        EACH(i) s->x[i] *= fx, s->y[i] *= fy;
+    } else EACH(i) s->x[i] = fx * s->a[i], s->y[i] = fy * s->b[i];
+    /* in a loop of its own, so that no processor does both at once: edges of images lie where round numbers put them */
+    EACH(i) u[i] = s->ok[i] ? s->x[i] + cx : -1, v[i] = s->ok[i] ? s->y[i] + cy : -1;
+    return waiting;
+}
+
 static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
     const int n = (count + LANES - 1) & -LANES;
     const int64_t *from = rows->row_strides, *to = rows->result_strides;
@@ -210,20 +230,9 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     T(Seen) s;
     ALIGNED R p[BLOCK], q[BLOCK];
     const int direct = T(is_plane)(to, count, n);
-    R *restrict u = direct ? pixels : p, *restrict v = direct ? pixels + to[2] : q;
+    R *u = direct ? pixels : p, *v = direct ? pixels + to[2] : q;
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
-    const int waiting = T(see)(c, 0, count, n, &s);
-    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
-    if (c->is_radial) { /* most often */
-        EACH(i) s.x[i] = s.a[i] * s.a[i] + s.b[i] * s.b[i];
-        T(radial)(c->factors + 1, n, s.x, s.scale, NULL);
-        EACH(i) s.x[i] = fx * (s.a[i] * s.scale[i]), s.y[i] = fy * (s.b[i] * s.scale[i]);
-    } else if (c->stages) {
-        T(lens)(c, 1, n, s.a, s.b, s.x, s.y, NULL, NULL);
-        EACH(i) s.x[i] *= fx, s.y[i] *= fy;
-    } else EACH(i) s.x[i] = fx * s.a[i], s.y[i] = fy * s.b[i];
-    /* in a loop of its own, so that no processor does both at once: edges of images lie where round numbers put them */
-    EACH(i) u[i] = s.ok[i] ? s.x[i] + cx : -1, v[i] = s.ok[i] ? s.y[i] + cy : -1;
+    const int waiting = T(pixels_of)(c, count, n, &s, u, v);
     if (!direct) T(store)(pixels, to, 2, count, u, v, NULL);
     for (int i = 0; i < count; i++) valid[i] = (uint8_t)s.ok[i];
     return waiting;
@@ -507,70 +516,16 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
     }
 }
 
-/* Of pixels that steps left open, by a bracket of the radial factor, whose fold is a circle; `_Search` */
+/* See geometry_search.h */
 static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
-                      I *restrict ok) {
-    const R fold2 = c->inner2 * (1 - 64 * EPS), inner2 = c->inner2, most2 = c->table[1] * (1 + 64 * EPS);
-    ALIGNED R p[BLOCK], q[BLOCK], r2[BLOCK], scale[BLOCK], x[BLOCK], y[BLOCK], stretch[BLOCK];
-    T(Seen) s;
-    T(Jacobian) to;
-    EACH(i) p[i] = u[i], q[i] = v[i], ok[i] = 1;
-    if (!c->is_radial) {
-        T(start)(c, 2, n, u, v, p, q);
-        for (int count = 0; count < 12; count++) { /* the first ones may take off no more than a third */
-            T(lens)(c, 2, n, p, q, x, y, &to, NULL);
-            EACH(i) {
-                R dp, dq;
-                T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], u[i] - x[i], v[i] - y[i], &dp, &dq);
-                p[i] += dp, q[i] += dq;
-            }
-        }
-        EACH(i) {
-            ok[i] = (u[i] * u[i] + v[i] * v[i] <= c->circle2) & (p[i] * p[i] + q[i] * q[i] <= most2);
-            p[i] = ok[i] ? p[i] : 0, q[i] = ok[i] ? q[i] : 0;
-        }
-    }
-    EACH(i) r2[i] = p[i] * p[i] + q[i] * q[i];
-    T(bracketed)(c->factors + 1, fold2, n, r2, scale);
-    EACH(i) a[i] = p[i] * scale[i], b[i] = q[i] * scale[i], ok[i] &= a[i] * a[i] + b[i] * b[i] < inner2;
-    T(lens)(c, 1, n, a, b, x, y, &to, NULL);
-    EACH(i) {
-        const R across = T(absolute)(to.ua[i]) + T(absolute)(to.ub[i]), down = T(absolute)(to.va[i]) + T(absolute)(to.vb[i]);
-        const R far = T(absolute)(a[i]) > T(absolute)(b[i]) ? T(absolute)(a[i]) : T(absolute)(b[i]);
-        stretch[i] = (across > down ? across : down) * far;
-    }
-    for (int count = 0; count < 2; count++) { /* what rounding left */
-        EACH(i) {
-            R da, db;
-            T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], u[i] - x[i], v[i] - y[i], &da, &db);
-            a[i] = ok[i] ? a[i] + da : 0, b[i] = ok[i] ? b[i] + db : 0;
-        }
-        T(lens)(c, 1, n, a, b, x, y, NULL, NULL);
-    }
-    /* next to a fold the polished solution may lie on its other side: what counts is where its ray is seen */
-    T(rays)(c, n, a, b, ok, s.x, s.y, s.z);
-    T(see)(c, 0, n, n, &s);
-    EACH(i) ok[i] &= s.ok[i] == 1;
-    T(lens)(c, 1, n, s.a, s.b, x, y, NULL, NULL);
-    EACH(i) {
-        const R du = T(absolute)(x[i] - u[i]), dv = T(absolute)(y[i] - v[i]);
-        const R far = T(absolute)(u[i]) > T(absolute)(v[i]) ? T(absolute)(u[i]) : T(absolute)(v[i]);
-        ok[i] &= (du > dv ? du : dv) <= 32 * EPS * (1 + far + stretch[i]);
-        a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
-    }
-}
+                      I *restrict ok);
 
-/* How many are left OPEN */
-static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
-    const int n = (count + LANES - 1) & -LANES, follows = c->follows;
-    const int64_t *from = rows->row_strides, *to = rows->result_strides;
-    const R *pixels = (const R *)rows->rows + camera * from[0] + first * from[1];
-    R *rays = (R *)rows->results + camera * to[0] + first * to[1];
-    uint8_t *valid = rows->valid + camera * rows->count + first;
-    ALIGNED R u[BLOCK], v[BLOCK], a[BLOCK], b[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
-    ALIGNED I ok[BLOCK], known[BLOCK], possible[BLOCK];
-    int left = 0;
-    T(load_pixels)(pixels, from, count, n, u, v, c->cx, c->cy);
+/* Pixels (u, v) to points (u, v) of the chart's plane and rays, the axis where there is none. `known` are numbers to
+   calculate with; where one is not `ok`, a lens that `waits` for its extent leaves open whether it has a ray */
+static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v, I *restrict known, I *restrict ok,
+                         R *x, R *y, R *z) {
+    ALIGNED R a[BLOCK], b[BLOCK];
+    ALIGNED I possible[BLOCK];
     const R by_fx = 1 / c->fx, by_fy = 1 / c->fy, cx = c->cx, cy = c->cy;
     const I usable = c->usable;
     EACH(i) {
@@ -579,15 +534,15 @@ static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, in
         u[i] = known[i] ? p : 0, v[i] = known[i] ? q : 0;
     }
     if (c->stages) {
-        int places[BLOCK], some;
         T(invert)(c, n, u, v, a, b, ok, possible);
-        if (!follows) EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
-        if (!follows && (some = T(chosen)(n, possible, places))) {
-            ALIGNED R found_a[BLOCK], found_b[BLOCK];
+        int places[BLOCK], some;
+        EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
+        if ((!c->follows || c->extent) && (some = T(chosen)(n, possible, places))) {
+            ALIGNED R p[BLOCK], q[BLOCK], found_a[BLOCK], found_b[BLOCK];
             ALIGNED I found[BLOCK];
             const int filled = (some + LANES - 1) & -LANES;
-            for (int i = 0; i < filled; i++) x[i] = u[places[i]], y[i] = v[places[i]];
-            T(search)(c, filled, x, y, found_a, found_b, found);
+            for (int i = 0; i < filled; i++) p[i] = u[places[i]], q[i] = v[places[i]];
+            T(search)(c, filled, p, q, found_a, found_b, found);
             for (int i = 0; i < some; i++)
                 a[places[i]] = found_a[i], b[places[i]] = found_b[i], ok[places[i]] = found[i];
         }
@@ -596,16 +551,27 @@ static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, in
             u[i] = ok[i] ? a[i] : 0, v[i] = ok[i] ? b[i] : 0;
         }
     } else T(cover)(c, n, u, v, known, ok);
+    T(rays)(c, n, u, v, ok, x, y, z);
+}
+
+/* How many wait for an extent */
+static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
+    const int n = (count + LANES - 1) & -LANES;
+    const int64_t *from = rows->row_strides, *to = rows->result_strides;
+    const R *pixels = (const R *)rows->rows + camera * from[0] + first * from[1];
+    R *rays = (R *)rows->results + camera * to[0] + first * to[1];
+    uint8_t *valid = rows->valid + camera * rows->count + first;
+    ALIGNED R u[BLOCK], v[BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
+    ALIGNED I ok[BLOCK], known[BLOCK];
+    int left = 0;
     const int direct = T(is_plane)(to, count, n);
     R *p = direct ? rays : x, *q = direct ? rays + to[2] : y, *r = direct ? rays + 2 * to[2] : z;
-    T(rays)(c, n, u, v, ok, p, q, r);
+    T(load_pixels)(pixels, from, count, n, u, v, c->cx, c->cy);
+    T(solutions)(c, n, u, v, known, ok, p, q, r);
     if (!direct) T(store)(rays, to, 3, count, p, q, r);
-    if (follows)
-        for (int i = 0; i < count; i++) {
-            const int open = !ok[i] & (known[i] != 0);
-            valid[i] = ok[i] ? VALID : open ? OPEN : 0, left += open;
-        }
-    else for (int i = 0; i < count; i++) valid[i] = (uint8_t)ok[i];
+    for (int i = 0; i < count; i++) valid[i] = (uint8_t)ok[i];
+    if (c->waits)
+        for (int i = 0; i < count; i++) left += !ok[i] & (known[i] != 0);
     if (rows->solution) {
         const int64_t planes[3] = {0, 1, rows->cameras->cameras * rows->count};
         T(store)((R *)rows->solution + camera * rows->count + first, planes, 2, count, u, v, NULL);
@@ -628,7 +594,7 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     const R *to_y = T(load)(cotangents + by[2], by[1], count, n, y, 0);
     const R *to_z = T(load)(cotangents + 2 * by[2], by[1], count, n, z, 0);
     for (int i = 0; i < count; i++) {
-        const int is_known = valid[i] == VALID;
+        const int is_known = valid[i] != 0;
         gx[i] = is_known ? to_x[i] : 0, gy[i] = is_known ? to_y[i] : 0, gz[i] = is_known ? to_z[i] : 0;
     }
     for (int i = count; i < n; i++) gx[i] = gy[i] = gz[i] = 0;
@@ -671,7 +637,7 @@ static int64_t T(rows)(const Rows *rows) {
     const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
     int64_t left = 0, last = -1, own = 0, at;
     T(Camera) camera;
-    while ((at = taken(rows, &own)) < tiles * rows->cameras->cameras) {
+    while ((at = taken(rows->next, &own)) < tiles * rows->cameras->cameras) {
         const int64_t index = at / tiles, first = at % tiles * rows->tile;
         const int64_t end = first + rows->tile < rows->count ? first + rows->tile : rows->count;
         double *sums = rows->sums ? rows->sums + at * width : NULL;

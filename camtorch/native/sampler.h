@@ -15,8 +15,9 @@ enum { UINT8, BOOL, UINT16, FLOAT32, BYTES1, BYTES2, BYTES4, BYTES8, TYPES };
 enum { NEAREST, BILINEAR, BICUBIC };
 enum { ZEROS, BORDER, REFLECTION };
 
-enum { STEP = 8 };                      /* pixels between the nodes of a lattice */
-enum { CELL_EMPTY = -2, CELL_CUBIC = -1 }; /* cells that are neither: the index of their exact positions */
+enum { SCRATCH = 25 };
+enum { STEP = 8 }; /* pixels between the nodes of a lattice */
+enum { CELL_NEXT = -3, CELL_EMPTY, CELL_CUBIC }; /* to be computed next, and others that have no place in `exact` */
 
 typedef struct {
     /* images (b, c, y, x) and results, in elements; a source image may serve all results (stride 0) */
@@ -58,7 +59,7 @@ typedef struct {
     double source_height, source_width, tolerance;
     int32_t padding; /* that is to be sampled with: what lies off the image then matters, or does not */
     int32_t *cells; /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, or 0 where positions are to be exact */
-    float *scratch; /* 25 (columns + 8) */
+    float *scratch; /* SCRATCH (columns + 8), and of lattices as often as there are */
 } Classification;
 
 #endif

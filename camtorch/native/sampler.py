@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 from collections.abc import Sequence
 from ctypes import addressof, byref, c_double, c_float, c_int32, c_int64, c_void_p
@@ -65,6 +66,9 @@ class _Job(ctypes.Structure):
 
 class _Classification(ctypes.Structure):
     """`Classification` of sampler.h."""
+
+    memory: Tensor
+    """That of its scratch."""
 
     _fields_ = (
         ("nodes", c_void_p),
@@ -146,7 +150,7 @@ def sample(
     job.count, job.channels, job.height, job.width = count, channels, height, width
     job.source_height, job.source_width = images.shape[-2:]
     values = (c_float * channels)(*fill)
-    elements = None if images.dtype == torch.float32 else _elements(fill, images.dtype)
+    elements = None if images.dtype == torch.float32 else _elements(tuple(fill), images.dtype)
     job.fill = addressof(values)
     job.fill_elements = job.fill if elements is None else elements.data_ptr()
     if grid is not None:
@@ -174,13 +178,14 @@ def _shared(tensor: Tensor) -> int:
     return 0 if tensor.shape[0] == 1 else tensor.stride(0)
 
 
-def _elements(fill: Sequence[float], dtype: torch.dtype) -> Tensor:
+@functools.lru_cache(maxsize=64)
+def _elements(fill: tuple[float, ...], dtype: torch.dtype) -> Tensor:
     """The values as pixels, (C,): rounded and in range, true from one half on."""
     if dtype == torch.bool:
         return torch.tensor([value >= 0.5 for value in fill], device="cpu")
     if not dtype.is_floating_point:
         low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
-        fill = [min(max(round(value), low), high) for value in fill]
+        fill = tuple(min(max(round(value), low), high) for value in fill)
     return torch.tensor(fill, dtype=dtype, device="cpu")
 
 
@@ -222,27 +227,32 @@ class Probed(NamedTuple):
     """"zeros", "border" or "reflection", of what is to be sampled."""
 
 
-def classify(probed: Probed) -> tuple[Tensor, int] | None:
-    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`, or None without a library. Nodes are of float32.
+def classify(probed: Probed) -> tuple[Tensor, int]:
+    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`. Nodes are of float32. There is a library.
 
     Returns:
         (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
     """
-    nodes, mapped, rim = probed[:3]
     native = library()
-    if native is None:
-        return None
-    rows, columns = nodes.shape[2] - 5, nodes.shape[3] - 5
-    cells = torch.empty(nodes.shape[0], rows, columns, dtype=torch.int32, device="cpu")
-    scratch = (c_float * (25 * (columns + 8)))()
-    given = _Classification(
+    assert native is not None  # who calls has looked
+    cells, asked = classification(probed)
+    return cells, native.camtorch_classify(byref(asked))
+
+
+def classification(probed: Probed) -> tuple[Tensor, _Classification]:
+    """The cells (B, n, m) int32, and what the compiled code is asked of them."""
+    nodes, mapped, rim = probed[:3]
+    count, rows, columns = nodes.shape[0], nodes.shape[2] - 5, nodes.shape[3] - 5
+    cells = torch.empty(count, rows, columns, dtype=torch.int32, device="cpu")
+    scratch = torch.empty(count, 25 * (columns + 8), dtype=torch.float32, device="cpu")
+    asked = _Classification(
         nodes.data_ptr(),
         nodes.stride()[:2],
         mapped.data_ptr(),
         mapped.stride(0),
         rim.data_ptr(),
         rim.stride(0),
-        nodes.shape[0],
+        count,
         rows,
         columns,
         *probed.size,
@@ -250,6 +260,7 @@ def classify(probed: Probed) -> tuple[Tensor, int] | None:
         probed.tolerance,
         _PADDINGS[probed.padding],
         cells.data_ptr(),
-        addressof(scratch),
+        scratch.data_ptr(),
     )
-    return cells, native.camtorch_classify(byref(given))
+    asked.memory = scratch
+    return cells, asked

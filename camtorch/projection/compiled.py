@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import operator
 import struct
+import threading
 from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +19,7 @@ from camtorch._arguments import columns
 from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
+from camtorch.native.sampler import Probed, classification
 from camtorch.optics.backprojection import FURTHEST
 
 if TYPE_CHECKING:
@@ -26,12 +29,12 @@ if TYPE_CHECKING:
     from camtorch.projection.domain import Domain, Optics
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
-_OPEN = 2  # of geometry.h
 _TILE = 1 << 14  # points of a tile, some 30 us
 _SHARED = 1 << 15  # points that threads are woken for
 _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
-_RADII = 512
+_RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
+_EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
 _TANGENTIAL, _PRISM = 1, 2
@@ -67,6 +70,7 @@ class _Cameras(ctypes.Structure):
         ("inner2", c_void_p),
         ("usual2", c_void_p),
         ("limits2", c_void_p),
+        ("extent", c_void_p),
         ("table", c_void_p),
         ("stagewise", c_void_p),
         ("circle2", c_void_p),
@@ -77,6 +81,10 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
+_Move = struct.Struct("6q2d12q").pack  # `Move` of geometry.h
+_Lattices = struct.Struct("6q2d17q").pack  # `Lattices`
+POSITIONS, PIXELS = range(2)
+_LEFT_FROM, _LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 
@@ -99,10 +107,14 @@ class _Domain(ctypes.Structure):
         ("folds", c_void_p),
         ("most", c_double),
         ("radii", c_void_p),
+        ("coarse", c_void_p),
+        ("even", c_void_p),
         ("inner2", c_void_p),
         ("usual2", c_void_p),
         ("circle2", c_void_p),
         ("table", c_void_p),
+        ("limits2", c_void_p),
+        ("extent", c_void_p),
         ("stagewise", c_void_p),
     )
 
@@ -135,6 +147,7 @@ class Plan:
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
+        self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
     def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
         """The radii at which the chart of some cameras ends, and beyond which there are no images."""
@@ -147,6 +160,17 @@ class Plan:
         if not (made.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
             self._ends[dtype] = end, usual_end
         return end, usual_end
+
+    def radii(self, chart: Callable[[], Chart], count: int, like: Tensor) -> Tensor:
+        """The radii of the chart of some cameras, as `Chart.radii` has them, in double precision."""
+        key = like.dtype, count
+        if key not in self._radii:
+            made = chart()
+            radii = made.radii(count, like).double()
+            if made.parameters:
+                return radii
+            self._radii[key] = radii
+        return self._radii[key]
 
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """(C, parameters) of coefficients (C, n)."""
@@ -170,46 +194,31 @@ def _plan(optics_of: Optics, k: Tensor) -> Plan | None:
     return _plans[key]
 
 
-class Native:
-    """Cameras (C,) of one model as the compiled geometry takes them."""
+class Lenses:
+    """Those of cameras (C,) as the compiled geometry takes them: numbers, and what was found of their domains."""
 
     plan: Plan
-    struct: _Cameras
     cameras: int
     dtype: torch.dtype
-    parameters: int
-    pointer: int
-    _kept: list[Any]
+    fields: dict[str, int]
+    """Where what `Cameras` of geometry.h has of them lies."""
+    table: int | None
+    azimuths: tuple[int, int] | None
+    _kept: list[object]
 
-    def __init__(
-        self,
-        plan: Plan,
-        optics_of: Optics,
-        intrinsics: Tensor,
-        k: Tensor,
-        usable: Tensor | None,
-        domain: Callable[[], Domain],
-    ):
+    def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
         """See `native_of`."""
-        self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, []
-        self._slow_domain = domain
-        self.struct = struct = _Cameras()
-        struct.parts, struct.part_count = addressof(plan.parts), plan.count
-        self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
-        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
-        struct.intrinsics = self._keep(intrinsics)
-        self.parameters = struct.parameter_count = plan.parameters
+        self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
+        self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
+        self.fields, self.table, self.azimuths = {}, None, None
         if plan.parameters:
-            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
+            self.fields["parameters"] = self._keep(plan.parameters_of(optics_of, k))
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
-            struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
-        if usable is not None:
-            struct.usable = self._keep(usable > 0)
+            self.fields |= {"constants": self._keep_columns(constants), "constant_count": len(constants)}
         if plan.is_chart:
             self._add_chart()
         if plan.has_stages:
             self._add_domain()
-        self.pointer = addressof(struct)
 
     def _optics(self) -> tuple[Chart, Lens]:
         """In double precision."""
@@ -220,7 +229,7 @@ class Native:
         """What it is asked with; its optics are of double precision."""
         made, plan, k = _Domain(), self.plan, self._k.double()
         made.parts, made.part_count = addressof(plan.parts), plan.count
-        made.is_double, made.cameras, made.is_radial = self.struct.is_double, self.cameras, plan.is_radial
+        made.is_double, made.cameras, made.is_radial = self.dtype == torch.float64, self.cameras, plan.is_radial
         made.parameters, made.parameter_count = self._keep(plan.parameters_of(self._optics_of, k)), plan.parameters
         made.most = torch.finfo(self.dtype).max ** 0.25
         made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
@@ -254,35 +263,46 @@ class Native:
 
     def _add_chart(self) -> None:
         """The fold and the inverse of a chart that is given the other way round."""
-        struct, table = self.struct, torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu")
-        struct.chart_inner2, struct.chart_table = self._new(1), self._keep(table)
-        self._ask({"inner2": struct.chart_inner2, "table": struct.chart_table, "is_chart": True})
-        struct.chart_most2 = self._keep(table[:, 1])
+        table, inner2 = torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu"), self._new(1)
+        place = self._keep(table)
+        self._ask({"inner2": inner2, "table": place, "is_chart": True})
+        self.fields |= {"chart_inner2": inner2, "chart_table": place, "chart_most2": self._keep(table[:, 1])}
 
     def _add_domain(self) -> None:
-        struct, plan = self.struct, self.plan
-        struct.inner2, struct.usual2 = self._new(1), self._new(1)
+        plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
-            struct.inner2, struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
+            self.fields |= {"inner2": self._keep(domain.inner2), "usual2": self._keep(domain.usual2)}
             return
-        wanted = {"inner2": struct.inner2, "usual2": struct.usual2}
+        wanted = {"inner2": self._new(1), "usual2": self._new(1)}
         if plan.has_rest:
-            struct.circle2, struct.stagewise = self._new(1), self._new(1, torch.bool)
-            wanted |= {"circle2": struct.circle2, "stagewise": struct.stagewise}
-        if not plan.is_radial:
-            wanted["radii"] = self._keep(self._optics()[0].radii(_RADII, self._k).double())
-        self._ask(wanted)
+            wanted |= {"circle2": self._new(1), "stagewise": self._new(1, torch.bool)}
+        self.fields |= wanted
+        radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
+        self._ask(wanted | radii)
 
-    def add_table(self) -> None:
-        """Make what the inverse of the radial factor starts from."""
-        table = self._new(_TABLE)
-        self._ask({"table": table})
-        self.struct.table = table  # when it is whole, for another thread may be looking
+    def inverse_table(self) -> int:
+        """What the inverse of the radial factor starts from; it is made when it is first asked for."""
+        if self.table is None:
+            table = self._new(_TABLE)
+            self._ask({"table": table})
+            self.table = table  # when it is whole, for another thread may be looking
+        return self.table
 
-    def add_limits(self) -> None:
-        """Make the limits of each azimuth, which take a while, and are asked for only when a point lies far out."""
-        self.struct.limits2 = self._keep(self._slow_domain().limits2)
+    def followed(self) -> tuple[int, int]:
+        """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
+        if self.azimuths is None:
+            chart, like = self._optics()[0], self._k.double()
+            wanted = {"limits2": self._new(_AZIMUTHS), "extent": self._new(_EXTENT)}
+            wanted |= {name: place for name, place in self.fields.items() if name in ("circle2", "stagewise")}
+            for name, count in (("radii", _RADII), ("even", _FOLLOWED), ("coarse", _FOLLOWED // 2)):
+                wanted[name] = self._keep(self.plan.radii(lambda: chart, count, like))
+            if self.plan.is_chart:
+                end = chart.end(self.dtype)
+                wanted["ends"] = self._keep_ends(end)
+            self._ask(wanted)
+            self.azimuths = wanted["limits2"], wanted["extent"]
+        return self.azimuths
 
     def _keep(self, tensor: Tensor) -> int:
         tensor = tensor.contiguous()
@@ -291,6 +311,58 @@ class Native:
 
     def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
+
+
+_MOST_LENSES, _LONGEST = 24, 512
+_lenses: dict[tuple[object, ...], Lenses] = {}
+
+
+def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]) -> Lenses:
+    """Those of these values: of the last ones that were asked for, or new ones."""
+    if k.numel() > _LONGEST:
+        return Lenses(plan, optics_of, k, domain)
+    key = plan, k.dtype, k.shape, k.numpy().tobytes()
+    found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain)
+    _lenses[key] = found  # the last one
+    while len(_lenses) > _MOST_LENSES:
+        _lenses.pop(next(iter(_lenses)), None)
+    return found
+
+
+class Native:
+    """Cameras (C,) of one model as the compiled geometry takes them."""
+
+    plan: Plan
+    struct: _Cameras
+    cameras: int
+    dtype: torch.dtype
+    parameters: int
+    pointer: int
+
+    def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
+        """See `native_of`."""
+        self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras()
+        self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
+        struct, plan = self.struct, self.plan
+        struct.parts, struct.part_count = addressof(plan.parts), plan.count
+        self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
+        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
+        self.parameters = struct.parameter_count = plan.parameters
+        struct.intrinsics, struct.usable = map(_address, self._kept)
+        struct.table = lenses.table
+        if lenses.azimuths is not None:
+            struct.limits2, struct.extent = lenses.azimuths
+        for name, value in lenses.fields.items():
+            setattr(struct, name, value)
+        self.pointer = addressof(struct)
+
+    def add_table(self) -> None:
+        """Have what the inverse starts from."""
+        self.struct.table = self._lenses.inverse_table()
+
+    def follow(self) -> None:
+        """Have the limits of each azimuth, and where it is sent."""
+        self.struct.limits2, self.struct.extent = self._lenses.followed()
 
 
 def native_of(
@@ -310,7 +382,7 @@ def native_of(
     if library() is None or not intrinsics.is_cpu or not len(k):
         return None
     plan = _plan(optics_of, k)
-    return None if plan is None else Native(plan, optics_of, intrinsics, k, usable, domain)
+    return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain), intrinsics, usable)
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
@@ -369,31 +441,28 @@ def _constants(lens: Lens) -> Sequence[Tensor]:
 # -- calls
 
 
-class Unprojected(NamedTuple):
-    """Rays (3, C, N); whether there is one (C, N); points on the chart's plane (2, C, N), if they were asked for; which
-    pixels are left open, where a ray may be that only a search finds, None where none is.
-    """
-
-    rays: Tensor
-    valid: Tensor
-    solution: Tensor | None
-    open: Tensor | None
-
-
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
     cameras, count, _ = points.shape
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     rows = points.data_ptr(), *points.stride(), *_planes(pixels, cameras, count), valid.data_ptr(), 0, *_NO_ROWS, 0
-    if _call(native, cameras, count, PROJECT, rows) and native.struct.limits2 is None:
-        native.add_limits()
+    if _call(native, cameras, count, PROJECT, rows):
+        native.follow()
         _call(native, cameras, count, PROJECT, rows)
     return pixels, valid
 
 
+class Unprojected(NamedTuple):
+    """Unit rays (3, C, N), whether there is one (C, N), and points on the chart's plane (2, C, N), if asked for."""
+
+    rays: Tensor
+    valid: Tensor
+    solution: Tensor | None
+
+
 def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
-    """Pixels (C, N, 2) to unit rays. keeps: whether `unproject_vjp` is to follow."""
+    """Pixels (C, N, 2) to rays. keeps: whether `unproject_vjp` is to follow."""
     cameras, count, _ = pixels.shape
     rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
@@ -401,11 +470,11 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     if native.plan.has_factor and native.struct.table is None:
         native.add_table()
     rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
-    kept = 0 if solution is None else solution.data_ptr()
-    if not _call(native, cameras, count, UNPROJECT, (*rows, kept, *_NO_ROWS, 0)):
-        return Unprojected(rays, valid, solution, None)
-    states = valid.view(torch.uint8)
-    return Unprojected(rays, states == 1, solution, states == _OPEN)
+    given = *rows, _address(solution), *_NO_ROWS, 0
+    if _call(native, cameras, count, UNPROJECT, given):
+        native.follow()
+        _call(native, cameras, count, UNPROJECT, given)
+    return Unprojected(rays, valid, solution)
 
 
 def project_vjp(
@@ -437,6 +506,133 @@ def unproject_vjp(
     rows = *_NO_ROWS, *_points(results), valid.data_ptr(), solution.data_ptr()
     _call(native, cameras, count, UNPROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), _address(sums)))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
+
+
+class Lattices(NamedTuple):
+    """What `sampler.sample` takes of the positions of cameras (C,)."""
+
+    nodes: Tensor
+    """(C, 2, n + 5, m + 5)."""
+    cells: Tensor
+    """(C, n, m) int32."""
+    exact: Tensor
+    """(2, K, 8, 8), NaN where there is none."""
+
+
+class Between:
+    """Cameras, and others that see their rays after a turn: pixels of the first as pixels of the others."""
+
+    cameras: int
+    """Of each as many, or one for all."""
+    is_batch: bool
+    """Whether pixels have a batch dim."""
+
+    def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
+        """turns: (3, 3) or (C, 3, 3), of their dtype. size: (height, width) of the others' image."""
+        turns, self.is_batch = None if turns is None else turns.contiguous(), is_batch
+        self._start, self._end, self._turns = start, end, turns
+        count = 1 if turns is None or turns.ndim == 2 else len(turns)
+        self.cameras = max(start.cameras, end.cameras, count)
+        if start.plan.has_factor and start.struct.table is None:
+            start.add_table()
+        self._size = size
+        self._given = start.pointer, end.pointer, _address(turns), 9 * (count > 1), self.cameras
+
+    def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
+        """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).
+
+        form: `POSITIONS` as of `grid_sample`, -9 where there is none; or `PIXELS`, -1 where there is none.
+        """
+        count = pixels.shape[1]
+        result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
+        valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
+        rows = *_rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
+        run, tiles = _entry("camtorch_moves", c_int64), -(-count // _TILE) * self.cameras
+
+        def call(following: int) -> int:
+            left: int = run(_Move(*self._given, form, *self._size, *rows, following))
+            return left
+
+        self._left(call, tiles if self.cameras * count >= _SHARED else 1)
+        return result, valid
+
+    def lattices(
+        self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
+    ) -> Lattices | None:
+        """Positions from nodes and from pixels at the rim: see `warp.grid.on_lattice`.
+
+        None where most cells would have positions of their own.
+
+        Args:
+            probes: (1, N, 2): of the nodes, then of the rim.
+            size: (h, w) of the target.
+            first_row: of the target.
+            tolerance: in pixels of the source.
+            padding: that positions are for.
+        """
+        cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
+        n, m = (-(-side // 8) for side in size)
+        nodes, shape = (n + 5) * (m + 5), (cameras, 2, n + 5, m + 5)
+        result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
+        valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+        exact = _kept_memory(2 * cameras * n * m * 64, dtype)  # of which parts are written
+        narrow = None if dtype == torch.float32 else torch.empty(shape, dtype=torch.float32, device="cpu")
+        made = result.as_strided(shape, (2 * count, count, m + 5, 1))
+        mapped, rim = valid.as_strided((cameras, n + 5, m + 5), (count, m + 5, 1)), valid[:, nodes:]
+        cells, asked = classification(Probed(made, mapped, rim, size, self._size, tolerance, padding))
+        rows = *_rows_of(probes), result.data_ptr(), 2 * count, 1, count, valid.data_ptr(), count, count
+        run, used = _entry("camtorch_lattices", c_int64), c_int64(0)
+
+        def call(following: int) -> int:
+            more = addressof(asked), first_row, _address(narrow), exact.data_ptr(), addressof(used)
+            left: int = run(_Lattices(*self._given, POSITIONS, *self._size, *rows, following, *more))
+            return left
+
+        if self._left(call, cameras, used):
+            return None
+        parts = exact[: 2 * cameras * n * m * 64].view(2, -1, 8, 8)[:, : used.value]
+        return Lattices(made, cells, parts.clone())
+
+    def _left(self, call: Callable[[int], int], tiles: int, used: c_int64 | None = None) -> int:
+        """Flags of what is not made. call: with where the next tile stands."""
+        shared = thread_count() if tiles > 1 else 1
+        while True:
+            following, left = c_int64(0), list[int]()
+            place = addressof(following)
+            if used is not None:
+                used.value = 0
+            spread(lambda: left.append(call(place)), min(shared, tiles))  # noqa: B023 (which is called at once)
+            flags = functools.reduce(operator.or_, left)
+            if not flags & (_LEFT_FROM | _LEFT_TO):
+                break
+            for flag, native in ((_LEFT_FROM, self._start), (_LEFT_TO, self._end)):
+                if flags & flag:
+                    native.follow()
+        return flags
+
+
+class _Kept(threading.local):
+    memory: Tensor | None = None
+
+
+_kept = _Kept()
+_MOST_KEPT = 1 << 22  # bytes
+
+
+def _kept_memory(count: int, dtype: torch.dtype) -> Tensor:
+    """At least so many numbers, for this call of this thread: the same memory as before, unless they are many."""
+    if count * dtype.itemsize > _MOST_KEPT:
+        return torch.empty(count, dtype=dtype, device="cpu")
+    if _kept.memory is None or len(_kept.memory) < count * dtype.itemsize:
+        with torch.inference_mode(False):
+            _kept.memory = torch.empty(count * dtype.itemsize, dtype=torch.uint8, device="cpu")
+    return _kept.memory[: count * dtype.itemsize].view(dtype)
+
+
+def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
+    """Where pixels (C or 1, N, 2) lie, and their strides."""
+    camera, point, component = pixels.stride()
+    return pixels.data_ptr(), camera if len(pixels) > 1 else 0, point, component
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:

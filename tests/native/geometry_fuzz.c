@@ -11,6 +11,8 @@
 #include "geometry.h"
 
 int64_t geometry_fuzzed(const Rows *);
+int64_t moves_fuzzed(const Move *);
+int64_t lattices_fuzzed(const Lattices *);
 void domain_fuzzed(const Domain *);
 
 static uint64_t state; /* of chance: splitmix64 */
@@ -62,12 +64,61 @@ static int32_t factor_of(Part *part, int first, int last) {
     return part->n * (part->factor == RADIUS_TABLE ? 4 : 1) + part->m;
 }
 
+/* Pixels, and a lattice, of cameras to themselves, turned */
+static int moved(const Cameras *cameras, int64_t tile) {
+    const int d = (int)cameras->is_double, fits = below(2);
+    const int64_t c = cameras->cameras, height = 1 + below(70), width = 1 + below(90);
+    const int64_t rows = (height + 7) / 8, columns = (width + 7) / 8, nodes = (rows + 5) * (columns + 5);
+    const int64_t n = fits ? nodes + 2 * (height + width) : 1 + below(700), size = d ? 8 : 4;
+    int fine = 1;
+    Move move = {0};
+    void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
+    int64_t following = 0, used = 0;
+    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(2);
+    if (below(2)) move.turns = turns, move.turn_stride = 9 * below(2);
+    move.height = 1 + (double)below(500), move.width = 1 + (double)below(500);
+    void *pixels = rows_of(d, c, n, 2, move.row_strides, 300), *results;
+    move.rows = pixels, move.count = n, move.tile = tile, move.valid = valid;
+    move.next = below(2) ? &following : NULL;
+    if (fits) {
+        move.result_strides[0] = 2 * n, move.result_strides[1] = 1, move.result_strides[2] = n;
+        results = malloc((size_t)(2 * c * n * size));
+    } else results = rows_of(d, c, n, 2, move.result_strides, 0);
+    move.results = results;
+    if (!fits) moves_fuzzed(&move);
+    else {
+        int32_t *cells = malloc((size_t)(c * rows * columns) * sizeof *cells);
+        float *scratch = malloc((size_t)(c * SCRATCH * (columns + 8)) * sizeof *scratch);
+        void *exact = malloc((size_t)(2 * c * rows * columns * 64 * size));
+        if (d) narrow = malloc((size_t)(2 * c * nodes) * sizeof(float));
+        Classification asked = {0};
+        asked.nodes = results, asked.node_strides[0] = 2 * n, asked.node_strides[1] = n;
+        asked.mapped = valid, asked.mapped_stride = n, asked.rim = (uint8_t *)valid + nodes, asked.rim_stride = n;
+        asked.count = c, asked.rows = rows, asked.columns = columns, asked.height = height, asked.width = width;
+        asked.source_height = move.height, asked.source_width = move.width, asked.tolerance = share() * 0.1;
+        asked.padding = (int32_t)below(3), asked.cells = cells, asked.scratch = scratch;
+        Lattices lattices = {move, &asked, below(50), narrow, exact, &used};
+        const int64_t left = lattices_fuzzed(&lattices);
+        fine &= used >= 0 && used <= c * rows * columns;
+        for (int64_t i = 0; !left && i < c * rows * columns; i++) fine &= cells[i] >= CELL_EMPTY && cells[i] < used;
+        free(cells), free(scratch), free(exact);
+    }
+    for (int64_t at = 0; at < 2 * c * n; at++) {
+        const int64_t camera = at / (2 * n), point = at / 2 % n;
+        const int64_t place = camera * move.result_strides[0] + point * move.result_strides[1] + at % 2 * move.result_strides[2];
+        const double value = d ? ((double *)results)[place] : ((float *)results)[place];
+        fine &= fits || ((uint8_t *)valid)[camera * n + point] == 1 || isfinite(value);
+    }
+    free(turns), free(narrow), free(valid), free(pixels), free(results);
+    return fine;
+}
+
 static int fuzz(uint64_t job) {
     Part parts[MOST_PARTS];
     Cameras cameras = {0};
     Rows rows = {0};
     int64_t numbers = 0, i;
-    void *kept[40];
+    void *kept[50];
     int used = 0, fine = 1;
     memset(parts, 0, sizeof parts);
     state = job * 0x2545f4914f6cdd1du;
@@ -99,7 +150,10 @@ static int fuzz(uint64_t job) {
     cameras.parameters = KEPT(filled(d, numbers * c, share(), 0));
     cameras.constants = KEPT(filled(d, nodes * c, 1, 1)), cameras.constant_count = nodes;
     cameras.inner2 = KEPT(filled(d, c, 2, 2)), cameras.usual2 = KEPT(filled(d, c, 2, 2));
-    if (below(2)) cameras.limits2 = KEPT(filled(d, c * AZIMUTHS, 2, 2));
+    if (below(2)) {
+        cameras.limits2 = KEPT(filled(d, c * AZIMUTHS, 2, 2));
+        cameras.extent = KEPT(filled(d, c * EXTENT, 2, 2));
+    }
     if (has_table) cameras.table = KEPT(filled(d, c * (2 + 2 * NODES), 1, 1));
     if (has_table && cameras.part_count > 2 && below(2)) {
         uint8_t *by_stages = KEPT(malloc((size_t)c));
@@ -124,13 +178,17 @@ static int fuzz(uint64_t job) {
     domain.table = KEPT(filled(d, c * (2 + 2 * NODES), 0, 0));
     if (has_factor && many && !domain.is_chart)
         domain.circle2 = KEPT(filled(d, c, 0, 0)), domain.stagewise = KEPT(malloc((size_t)c));
+    if (cameras.part_count > 1 && !domain.is_chart && below(4) == 0) {
+        domain.coarse = KEPT(filled(1, RADII / 2, 3, 3)), domain.even = KEPT(filled(1, RADII, 3, 3));
+        domain.limits2 = KEPT(filled(d, c * AZIMUTHS, 0, 0)), domain.extent = KEPT(filled(d, c * EXTENT, 0, 0));
+    }
     if (cameras.part_count > 1 || domain.is_chart) domain_fuzzed(&domain);
     const int64_t size_in = direction % 2 ? 2 : 3, size_out = 5 - size_in;
     rows.cameras = &cameras, rows.count = n, rows.tile = 1 + below(600), rows.direction = direction;
     rows.rows = KEPT(rows_of(d, c, n, size_in, rows.row_strides, below(2) ? 0 : 300));
     rows.results = KEPT(rows_of(d, c, n, is_vjp ? size_in : size_out, rows.result_strides, 0));
     rows.valid = KEPT(malloc((size_t)(c * n)));
-    for (i = 0; i < c * n; i++) rows.valid[i] = (uint8_t)below(3);
+    for (i = 0; i < c * n; i++) rows.valid[i] = (uint8_t)below(2);
     if (below(2) || direction == UNPROJECT_VJP) rows.solution = KEPT(filled(d, 2 * c * n, 1, 0));
     if (is_vjp) {
         const int64_t tiles = (n + rows.tile - 1) / rows.tile;
@@ -145,8 +203,9 @@ static int fuzz(uint64_t job) {
             const int64_t place = camera * rows.result_strides[0] + point * rows.result_strides[1] +
                                   at % size_out * rows.result_strides[2];
             const double value = d ? ((double *)rows.results)[place] : ((float *)rows.results)[place];
-            fine &= rows.valid[camera * n + point] == VALID || isfinite(value);
+            fine &= rows.valid[camera * n + point] == 1 || isfinite(value);
         }
+    fine &= moved(&cameras, rows.tile);
     while (used) free(kept[--used]);
     return fine;
 }

@@ -127,6 +127,7 @@ def test_bad_options_are_refused(options, text):
 # -- tolerance
 
 
+@pytest.mark.skipif(not ct.native_available(), reason="without the compiled library positions are exact")
 def test_a_lattice_is_used_and_small_images_do_without():
     camera, target = pinhole(dtype=torch.float64), pinhole(focal=120.0, dtype=torch.float64)
     rotation = turn(10, 5, 20, dtype=torch.float64)

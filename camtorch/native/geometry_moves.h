@@ -1,0 +1,159 @@
+/* Pixels of cameras to those of others, block by block; the rays in between are turned. warp/grid.py */
+
+typedef struct {
+    int64_t index; /* of the cameras that these are; -1: none yet */
+    T(Camera) from, to;
+    R turn[9];
+} T(Between);
+
+static void T(between)(const Move *move, int64_t index, T(Between) *b) {
+    const int is_first = b->index < 0;
+    if (b->index == index) return;
+    if (is_first || move->from->cameras > 1) T(prepare)(move->from, move->from->cameras > 1 ? index : 0, &b->from);
+    if (is_first || move->to->cameras > 1) T(prepare)(move->to, move->to->cameras > 1 ? index : 0, &b->to);
+    if (move->turns && (is_first || move->turn_stride))
+        memcpy(b->turn, (const R *)move->turns + index * move->turn_stride, sizeof b->turn);
+    b->index = index;
+}
+
+/* Pixels (u, v) to what `form` says, `ok` where there is any; flags of what is left to do */
+static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
+                    I *restrict ok) {
+    ALIGNED I known[BLOCK];
+    T(Seen) s;
+    int left = 0;
+    T(solutions)(&b->from, n, u, v, known, ok, s.x, s.y, s.z);
+    if (b->from.waits)
+        for (int i = 0; i < count; i++) left |= !ok[i] & (known[i] != 0) ? LEFT_FROM : 0;
+    if (move->turns) {
+        const R *t = b->turn;
+        EACH(i) {
+            const R x = s.x[i], y = s.y[i], z = s.z[i];
+            s.x[i] = t[0] * x + t[1] * y + t[2] * z;
+            s.y[i] = t[3] * x + t[4] * y + t[5] * z;
+            s.z[i] = t[6] * x + t[7] * y + t[8] * z;
+        }
+    }
+    left |= T(pixels_of)(&b->to, count, n, &s, u, v) ? LEFT_TO : 0;
+    EACH(i) ok[i] &= s.ok[i];
+    if (move->form == POSITIONS) {
+        const R across = (R)(2 / move->width), down = (R)(2 / move->height), far = FAR;
+        const R right = (R)(1 / move->width - 1), below = (R)(1 / move->height - 1);
+        EACH(i) s.x[i] = u[i] * across, s.y[i] = v[i] * down; /* not at once, see `pixels_of` */
+        EACH(i) {
+            const R p = s.x[i] + right, q = s.y[i] + below;
+            u[i] = !ok[i] ? OUTSIDE : p < -far ? -far : p > far ? far : p;
+            v[i] = !ok[i] ? OUTSIDE : q < -far ? -far : q > far ? far : q;
+        }
+        return left;
+    }
+    EACH(i) u[i] = ok[i] ? u[i] : -1, v[i] = ok[i] ? v[i] : -1;
+    return left;
+}
+
+static int T(move_row)(const Move *move, const T(Between) *b, int64_t first, int count) {
+    const int n = (count + LANES - 1) & -LANES;
+    const int64_t *from = move->row_strides, *to = move->result_strides;
+    ALIGNED R u[BLOCK], v[BLOCK];
+    ALIGNED I ok[BLOCK];
+    T(load_pixels)((const R *)move->rows + b->index * from[0] + first * from[1], from, count, n, u, v, b->from.cx,
+                   b->from.cy);
+    const int left = T(moved)(move, b, count, n, u, v, ok);
+    T(store)((R *)move->results + b->index * to[0] + first * to[1], to, 2, count, u, v, NULL);
+    uint8_t *valid = move->valid + b->index * move->count + first;
+    for (int i = 0; i < count; i++) valid[i] = (uint8_t)ok[i];
+    return left;
+}
+
+static int64_t T(moves)(const Move *move) {
+    const int64_t tiles = (move->count + move->tile - 1) / move->tile;
+    int64_t own = 0, at;
+    int left = 0;
+    T(Between) b;
+    b.index = -1;
+    while ((at = taken(move->next, &own)) < tiles * move->cameras) {
+        const int64_t first = at % tiles * move->tile;
+        const int64_t end = first + move->tile < move->count ? first + move->tile : move->count;
+        T(between)(move, at / tiles, &b);
+        for (int64_t i = first; i < end; i += BLOCK)
+            left |= T(move_row)(move, &b, i, (int)(end - i < BLOCK ? end - i : BLOCK));
+    }
+    return left;
+}
+
+/* -- lattices */
+
+/* All pixels of some cells, `number` of the first one; where what is mapped ends in one, those around it are next */
+static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells, const int64_t *places, int count,
+                      int64_t number) {
+    const int64_t rows = given->cells->rows, columns = given->cells->columns;
+    const int n = count * SQUARE;
+    ALIGNED R u[BLOCK], v[BLOCK];
+    ALIGNED I ok[BLOCK];
+    for (int k = 0; k < count; k++)
+        for (int i = 0; i < SQUARE; i++) {
+            u[k * SQUARE + i] = (R)(STEP * (places[k] % columns) + i % STEP);
+            v[k * SQUARE + i] = (R)(STEP * (places[k] / columns) + i / STEP + given->first_row);
+        }
+    const int left = T(moved)(&given->move, b, n, n, u, v, ok);
+    R *across = (R *)given->exact + number * SQUARE, *down = across + given->move.cameras * rows * columns * SQUARE;
+    for (int i = 0; i < n; i++) across[i] = ok[i] ? u[i] : NAN, down[i] = ok[i] ? v[i] : NAN;
+    for (int k = 0; k < count; k++) {
+        const int64_t i = places[k] / columns, j = places[k] % columns;
+        int known = 0;
+        for (int at = 0; at < SQUARE; at++) known += ok[k * SQUARE + at] != 0;
+        cells[places[k]] = (int32_t)(number + k);
+        if (known == 0 || known == SQUARE) continue;
+        for (int64_t y = i > 0 ? i - 1 : 0; y <= i + 1 && y < rows; y++)
+            for (int64_t x = j > 0 ? j - 1 : 0; x <= j + 1 && x < columns; x++) {
+                int32_t *at = cells + y * columns + x;
+                if (*at == CELL_EMPTY || *at == CELL_CUBIC) *at = CELL_NEXT;
+            }
+    }
+    return left;
+}
+
+static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
+    const Move *move = &given->move;
+    Classification asked = *given->cells;
+    const int64_t cells = asked.rows * asked.columns, nodes = (asked.rows + 5) * (asked.columns + 5);
+    const R *at = (const R *)move->results + camera * move->result_strides[0];
+    int left = 0;
+    T(between)(move, camera, b);
+    for (int64_t i = 0; i < move->count; i += BLOCK)
+        left |= T(move_row)(move, b, i, (int)(move->count - i < BLOCK ? move->count - i : BLOCK));
+    if (left) return left;
+    asked.count = 1, asked.cells += camera * cells, asked.mapped = move->valid + camera * move->count;
+    asked.rim = asked.mapped + nodes, asked.nodes = (const float *)at;
+    asked.scratch += camera * SCRATCH * (asked.columns + 8);
+    if (given->narrow) {
+        float *to = given->narrow + 2 * camera * nodes;
+        for (int64_t i = 0; i < nodes; i++) to[i] = (float)at[i], to[nodes + i] = (float)at[move->result_strides[2] + i];
+        asked.nodes = to, asked.node_strides[1] = nodes;
+    }
+    if (2 * THIS(classify)(&asked) > cells) return LEFT_MOST;
+    static const int32_t wanted[2] = {0, CELL_NEXT};
+    for (int turn = 0; turn < 2; turn++) {
+        int64_t places[BLOCK / SQUARE], found;
+        do { /* those that are next turn up ahead, and behind */
+            int count = 0;
+            found = 0;
+            for (int64_t i = 0; i < cells || count; i++) {
+                if (i < cells && asked.cells[i] == wanted[turn]) places[count++] = i;
+                if (count < BLOCK / SQUARE && (i < cells || !count)) continue;
+                left |= T(squares)(given, b, asked.cells, places, count, added(given->used, count));
+                found += count, count = 0;
+            }
+        } while (found && turn);
+    }
+    return left;
+}
+
+static int64_t T(lattices)(const Lattices *given) {
+    int64_t own = 0, at;
+    int left = 0;
+    T(Between) b;
+    b.index = -1;
+    while ((at = taken(given->move.next, &own)) < given->move.cameras && !left) left |= T(lattice)(given, at, &b);
+    return left;
+}
