@@ -8,7 +8,7 @@ import math
 import torch
 
 from camtorch.cli import cameras, images
-from camtorch.cli.options import LARGEST_SIDE
+from camtorch.cli.words import LARGEST_SIDE
 from camtorch.extrinsics import Extrinsics
 from camtorch.warp.plane import BirdsEye
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from camtorch import lenses
 from camtorch.camera import Camera
-from camtorch.cli.options import GUESS, LENS
 from camtorch.cli.terminal import note
+from camtorch.cli.words import GUESS, LENS
 from camtorch.data.columns import camera_of
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import CameraFileError, load, opencv

@@ -5,34 +5,21 @@ from __future__ import annotations
 import argparse
 import glob
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from camtorch.cli.options import (
-    PAPERS,
-    add_board,
-    add_calibration,
-    add_force,
-    add_jobs,
-    add_output,
-    add_pair,
-    add_photograph,
-    add_projection,
-    parse_count,
-    parse_fov,
-    parse_paper,
-    parse_path,
-    parse_range,
-    parse_size,
-    parse_suffix,
-    parse_word,
-)
+from camtorch.cli import words
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
+Add: TypeAlias = Callable[..., Any]
+"""The method `add_argument` of a command, or of a group of its options."""
 NEAR, FAR = 3.0, 100.0
 """Depths in baselines, of which disparities and points are by default."""
 SHEET, SHEET_COUNT = "augment.png", 8
 """Of `camtorch augment`: the image that it writes, and how many cameras that shows."""
+_FORMAT = "of OUT; by default what its name says"
+_BOARDS = ("chessboard", "charuco", "aprilgrid")  # as `camtorch.boards` has them, which takes numpy to import
 
 
 def add_all(commands: Commands) -> None:
@@ -48,10 +35,10 @@ def uses_processes(arguments: argparse.Namespace) -> bool:
     return are_several(arguments.image) if arguments.command == "dewarp" else arguments.dataset is not None
 
 
-def are_several(words: list[str]) -> bool:
-    """Whether words mean more than one file."""
-    is_pattern = glob.has_magic(words[0]) and not os.path.lexists(words[0])
-    return len(words) > 1 or os.path.isdir(words[0]) or is_pattern
+def are_several(names: list[str]) -> bool:
+    """Whether names mean more than one file."""
+    is_pattern = glob.has_magic(names[0]) and not os.path.lexists(names[0])
+    return len(names) > 1 or os.path.isdir(names[0]) or is_pattern
 
 
 def _dewarp(commands: Commands) -> None:
@@ -62,32 +49,18 @@ def _dewarp(commands: Commands) -> None:
         "folder: camtorch dewarp images/ --camera camera.yml -o straight/",
     )
     add = command.add_argument
-    add(
-        "image",
-        type=parse_word,
-        nargs="+",
-        metavar="IMAGE",
-        help="the image; or images, videos, folders, quoted patterns",
-    )
-    add_projection(command)
-    add_photograph(command)
-    add(
-        "-o",
-        "--output",
-        type=parse_word,
-        metavar="OUT",
-        help="the new image, dewarped.png by default; OUT/, a folder, where there are several",
-    )
-    add_force(command)
-    many = add_jobs(command)
-    many.add_argument(
-        "--suffix", type=parse_suffix, metavar=".EXT", help="of new images or videos; by default those of the old ones"
-    )
-    video = command.add_argument_group("videos (pip install 'camtorch[video]')")
-    video.add_argument(
-        "--codec", metavar="NAME", help="an encoder of ffmpeg's; libx264 by default, in .webm libvpx-vp9"
-    )
-    video.add_argument("--crf", type=int, metavar="N", help="the encoder's quality, lower is better; 18 in libx264")
+    text = "the image; or images, videos, folders, quoted patterns"
+    add("image", type=words.raw_path, nargs="+", metavar="IMAGE", help=text)
+    _projection(add)
+    _photograph(command)
+    text = "the new image, dewarped.png by default; OUT/, a folder, where there are several"
+    add("-o", "--output", type=words.raw_path, metavar="OUT", help=text)
+    _force(add)
+    text = "of new images or videos; by default those of the old ones"
+    _many_files(command)("--suffix", type=words.suffix, metavar=".EXT", help=text)
+    video = command.add_argument_group("videos (pip install 'camtorch[video]')").add_argument
+    video("--codec", metavar="NAME", help="an encoder of ffmpeg's; libx264 by default, in .webm libvpx-vp9")
+    video("--crf", type=int, metavar="N", help="the encoder's quality, lower is better; 18 in libx264")
 
 
 def _rectify(commands: Commands) -> None:
@@ -99,49 +72,37 @@ def _rectify(commands: Commands) -> None:
         "rows, rectified.json, their cameras, and in perspective opencv.yml: R1, R2, P1, P2, Q.",
     )
     add = command.add_argument
-    add("left", type=parse_path, metavar="LEFT", help="the left camera's image")
-    add("right", type=parse_path, metavar="RIGHT", help="the right camera's, of the same moment")
-    add_pair(command)
-    images = command.add_argument_group("rectified images")
-    images.add_argument(
-        "--projection",
-        choices=("perspective", "latlon", "cylindrical"),
-        default="perspective",
-        help="perspective (the default) goes to some 120 degrees; latlon and cylindrical, about the baseline, further",
+    add("left", type=words.path, metavar="LEFT", help="the left camera's image")
+    add("right", type=words.path, metavar="RIGHT", help="the right camera's, of the same moment")
+    add("--camera", type=words.path, metavar="RIG", help="its calibration with both poses, any format")
+    add("--left-camera", metavar="NAME", help="the camera of LEFT; by default the first of two")
+    add("--right-camera", metavar="NAME", help="that of RIGHT; by default the second of two")
+    _from_model(add)
+    _rescale(add)
+    image = command.add_argument_group("rectified images").add_argument
+    ways = ("perspective", "latlon", "cylindrical")
+    text = "perspective (the default) goes to some 120 degrees; latlon and cylindrical, about the baseline, further"
+    image("--projection", choices=ways, default="perspective", help=text)
+    text = "of view, horizontal, or horizontal,vertical; else what fits"
+    image("--fov", type=words.span, metavar="DEGREES", help=text)
+    image("--size", type=words.size, metavar="WxH", help="else what loses no detail")
+    image("--vertical", action="store_true", help="LEFT is the upper of two: columns correspond")
+    text = "mean: look where both cameras look on average (the default); opencv: halve their rotation, as it does"
+    image("--align", choices=("mean", "opencv"), default="mean", help=text)
+    depth = command.add_argument_group('depth, with OpenCV: pip install "camtorch[stereo]"').add_argument
+    text = (
+        "pixels of disparity: a .png of 16 bits, 256 times as many, 0 where unknown, or an .npy, NaN where "
+        "unknown; OUT/disparity.png by default. And OUT/disparity_colours.png to look at"
     )
-    images.add_argument(
-        "--fov", type=parse_range, metavar="DEGREES", help="of view, horizontal, or horizontal,vertical; else what fits"
+    depth("--disparity", nargs="?", type=words.path, const=Path(), metavar="FILE", help=text)
+    text = "coloured points, in the left camera's frame and unit"
+    depth("--points", type=words.path, metavar="FILE.ply", help=text)
+    text = (
+        f"the depths to look for, in the unit of RIG's poses; FAR may be inf; else {NEAR:g} to {FAR:g} times "
+        "the distance of the cameras for points, and what is farther too for disparities"
     )
-    images.add_argument("--size", type=parse_size, metavar="WxH", help="else what loses no detail")
-    images.add_argument("--vertical", action="store_true", help="LEFT is the upper of two: columns correspond")
-    images.add_argument(
-        "--align",
-        choices=("mean", "opencv"),
-        default="mean",
-        help="mean: look where both cameras look on average (the default); opencv: halve their rotation, as it does",
-    )
-    depth = command.add_argument_group('depth, with OpenCV: pip install "camtorch[stereo]"')
-    depth.add_argument(
-        "--disparity",
-        nargs="?",
-        type=parse_path,
-        const=Path(),
-        metavar="FILE",
-        help="pixels of disparity: a .png of 16 bits, 256 times as many, 0 where unknown, or an .npy, NaN where "
-        "unknown; OUT/disparity.png by default. And OUT/disparity_colours.png to look at",
-    )
-    depth.add_argument(
-        "--points", type=parse_path, metavar="FILE.ply", help="coloured points, in the left camera's frame and unit"
-    )
-    depth.add_argument(
-        "--depth",
-        nargs=2,
-        type=float,
-        metavar=("NEAR", "FAR"),
-        help=f"the depths to look for, in the unit of RIG's poses; FAR may be inf; else {NEAR:g} to {FAR:g} times "
-        "the distance of the cameras for points, and what is farther too for disparities",
-    )
-    add_output(command, "rectified", "the folder of the new images")
+    depth("--depth", nargs=2, type=float, metavar=("NEAR", "FAR"), help=text)
+    _output(add, "rectified", "the folder of the new images")
 
 
 def _birdseye(commands: Commands) -> None:
@@ -153,22 +114,17 @@ def _birdseye(commands: Commands) -> None:
         "--pitch say how the camera looks, and the ground's y axis lies ahead of it, x to its right, the origin "
         "below it.",
     )
-    command.add_argument("image", type=parse_path, metavar="IMAGE", help="the image")
-    ground = command.add_argument_group("ground, in the unit of the pose, or of --height")
-    ground.add_argument(
-        "--x", type=float, nargs=2, required=True, metavar=("FROM", "TO"), help="what is seen, left to right"
-    )
-    ground.add_argument(
-        "--y", type=float, nargs=2, required=True, metavar=("FROM", "TO"), help="what is seen, bottom to top"
-    )
-    ground.add_argument("--resolution", type=float, required=True, metavar="UNITS", help="of a pixel: 0.01 for 1 cm")
-    pose = command.add_argument_group("pose, instead of that in FILE")
-    pose.add_argument("--height", type=float, help="of the camera above the ground")
-    pose.add_argument(
-        "--pitch", type=float, metavar="DEGREES", help="down from the horizon, 90 for straight down; 0 by default"
-    )
-    add_photograph(command)
-    add_output(command, "birdseye.png")
+    command.add_argument("image", type=words.path, metavar="IMAGE", help="the image")
+    ground = command.add_argument_group("ground, in the unit of the pose, or of --height").add_argument
+    for name, text in (("--x", "what is seen, left to right"), ("--y", "what is seen, bottom to top")):
+        ground(name, type=float, nargs=2, required=True, metavar=("FROM", "TO"), help=text)
+    ground("--resolution", type=float, required=True, metavar="UNITS", help="of a pixel: 0.01 for 1 cm")
+    pose = command.add_argument_group("pose, instead of that in FILE").add_argument
+    pose("--height", type=float, help="of the camera above the ground")
+    text = "down from the horizon, 90 for straight down; 0 by default"
+    pose("--pitch", type=float, metavar="DEGREES", help=text)
+    _photograph(command)
+    _output(command.add_argument, "birdseye.png")
 
 
 def _augment(commands: Commands) -> None:
@@ -180,48 +136,32 @@ def _augment(commands: Commands) -> None:
         "--yaw=-5,20, or a number: so far to either side of doing nothing, or just that --fov.",
     )
     add = command.add_argument
-    add("image", type=parse_path, nargs="?", metavar="IMAGE", help="the image; the folder of images of a data set")
-    add(
-        "--labels",
-        type=parse_path,
-        metavar="FILE",
-        help="of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera",
-    )
+    text = "the image; the folder of images of a data set"
+    add("image", type=words.path, nargs="?", metavar="IMAGE", help=text)
+    text = "of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera"
+    add("--labels", type=words.path, metavar="FILE", help=text)
     add("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
     add("--list", action="store_true", help="print the presets, and nothing else")
-    add("-n", type=parse_count(100), metavar="COUNT", help=f"how many other cameras; {SHEET_COUNT} by default")
+    add("-n", type=words.count(100), metavar="COUNT", help=f"how many other cameras; {SHEET_COUNT} by default")
     add("--seed", type=int, default=0, help="of what is drawn; 0 by default")
-    add("--size", type=parse_size, metavar="WxH", help="of the new images; by default the old one's")
+    add("--size", type=words.size, metavar="WxH", help="of the new images; by default the old one's")
     for name, text in (
         ("yaw", "degrees by which the camera turns to its right"),
         ("pitch", "degrees by which it then looks up"),
         ("roll", "degrees by which it then leans to its right"),
         ("zoom", "factor on the focal lengths"),
     ):
-        add(f"--{name}", type=parse_range, metavar="RANGE", help=text)
-    add(
-        "--fov",
-        type=parse_fov,
-        metavar="RANGE",
-        help="horizontal field of view in degrees; or source: as much of the lens's as the image fills",
-    )
-    add(
-        "--min-filled",
-        type=float,
-        default=0.0,
-        metavar="PART",
-        help="of each new image that has to show something, 0 to 1: it zooms until it does; 0 by default",
-    )
-    add_photograph(command)
-    add_output(command, None, f"the sheet, {SHEET} by default; of a data set, a folder")
-    many = add_jobs(command)
-    many.add_argument(
-        "--dataset",
-        type=parse_path,
-        metavar="LABELS",
-        help="of all images of the folder IMAGE: a JSON file in COCO's format, or a folder of a JSON file for each",
-    )
-    many.add_argument("--copies", type=parse_count(10000), metavar="N", help="new images of each; 1 by default")
+        add(f"--{name}", type=words.span, metavar="RANGE", help=text)
+    text = "horizontal field of view in degrees; or source: as much of the lens's as the image fills"
+    add("--fov", type=words.fov, metavar="RANGE", help=text)
+    text = "of each new image that has to show something, 0 to 1: it zooms until it does; 0 by default"
+    add("--min-filled", type=float, default=0.0, metavar="PART", help=text)
+    _photograph(command)
+    _output(add, None, f"the sheet, {SHEET} by default; of a data set, a folder")
+    many = _many_files(command)
+    text = "of all images of the folder IMAGE: a JSON file in COCO's format, or a folder of a JSON file for each"
+    many("--dataset", type=words.path, metavar="LABELS", help=text)
+    many("--copies", type=words.count(10000), metavar="N", help="new images of each; 1 by default")
 
 
 def _map(commands: Commands) -> None:
@@ -231,28 +171,25 @@ def _map(commands: Commands) -> None:
         description="Write where each pixel of a dewarped image is taken from, for another runtime, and say how far "
         "that is from exact: camtorch map camera.yml -o map.exr",
     )
-    command.add_argument("camera", type=parse_path, metavar="CAMERA", help="the calibration of the images, any format")
-    add_calibration(command, size="--camera-size")
-    target = command.add_argument_group("the new image")
-    add_projection(target)
-    target.add_argument(
-        "--target", type=parse_path, metavar="FILE", help="a calibration: the new image is what that camera would see"
-    )
-    file = command.add_argument_group("the map")
-    file.add_argument(
-        "--format",
-        help="opencv, opencv_fixed, stmap, dw100, ti_ldc, depthai, obj, gltf or onnx; by default what OUT's name says",
-    )
-    file.add_argument("--step", type=int, metavar="PIXELS", help="between nodes: ti_ldc, depthai, obj, gltf")
-    file.add_argument("--v", choices=("up", "down"), help="stmap: which way v runs; up by default, as in Nuke")
-    file.add_argument("--order", choices=("yx", "xy"), help="depthai: yx for loadMeshFiles (the default), or xy")
-    file.add_argument("--block", type=parse_size, metavar="WxH", help="ti_ldc: of the new image; by default what fits")
-    file.add_argument("--dtype", choices=("float32", "uint8"), help="onnx: of images; float32 by default")
-    file.add_argument("--clip", action="store_true", default=None, help="dw100, ti_ldc: draw in what they cannot hold")
-    file.add_argument(
-        "--check", type=parse_path, metavar="MAP", help="write nothing; say how far this map is from the dewarping"
-    )
-    add_output(command, None, "the map")
+    add = command.add_argument
+    add("camera", type=words.path, metavar="CAMERA", help="the calibration of the images, any format")
+    _calibration(add, size="--camera-size")
+    target = command.add_argument_group("the new image").add_argument
+    _projection(target)
+    text = "a calibration: the new image is what that camera would see"
+    target("--target", type=words.path, metavar="FILE", help=text)
+    file = command.add_argument_group("the map").add_argument
+    text = "opencv, opencv_fixed, stmap, dw100, ti_ldc, depthai, obj, gltf or onnx; by default what OUT's name says"
+    file("--format", help=text)
+    file("--step", type=int, metavar="PIXELS", help="between nodes: ti_ldc, depthai, obj, gltf")
+    file("--v", choices=("up", "down"), help="stmap: which way v runs; up by default, as in Nuke")
+    file("--order", choices=("yx", "xy"), help="depthai: yx for loadMeshFiles (the default), or xy")
+    file("--block", type=words.size, metavar="WxH", help="ti_ldc: of the new image; by default what fits")
+    file("--dtype", choices=("float32", "uint8"), help="onnx: of images; float32 by default")
+    file("--clip", action="store_true", default=None, help="dw100, ti_ldc: draw in what they cannot hold")
+    text = "write nothing; say how far this map is from the dewarping"
+    file("--check", type=words.path, metavar="MAP", help=text)
+    _output(add, None, "the map")
 
 
 def _convert(commands: Commands) -> None:
@@ -262,23 +199,22 @@ def _convert(commands: Commands) -> None:
         description="Write the cameras of a calibration file as cameras of another model, and print how good that is.",
     )
     add = command.add_argument
-    add("input", type=parse_path, metavar="IN", help="a calibration file")
-    add("output", type=parse_path, metavar="OUT", help="the new one")
+    add("input", type=words.path, metavar="IN", help="a calibration file")
+    add("output", type=words.path, metavar="OUT", help="the new one")
     add("--model", metavar="KEY", help="the model of OUT; by default that of IN")
     add("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
     add("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")
-    add("--format", help="of OUT; by default what its name says")
-    add_calibration(command, "which camera is saved, alone and without its pose")
-    add_force(command)
+    add("--format", help=_FORMAT)
+    _calibration(add, "which camera is saved, alone and without its pose")
+    _force(add)
 
 
 def _show(commands: Commands) -> None:
-    command = commands.add_parser("show", help="what a calibration says, in numbers and in an image")
-    add = command.add_argument
-    add("input", type=parse_path, metavar="FILE", help="a calibration file")
-    add("--against", type=parse_path, metavar="OTHER", help="another calibration, to compare with")
-    add_calibration(command)
-    add_output(command, None, "an image: distortion, radius over angle")
+    add = commands.add_parser("show", help="what a calibration says, in numbers and in an image").add_argument
+    add("input", type=words.path, metavar="FILE", help="a calibration file")
+    add("--against", type=words.path, metavar="OTHER", help="another calibration, to compare with")
+    _calibration(add)
+    _output(add, None, "an image: distortion, radius over angle")
 
 
 def _lenses(commands: Commands) -> None:
@@ -290,10 +226,10 @@ def _lenses(commands: Commands) -> None:
     )
     add = command.add_argument
     add("words", nargs="+", metavar="WORD", help="of brand, camera, lens and setting, in any order")
-    add("--size", type=parse_size, metavar="WxH", help="of images: only lenses of that aspect ratio, scaled to it")
-    add("-n", type=parse_count(100000), default=10, metavar="N", help="how many are listed at most; 10 by default")
-    add("--format", help="of OUT; by default what its name says")
-    add_output(command, None, "the calibration of the first")
+    add("--size", type=words.size, metavar="WxH", help="of images: only lenses of that aspect ratio, scaled to it")
+    add("-n", type=words.count(100000), default=10, metavar="N", help="how many are listed at most; 10 by default")
+    add("--format", help=_FORMAT)
+    _output(add, None, "the calibration of the first")
 
 
 def _calibrate(commands: Commands) -> None:
@@ -306,27 +242,24 @@ def _calibrate(commands: Commands) -> None:
     )
     add = command.add_argument
     add("images", nargs="*", metavar="IMAGE", help="files, quoted patterns, or folders; or a video")
-    rigs = command.add_argument_group("several cameras, instead of IMAGE")
-    rigs.add_argument("--left", nargs="+", metavar="IMAGE", help="of the left camera of a pair")
-    rigs.add_argument("--right", nargs="+", metavar="IMAGE", help="of the right one")
-    rigs.add_argument("--rig", nargs="+", metavar="NAME=IMAGE", help="of any number of cameras: a folder or a pattern")
-    rigs.add_argument(
-        "--match",
-        choices=("name", "order"),
-        help="what says which images were taken together; by default names where they agree, else the order",
-    )
-    add_board(command, "if left out, distances are in squares")
-    lens = command.add_argument_group("camera")
-    lens.add_argument("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
-    lens.add_argument("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
-    lens.add_argument("--fixed", metavar="NAMES", help="held parameters, as cx,cy (in the middle) or k3 (at 0)")
-    lens.add_argument("--loss", choices=("huber", "cauchy"), help="for corners of which some are wrong")
-    lens.add_argument("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
-    lens.add_argument("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
-    add("--corners", type=parse_path, metavar="FILE", help="a .json to keep corners in, and to take them from")
-    add("--report", type=parse_path, metavar="FILE", help="an .html to look at: how far the result can be trusted")
-    add("--format", help="of OUT; by default what its name says, OpenCV's for .yml")
-    add_output(command, "camera.json", "the calibration")
+    rig = command.add_argument_group("several cameras, instead of IMAGE").add_argument
+    rig("--left", nargs="+", metavar="IMAGE", help="of the left camera of a pair")
+    rig("--right", nargs="+", metavar="IMAGE", help="of the right one")
+    rig("--rig", nargs="+", metavar="NAME=IMAGE", help="of any number of cameras: a folder or a pattern")
+    text = "what says which images were taken together; by default names where they agree, else the order"
+    rig("--match", choices=("name", "order"), help=text)
+    _board_options(command, "if left out, distances are in squares")
+    lens = command.add_argument_group("camera").add_argument
+    lens("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
+    lens("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
+    lens("--fixed", metavar="NAMES", help="held parameters, as cx,cy (in the middle) or k3 (at 0)")
+    lens("--loss", choices=("huber", "cauchy"), help="for corners of which some are wrong")
+    lens("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
+    lens("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
+    add("--corners", type=words.path, metavar="FILE", help="a .json to keep corners in, and to take them from")
+    add("--report", type=words.path, metavar="FILE", help="an .html to look at: how far the result can be trusted")
+    add("--format", help=f"{_FORMAT}, OpenCV's for .yml")
+    _output(add, "camera.json", "the calibration")
 
 
 def _board(commands: Commands) -> None:
@@ -336,12 +269,91 @@ def _board(commands: Commands) -> None:
         description="Draw a board to print, to scale: camtorch board --board 9x6 --square 25mm -o board.pdf. "
         "Print it at 100 % (no fit to page), on something flat.",
     )
-    add_board(command, "by default as many whole millimetres as fit on the paper")
-    command.add_argument(
-        "--paper",
-        type=parse_paper,
-        default="a4",
-        metavar="NAME",
-        help=f"{', '.join(PAPERS)}, WIDTHxHEIGHT as in 400x300mm, or board: as large as needed; a4 by default",
+    _board_options(command, "by default as many whole millimetres as fit on the paper")
+    papers = ", ".join(words.PAPERS)
+    text = f"{papers}, WIDTHxHEIGHT as in 400x300mm, or board: as large as needed; a4 by default"
+    command.add_argument("--paper", type=words.paper, default="a4", metavar="NAME", help=text)
+    _output(command.add_argument, "board.pdf", "the drawing, a .pdf or .svg")
+
+
+# -- options of several commands
+
+
+def _photograph(command: argparse.ArgumentParser) -> None:
+    """The calibration of an image."""
+    which = command.add_mutually_exclusive_group().add_argument
+    which("--camera", type=words.path, metavar="FILE", help="its calibration, of any format")
+    text = "instead of a calibration, a real lens by its name: camtorch lenses lists them"
+    which("--lens", type=lambda text: words.path(words.LENS + text), dest="camera", metavar="NAME", help=text)
+    text = (
+        "instead of a calibration, a guess: a camera of this horizontal field of view, pinhole below 100 degrees, "
+        "equidistant kannala_brandt from there on, or what --model says"
     )
-    add_output(command, "board.pdf", "the drawing, a .pdf or .svg")
+    which("--guess-fov", type=words.guess, dest="camera", metavar="DEGREES", help=text)
+    _from_model(command.add_argument, "--model")
+    command.add_argument("--name", help="which camera, in a file with several")
+    _rescale(command.add_argument)
+
+
+def _calibration(add: Add, of_name: str = "which camera, in a file with several", size: str = "--size") -> None:
+    """How to read a calibration that is the command's subject; `size` is the option that says for which images."""
+    add("--name", help=of_name)
+    _from_model(add)
+    add(size, type=words.size, metavar="WxH", help="of images, where the file does not say")
+
+
+def _from_model(add: Add, *others: str) -> None:
+    text = "the model in the file, where that does not say it: kannala_brandt, brown_conrady ..."
+    add("--from-model", *others, metavar="KEY", help=text)
+
+
+def _rescale(add: Add) -> None:
+    add("--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio")
+
+
+def _projection(add: Add) -> None:
+    """What a dewarped image shows."""
+    add("--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective")
+    text = "horizontal field of view of the new image; by default that of the old one, up to 120 in perspective"
+    add("--fov", type=float, metavar="DEGREES", help=text)
+    add("--size", type=words.size, metavar="WxH", help="size of the new image; by default the old one's")
+
+
+def _board_options(command: argparse.ArgumentParser, square: str) -> None:
+    """The board, of which `square` says what its side is without --square."""
+    add = command.add_argument_group("board").add_argument
+    add("--type", choices=_BOARDS, help="chessboard by default")
+    text = "columns and rows: of a chessboard's inner corners, of ChArUco's squares, of AprilGrid's tags"
+    add("--board", type=words.board, metavar="CxR", help=text)
+    text = f"the side of a square or AprilTag, as 30mm, or in metres: 0.03; {square}"
+    add("--square", type=words.length, metavar="LENGTH", help=text)
+    add("--marker", type=words.length, metavar="LENGTH", help="of ChArUco; by default 3/4 of a square")
+    add("--legacy", action="store_true", help="a ChArUco board drawn by OpenCV before 4.6")
+    add("--spacing", type=float, metavar="PART", help="of AprilTags, in sides of a tag; 0.3 by default")
+    add("--border", type=int, metavar="CELLS", help="of AprilTags; 2 by default, as Kalibr prints")
+    text = "of markers, as OpenCV calls it; 5X5_1000 for ChArUco and APRILTAG_36h11 by default"
+    add("--dictionary", metavar="NAME", help=text)
+
+
+def _output(add: Add, default: str | None, text: str = "the new image") -> None:
+    """Where the result goes."""
+    usual = f"; {default} by default" if default else ""
+    path = default and Path(default)
+    add("-o", "--output", type=words.path, default=path, metavar="OUT", help=text + usual)
+    _force(add)
+
+
+def _force(add: Add) -> None:
+    add("--force", action="store_true", help="overwrite OUT if it exists")
+
+
+def _many_files(command: argparse.ArgumentParser) -> Add:
+    """How many files are worked on; what is returned adds more of this."""
+    add = command.add_argument_group("many files").add_argument
+    add("--jobs", type=words.count(1024), metavar="N", help="processes; by default as many as there are cores")
+    text = "go on where a run was broken off; what is done and unchanged is kept"
+    add("--resume", action="store_true", help=text)
+    text = "only the I-th of N parts, as 1/4; processes of torchrun and srun know theirs"
+    add("--shard", type=words.shard, metavar="I/N", help=text)
+    add("--dry-run", action="store_true", help="print what would be done")
+    return add

@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import Any
 
 from camtorch.cli import targets
 from camtorch.cli.cameras import read_rig
 from camtorch.cli.terminal import note
-from camtorch.convert.conversion import Conversion
 from camtorch.io import formats
 from camtorch.rig import Rig
 
@@ -31,7 +29,13 @@ def run(arguments: argparse.Namespace) -> None:
         result = camera.convert(model, count=arguments.count, max_angle=None if angle is None else math.radians(angle))
         cameras[name] = result.camera
         part = "what the image has rays for" if camera.image_size else "its rays"
-        notes.append(f"{path}: {name}, {camera.key} to {result.camera.key}: {_quality(result)} of {part}")
+        # of a batch, the worst of it
+        error = f"rms {float(result.rms.max()):.3g} px, at most {float(result.max_error.max()):.3g} px"
+        degrees, covered = math.degrees(float(result.max_angle.min())), 100 * float(result.valid_fraction.min())
+        notes.append(
+            f"{path}: {name}, {camera.key} to {result.camera.key}: {'exact' if bool(result.exact.all()) else error}, "
+            f"up to {degrees:.1f} degrees from the axis, {covered:.4g} % of {part}"
+        )
     # camtorch's own JSON holds every model; the format that the rig comes from may not
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, None if alone else rig.extrinsics, images=rig.images, format=stays)
@@ -49,11 +53,3 @@ def _read(path: Path) -> tuple[Path, ...]:
     if path.is_dir():
         return tuple(path.iterdir())
     return (path, *path.parent.glob("images.*")) if path.stem == "cameras" else (path,)
-
-
-def _quality(result: Conversion[Any]) -> str:
-    """How good a conversion is; of a batch, the worst of it."""
-    error = f"rms {float(result.rms.max()):.3g} px, at most {float(result.max_error.max()):.3g} px"
-    degrees, covered = math.degrees(float(result.max_angle.min())), 100 * float(result.valid_fraction.min())
-    exact = bool(result.exact.all())
-    return f"{'exact' if exact else error}, up to {degrees:.1f} degrees from the axis, {covered:.4g} %"

@@ -68,7 +68,10 @@ class Augmenting:
         if orientation not in (None, 1):
             listener.note(f"{item.name} is taken as stored, not turned by its Exif orientation, and so are its labels")
         camera = self._camera(item.inputs[0], size, entry.get("camera"))
-        samples = self._samples_of(camera)
+        known = json.dumps(cameras.settings_of(camera))
+        if known not in self._samples:  # mostly it is that of the image before
+            self._samples = {known: MapSamples(self.augmentation(camera), key="key", seed=self.seed)}
+        samples = self._samples[known]
         moving = coco.Annotations(annotations, size, listener.note)
         labels = moving.labels if item.labels else dict(entry)
         if _EYE in labels:  # a pixel, though its name begins with that of a direction
@@ -109,13 +112,6 @@ class Augmenting:
         size = self.options["image_size"]
         shrinks = camera is not None and size is not None and (size[0] < camera.height or size[1] < camera.width)
         return RandomCamera(camera=camera and camera.requires_grad_(False), antialias=shrinks, **self.options)
-
-    def _samples_of(self, camera: Camera) -> MapSamples:
-        """For images of a camera, which mostly is that of the image before."""
-        known = json.dumps(cameras.settings_of(camera))
-        if known not in self._samples:
-            self._samples = {known: MapSamples(self.augmentation(camera), key="key", seed=self.seed)}
-        return self._samples[known]
 
 
 def run(arguments: argparse.Namespace, like: str | None, ranges: dict[str, Any]) -> int:

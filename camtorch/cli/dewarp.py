@@ -142,9 +142,13 @@ def _many(arguments: argparse.Namespace) -> int:
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
         raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
     found, faults = inputs.find(arguments.image, known, output)
-    everything = [_item(one.path, output / one.place, arguments.suffix) for one in found]
-    for item in everything:
-        (videos if videos.is_video(item.inputs[0]) else images).check_kind(item.outputs[0])
+    everything, suffix = list[Item](), arguments.suffix
+    for one in found:
+        target, is_video = output / one.place, videos.is_video(one.path)
+        if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
+            target = target.with_suffix(suffix)
+        (videos if is_video else images).check_kind(target)
+        everything.append(Item((one.path,), (target,)))
     items.check(everything, [arguments.camera] if arguments.camera else [])
     work = _dewarping(arguments, [one.path for one in found])
 
@@ -164,12 +168,6 @@ def _is_calibration(word: str) -> bool:
     except (CameraFileError, OSError):
         return False
     return True
-
-
-def _item(source: Path, target: Path, suffix: str | None) -> Item:
-    if suffix is not None and videos.is_video(target) == videos.is_video(Path("any" + suffix)):
-        target = target.with_suffix(suffix)
-    return Item((source,), (target,))
 
 
 def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from camtorch.cli.terminal import bar, note, say
 from camtorch.jobs import run
-from camtorch.jobs.items import Item, Shard, Work
+from camtorch.jobs.items import Item, Work
 from camtorch.jobs.manifest import Manifest
 from camtorch.jobs.run import Report
 
@@ -49,13 +49,14 @@ def carry_out(
     if arguments.dry_run:
         return _dry_run(items, faults, manifest, arguments.resume)
     part = "" if shard.count == 1 else f", shard {shard.rank + 1} of {shard.count}"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         with manifest, bar(doing + part, sum(item.size for item in items), units) as shown:
             report = run.run(
                 items,
                 work,
                 manifest,
-                processes=min(arguments.jobs or _cores(shard), max(len(items), 1)),
+                processes=min(arguments.jobs or max(cores // shard.local, 1), max(len(items), 1)),
                 resume=arguments.resume,
                 force=arguments.force,
                 add=shown.update,
@@ -85,8 +86,3 @@ def _dry_run(items: Sequence[Item], faults: Sequence[tuple[Path, str]], manifest
         say(f"error: {path}: {why}")
     print(f"{len(todo)} to be made, {len(items) - len(todo)} there already")
     return 1 if faults else 0
-
-
-def _cores(shard: Shard) -> int:
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(own // shard.local, 1)

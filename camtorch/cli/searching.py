@@ -26,8 +26,7 @@ from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_c
 from camtorch.boards.detection import NOT_FOUND, detect, largest_chessboard
 from camtorch.cli import images, videos
 from camtorch.cli.terminal import note, progress
-from camtorch.io.hashing import hash_of
-from camtorch.jobs.inputs import IMAGES, natural
+from camtorch.jobs.inputs import IMAGES, hash_of, natural
 
 _LEAST_VIEWS = 3
 _TRIED_ANEW = 5  # images in which a board of another size is looked for

@@ -64,11 +64,10 @@ def render(rig: Rig, path: str) -> str:
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]
         height, width = lossy.size(name, camera)
-        key = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
-        intrinsics, distortion = lossy.numbers(name, camera)
+        key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
         kind, focals, count = next((kind, f, count) for kind, (k, f, count) in _MODELS.items() if k == key)
-        if focals == 1:
-            intrinsics = lossy.single_focal(name, intrinsics)
+        if focals == 1 and fx != fy:
+            lossy.fail(name, f"fx = {fx!r} and fy = {fy!r}; the model has one focal length in {lossy.format}")
         w, x, y, z, *translation = poses.quaternions(extrinsics, undo=True).tolist()
         entries.append(
             {
@@ -78,7 +77,7 @@ def render(rig: Rig, path: str) -> str:
                 "Projection": {
                     "Description": f"see {kind}.h",
                     "Name": kind,
-                    "Params": [*intrinsics, *lossy.at_most(name, camera, distortion, (count,))],
+                    "Params": [*(fx, fy)[:focals], cx, cy, *lossy.at_most(name, camera, distortion, (count,))],
                 },
                 "SerialNumber": "0",
                 "T_Device_Camera": {

@@ -68,8 +68,7 @@ def render(rig: Rig, path: str) -> str:
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]
         height, width = lossy.size(name, camera)
-        key = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
-        intrinsics, distortion = lossy.numbers(name, camera)
+        key, intrinsics, distortion = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
         camera_type, names = next((kind, names) for kind, (k, names) in _MODELS.items() if k == key)
         numbers = [*intrinsics, *lossy.at_most(name, camera, distortion, (len(names),))]
         values = dict(zip((*_CORE, *names), numbers, strict=True))

@@ -9,17 +9,22 @@ import math
 import os
 import re
 import struct
-from typing import Any
+from array import array
+from collections.abc import Iterable, Iterator
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import torch
 
 from camtorch.camera import Camera
-from camtorch.io import colmap_images, poses
-from camtorch.io.colmap_images import LARGEST_ID
+from camtorch.io import poses
 from camtorch.io.nerfstudio import panorama
-from camtorch.io.parsing import decoded
+from camtorch.io.parsing import check_ordinary, decoded
 from camtorch.io.protocol import Names
-from camtorch.io.record import Record
+from camtorch.io.record import Record, repeated
 from camtorch.io.writing import Lossy, all_left_over, number
 from camtorch.rig import Rig
+from camtorch.rotations import quaternion_vector
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
 
@@ -51,6 +56,15 @@ _MOST_WORDS = 32
 _LINE = re.compile(rb"^[^\S\n]*([^\s#][^\n]*)", re.MULTILINE)  # no comment
 _CAMERA = re.compile(rb"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)")
 
+_HEAD = struct.Struct("<I7dI")
+_POINT = 24  # x, y and the id of a 3D point
+_MOST_COMMENTS = 10_000  # and blank lines, before the first image or between two
+_MOST_IMAGES = 1 << 18  # each takes some 400 bytes
+_LONGEST_NAME = 4096
+_LONGEST_LINE = 1 << 26
+_SAME = 1e-12  # of poses: what another format may have rounded
+_LARGEST_ID = (1 << 32) - 2  # of cameras; the one above means none
+
 
 def matches(path: str, content: bytes) -> bool:
     """Whether a file is a cameras.bin, by its name, or a cameras.txt: its first line without # is a camera."""
@@ -67,7 +81,7 @@ def read(path: str, content: bytes) -> Rig:
             name = os.path.basename(lost[0])
             Record(beside, None, "file").fail(f"missing; an interrupted save left {name}: rename it, or delete it")
         return Rig(cameras)
-    images = colmap_images.read(beside)
+    images = _read_images(beside)
     if unknown := set(images.cameras) - cameras.keys():
         row = next(row for row, camera in enumerate(images.cameras) if camera in unknown)
         images.record(row).fail(f"its camera {images.cameras[row]} is not in {os.path.basename(path)}")
@@ -97,7 +111,7 @@ def _from_text(path: str, content: bytes) -> dict[str, Camera]:
         if name.value not in _MODELS:
             name.fail(f"the model {name.value!r:.60} is not known here; known are {', '.join(_MODELS)}")
         size = height.side(), width.side()
-        identity = first.whole(0, LARGEST_ID, "camera id")
+        identity = first.whole(0, _LARGEST_ID, "camera id")
         _add(cameras, identity, record, name.value, size, [value.number() for value in values])
     return cameras
 
@@ -119,7 +133,7 @@ def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
     for _ in range(count):
         identity, model, width, height = take("<IiQQ")
         name = _IDS.get(model) or record.fail(f"the model {model} is not known here; known are {sorted(_IDS)}")
-        if identity > LARGEST_ID:
+        if identity > _LARGEST_ID:
             record.fail(f"{identity} is no camera id")
         size = Record(path, [str(width), str(height)], record.place).size()
         values = list(take(f"<{_parameters(name)}d"))
@@ -157,6 +171,126 @@ def _add(
     cameras[str(identity)] = record.camera(key, intrinsics, distortion, size)
 
 
+# -- images.txt and images.bin: the poses of images, whose points are passed over
+
+
+class _Images(NamedTuple):
+    """The images of a file.
+
+    names and cameras: of each image, the latter by their ids.
+    values: (N, 7), unit quaternions w, x, y, z and translations.
+    has_points: whether any of them has points.
+    unit, places: what numbers the place of an image in the file, and those numbers.
+    """
+
+    path: str
+    names: list[str]
+    cameras: list[str]
+    values: np.ndarray
+    has_points: bool
+    unit: str
+    places: array[int]
+
+    def record(self, row: int) -> Record:
+        """The place of an image."""
+        return Record(self.path, None, f"{self.unit} {self.places[row]}")
+
+
+def _read_images(path: str) -> _Images:
+    """The images of an images.txt or images.bin.
+
+    Raises:
+        CameraFileError: it is none, or two images have one name.
+    """
+    check_ordinary(path)
+    unit, entries = ("byte", _images_from_bytes) if path.endswith(".bin") else ("line", _images_from_text)
+    names: list[str] = []
+    cameras: list[str] = []
+    values, places, has_points = array("d"), array("q"), False
+    with open(path, "rb", buffering=1 << 16) as file:
+        for place, pose, camera, name, with_points in entries(path, file):
+            if len(names) >= _MOST_IMAGES:
+                Record(path, None, f"{unit} {place}").fail(f"more than {_MOST_IMAGES} images")
+            values.extend(pose)
+            cameras.append(camera)
+            names.append(name)
+            places.append(place)
+            has_points = has_points or with_points
+    images = _Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, unit, places)
+    if (twice := repeated(names)) is not None:
+        images.record(names.index(twice, names.index(twice) + 1)).fail(f"a second image is called {twice!r:.60}")
+    finite = np.isfinite(images.values).all(1)
+    if not finite.all():
+        row = int(finite.argmin())
+        images.record(row).fail(f"a pose that is no finite number: {images.values[row].tolist()}")
+    return images
+
+
+_ImageEntry = tuple[int, Iterable[float], str, str, bool]
+"""The place of an image, its pose, the id of its camera, its name, and whether it has points."""
+
+
+def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
+    number = passed = 0
+    known: dict[bytes, str] = {}
+    while line := file.readline(_LONGEST_LINE):
+        number += 1
+        record = Record(path, None, f"line {number}")
+        words = line.split(None, 9)
+        if not words or words[0].startswith(b"#"):
+            passed += 1
+            if passed > _MOST_COMMENTS:
+                record.fail(f"more than {_MOST_COMMENTS} lines without an image")
+            continue
+        if len(words) < 10:
+            _text(record, line)
+            record.fail(f"less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {len(words)} words")
+        try:
+            pose = list(map(float, words[1:8]))
+        except ValueError:
+            pose = [Record(path, _text(record, word), record.place).number() for word in words[1:8]]
+        if words[8] not in known:
+            identity = Record(path, _text(record, words[8]), record.place).whole(0, _LARGEST_ID, "camera id")
+            known[words[8]] = str(identity)
+        name = _text(record, words[9].strip())
+        points = file.readline(_LONGEST_LINE)  # of the image; the line may be empty
+        yield number, pose, known[words[8]], name, not (points.isspace() or not points)
+        number += 1
+
+
+def _text(record: Record, content: bytes) -> str:
+    if len(content) > _LONGEST_NAME:
+        record.fail(f"the name of the image has no end within {_LONGEST_NAME} bytes")
+    try:
+        return content.decode()
+    except UnicodeDecodeError:
+        record.fail("not text")
+
+
+def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
+    size = os.fstat(file.fileno()).st_size
+    (count,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
+    if size < 8 or count > (size - 8) // (_HEAD.size + 9):
+        Record(path, None, "byte 0").fail(f"{count} images, for which the file is too small")
+    position = 8
+    for _ in range(count):
+        record = Record(path, None, f"byte {position}")
+        file.seek(position)
+        block = file.read(_HEAD.size + _LONGEST_NAME + 9)
+        end = block.find(b"\0", _HEAD.size)
+        if end + 9 > len(block) or (end < 0 and len(block) < _HEAD.size + _LONGEST_NAME):
+            record.fail("the file ends within this image")
+        name = _text(record, block[_HEAD.size : end] if end > 0 else block)
+        _, *pose, camera = _HEAD.unpack_from(block)
+        (points,) = struct.unpack_from("<Q", block, end + 1)
+        if position + end + 9 + points * _POINT > size:
+            record.fail(f"{points} points, for which the file is too small")
+        yield position, pose, str(camera), name, points > 0
+        position += end + 9 + points * _POINT
+    if position < size:
+        Record(path, None, f"byte {position}").fail(f"{size - position} bytes after the last image")
+
+
 # -- writing
 
 
@@ -167,7 +301,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
     """
     lossy = Lossy(path, NAMES.title)
     ids = [int(name) if re.fullmatch(r"0|[1-9]\d{0,9}", name) else -1 for name in rig.cameras]
-    if not all(0 <= i <= LARGEST_ID for i in ids):
+    if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
     identities = dict(zip(rig.cameras, ids, strict=True))
     entries = []
@@ -184,7 +318,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
         if beside is None:
             way = f"call the file cameras{suffix}, or name a folder"
             lossy.fail("extrinsics", f"no place: COLMAP has them in images{suffix} beside cameras, so {way}")
-        content = colmap_images.content(lossy, rig, identities, beside, binary)
+        content = _images_content(lossy, rig, identities, beside, binary)
         if content is not None:
             contents[beside] = content
             # COLMAP opens no folder without its points
@@ -198,8 +332,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
 
 def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]]:
     """The smallest model whose camera has these values and this many coefficients, and its parameters."""
-    key = lossy.model(name, camera, {values[1] for values in _MODELS.values()})
-    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, {values[1] for values in _MODELS.values()})
     if key == "equirectangular":
         height, width = lossy.size(name, camera)
         if [fx, fy, cx, cy] != panorama((height, width)):
@@ -235,3 +368,46 @@ def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
         parts.append(struct.pack("<IiQQ", identity, _MODELS[model][0], width, height))
         parts.append(struct.pack(f"<{len(values)}d", *values))
     return b"".join(parts)
+
+
+def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes | None:
+    """The file of a rig's poses, or None if the file that is there says the same.
+
+    Raises:
+        CameraFileError: the file that is there has points, which would be lost.
+    """
+    entries = []
+    posed = poses.all_of(rig, lossy)
+    for name, values in zip(rig.extrinsics, poses.quaternions(posed).tolist(), strict=True):
+        if not name or "\0" in name or (not binary and (name.split() != [name])):
+            lossy.fail(
+                repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
+            )
+        entries.append((name, identities[rig.images.get(name, name)], values))
+    if os.path.exists(path):
+        there = _read_images(path)
+        if [entry[:2] for entry in entries] == list(zip(there.names, map(int, there.cameras), strict=True)):
+            its = poses.as_float64(there.values)
+            theirs = torch.cat((quaternion_vector(its[:, :4]), its[:, 4:]), -1)
+            if torch.allclose(theirs, torch.cat((posed.rotation, posed.translation), -1), rtol=_SAME, atol=_SAME):
+                return None
+        if there.has_points:
+            Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
+    folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
+    for name in ("rigs", "frames"):
+        if os.path.exists(os.path.join(folder, name + suffix)):
+            lossy.fail("extrinsics", f"would contradict {name}{suffix} beside them; write to another folder")
+    if binary:
+        parts = [struct.pack("<Q", len(entries))]
+        for i, (name, camera, values) in enumerate(entries, 1):
+            parts += [_HEAD.pack(i, *values, camera), name.encode(), b"\0", struct.pack("<Q", 0)]
+        return b"".join(parts)
+    lines = [
+        "# Image list with two lines of data per image:",
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
+        f"# Number of images: {len(entries)}, mean observations per image: 0",
+    ]
+    for i, (name, camera, values) in enumerate(entries, 1):
+        lines += [f"{i} {' '.join(map(number, values))} {camera} {name}", ""]
+    return ("\n".join(lines) + "\n").encode()

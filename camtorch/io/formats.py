@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import fnmatch
 import os
-from typing import Any
 
 from camtorch.camera import Camera
 from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, ocamcalib, opencv, ros
 from camtorch.io._errors import CameraFileError
-from camtorch.io.parsing import parse_mapping, read_bytes
+from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat
 from camtorch.io.record import Record
 from camtorch.io.writing import replacing
@@ -48,9 +47,13 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         CameraFileError: the file cannot be used; it says where and why. OSError: it cannot be opened.
         ValueError: an unknown format. TypeError: no path.
     """
-    path, format = _path(path, "load"), _known(format)
+    path, format = path_of(path, "load", "calibration file"), _known(format)
     if os.path.isdir(path):
-        path = _in_folder(path)
+        names = [name for names in NAMES_BY_FORMAT.values() for name in names.in_folder]
+        found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
+        if found is None:
+            raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
+        path = os.path.join(path, found)
     content = read_bytes(path)
     try:
         rig, format = _read(path, content, format)
@@ -60,25 +63,6 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         raise CameraFileError(path, "cameras", "none")
     rig.format = format
     return rig.requires_grad_(False)
-
-
-def _path(path: Any, owner: str) -> str:
-    try:
-        name = os.fsdecode(path)
-    except TypeError:
-        hint = "; it may lie beside others, so name it: file.name" if hasattr(path, "read") else ""
-        raise TypeError(f"{owner}: path must be that of a calibration file; got {type(path).__name__}{hint}") from None
-    if "\0" in name:
-        raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
-    return name
-
-
-def _in_folder(path: str) -> str:
-    names = [name for format in NAMES_BY_FORMAT.values() for name in format.in_folder]
-    found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
-    if found is None:
-        raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
-    return os.path.join(path, found)
 
 
 def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
@@ -128,7 +112,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
         part = next((name for name in ("camera", "rig") if isinstance(getattr(rig, name, None), (Camera, Rig))), None)
         hint = f", whose .{part} it takes" if part else ""
         raise TypeError(f"save: a Rig or a Camera can be saved; got {type(rig).__name__}{hint}")
-    path = _path(path, "save")
+    path = path_of(path, "save", "calibration file")
     if not rig.cameras:
         raise ValueError(f"{path}: a rig without cameras, which no format holds")
     for name, camera in rig.cameras.items():

@@ -97,14 +97,13 @@ def render(rig: Rig, path: str) -> str:
 
 def _entries(lossy: Lossy, name: str, camera: Camera, index: int) -> list[str]:
     height, width = lossy.size(name, camera)
-    key = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
-    intrinsics, distortion = lossy.numbers(name, camera)
+    key, intrinsics, distortion = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
     names, before, after = next((names, b, a) for names, (k, b, a) in _MODELS.items() if k == key)
     distortion = lossy.at_most(name, camera, distortion, (before + after,))
     return [
         f"  camera_model: {names[0]}",
         f"  distortion_model: {names[1]}",
-        f"  intrinsics: {listed(distortion[:before] + intrinsics)}",
+        f"  intrinsics: {listed([*distortion[:before], *intrinsics])}",
         f"  distortion_coeffs: {listed(distortion[before:])}",
         f"  resolution: [{width}, {height}]",
         "  cam_overlaps: []",

@@ -48,8 +48,7 @@ def render(rig: Rig, path: str) -> str:
     name, camera = lossy.only_camera(rig)
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)
-    key = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
-    intrinsics, distortion = lossy.numbers(name, camera)
+    key, intrinsics, distortion = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
     if key == "stereographic":  # without the polynomial
         distortion = lossy.at_most(name, camera, distortion, (0,))
     model = next(model for model, (k, count) in _MODELS.items() if k == key and count == len(distortion))
@@ -61,7 +60,7 @@ def render(rig: Rig, path: str) -> str:
     'lensmodel':  '{model}',
 
     # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....
-    'intrinsics': {_listed(intrinsics + distortion)},
+    'intrinsics': {_listed([*intrinsics, *distortion])},
 
     'rt_cam_ref': {pose},
     'extrinsics': {pose}, # for compatibility with mrcal < 2.5

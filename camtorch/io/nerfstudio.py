@@ -153,8 +153,7 @@ def render(rig: Rig, path: str) -> str:
 
 
 def _entries(lossy: Lossy, name: str, camera: Camera) -> dict[str, Any]:
-    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
-    key = lossy.model(name, camera, set(_MODELS.values()))
+    key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, set(_MODELS.values()))
     entries: dict[str, Any] = {"camera_model": next(model for model, k in _MODELS.items() if k == key)}
     if key == "equirectangular":
         size = lossy.size(name, camera)

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.camera import Camera
+from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import decoded
 from camtorch.io.protocol import Names
@@ -26,6 +25,7 @@ from camtorch.rig import Rig
 NAMES = Names("ocamcalib", "OCamCalib", (".txt",), ("*calib_results*.txt", "*ocam*.txt"))
 
 _LINES = ("polynomial", "inverse polynomial", "centre", "affine", "image size")
+_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
 _MOST_TERMS = 64
 _START = 1 << 14  # of a file, where its kind shows
 _LARGEST = 1 << 16
@@ -37,11 +37,7 @@ def matches(path: str, content: bytes) -> bool:
     lines = [line.split() for line in content[:_START].splitlines() if line.strip()]
     numbers = next((line for line in lines if not line[0].startswith(b"#")), [b""])
     counted = re.fullmatch(rb"[1-9]\d?", numbers[0]) is not None and int(numbers[0]) == len(numbers) - 1
-    return counted and lines[0][0].startswith(b"#") and all(map(_is_number, numbers))
-
-
-def _is_number(text: bytes) -> bool:
-    return re.fullmatch(rb"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf)", text, re.IGNORECASE) is not None
+    return counted and lines[0][0].startswith(b"#") and all(map(_NUMBER.fullmatch, numbers))
 
 
 def read(path: str, content: bytes) -> Rig:
@@ -66,13 +62,9 @@ def read(path: str, content: bytes) -> Rig:
     )
     values = polynomial.numbers()[1:], centre.numbers(2), affine.numbers(3)
     try:
-        return Rig({"camera": OCamCalib.from_ocamcalib(*map(_float64, values), image_size=(height, width))})
+        return Rig({"camera": OCamCalib.from_ocamcalib(*map(poses.as_float64, values), image_size=(height, width))})
     except (ValueError, TypeError) as error:
         return record.fail(error)
-
-
-def _float64(values: Sequence[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def files(rig: Rig, path: str) -> dict[str, bytes]:
@@ -81,8 +73,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
     lossy.no_pose(rig)
     name, camera = lossy.only_camera(rig)
     height, width = lossy.size(name, camera)
-    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
-    lossy.model(name, camera, {OCamCalib.key})
+    _, (fx, fy, cx, cy), distortion = lossy.model(name, camera, {OCamCalib.key})
     c, d = fy / fx, distortion[0] * fy / fx
     terms = [-value / fx**i + 0.0 for i, value in enumerate(distortion[2:])]
     inverse, error, angle = _inverse(camera, (height, width))

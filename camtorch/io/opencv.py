@@ -245,8 +245,7 @@ def render(rig: Rig, path: str) -> str:
 
 
 def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera, end: str) -> None:
-    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt", "mei"))
-    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt", "mei"))
     if camera.image_size is not None:
         values_of_size = {"image_width": camera.image_size[1], "image_height": camera.image_size[0]}
         if values and any(values.get(key) != value for key, value in values_of_size.items()):

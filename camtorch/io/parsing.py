@@ -37,17 +37,34 @@ _OTHERS = (
 )
 
 
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
+def path_of(path: Any, owner: str, file: str = "file") -> str:
+    """What `owner` was given as the path of a kind of file, as text.
+
+    Raises:
+        TypeError: it is no path. CameraFileError: it has a NUL character.
+    """
+    try:
+        name = os.fsdecode(path)
+    except TypeError:
+        hint = "; it may lie beside others, so name it: file.name" if hasattr(path, "read") else ""
+        raise TypeError(f"{owner}: path must be that of a {file}; got {type(path).__name__}{hint}") from None
+    if "\0" in name:
+        raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
+    return name
+
+
+def read_bytes(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> bytes:
     """The content of a file that is not suspiciously large.
 
     Raises:
-        CameraFileError: no ordinary file, nothing in it, over 16 MiB. OSError: it cannot be opened.
+        CameraFileError: no ordinary file, nothing in it, more bytes than `largest`. OSError: it cannot be opened.
     """
     check_ordinary(path)
     with open(path, "rb") as file:
-        content = file.read(LARGEST_FILE + 1)
-    if len(content) > LARGEST_FILE:
-        raise CameraFileError(path, "size", f"more than {LARGEST_FILE >> 20} MiB")
+        size = os.fstat(file.fileno()).st_size
+        if size > largest:
+            raise CameraFileError(path, "size", f"more than {largest >> 20} MiB")
+        content = file.read(size)
     if not content:
         raise CameraFileError(path, "content", "the file is empty")
     return content
@@ -106,29 +123,25 @@ def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
 
 
 def _from_json(path: str | os.PathLike[str], text: str) -> Any:
-    _check_count(path, text)
-    # floats at once: no text is made of a number, and integers of any length are no work
-    options: dict[str, Any] = {"parse_int": float, "parse_constant": float}
-    try:
-        return json.loads(text, object_pairs_hook=_unique, **options)
-    except json.JSONDecodeError as error:
-        raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
-    except ValueError as error:
-        raise CameraFileError(path, "content", error) from None
-
-
-def _check_count(path: str | os.PathLike[str], text: str) -> None:
-    """Refuse more values than are worth their memory."""
+    # more values than are worth their memory
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
     if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
         raise CameraFileError(path, "content", "too many values")
 
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = dict(pairs)
+        if len(keys) < len(pairs):
+            raise ValueError(f"the key {repeated(key for key, _ in pairs)!r:.60} stands there twice")
+        return keys
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys = dict(pairs)
-    if len(keys) < len(pairs):
-        raise ValueError(f"the key {repeated(key for key, _ in pairs)!r:.60} stands there twice")
-    return keys
+    # floats at once: no text is made of a number, and integers of any length are no work
+    options: dict[str, Any] = {"parse_int": float, "parse_constant": float}
+    try:
+        return json.loads(text, object_pairs_hook=unique, **options)
+    except json.JSONDecodeError as error:
+        raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
+    except ValueError as error:
+        raise CameraFileError(path, "content", error) from None
 
 
 # -- Python literals, as mrcal writes them

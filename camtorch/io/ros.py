@@ -65,8 +65,7 @@ def render(rig: Rig, path: str) -> str:
     name, camera = lossy.only_camera(rig)
     lossy.no_pose(rig)
     height, width = lossy.size(name, camera)
-    key = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt"))
-    (fx, fy, cx, cy), distortion = lossy.numbers(name, camera)
+    key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, ("pinhole", "brown_conrady", "kannala_brandt"))
     model = "rational_polynomial" if len(distortion) > 5 else "plumb_bob"
     if key == "kannala_brandt":
         model, distortion = "equidistant", lossy.at_most(name, camera, distortion, (4,))

@@ -14,6 +14,8 @@ import stat
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import IO, NoReturn
 
+from torch import Tensor
+
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io._errors import CameraFileError
@@ -180,27 +182,23 @@ class Lossy:
             self.fail(name, f"no image_size, which {self.format} needs")
         return camera.image_size
 
-    def numbers(self, name: str, camera: Camera) -> tuple[list[float], list[float]]:
-        """Intrinsics and distortion of a single camera."""
-        if camera.batch_shape:
-            self.fail(name, f"a batch of cameras {tuple(camera.batch_shape)}; {self.format} holds single ones")
-        values = [t.detach().double().tolist() for t in (camera.intrinsics, camera.distortion)]
-        if not all(math.isfinite(v) for vector in values for v in vector):
-            self.fail(name, "intrinsics or distortion that are not finite")
-        return values[0], values[1]
-
-    def single_focal(self, name: str, intrinsics: list[float]) -> list[float]:
-        """f, cx, cy of fx, fy, cx, cy."""
-        fx, fy, cx, cy = intrinsics
-        if fx != fy:
-            self.fail(name, f"fx = {fx!r} and fy = {fy!r}; the model has one focal length in {self.format}")
-        return [fx, cx, cy]
-
-    def model(self, name: str, camera: Camera, known: Collection[str]) -> str:
-        """The key of the camera's model, which must be a known one."""
+    def model(
+        self, name: str, camera: Camera, known: Collection[str]
+    ) -> tuple[str, tuple[float, float, float, float], list[float]]:
+        """The key of a single camera's model, which must be a known one, its intrinsics and its distortion."""
+        (fx, fy, cx, cy), distortion = self._single(name, camera, "cameras", camera.intrinsics, camera.distortion)
         if camera.key not in known:
             self.fail(name, f"{self.format} has no name for {camera.key}; it has for {', '.join(sorted(known))}")
-        return camera.key
+        return camera.key, (fx, fy, cx, cy), distortion
+
+    def _single(self, name: str, owner: Camera | Extrinsics, what: str, *tensors: Tensor) -> list[list[float]]:
+        """The finite numbers of what is no batch."""
+        if owner.batch_shape:
+            self.fail(name, f"a batch of {what} {tuple(owner.batch_shape)}; {self.format} holds single ones")
+        values: list[list[float]] = [t.detach().double().tolist() for t in tensors]
+        if not all(math.isfinite(v) for vector in values for v in vector):
+            self.fail(name, f"{'intrinsics or distortion' if what == 'cameras' else what} that are not finite")
+        return values
 
     def at_most(self, name: str, camera: Camera, distortion: list[float], counts: Sequence[int]) -> list[float]:
         """The coefficients, with zeros added or left out to make their number one of `counts`."""
@@ -241,12 +239,10 @@ class Lossy:
 
     def pose(self, name: str, extrinsics: Extrinsics) -> tuple[list[float], list[float]]:
         """Rotation vector and translation of a single pose."""
-        if extrinsics.batch_shape:
-            self.fail(name, f"a batch of extrinsics {tuple(extrinsics.batch_shape)}; {self.format} holds single ones")
-        values = [t.detach().double().tolist() for t in (extrinsics.rotation, extrinsics.translation)]
-        if not all(math.isfinite(v) for vector in values for v in vector):
-            self.fail(name, "extrinsics that are not finite")
-        return values[0], values[1]
+        rotation, translation = self._single(
+            name, extrinsics, "extrinsics", extrinsics.rotation, extrinsics.translation
+        )
+        return rotation, translation
 
     def all_posed(self, rig: Rig) -> dict[str, Extrinsics]:
         """A pose for each camera; a single camera without one is where the rig is."""

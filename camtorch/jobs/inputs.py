@@ -1,8 +1,9 @@
-"""Which files a command line means by files, patterns and folders, and where what is made of them goes."""
+"""Which files a command line means by files, patterns and folders, where what is made of them goes; and hashes."""
 
 from __future__ import annotations
 
 import glob
+import hashlib
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -94,3 +95,16 @@ def _matching(pattern: str, root: Path, output: Path) -> list[Path]:
 
 def _is_below(path: str, folder: str) -> bool:
     return path == folder or path.startswith(os.path.join(folder, ""))
+
+
+def hash_of(path: str | os.PathLike[str]) -> str:
+    """BLAKE2b of what is in a file, 16 bytes, hexadecimal.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    found = hashlib.blake2b(digest_size=16)
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            found.update(block)
+    return found.hexdigest()

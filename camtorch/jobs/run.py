@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from camtorch.io.hashing import hash_of
 from camtorch.io.writing import all_left_over
 from camtorch.jobs import pool
+from camtorch.jobs.inputs import hash_of
 from camtorch.jobs.items import Item, Json, Listener, Work
 from camtorch.jobs.manifest import Manifest
 

@@ -59,19 +59,14 @@ def as_storage(arrays: dict[str, Any], *, xml: bool) -> bytes:
         text = base64.b64encode(f"{channels}{letter}".ljust(_HEADER).encode() + np.ascontiguousarray(value).tobytes())
         lines = b"\n    ".join(text[i : i + _LINE] for i in range(0, len(text), _LINE))
         if xml:
-            parts.append(
+            start = (
                 f'<{key} type_id="opencv-matrix">\n  <rows>{rows}</rows>\n  <cols>{columns}</cols>\n  <dt>{dt}</dt>\n'
-                '  <data type_id="binary">\n    '.encode()
-                + lines
-                + f"\n    </data></{key}>\n".encode()
             )
+            data, end = '  <data type_id="binary">\n    ', f"\n    </data></{key}>\n"
         else:
-            parts.append(
-                f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: {dt}\n   data: !!binary |\n"
-                "    ".encode()
-                + lines
-                + b"\n"
-            )
+            start = f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: {dt}\n"
+            data, end = "   data: !!binary |\n    ", "\n"
+        parts += [(start + data).encode(), lines, end.encode()]
     return b"".join([*parts, b"</opencv_storage>\n" if xml else b""])
 
 
@@ -113,15 +108,14 @@ def from_storage(content: bytes) -> Arrays:
             raise ValueError(f"{what} without an end, or too large")
         dtype, data = np.dtype(_TYPES[letter]), content[found.end() : end]
         try:
-            values = _from_base64(data, dtype) if coded else _from_words(data, dtype)
+            if coded:
+                values = np.frombuffer(base64.b64decode(b"".join(data.split()), validate=True), dtype, offset=_HEADER)
+            else:
+                values = _from_words(data, dtype)
             arrays[name] = values.reshape((rows, columns, channels) if channels > 1 else (rows, columns))
         except ValueError as error:
             raise ValueError(f"{what}: {error}") from None
     return arrays
-
-
-def _from_base64(data: bytes, dtype: np.dtype) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(b"".join(data.split()), validate=True), dtype, offset=_HEADER)
 
 
 def _from_words(data: bytes, dtype: np.dtype) -> np.ndarray:

@@ -25,12 +25,10 @@ class DepthAI(Table):
     options: tuple[str, ...] = ("step", "order")
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """See `Table`."""
         order = _order(options)
         return np.ascontiguousarray(_ordered(mesh.nodes, order), "<f4").tobytes(), {"order": order}
 
     def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
-        """See `Table`."""
         order = _order(given)
         nodes = table(content, "<f4", (len(rows), len(columns), 2)).astype(np.float64)
         return _ordered(nodes, order), {"order": order}

@@ -45,6 +45,5 @@ class DW100(Table):
         return (parts[..., 1] << 16 | parts[..., 0]).astype("<u4").tobytes(), {}
 
     def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
-        """See `Table`."""
         words = table(content, "<u4", (len(rows), len(columns)))
         return np.stack((words & _MOST, words >> 16), -1) / _PARTS, {}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
-from camtorch.io.parsing import check_ordinary
+from camtorch.io.parsing import path_of, read_bytes
 from camtorch.io.writing import as_json, replacing
 from camtorch.maps.depthai import DepthAI
 from camtorch.maps.dw100 import DW100
@@ -52,7 +52,7 @@ _LARGEST_DESCRIPTION = 1 << 16
 
 def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, **said: Any) -> MapReport:
     """See `Warp.save`; `said` are fields of `Options`."""
-    name = _path(path, "Warp.save")
+    name = path_of(path, "Warp.save")
     chosen = _chosen(name, format)
     if said["step"] is not None:
         said["step"] = as_whole(said["step"], "step", "Warp.save")
@@ -109,7 +109,7 @@ def load_map(
         CameraFileError: the file cannot be used; it says why. OSError: it cannot be opened. ValueError: an unknown
             format. ImportError: a library that the format needs is missing; the error names the extra.
     """
-    name = _path(path, "load_map")
+    name = path_of(path, "load_map")
     given = Options(
         step=None if step is None else as_whole(step, "step", "load_map"),
         v=v,
@@ -117,7 +117,7 @@ def load_map(
         source_size=as_image_size(source_size, "load_map", "source_size"),
         target_size=as_image_size(target_size, "load_map", "target_size"),
     )
-    content = _content(name)
+    content = read_bytes(name, _LARGEST_FILE)
     chosen: MapFormat | None
     if format is not None:
         chosen = _named(format)
@@ -152,7 +152,7 @@ def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[s
     Raises:
         ValueError: as `Warp.save`, of the path and the format.
     """
-    name = _path(path, "Warp.save")
+    name = path_of(path, "Warp.save")
     return (name, _description(name)) if _chosen(name, format).described else (name,)
 
 
@@ -173,7 +173,7 @@ def check_map(
     exact = Exact(warp, "check_map")
     sizes: dict[str, Any] = {"source_size": exact.source_size, "target_size": exact.target_size}
     read = load_map(path, format, step=step, v=v, order=order, **sizes)
-    return measure(_path(path, "check_map"), read, exact, (), read.facts)
+    return measure(path_of(path, "check_map"), read, exact, (), read.facts)
 
 
 _NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
@@ -198,28 +198,6 @@ def _read_description(path: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise CameraFileError(beside, "content", f"no description of a map: {error}") from None
     return described
-
-
-def _content(path: str) -> bytes:
-    check_ordinary(path)
-    with open(path, "rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > _LARGEST_FILE:
-            raise CameraFileError(path, "size", f"{size} bytes; at most {_LARGEST_FILE} are read")
-        content = file.read(_LARGEST_FILE)
-    if not content:
-        raise CameraFileError(path, "content", "the file is empty")
-    return content
-
-
-def _path(path: Any, owner: str) -> str:
-    try:
-        name = os.fsdecode(path)
-    except TypeError:
-        raise TypeError(f"{owner}: path must be that of a file; got {type(path).__name__}") from None
-    if "\0" in name:
-        raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
-    return name
 
 
 def _chosen(path: str, format: str | None) -> MapFormat:

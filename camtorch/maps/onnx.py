@@ -30,7 +30,6 @@ class ONNX(MapFormat):
     options: tuple[str, ...] = ("dtype",)
 
     def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """See `MapFormat`."""
         warp, dtype = exact.warp, options.dtype or "float32"
         if dtype not in _DTYPES:
             raise ValueError(f"Warp.save: dtype must be one of {_DTYPES}; got {dtype!r}")

@@ -35,7 +35,6 @@ class OpenCV(MapFormat):
         self.name = name
 
     def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """See `MapFormat`."""
         sides = (*exact.source_size, *exact.target_size)
         if max(sides) > _LONGEST:
             raise CameraFileError(path, "size", f"a side of {max(sides)} px; cv2.remap takes at most {_LONGEST}")
@@ -57,7 +56,6 @@ class OpenCV(MapFormat):
         return content[:100].lstrip().startswith((b"PK\3\4", b"%YAML", b"<?xml", b"<opencv_storage"))
 
     def decode(self, content: bytes, given: Options) -> LookupMap:
-        """See `MapFormat`."""
         arrays = from_archive(content) if content.startswith(b"PK") else from_storage(content)
         positions, fixed = _positions(arrays)
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan

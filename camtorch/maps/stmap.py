@@ -40,7 +40,6 @@ class STMap(MapFormat):
     options: tuple[str, ...] = ("v",)
 
     def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """See `MapFormat`."""
         way = "up" if options.v is None else options.v
         if way not in _WAYS:
             raise ValueError(f"Warp.save: v must be 'up' (as Nuke has it) or 'down'; got {shown(way)}")
@@ -54,11 +53,9 @@ class STMap(MapFormat):
         return (_as_exr if path.lower().endswith(".exr") else _as_tiff)(pixels, facts), {"v": way}
 
     def matches(self, path: str, content: bytes) -> bool:
-        """See `MapFormat`."""
         return content.startswith((_EXR, *_TIFF))
 
     def decode(self, content: bytes, given: Options) -> LookupMap:
-        """See `MapFormat`."""
         pixels, stated = (_from_exr if content.startswith(_EXR) else _from_tiff)(content)
         if any(plane.ndim != 2 or plane.dtype.kind != "f" or not plane.size for plane in pixels):
             raise ValueError("red and green are not float")

@@ -36,7 +36,6 @@ class Table(MapFormat):
         """The positions (n, m, 2) of nodes at columns (m,) and rows (n,), and what else is known of the file."""
 
     def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """See `MapFormat`."""
         step = as_step(options.step, "Warp.save", self.steps, self.step)
         height, width = exact.target_size
         mesh = mesh_of(path, exact, nodes_every(step, width), nodes_every(step, height))
@@ -44,7 +43,6 @@ class Table(MapFormat):
         return content, {"step": step, "nodes": (len(mesh.rows), len(mesh.columns)), **facts}
 
     def decode(self, content: bytes, given: Options) -> LookupMap:
-        """See `MapFormat`."""
         source, target = checked("source_size", given.source_size), checked("target_size", given.target_size)
         step = as_step(given.step, "load_map", self.steps, self.step)
         columns, rows = nodes_every(step, target[1]), nodes_every(step, target[0])

@@ -48,7 +48,6 @@ class TextureMesh(MapFormat):
         """The triangles of a file, and the sizes that it states."""
 
     def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """See `MapFormat`."""
         step = as_step(options.step, "Warp.save")
         height, width = exact.target_size
         mesh = mesh_of(path, exact, _edges(step, width), _edges(step, height), triangles=True)
@@ -105,7 +104,6 @@ class OBJ(TextureMesh):
     suffixes: tuple[str, ...] = (".obj",)
 
     def write(self, path: str, mesh: Triangles, sizes: dict[str, int]) -> bytes:
-        """See `TextureMesh`."""
         places, parts, triangles = mesh
         lines = [
             "# a warp: v in pixels of the target from its lower left corner, y up; vt on the source",
@@ -117,7 +115,6 @@ class OBJ(TextureMesh):
         return ("\n".join(lines) + "\n").encode()
 
     def read(self, content: bytes) -> tuple[Triangles, dict[str, Any]]:
-        """See `TextureMesh`."""
         lines: dict[str, list[list[str]]] = {"v": [], "vt": [], "f": [], "#": []}
         for kind, *words in map(str.split, filter(str.strip, content.decode("ascii").splitlines())):
             lines.get(kind, []).append(words)
@@ -138,7 +135,6 @@ class GLTF(TextureMesh):
     suffixes: tuple[str, ...] = (".glb", ".gltf")
 
     def write(self, path: str, mesh: Triangles, sizes: dict[str, int]) -> bytes:
-        """See `TextureMesh`."""
         points = np.pad(mesh[0], ((0, 0), (0, 1))).astype("<f4")
         arrays = points, mesh[1].astype("<f4"), mesh[2].astype("<u4").reshape(-1)
         buffer = b"".join(array.tobytes() for array in arrays)
@@ -169,11 +165,9 @@ class GLTF(TextureMesh):
         return head + text + struct.pack("<II", len(buffer), _BINARY) + buffer
 
     def matches(self, path: str, content: bytes) -> bool:
-        """See `MapFormat`."""
         return content.startswith(_GLB) or path.lower().endswith(".gltf")
 
     def read(self, content: bytes) -> tuple[Triangles, dict[str, Any]]:
-        """See `TextureMesh`."""
         if content.startswith(_GLB):
             length, kind = struct.unpack_from("<II", content, 12)
             following, second = struct.unpack_from("<II", content, 20 + length)

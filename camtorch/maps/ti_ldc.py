@@ -67,7 +67,6 @@ class TILDC(Table):
         return lines.tobytes(), facts
 
     def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
-        """See `Table`."""
         lines = table(content, "<i2", (len(rows), _pitch(len(columns)) // 2))
         offsets = lines[:, : 2 * len(columns)].reshape(len(rows), len(columns), 2) / _PARTS
         return np.stack(np.meshgrid(columns, rows), -1) + offsets, {}

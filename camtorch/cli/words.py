@@ -1,0 +1,138 @@
+"""How the command line reads paths, sizes, lengths and ranges: types of options, as argparse takes them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from camtorch.jobs.items import Shard
+
+LARGEST_SIDE = 32768
+"""Pixels."""
+LENS = "lens:"
+"""What the name of a real lens begins with, in the place of a calibration file."""
+GUESS = "guess:"
+"""What a guessed horizontal field of view in degrees begins with, in the place of a calibration file."""
+PAPERS = ("a4", "a3", "a2", "a1", "a0", "letter", "legal", "tabloid")
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "m": 1.0}
+_WrongWord = argparse.ArgumentTypeError
+
+
+def path(text: str) -> Path:
+    """A path that a file can have."""
+    return Path(raw_path(text))
+
+
+def raw_path(text: str) -> str:
+    """A path as it was written: a slash at its end says that it is a folder."""
+    if not text or "\0" in text:
+        raise _WrongWord(f"{text!r} is no name of a file")
+    return text
+
+
+def suffix(text: str) -> str:
+    """A suffix, as ".png"."""
+    if not (text.startswith(".") and text[1:].isalnum()):
+        raise _WrongWord(f"{text!r} is no suffix, as .png is")
+    return text
+
+
+def _counts(text: str, separator: str) -> tuple[int, ...]:
+    """Two whole numbers of up to eight digits, or nothing."""
+    words = text.lower().split(separator)
+    fits = len(words) == 2 and all(word.isascii() and word.isdigit() and len(word) < 9 for word in words)
+    return tuple(map(int, words)) if fits else ()
+
+
+def size(text: str) -> tuple[int, int]:
+    """(height, width) of "WIDTHxHEIGHT"."""
+    if not (sides := _counts(text, "x")):
+        raise _WrongWord(f"{text!r} is not WIDTHxHEIGHT, as in 1280x720")
+    if not all(0 < side <= LARGEST_SIDE for side in sides):
+        raise _WrongWord(f"{text!r}: each side must be 1 to {LARGEST_SIDE} pixels")
+    return sides[1], sides[0]
+
+
+def board(text: str) -> tuple[int, int]:
+    """(columns, rows) of "COLUMNSxROWS"."""
+    counts = _counts(text, "x")
+    if not counts or max(counts) > 9999:
+        raise _WrongWord(f"{text!r} is not COLUMNSxROWS, as in 9x6")
+    return counts[0], counts[1]
+
+
+def shard(text: str) -> Shard:
+    """The I-th of N parts, of "I/N"."""
+    part = _counts(text, "/")
+    if not part or not 0 < part[0] <= part[1]:
+        raise _WrongWord(f"{text!r} is not I/N, the I-th of N parts, from 1/N to N/N")
+    return Shard(part[0] - 1, part[1])
+
+
+def count(most: int) -> Callable[[str], int]:
+    """What reads a whole number from 1 to `most`."""
+
+    def parse(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and 0 < int(text) <= most):
+            raise _WrongWord(f"{text!r} is not a whole number from 1 to {most}")
+        return int(text)
+
+    return parse
+
+
+def span(text: str) -> float | tuple[float, float]:
+    """A number, or two."""
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (1, 2):
+        raise _WrongWord(f"{text!r} is neither a number nor LOW,HIGH, as in -5,20")
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else numbers[0]
+
+
+def fov(text: str) -> float | tuple[float, float] | str:
+    """A range, or the word "source"."""
+    return text if text == "source" else span(text)
+
+
+def guess(text: str) -> Path:
+    """A guessed field of view in degrees, in the place of a calibration file."""
+    try:
+        degrees = float(text)
+    except ValueError:
+        degrees = math.nan
+    if 0 < degrees <= 2 * math.pi:
+        raise _WrongWord(f"{text} seems to be radians: {math.degrees(degrees):.4g} degrees; it takes degrees")
+    if not 0 < degrees <= 360:
+        raise _WrongWord(f"{text!r} is no field of view in degrees, as 120")
+    return Path(GUESS + text)
+
+
+def length(text: str) -> float:
+    """Metres of "30mm", "3cm", "0.03m", "0.03" or "1in"."""
+    unit = next((unit for unit in _UNITS if text.endswith(unit)), "")
+    try:
+        metres = float(text.removesuffix(unit)) * _UNITS.get(unit, 1.0)
+    except ValueError:
+        metres = math.nan
+    if not 0 < metres < math.inf:
+        raise _WrongWord(f"{text!r} is no length above 0, as 30mm, 3cm, 1in or, in metres, 0.03")
+    if not unit and metres >= 1:
+        raise _WrongWord(f"{text!r} would be metres: {text}mm, or {text}m if it is that large")
+    return metres
+
+
+def paper(text: str) -> str | tuple[float, float]:
+    """The name of a paper, or (width, height) in mm of "WIDTHxHEIGHT", as in 400x300mm."""
+    name = text.lower()
+    if name in (*PAPERS, "board"):
+        return name
+    unit = next((unit for unit in _UNITS if name.endswith(unit)), "mm")
+    sides = name.removesuffix(unit).split("x")
+    if len(sides) != 2:
+        raise _WrongWord(f"{text!r} is no paper: {', '.join(PAPERS)}, board, or WIDTHxHEIGHT, as in 400x300mm")
+    width, height = (1000 * length(f"{side}{unit}") for side in sides)
+    return width, height
