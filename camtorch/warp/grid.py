@@ -196,9 +196,9 @@ def tabulate(
     height, width = target._size_for("Warp")
     rows = range(height) if rows is None else rows
     like = _like(target)
-    exact = partial(_positions, source, target, rotation, _native(source, target, rotation, like))
     if in_transform() or not is_concrete(target.intrinsics):
-        return exact(_pixels(rows, width, like))
+        return _positions(source, target, rotation, None, _pixels(rows, width, like))
+    exact = partial(_positions, source, target, rotation, _native(source, target, rotation, like))
     if tolerance and like.is_cpu:
         lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
         if lattice is not None:
