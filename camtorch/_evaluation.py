@@ -103,7 +103,7 @@ def evaluated(
                 if learns and torch.is_grad_enabled():
                     planes, valid = _Native.apply(*inputs, cameras, type(camera), direction)  # type: ignore[no-untyped-call]
                     return planes, valid
-                return direction.native(cameras, made, rows.detach())[:2]
+                return direction.native(made, rows.detach())[:2]
     # what is compiled has no derivatives of derivatives
     order = 1 if torch.compiler.is_compiling() else 2
     known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
@@ -154,7 +154,7 @@ class _Native(Function):
     ) -> tuple[Tensor, Tensor]:
         made = cameras.native
         assert made is not None  # who calls has looked
-        planes, valid, kept = direction.native(cameras, made, rows, keeps=True)
+        planes, valid, kept = direction.native(made, rows, keeps=True)
         ctx.save_for_backward(rows, intrinsics, distortion, *kept)
         ctx.cameras, ctx.model, ctx.direction = cameras, model, direction
         ctx.mark_non_differentiable(valid)

@@ -26,7 +26,7 @@ enum { MOST_PARTS = 5 };
 enum { MOST_DEGREE = 64 }; /* of a polynomial whose root is asked for, and of a ratio's denominator */
 enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabulate` */
 enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of its stages */
-enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.Azimuths` */
+enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
    direction (AZIMUTHS) */

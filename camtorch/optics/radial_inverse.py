@@ -341,19 +341,6 @@ def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor
     return scale
 
 
-def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    # the first call of an operator of our own imports torch's compiler, which takes seconds
-    of = _found_inverse if is_concrete(k) and is_concrete(r2) else _radial_inverse
-    found: tuple[Tensor, Tensor, Tensor] = of(name, k, end, r2)
-    return found
-
-
-@torch.library.custom_op("camtorch::radial_inverse", mutates_args=())
-def _radial_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`_found_inverse`, in graphs and transforms."""
-    return _found_inverse(name, k, end, r2)
-
-
 def _found_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The factors of coefficients (C, n) and squared radii (C, N), and `RadialInverse.inner2` and `most2`."""
     inner2, table = _tables((k,), (name, end), lambda: _made_tables(name, k.detach(), end))
@@ -361,6 +348,16 @@ def _found_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor
     scale = _scale(name, k, inner2, inverse, r2) if r2.numel() else torch.empty_like(r2)
     # clones: who gets them may write into them
     return scale, inner2.clone(), inverse.most2.clone()
+
+
+_radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _found_inverse, mutates_args=())
+
+
+def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    # by the operator in graphs and transforms alone: its first call imports torch's compiler, which takes seconds
+    of = _found_inverse if is_concrete(k) and is_concrete(r2) else _radial_inverse
+    found: tuple[Tensor, Tensor, Tensor] = of(name, k, end, r2)
+    return found
 
 
 @_radial_inverse.register_fake

@@ -83,9 +83,7 @@ class Project:
         return pixels, positive(mask)
 
     @staticmethod
-    def native(
-        cameras: Cameras, made: compiled.Native, points: Tensor, keeps: bool = False
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    def native(made: compiled.Native, points: Tensor, keeps: bool = False) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """The same by the compiled geometry, without a graph, and what `native_vjp` needs: the points."""
         return *compiled.project(made, points), (points,)
 

@@ -195,9 +195,7 @@ class Unproject:
         return rays, positive(mask.expand_as(a))
 
     @staticmethod
-    def native(
-        cameras: Cameras, made: compiled.Native, pixels: Tensor, keeps: bool = False
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    def native(made: compiled.Native, pixels: Tensor, keeps: bool = False) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """The same by the compiled geometry, without a graph, and what `native_vjp` needs of it, if it is kept."""
         rays, valid, solution = compiled.unproject(made, pixels, keeps)
         # a copy: what is handed out belongs to the caller

@@ -27,11 +27,7 @@ _STRIP = 1 << 19  # pixels
 _FEWEST = 8  # cells along a side from which on a lattice pays
 STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
-_MARGIN = 0.05  # of half an image: what lies beyond is not sampled
 _MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
-_OVERSHOOT = 0.5  # of the range of its nodes by which a cubic may leave it: 0.27 along each axis
-_CUBIC = 3 / 128  # a cubic through four even nodes misses its middle by this part of their fourth difference
-_SAFETY = 3.0  # times that is assumed: at steps of the curvature, fourth differences tell less; 0.9 of it is then used
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
@@ -198,11 +194,11 @@ def tabulate(
     like = _like(target)
     if in_transform() or not is_concrete(target.intrinsics):
         return _positions(source, target, rotation, None, _pixels(rows, width, like))
-    exact = partial(_positions, source, target, rotation, _native(source, target, rotation, like))
     if tolerance and like.is_cpu:
         lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
         if lattice is not None:
             return lattice.pixels[:2]
+    exact = partial(_positions, source, target, rotation, _native(source, target, rotation, like))
     # by strips: memory for what is in between is used again
     count = max(math.prod(c.batch_shape) for c in (source, target))
     count = count if rotation is None else max(count, math.prod(rotation.shape[:-2]))
