@@ -4,6 +4,7 @@
 """
 
 from camtorch.augment.augmentation import Augmentation, Range
+from camtorch.augment.box_crop import BoxCrop
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate
 from camtorch.augment.compose import Compose
@@ -30,6 +31,7 @@ __all__ = [
     "LANDMARKS",
     "PRESETS",
     "Augmentation",
+    "BoxCrop",
     "CenterCrop",
     "Change",
     "Compose",

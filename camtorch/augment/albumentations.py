@@ -88,7 +88,10 @@ class Transform(A.DualTransform):
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
         camera = self._source(data)
-        drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
+        drawn: Any = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
+        if self.augmentation.crops:
+            given = data.get("bboxes")
+            drawn = self.augmentation.with_boxes(drawn, None if given is None else _corners(given, camera)[None])
         with torch.no_grad():
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.last = self.augmentation.change(camera, drawn)
@@ -114,12 +117,9 @@ class Transform(A.DualTransform):
 
     def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
         """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""
-        before, after = (
-            torch.tensor([[*size[::-1], *size[::-1]]], dtype=torch.float64)
-            for size in ((one.height, one.width) for one in (change.parts[0].camera, change.parts[0].target))
-        )
-        corners = torch.as_tensor(bboxes[:, :4], dtype=torch.float64) * before - 0.5
-        moved, seen = change.boxes(corners[None])
+        target = change.parts[0].target
+        moved, seen = change.boxes(_corners(bboxes, change.parts[0].camera)[None])
+        after = torch.tensor([target.width, target.height] * 2, dtype=torch.float64)
         moved = torch.where(seen[0, :, None], (moved[0] + 0.5) / after, 0.0)
         return np.concatenate((moved.numpy().astype(bboxes.dtype), bboxes[:, 4:]), 1)
 
@@ -135,3 +135,9 @@ class Transform(A.DualTransform):
             return moved[0].numpy()
 
         return move
+
+
+def _corners(bboxes: Any, camera: Camera) -> Tensor:
+    """(M, 4) pixels x1, y1, x2, y2 of boxes (M, 4 and more) that are parts of an image's width and height."""
+    sides = torch.tensor([camera.width, camera.height] * 2, dtype=torch.float64)
+    return torch.as_tensor(np.asarray(bboxes)[:, :4], dtype=torch.float64) * sides - 0.5

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -29,7 +30,7 @@ from camtorch._module import typed_as
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, Unknown, on_samples
+from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
 from camtorch.warp.shutter import RollingShutter
@@ -202,6 +203,8 @@ class Augmentation(SampleTransform):
     """The ranges of what the new images have beside a camera."""
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
+    crops: Mapping[str, int] = MappingProxyType({})
+    """Boxes that a draw needs, by their names in it: which of each sample's."""
     p: float
     same_on_batch: bool
     min_filled: float | None
@@ -267,6 +270,25 @@ class Augmentation(SampleTransform):
         """The draw as arrays or tensors; see the function `draw`."""
         return draw(self.ranges, count, p, same_on_batch, generator)
 
+    def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
+        """A draw with the boxes of samples that it needs, where it has not got them.
+
+        Args:
+            draw: as of `draw`.
+            boxes: of the samples (B, M, 4), or (M, 4) each; None if they have none.
+        """
+        missing = {name: index for name, index in self.crops.items() if name not in draw}
+        if not missing:
+            return draw
+        if boxes is None:
+            raise ValueError(f"{self._name}: the sample has no boxes, (B, M, 4) pixels x1, y1, x2, y2, to crop one of")
+        for i, rows in enumerate(boxes):
+            for index in missing.values():
+                if not -len(rows) <= index < len(rows):
+                    raise ValueError(f"{self._name}: sample {i} has {len(rows)} boxes, and none of index {index}")
+        chosen = {name: [rows[index] for rows in boxes] for name, index in missing.items()}
+        return {**draw, **{n: torch.stack(rows) if rows else torch.empty(0, 4) for n, rows in chosen.items()}}
+
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
         """(height, width) of what comes out of images of a size."""
         return self.image_size or size
@@ -318,17 +340,18 @@ class Augmentation(SampleTransform):
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
         """As arrays, where nothing records what becomes of it."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
-        missing = [name for name in ("apply", *self.ranges) if name not in draw]
+        missing = [name for name in ("apply", *self.ranges, *self.crops) if name not in draw]
         if missing:
             has = ", ".join(map(str, draw)) or "nothing"
             raise ValueError(f"{self._name}: the draw lacks {', '.join(missing)}; it has {has}")
-        given = {name: torch.as_tensor(draw[name]) for name in ("apply", *self.ranges)}
-        values: dict[str, Any] = {"apply": given["apply"] > 0.5, **{name: given[name] for name in self.ranges}}
+        sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}
+        given = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
+        values: dict[str, Any] = {"apply": given["apply"] > 0.5, **{name: given[name] for name in sizes}}
         if are_numbers(*values.values()):
-            values = {"apply": values["apply"].numpy(), **{name: given[name].double().numpy() for name in self.ranges}}
+            values = {"apply": values["apply"].numpy(), **{name: given[name].double().numpy() for name in sizes}}
         count = len(values["apply"])
-        for name, interval in self.ranges.items():
-            value, shape = values[name], (count,) if interval.size is None else (count, interval.size)
+        for name, size in sizes.items():
+            value, shape = values[name], (count,) if size is None else (count, size)
             if tuple(value.shape) != shape:
                 raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
             if isinstance(value, np.ndarray) and not np.isfinite(value).all():
@@ -444,10 +467,12 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
+        of_sample = self._boxes_of(named) if self.crops else None
         if draw is None:
-            change = self._change(camera, self._numbers(count, self.p, self.same_on_batch, generator))
+            numbers = self._numbers(count, self.p, self.same_on_batch, generator)
+            change = self._change(camera, self.with_boxes(numbers, of_sample))
         else:
-            change = self.change(camera, draw)
+            change = self.change(camera, self.with_boxes(draw, of_sample))
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
@@ -486,6 +511,12 @@ class Augmentation(SampleTransform):
         if count != change.count:
             raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
         return self._moved(sample, named, batched, change)
+
+    @staticmethod
+    def _boxes_of(named: Named) -> Any:
+        """The boxes among a sample's fields: those of that name, or the first of that kind."""
+        found = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
+        return found.get("boxes", next(iter(found.values()), None))
 
     if TYPE_CHECKING:
 

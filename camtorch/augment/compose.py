@@ -91,6 +91,9 @@ class Compose(Augmentation):
             **options,
         )
         self.augmentations = nn.ModuleList(parts)
+        self.crops: Mapping[str, int] = {
+            f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()
+        }
         self.needs_camera: bool = any(part.needs_camera for part in parts)
         self._check_options(parts)
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
@@ -169,6 +172,8 @@ class Compose(Augmentation):
                 step = change_by(edits, camera, options)
             else:
                 part, own = steps.pop(0)
+                if total is not None:
+                    own |= {name: _moved(total, own[name], camera) for name in part.crops}
                 step = part._change(camera, own)
             total = step if total is None else total.then(step)
             (first, *others) = step.parts  # one camera for all where it is one
@@ -185,7 +190,7 @@ class Compose(Augmentation):
         """The augmentations, and what each was drawn."""
         steps = []
         for i, part in enumerate(self.parts):
-            own = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges)}
+            own = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges, *part.crops)}
             steps.append((part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}))
         return steps
 
@@ -193,3 +198,11 @@ class Compose(Augmentation):
         """The options."""
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _moved(change: Change, boxes: Any, camera: Camera) -> Tensor:
+    """Boxes (B, 4) after a change; one that left the image becomes the middle of it."""
+    moved, valid = (t[:, 0] for t in change.boxes(torch.as_tensor(boxes)[:, None]))
+    width, height = camera.width, camera.height
+    middle = moved.new_tensor([0.25 * width, 0.25 * height, 0.75 * width, 0.75 * height])
+    return torch.where(valid[:, None], moved, middle)

@@ -20,10 +20,10 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_part, shown
+from camtorch._arguments import as_part, as_values, check_boxes, fails, shown
 from camtorch._dtypes import narrow, widen
 from camtorch._module import Memo, remade
-from camtorch.augment import compose, edits, random_camera
+from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation, check_front_end, check_single, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
@@ -38,6 +38,7 @@ if not hasattr(GeometricAugmentationBase2D, "_gate"):
     )
 
 __all__ = [
+    "BoxCrop",
     "CameraAugmentation",
     "CenterCrop",
     "Compose",
@@ -51,6 +52,7 @@ __all__ = [
     "Resize",
     "Rotate90",
     "VerticalFlip",
+    "with_boxes",
     "with_cameras",
 ]
 
@@ -143,6 +145,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
             self.augmentation.tell_of_empty_images(self.camera)
         drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)
         del drawn["apply"]
+        drawn |= {name: torch.full((count, 4), torch.nan) for name in self.augmentation.crops}
         drawn[_KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()
         if "size" in self.flags:
             drawn["output_size"] = torch.tensor(self.flags["size"]).expand(count, -1).contiguous()
@@ -151,10 +154,18 @@ class CameraAugmentation(GeometricAugmentationBase2D):
     def change(self, params: Params | None = None, device: torch.device | None = None) -> Change:
         """What params, by default the last, do to a batch: `source`, `target`, `rotation`, `points(...)` and so on."""
         params = self._params if params is None else params
-        missing = [name for name in ("batch_prob", *self.augmentation.ranges) if name not in params]
+        missing = [
+            name for name in ("batch_prob", *self.augmentation.ranges, *self.augmentation.crops) if name not in params
+        ]
         if missing:
             raise ValueError(f"{type(self).__name__}: the params lack {', '.join(missing)}; call it first")
-        values = {"apply": self._gate(params), **{name: params[name] for name in self.augmentation.ranges}}
+        own = *self.augmentation.ranges, *self.augmentation.crops
+        values = {"apply": self._gate(params), **{name: params[name] for name in own}}
+        if self.augmentation.crops and any(fails(~values[name].isnan()) for name in self.augmentation.crops):
+            raise ValueError(
+                f"{type(self).__name__}: kornia hands on boxes after images, so that they go in before: "
+                "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"
+            )
         camera = self._source(params, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
@@ -352,8 +363,40 @@ class Rotate90(_Random, wraps=edits.Rotate90):
     """Turned by quarters."""
 
 
+class BoxCrop(_Random, wraps=box_crop.BoxCrop):
+    """What a camera sees that looks at a box of the sample, which `with_boxes` gives."""
+
+
 class Compose(_Random, wraps=compose.Compose):
     """Several augmentations of camtorch, not of kornia, as one."""
+
+
+def with_boxes(params: Any, boxes: Tensor) -> Any:
+    """Params with the boxes (B, 4) that a `BoxCrop` crops, pixels x1, y1, x2, y2: of one augmentation, or a container.
+
+    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_boxes(params, boxes))`.
+
+    Raises:
+        ValueError: another shape or number, or nothing among the params that crops.
+    """
+    given = as_values(boxes, "boxes", "with_boxes")
+    check_boxes(given, "boxes", "with_boxes")
+    found: list[str] = []
+
+    def changed(params: Any) -> Any:
+        if not isinstance(params, dict):
+            return [p._replace(data=changed(p.data)) if isinstance(p, ParamItem) and p.data else p for p in params]
+        names = [name for name in params if name.rpartition(".")[2] == "box"]
+        found.extend(names)
+        for name in names:
+            if tuple(given.shape) != (len(params[name]), 4):
+                raise ValueError(f"with_boxes: boxes must be ({len(params[name])}, 4); got {tuple(given.shape)}")
+        return {**params, **dict.fromkeys(names, given)}
+
+    result = changed(params)
+    if not found:
+        raise ValueError(f"with_boxes: params must be those of a BoxCrop; got {shown(params)}")
+    return result
 
 
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:

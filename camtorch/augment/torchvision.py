@@ -107,7 +107,11 @@ class Transform(v2.Transform):
         camera = camera_of_sample(_OWNER, self.augmentation, cameras[0] if cameras else self.camera, sizes)
         with torch.no_grad():
             self.augmentation.tell_of_empty_images(camera)
-            change = self.augmentation.change(camera, self.augmentation.draw(1))
+            boxes = next((one for one in flat_inputs if isinstance(one, tv_tensors.BoundingBoxes)), None)
+            if boxes is not None and self.augmentation.crops:
+                plain = boxes.as_subclass(torch.Tensor)
+                boxes = torch.cat(_ends(plain.reshape(-1, 4), boxes.format.value), -1)[None] - 0.5
+            change = self.augmentation.change(camera, self.augmentation.with_boxes(self.augmentation.draw(1), boxes))
             self.augmentation.last, self._flags = change, []
             return {"change": change, "camera": change.single}
 
@@ -198,15 +202,20 @@ def _labels(change: Change, masks: Tensor, fill: float) -> Tensor:
     return moved.reshape(*masks.shape[:-2], *moved.shape[-2:])
 
 
-def _boxes(change: Change, boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
-    """Boxes (M, 4) between pixel edges, of one of torchvision's formats, and valid (M,)."""
+def _ends(boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
+    """(M, 2) and (M, 2): the lower and the upper corners of boxes of one of torchvision's formats."""
     if form not in ("XYXY", "XYWH", "CXCYWH"):
         raise ValueError(
             f"{_OWNER}: boxes of the format {form} turn with no lens; v2.ConvertBoundingBoxFormat('XYXY') encloses them"
         )
     one, two = _wide(boxes).chunk(2, -1)
     low = one - two / 2 if form == "CXCYWH" else one
-    high = {"XYXY": two, "XYWH": one + two, "CXCYWH": one + two / 2}[form]
+    return low, {"XYXY": two, "XYWH": one + two, "CXCYWH": one + two / 2}[form]
+
+
+def _boxes(change: Change, boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
+    """Boxes (M, 4) between pixel edges, of one of torchvision's formats, and valid (M,)."""
+    low, high = _ends(boxes, form)
     whole = not boxes.is_floating_point()
     if whole:  # as torchvision reads them
         low, high = low.trunc(), high.trunc()

@@ -1,17 +1,17 @@
-"""A wide image as several pinhole images, and back: the faces of a cube, or a ring of views around."""
+"""Pinhole views of an image: the faces of a cube, a ring of views around, or one that looks at a box."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_fov, as_number, as_whole, shown
+from camtorch._arguments import Numbers, as_fov, as_image_size, as_number, as_values, as_whole, check_boxes, shown
 from camtorch._dtypes import narrow, widen
-from camtorch._module import GeometryModule, typed_as
+from camtorch._module import GeometryModule, remade, typed_as
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.projection.rays import slopes_at_axis
@@ -20,12 +20,16 @@ from camtorch.warp.panorama import rays_of
 from camtorch.warp.sampling import Mode, blended
 from camtorch.warp.warp import Warp, as_sized
 
-__all__ = ["FACES", "Views", "cube", "ring"]
+__all__ = ["FACES", "Views", "cube", "look_at", "ring"]
 
 FACES = ("front", "right", "back", "left", "up", "down")
 """Of a cube, as the camera sees them from within; its own axis goes through the middle of the front."""
 _HALF = 0.5  # px, that a view reaches beyond the middle of its outermost pixels
 _EDGE = 1e-3  # px
+_ALONG = 65  # samples of an edge of a box, and of the steps to either side of the farthest of them
+_ROUNDS = 3  # of such samples: 2e-6 of an edge
+_VIRTUAL = Pinhole([1.0, 1.0, 0.0, 0.0]).detach()
+_STRAIGHT_UP = 1e-6  # radians from the y axis: what float32 cameras leave of none
 _OVERLAP = 1.25  # the width of a view in a ring over the step to the next one
 
 
@@ -200,3 +204,119 @@ def _views(camera: Camera, size: int, fov: float, rotations: Tensor, names: tupl
     intrinsics = camera.intrinsics.detach().new_tensor([focal, focal, centre, centre])
     view = Pinhole(nn.Parameter(intrinsics, requires_grad=False), image_size=(size, size))
     return Views(camera, view, rotations.to(intrinsics), names, mode)
+
+
+def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin: float = 0.25) -> Warp:
+    """A pinhole camera that looks at a box, as the detector of faces or of people gives it: a crop without perspective.
+
+    A plain crop of a face away from the axis is the face as seen from the side of the lens: wider, leaning, and turned
+    against the same face on the axis. The new camera looks along the ray of the box's middle, and the source's y axis
+    stays in its y-z plane, so that upright stays upright. Its pixels are square, its principal point is the middle of
+    the image, and its focal length is the largest at which the outline of box and margin is inside the image.
+
+    Args:
+        camera: of the images, of any model, with image_size; single, or a batch of B.
+        boxes: (B, 4) or (4,), pixels x1, y1, x2, y2 of the camera's images, whole numbers at the middles of pixels.
+        image_size: (height, width) of the crop.
+        margin: how far left and right move out, in widths of the box, and top and bottom, in heights.
+
+    Returns:
+        A `Warp` to a `Pinhole` of batch (B,), or single for one box. Images (1, C, H, W) of a single camera give B
+        crops. `warp.transform_points`, `.transform_rays` and so on move labels, `warp.inverse()` takes them back,
+        `warp.target` is the new camera and `warp.rotation` its turn, `ray_crop = R ray_camera`. Boxes and what follows
+        from them count as given, without gradients.
+
+    Raises:
+        ValueError: boxes of another shape, without extent, beside the image, without a ray in the middle or parallel
+            to the camera's y axis there, or with an outline 90 degrees or more from it: the text names the box.
+    """
+    camera, owner = as_sized(camera, "camera", "look_at"), "look_at"
+    given = as_values(boxes, "boxes", owner, camera.intrinsics.device)
+    if given.ndim not in (1, 2) or given.shape[-1] != 4:
+        raise ValueError(
+            f"{owner}: boxes must be (B, 4) or (4,), pixels x1, y1, x2, y2; got shape {tuple(given.shape)}"
+        )
+    batch = tuple(camera.batch_shape)
+    if len(batch) > 1 or (batch and given.ndim == 2 and len(given) != batch[0]):
+        raise ValueError(f"{owner}: {len(given)} boxes do not fit a camera of batch dims {batch}")
+    size = as_image_size(image_size, owner)
+    if size is None:
+        raise TypeError(f"{owner}: image_size must be two integers (height, width); got None")
+    rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
+    check_extents(rows, camera, "boxes", owner)
+    intrinsics, rotation = looking_at(camera, rows, size, as_number(margin, "margin", owner), owner)
+    if given.ndim == 1 and not batch:
+        intrinsics, rotation = intrinsics[0], rotation[0]
+    intrinsics, rotation = (
+        t.to(torch.promote_types(camera.intrinsics.dtype, torch.float32)) for t in (intrinsics, rotation)
+    )
+    return Warp(camera, pinhole(intrinsics, size)).turned_by(rotation)
+
+
+def pinhole(intrinsics: Tensor, size: tuple[int, int]) -> Pinhole:
+    """A pinhole camera of intrinsics (*B, 4) that camtorch made, which do not learn."""
+    return remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=size)
+
+
+def check_extents(boxes: Tensor, camera: Camera, name: str, owner: str) -> None:
+    """Raise a ValueError unless boxes (B, 4) are finite, have an extent, and are on the camera's image."""
+    check_boxes(boxes, name, owner)
+    limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
+    low, high = boxes.split(2, -1)
+    for wrong, what in (
+        (~torch.isfinite(boxes).all(-1), "must be finite"),
+        (~(low < high).all(-1), "must have a width and a height: x1 < x2 and y1 < y2"),
+        (~((low < limits) & (high > -0.5)).all(-1), f"must be on the image, {camera.width} x {camera.height}, in part"),
+    ):
+        if bool(wrong.any()):
+            i = int(wrong.nonzero()[0])
+            raise ValueError(f"{owner}: {name} {what}; got {name}[{i}] = {boxes[i].tolist()}")
+
+
+@torch.no_grad()
+def looking_at(
+    camera: Camera, boxes: Tensor, size: tuple[int, int], margin: float, owner: str
+) -> tuple[Tensor, Tensor]:
+    """Intrinsics (B, 4) and rotations (B, 3, 3), in float64, of what `look_at` makes for boxes (B, 4)."""
+
+    def refuse(wrong: Tensor, what: str) -> None:
+        if bool(wrong.any()):
+            i = int(wrong.nonzero()[0])
+            raise ValueError(f"{owner}: box {i}, {boxes[i].tolist()}, {what}")
+
+    low, high = boxes.detach().double().split(2, -1)
+    axis, has_ray = rays_of(camera, (low + high) / 2)
+    refuse(~has_ray, "has no ray in its middle: the lens does not see there")
+    axis = axis / axis.norm(dim=-1, keepdim=True)
+    across = torch.stack((axis[:, 2], torch.zeros_like(axis[:, 0]), -axis[:, 0]), -1)
+    length = across.norm(dim=-1, keepdim=True)
+    refuse(length[:, 0] < _STRAIGHT_UP, "is seen along the camera's y axis, and no way up is the better one")
+    across = across / length
+    rotation = torch.stack((across, torch.linalg.cross(axis, across), axis), -2)
+    moved = margin * (high - low)
+    (left, top), (right, bottom) = (low - moved).unbind(-1), (high + moved).unbind(-1)
+    corners = torch.stack([torch.stack(c, -1) for c in ((left, top), (right, top), (right, bottom), (left, bottom))], 1)
+    start, edge = corners[:, :, None, None], (corners.roll(-1, 1) - corners)[:, :, None, None]
+    # along each edge the largest slope x / z, and the largest y / z: closer and closer to where it is
+    steps = torch.linspace(-1, 1, _ALONG, dtype=torch.float64, device=boxes.device)
+    place, half = torch.full((len(boxes), 4, 1), 0.5, dtype=torch.float64, device=boxes.device), 0.5
+    farthest = torch.full((len(boxes), 2), -math.inf, dtype=torch.float64, device=boxes.device)
+    for _ in range(_ROUNDS):
+        share = (place[..., None] + half * steps).clamp(0, 1)  # (B, 4, 1 or 2, K)
+        pixels = start + share[..., None] * edge
+        rays, seen = rays_of(camera, pixels.flatten(1, 3))
+        turned = (rays @ rotation.mT).view(*share.shape, 3)
+        seen = seen.view(share.shape)
+        refuse(
+            (seen & (turned[..., 2] <= 1e-9)).flatten(1).any(-1), "has an outline 90 degrees or more from its middle"
+        )
+        slopes = turned[..., :2].abs() / turned[..., 2:].clamp(min=1e-9)
+        slopes = torch.where(seen[..., None], slopes, -math.inf)
+        slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
+        best, index = slopes.max(-1)
+        farthest = torch.maximum(farthest, best.amax(1))
+        place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
+    refuse(~torch.isfinite(farthest).all(-1), "has no ray on its outline")
+    sides = farthest.new_tensor(size[::-1])
+    focal = (sides / 2 / farthest).amin(-1, keepdim=True).expand(-1, 2)
+    return torch.cat((focal, ((sides - 1) / 2).expand_as(focal)), -1), rotation

@@ -1,0 +1,97 @@
+"""Crops that look at a box of each sample, as of a face detector: without perspective error, labels and camera move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import as_image_size, as_number, as_whole
+from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
+from camtorch.camera import Camera
+from camtorch.rotations import mount_rotation
+from camtorch.warp.views import check_extents, looking_at, pinhole
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+RangeLike = float | Sequence[float]
+
+
+class BoxCrop(Augmentation):
+    """What a pinhole camera sees that looks at a box of the sample: `ct.views.look_at` as an augmentation.
+
+    Landmarks, other boxes, masks, depth, gaze, head pose and the camera move along, and `inverse` takes them back. The
+    draw holds the boxes beside the numbers, as `draw["box"]` (B, 4), which `forward` takes from the sample's `boxes`;
+    for `change`, and for the first of several calls of a replay, it is put there.
+
+    In a `Compose` the box moves with what comes before. Where that turned the camera so far that the box left the
+    image, the crop is of the middle of the image, and the labels say that they are not on it.
+
+    Args:
+        image_size: (height, width) of the crop.
+        margin: how far left and right move out, in widths of the box, and top and bottom, in heights.
+        index: of the box among those of a sample; -1 is the last one.
+        yaw, pitch, roll: ranges of degrees by which the camera turns away from the box, as of `RandomMount`.
+        zoom: range of the factor on the focal length; below 1 more than box and margin is seen.
+        options: see `Augmentation`.
+
+    Raises:
+        ValueError: a sample without that box, and the boxes that `ct.views.look_at` refuses, with their place in the
+            batch.
+    """
+
+    image_size: tuple[int, int]
+    crops: Mapping[str, int]
+
+    def __init__(
+        self,
+        image_size: Sequence[int],
+        *,
+        margin: float = 0.25,
+        index: int = 0,
+        yaw: RangeLike | None = None,
+        pitch: RangeLike | None = None,
+        roll: RangeLike | None = None,
+        zoom: RangeLike | None = None,
+        **options: Unpack[EditOptions],
+    ):
+        name = type(self).__name__
+        turns = {"yaw": yaw, "pitch": pitch, "roll": roll}
+        ranges = {n: as_range(v, n, name, least=-180, most=180) for n, v in turns.items() if v is not None}
+        if zoom is not None:
+            ranges["zoom"] = as_range(zoom, "zoom", name, around=1, least=1e-3, most=1e3)
+        super().__init__(ranges, **options)
+        size = as_image_size(image_size, name)
+        if size is None:
+            raise TypeError(f"{name}: image_size must be two integers (height, width); got None")
+        self.image_size, self.margin = size, as_number(margin, "margin", name)
+        if self.margin <= -0.5:
+            raise ValueError(f"{name}: margin must be more than -0.5, which leaves nothing of a box; got {margin!r}")
+        self.crops = {"box": as_whole(index, "index", name)}
+
+    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+        """The camera that looks at `values["box"]`, (*B, 4); see `Augmentation.new_camera`."""
+        box = values["box"]
+        rows = box.reshape(-1, 4)
+        check_extents(rows, source, "boxes", self._name)
+        intrinsics, rotation = looking_at(source, rows, self.image_size, self.margin, self._name)
+        intrinsics, rotation = (t[0] if box.ndim == 1 else t for t in (intrinsics, rotation))
+        if "zoom" in values:
+            zoom = values["zoom"].double()
+            one = torch.ones_like(zoom)
+            intrinsics = intrinsics * torch.stack((zoom, zoom, one, one), -1)
+        if {"yaw", "pitch", "roll"} & values.keys():
+            nothing = torch.zeros_like(box[..., 0])
+            rotation = mount_rotation(*(values.get(n, nothing).double() for n in ("yaw", "pitch", "roll"))) @ rotation
+        return pinhole(intrinsics.to(box), self.image_size), rotation.to(box)
+
+    def tell_of_empty_images(self, camera: Camera) -> None:
+        """A box at the rim of the image is meant so."""
+
+    def extra_repr(self) -> str:
+        """Where it looks, what is drawn from, and the options."""
+        own = f"image_size={self.image_size}, margin={self.margin:g}, index={self.crops['box']}"
+        return f"{own}, {super().extra_repr()}"

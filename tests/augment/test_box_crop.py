@@ -1,0 +1,235 @@
+"""Cameras that look at boxes: `ct.views.look_at`, and `BoxCrop`, which moves whole samples by it."""
+
+import importlib
+import math
+
+import numpy as np
+import pytest
+import torch
+from cameras import every_model, one
+from torchvision_stand_in import torchvision_of
+
+import camtorch as ct
+import camtorch.augment.kornia
+import camtorch.augment.numpy
+
+SIZE = (160, 120)
+
+
+def boxes_of(camera, count, seed=0):
+    """(count, 4): boxes of some pixels to a quarter of the image, whose middle is on it."""
+    generator = torch.Generator().manual_seed(seed)
+    sides = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    middle = torch.rand(count, 2, generator=generator, dtype=torch.float64) * (sides - 1)
+    half = (0.01 + 0.12 * torch.rand(count, 2, generator=generator, dtype=torch.float64)) * sides
+    return torch.cat((middle - half, middle + half), -1)
+
+
+def fisheye(dtype=torch.float32):
+    numbers = [200.0, 205.0, 321.0, 238.0], [0.01, -0.002, 0.001, 0.0003]
+    return ct.KannalaBrandt(*(torch.tensor(n, dtype=dtype) for n in numbers), image_size=(480, 640)).requires_grad_(
+        False
+    )
+
+
+@every_model
+def test_the_axis_is_the_middle_and_the_outline_touches_a_side(key):
+    camera = one(key).requires_grad_(False)
+    boxes, margin = boxes_of(camera, 40), 0.2
+    rays, has_ray = camera.unproject((boxes[:, :2] + boxes[:, 2:]) / 2)
+    moved = margin * (boxes[:, 2:] - boxes[:, :2])
+    outer = torch.cat((boxes[:, :2] - moved, boxes[:, 2:] + moved), -1)
+    around, seen = camera.unproject(ct.augment.outlines(outer[:, None], 500)[:, 0])
+    angle = torch.acos((around * rays[:, None]).sum(-1).clamp(-1, 1))
+    plain = has_ray & seen.any(-1) & (~seen | (angle < 1.5)).all(-1) & (rays[:, 1].abs() < 0.99)
+    boxes, rays, around, seen = boxes[plain], rays[plain], around[plain], seen[plain]
+    assert len(boxes) > 10
+    warp = ct.views.look_at(camera, boxes, SIZE, margin=margin)
+    fx, fy, cx, cy = warp.target.intrinsics.unbind(-1)
+    assert torch.equal(fx, fy)
+    assert (cx == (SIZE[1] - 1) / 2).all()
+    assert (cy == (SIZE[0] - 1) / 2).all()
+    axis = (warp.rotation @ rays[..., None])[..., 0]
+    torch.testing.assert_close(axis, torch.tensor([0.0, 0, 1], dtype=axis.dtype).expand_as(axis), atol=1e-9, rtol=0)
+    assert warp.rotation[:, 0, 1].abs().max() < 1e-12  # the source's y axis stays in the y-z plane
+    assert (warp.rotation[:, 1, 1] > 0).all()
+    pixels = warp.target.project(around @ warp.rotation.mT)[0]
+    sides = pixels.new_tensor(SIZE[::-1])
+    beyond = torch.where(seen[..., None], (pixels - (sides - 1) / 2).abs() - sides / 2, -torch.inf)
+    assert beyond.max() < 1e-3
+    # an outline that the lens cuts off may end between two samples
+    whole = seen.all(-1)
+    assert beyond.amax((1, 2))[whole].min() > -1e-2
+
+
+def test_a_board_seen_from_the_side_comes_out_with_right_angles():
+    camera = fisheye(torch.float64)
+    u, v = torch.meshgrid(*(torch.linspace(-0.1, 0.1, 5, dtype=torch.float64) for _ in range(2)), indexing="xy")
+    middle = torch.tensor([1.3, 0.4, 0.7], dtype=torch.float64)
+    z = middle / middle.norm()
+    x = torch.linalg.cross(torch.tensor([0.0, 1, 0], dtype=torch.float64), z)
+    x = x / x.norm()
+    points = middle + u[..., None] * x + v[..., None] * torch.linalg.cross(z, x)
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    flat = pixels.flatten(0, 1)
+    warp = ct.views.look_at(camera, torch.cat((flat.amin(0), flat.amax(0))), (200, 200))
+    seen, valid = warp.transform_points(pixels)
+    assert valid.all()
+    across, down = seen[:, -1] - seen[:, 0], seen[-1] - seen[0]
+    assert (across[:, 1] / across[:, 0]).abs().max() < 0.03  # the box's middle is not quite the board's
+    assert (down[:, 0] / down[:, 1]).abs().max() < 0.03
+    assert ((across[:, 0].mean() / down[:, 1].mean()) - 1).abs() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("boxes", "message"),
+    [
+        ([100, 100, 50, 120], r"xyxy.*x, y, width, height"),
+        ([100, 100, 100, 100], "a width and a height"),
+        ([900, 100, 950, 120], "on the image, 640 x 480"),
+        ([[1, 1, 20, 20], [float("nan"), 1, 2, 3]], r"boxes\[1\]"),
+        ([1, 2, 3], r"\(B, 4\)"),
+        ([-300, 200, 940, 280], "box 0.*90 degrees"),
+        ([-2000, -2000, 2700, 2600], "box 0.*no ray on its outline"),
+    ],
+)
+def test_boxes_that_are_none_are_refused(boxes, message):
+    with pytest.raises(ValueError, match=message):
+        ct.views.look_at(fisheye(), boxes, SIZE)
+
+
+def test_a_box_seen_straight_up_has_no_way_up():
+    focal = 100 / math.pi
+    camera = ct.Equirectangular([focal, focal, 99.5, 49.5], image_size=(100, 200)).double().requires_grad_(False)
+    with pytest.raises(ValueError, match=r"box 0.*y axis"):
+        ct.views.look_at(camera, [98, -2, 102, 1], SIZE)
+
+
+def test_single_boxes_and_batches():
+    camera = fisheye()
+    assert ct.views.look_at(camera, (10, 10, 60, 90), SIZE).rotation.shape == (3, 3)
+    boxes = boxes_of(camera, 3).numpy()
+    warp = ct.views.look_at(camera, boxes, SIZE)
+    assert warp(torch.zeros(1, 3, 480, 640)).shape == (3, 3, *SIZE)
+    assert ct.views.look_at(camera.expand(3), boxes, SIZE).target.batch_shape == (3,)
+    with pytest.raises(ValueError, match="2 boxes do not fit"):
+        ct.views.look_at(camera.expand(3), boxes[:2], SIZE)
+
+
+def sample_of(camera, count=3):
+    boxes = boxes_of(camera, count)
+    generator = torch.Generator().manual_seed(1)
+    points = boxes[:, None, :2] + (boxes[:, 2:] - boxes[:, :2])[:, None] * torch.rand(
+        count, 9, 2, generator=generator, dtype=torch.float64
+    )
+    gaze = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    both = torch.stack((boxes_of(camera, count, 5), boxes), 1)
+    return {"boxes": both, "keypoints": points, "gaze": gaze, "points": camera.unproject(points)[0] * 0.7}
+
+
+def test_labels_move_with_the_crop_and_back():
+    camera = fisheye(torch.float64)
+    crop = ct.augment.BoxCrop(SIZE, index=-1, margin=0.1, yaw=4, pitch=4, roll=9, zoom=(0.9, 1.1), camera=camera)
+    sample = sample_of(camera)
+    torch.manual_seed(0)
+    out = crop(sample)
+    pixels, rotation = sample["keypoints"].numpy(), out["rotation"].numpy()
+    for i in range(3):  # by numpy, from the pinhole that came out
+        rays = camera.unproject(torch.from_numpy(pixels[i]))[0].numpy() @ rotation[i].T
+        fx, fy, cx, cy = out["camera"].intrinsics[i].numpy()
+        want = np.stack((fx * rays[:, 0] / rays[:, 2] + cx, fy * rays[:, 1] / rays[:, 2] + cy), -1)
+        np.testing.assert_allclose(out["keypoints"][i].numpy(), want, atol=1e-9)
+        np.testing.assert_allclose(out["gaze"][i].numpy(), rotation[i] @ sample["gaze"][i].numpy(), atol=1e-9)
+        np.testing.assert_allclose(out["points"][i].numpy(), sample["points"][i].numpy() @ rotation[i].T, atol=1e-9)
+    back = crop.inverse(out)
+    torch.testing.assert_close(back["keypoints"], sample["keypoints"], atol=1e-9, rtol=0)
+    torch.testing.assert_close(back["gaze"], sample["gaze"])
+
+
+def test_in_a_chain_the_box_moves_with_what_comes_before():
+    camera = fisheye(torch.float64)
+    sample = sample_of(camera)
+    mount = ct.augment.RandomMount(yaw=(20, 20), pitch=None, roll=None)
+    crop = ct.augment.BoxCrop(SIZE, index=1)
+    chain = ct.augment.Compose([mount, crop, ct.augment.HorizontalFlip(p=1)], camera=camera)
+    first = mount(sample, camera=camera)
+    want = ct.augment.HorizontalFlip(p=1)(crop(first))
+    out = chain(sample)
+    for name in ("keypoints", "gaze", "points"):
+        torch.testing.assert_close(out[name], want[name])
+    torch.testing.assert_close(out["camera"].intrinsics, want["camera"].intrinsics)
+    image = torch.rand(3, 1, 480, 640)
+    away = ct.augment.Compose(
+        [ct.augment.RandomMount(yaw=(95, 95), pitch=None, roll=None, min_filled=0), crop], camera=camera
+    )
+    out = away(image=image, boxes=torch.tensor([[[10.0, 200, 60, 260]]]).expand(3, 2, 4))
+    assert not out["boxes_valid"].any()  # and nothing is raised
+    assert torch.isfinite(out["boxes"]).all()
+
+
+def test_every_front_end_crops_the_same():
+    camera, (sample, i) = fisheye(), (sample_of(fisheye()), 1)
+    generator = np.random.default_rng(0)
+    image = generator.integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    boxes, points = (sample[name][i].float() for name in ("boxes", "keypoints"))
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
+    crop = ct.augment.BoxCrop(SIZE)
+    want = crop(image=tensor, boxes=boxes[None], keypoints=points[None], camera=camera)
+    out = ct.augment.numpy.Transform(crop)(image=image, boxes=boxes.numpy(), keypoints=points.numpy(), camera=camera)
+    np.testing.assert_array_equal(out["image"], want["image"][0].permute(1, 2, 0).numpy())
+    np.testing.assert_array_equal(out["keypoints"], want["keypoints"][0].numpy())
+
+    kornia = ct.augment.kornia
+    aug = kornia.BoxCrop(camera, SIZE)
+    images = tensor.float() / 255
+    params = aug.forward_parameters(images.shape)
+    with pytest.raises(ValueError, match="with_boxes"):
+        aug(images, params=params)
+    moved = aug(images, params=kornia.with_boxes(params, boxes[None, 0]))
+    torch.testing.assert_close(moved, crop(image=images, boxes=boxes[None], camera=camera)["image"])
+
+
+def test_pipelines_of_albumentations_crop_the_same():
+    A = pytest.importorskip("albumentations", reason="albumentations is not installed")  # noqa: N806
+    front_end = importlib.import_module("camtorch.augment.albumentations")
+    camera, (sample, i) = fisheye(), (sample_of(fisheye()), 1)
+    image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
+    boxes, points = (sample[name][i].float() for name in ("boxes", "keypoints"))
+    crop = ct.augment.BoxCrop(SIZE)
+    pipeline = A.Compose(
+        [front_end.Transform(crop, camera)],
+        bbox_params=A.BboxParams("pascal_voc", label_fields=["kinds"], filter_invalid_bboxes=False, clip=False),
+        keypoint_params=A.KeypointParams("xy", remove_invisible=False),
+    )
+    inside = boxes.clamp(min=0).numpy() + 0.5
+    inside = np.minimum(inside, [640, 480, 640, 480])
+    given = torch.from_numpy(inside - 0.5)[None].float()
+    want = crop(image=tensor, boxes=given, keypoints=points[None], camera=camera)
+    out = pipeline(image=image, bboxes=inside, kinds=[0, 1], keypoints=points.numpy())
+    np.testing.assert_allclose(out["keypoints"], want["keypoints"][0].numpy(), atol=1e-3)
+
+
+def test_transforms_of_torchvision_crop_the_same(monkeypatch):
+    camera, image = fisheye(), torch.rand(3, 480, 640)
+    crop = ct.augment.BoxCrop(SIZE)
+    want = crop(image=image, boxes=torch.tensor([[99.5, 99.5, 199.5, 219.5]]), camera=camera)
+    with torchvision_of("stand-in", monkeypatch) as tv_tensors:
+        transform = importlib.import_module("camtorch.augment.torchvision").Transform(crop, camera)
+        boxes = tv_tensors.BoundingBoxes(
+            torch.tensor([[100.0, 100, 100, 120]]), format=tv_tensors.BoundingBoxFormat.XYWH, canvas_size=(480, 640)
+        )
+        out = transform({"image": tv_tensors.Image(image), "boxes": boxes})
+    torch.testing.assert_close(torch.Tensor(out["image"]), want["image"], atol=1e-4, rtol=0)
+
+
+def test_samples_without_the_box_are_refused():
+    camera = fisheye()
+    image, boxes = torch.zeros(2, 1, 480, 640), [torch.tensor([[1.0, 1, 9, 9]]), torch.empty(0, 4)]
+    with pytest.raises(ValueError, match="no boxes"):
+        ct.augment.BoxCrop(SIZE, camera=camera)(image=image)
+    with pytest.raises(ValueError, match="sample 1 has 0 boxes"):
+        ct.augment.BoxCrop(SIZE, camera=camera)(image=image, boxes=boxes)
+    with pytest.raises(ValueError, match="margin"):
+        ct.augment.BoxCrop(SIZE, margin=-0.5)
