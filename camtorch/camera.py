@@ -24,6 +24,7 @@ from camtorch._arguments import (
 )
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
+from camtorch._freezing import INTRINSICS, PREFIX, freeze, frozen_names, loaded, restore, with_frozen
 from camtorch._module import BatchedModule, Memo, remade, typed_as
 from camtorch._numbers import (
     camera_of_fov,
@@ -86,8 +87,10 @@ def _held(name: str, doc: str) -> Any:
             found = camera._buffers.get(name)
             if found is None:
                 raise AttributeError(f"{type(camera).__name__} has no {name}")
-        return found
+        frozen = camera._buffers.get(of_frozen)
+        return found if frozen is None else with_frozen(found, frozen)
 
+    of_frozen = PREFIX + name
     return property(tensor, doc=doc)
 
 
@@ -265,6 +268,40 @@ class Camera(BatchedModule):
             ValueError, TypeError: as of the constructor.
         """
         return replaced(self, intrinsics, distortion, image_size)
+
+    def freeze(self, *names: str) -> Self:
+        """Let parameters stay as they are while the others learn: `camera.freeze("fx", "fy", "k3")`.
+
+        They have no gradient, and neither weight decay nor the momentum of an optimizer moves them; `ct.fit` and
+        `ct.calibrate` hold them where they start from the camera. States, pickles and `copy.deepcopy` keep them frozen.
+        What is made from the camera, as by `resize` or `clone`, sends its gradients to what learns here.
+
+        Args:
+            names: "fx", "fy", "cx", "cy", and of `distortion_names`; all parameters if there are none.
+
+        Returns:
+            The camera itself.
+
+        Raises:
+            ValueError: an unknown name. TypeError: a parameter that `torch.nn.utils.parametrize` makes; a `Mixed`.
+        """
+        freeze(self, names, True)
+        return self
+
+    def unfreeze(self, *names: str) -> Self:
+        """Let parameters that were frozen learn again, from the values that they have; all of them for no name."""
+        freeze(self, names, False)
+        return self
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        restore(self)
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if (names := frozen_names(self)) and hasattr(destination, "_metadata"):
+            destination._metadata[prefix[:-1]]["frozen"] = names
+
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        super()._load_from_state_dict(*arguments)
+        loaded(self, arguments[2])
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -645,13 +682,14 @@ class Camera(BatchedModule):
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
         numbers = None if self.batch_shape else values_of(torch.cat(self._tensors, -1))
         if numbers is not None:
-            names = "fx", "fy", "cx", "cy", *self.distortion_names
+            names = *INTRINSICS, *self.distortion_names
             parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]
         elif self.distortion_names:
             parts.append(f"distortion=({' '.join(self.distortion_names)})")
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
-        return ", ".join(parts)
+        frozen = frozen_names(self)
+        return ", ".join([*parts, f"frozen=({', '.join(frozen)})"] if frozen else parts)
 
 
 def _add_model(model: type[Camera]) -> None:

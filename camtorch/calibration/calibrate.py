@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_flag, as_number, as_whole, shown
+from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
@@ -25,7 +26,6 @@ from camtorch.camera import as_model as as_kind
 from camtorch.extrinsics import Extrinsics
 from camtorch.rotations import rotation_vector
 
-INTRINSICS = ("fx", "fy", "cx", "cy")
 STEPS = 300
 _MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
@@ -95,6 +95,8 @@ def as_model(
         raise ValueError(
             f"{owner}: fixed names {', '.join(map(repr, unknown))}; {model.__name__} has {', '.join(names)}"
         )
+    if start is not None:
+        fixed = *fixed, *frozen_names(start)
     if start is None and {"fx", "fy"} & set(fixed):
         raise ValueError(f"{owner}: a focal length is held at its value of the start; give start=a camera")
     return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_image_size, as_values
 from camtorch._threads import on_one_thread
-from camtorch.calibration.calibrate import as_model
+from camtorch.calibration.calibrate import Model, as_model
 from camtorch.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.convert.conversion import Conversion
@@ -26,13 +26,14 @@ _LEAST = 4  # rays
 @on_one_thread
 @torch.no_grad()
 def fit(
-    model: type[Camera] | str,
+    model: type[Camera] | str | Camera,
     pixels: Numbers,
     rays: Numbers,
     *,
     weights: Numbers | None = None,
     image_size: Sequence[int] | None = None,
     count: int | None = None,
+    fixed: Collection[str] | str = (),
 ) -> Conversion[Camera]:
     """The camera of a model that sees rays at pixels, as nearly as it can: by least squares of the distances in px.
 
@@ -40,23 +41,28 @@ def fit(
     is 0, or they are NaN. How far the result is from them is said in `Conversion.rms` and `max_error`, in px.
 
     Args:
-        model: a class of cameras, or its key.
+        model: a class of cameras, its key, or a camera to start from, whose frozen parameters stay.
         pixels: (*N, 2).
         rays: (*N, 3) for one camera, or (*B, *N, 3) for a batch of them, of any length, in the camera's frame.
         weights: of the squared errors, broadcast against the rays' (*B, *N); 1 if left out.
-        image_size: (height, width) of the camera that is made.
+        image_size: (height, width) of the camera that is made; by default that of a camera to start from.
         count: of the coefficients; the model's default if left out.
+        fixed: names of parameters that are held ("cx", "k3", ...) where the camera to start from has them; without
+            one distortion as in `ideal`, at zero, and the principal point in the middle of the image.
 
     Returns:
         The camera, float64, and how far it is from the rays: compared are the pixels of those that count.
 
     Raises:
-        ValueError: shapes that do not fit, fewer than four rays, rays and pixels that no lens looking along z makes.
+        ValueError: shapes that do not fit, fewer than four rays, rays and pixels that no lens looking along z makes;
+            unknown names, a focal length that is fixed without a start, a principal point without an image_size.
         TypeError: no model, no numbers.
     """
     owner = "fit"
-    asked = as_model(model, count, None, (), owner)
-    size = as_image_size(image_size, owner)
+    asked = as_model(model, count, None, fixed, owner)
+    start = asked.start
+    size = as_image_size(image_size, owner) or (None if start is None else start.image_size)
+    kept = _fixed(asked, size, owner)
     given_pixels = as_values(pixels, "pixels", owner).detach().double()
     given_rays = as_values(rays, "rays", owner).detach().double()
     dims = given_pixels.ndim - 1
@@ -79,9 +85,15 @@ def fit(
     reach = torch.where(counts, angles_from_axis(seen.rays), 0.0).amax(-1)
     names = asked.kind.names_of(asked.count) or ()
     starts = asked.kind.fit_start(names, *views.radii(lens, slopes, reach.clamp(max=math.pi)))
+    if start is not None:
+        own = start.distortion.detach().to(starts).reshape(1, 1, -1).expand(1, *starts.shape[1:])
+        starts = torch.cat((own, starts))
     ideal = slopes.new_tensor(asked.kind.ideal(asked.count)).expand(len(slopes), -1)
     template = fixed_camera(asked.kind, slopes, ideal, size or (1, 1))
-    parameters = fitting.fit(template, seen, starts, slopes)
+    if kept is not None:
+        kept = kept.to(starts)
+        starts = torch.where(kept[4:].isnan(), starts, kept[4:])
+    parameters = fitting.fit(template, seen, starts, slopes, fixed=kept)
     parts = parameters[:, :4].reshape(*batch, 4), parameters[:, 4:].reshape(*batch, asked.count)
     camera = asked.kind(*parts[: 1 + (asked.count > 0)], image_size=size)
     found, valid = fixed_camera(asked.kind, parameters[:, :4], parameters[:, 4:]).project(seen.rays)
@@ -95,6 +107,21 @@ def fit(
         "exact": torch.zeros_like(counts[:, 0]),
     }
     return Conversion(camera, **{name: t.reshape(batch) for name, t in numbers.items()}, source_name="rays")
+
+
+def _fixed(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | None:
+    """(4 + n,): the values that parameters keep, NaN for those that are looked for; None if all are."""
+    if bool(asked.free.all()):
+        return None
+    if asked.start is not None:
+        values = torch.cat([t.detach().double().reshape(-1).cpu() for t in asked.start._tensors])
+    else:
+        if size is None and not bool(asked.free[2:4].all()):
+            raise ValueError(f"{owner}: cx and cy are held in the middle of the image; give image_size=(height, width)")
+        height, width = size or (1, 1)
+        ideal = asked.kind.ideal(asked.count)
+        values = torch.tensor([torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2, *ideal], dtype=torch.float64)
+    return torch.where(asked.free, torch.nan, values)
 
 
 def _observations(pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: int, owner: str) -> fitting.Observations:

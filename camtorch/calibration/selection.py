@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.calibrate import INTRINSICS, Calibration, calibrate
+from camtorch._freezing import INTRINSICS
+from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.observations import Points, as_observations
 from camtorch.camera import MODELS, Camera
 

@@ -39,7 +39,12 @@ class Observations(NamedTuple):
 
 
 def fit(
-    camera: Camera, observations: Observations, starts: Tensor, slopes: Tensor, held: Collection[str] = ()
+    camera: Camera,
+    observations: Observations,
+    starts: Tensor,
+    slopes: Tensor,
+    held: Collection[str] = (),
+    fixed: Tensor | None = None,
 ) -> Tensor:
     """The parameters (C, 4 + n) at which a camera sees the pixels of the rays as nearly as it can.
 
@@ -51,6 +56,7 @@ def fit(
         starts: (S, C, n) coefficients to start from; of what becomes of them the best is kept.
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
         held: names of coefficients that stay as they start.
+        fixed: (4 + n,) values that parameters keep, NaN for those that are looked for.
     """
     results, scores = [], []
     tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
@@ -59,6 +65,8 @@ def fit(
         focal = slopes[:, :2] / slopes_at_axis(camera.optics, start).clamp(min=_LEAST_SLOPE)
         parameters = torch.cat((focal, slopes[:, 2:], start), -1)
         low, high = bounds(camera, parameters, held)
+        if fixed is not None:
+            low, high = (torch.where(fixed.isnan(), ends, fixed) for ends in (low, high))
         parameters = parameters.clamp(low, high)
         within = observations._replace(weights=torch.zeros_like(observations.weights))
         for _ in range(_ROUNDS):

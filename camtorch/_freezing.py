@@ -1,0 +1,80 @@
+"""Parameters of a camera that stay as they are, by name, while the others learn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+INTRINSICS = "fx", "fy", "cx", "cy"
+PREFIX = "_frozen_"
+"""Of the buffers of the values that stay: NaN where one learns. Derived cameras have none."""
+
+
+def with_frozen(tensor: Tensor, frozen: Tensor) -> Tensor:
+    """What learns from the Parameter, which weight decay and momentum may move, and the rest as it was frozen."""
+    return torch.where(frozen.isnan(), tensor, frozen)
+
+
+def frozen_names(camera: Camera) -> tuple[str, ...]:
+    """Of all frozen parameters."""
+    found = []
+    for tensor, names in _tensors_of(camera):
+        frozen = camera._buffers.get(PREFIX + tensor)
+        if frozen is not None:
+            kept = ~frozen.isnan().reshape(-1, len(names)).any(0)
+            found += [name for name, is_kept in zip(names, kept.tolist(), strict=True) if is_kept]
+    return tuple(found)
+
+
+def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
+    """Freeze, or let learn again, the parameters of these names; all of them for none."""
+    owner = f"{type(camera).__name__}.{'freeze' if frozen else 'unfreeze'}"
+    if camera.is_mixed:
+        raise TypeError(f"{owner}: a Mixed has no parameters of its own; freeze the cameras that it is made of")
+    known = [name for _, each in _tensors_of(camera) for name in each]
+    for name in names:
+        if name not in known:
+            raise ValueError(f"{owner}: {name!r} is no parameter; there are {', '.join(known)}")
+    for tensor, own in _tensors_of(camera):
+        chosen = [i for i, name in enumerate(own) if not names or name in names]
+        before = camera._buffers.get(PREFIX + tensor)
+        if not chosen or (before is None and not frozen):
+            continue
+        if "parametrizations" in camera._modules and tensor in camera.parametrizations:  # type: ignore[operator]
+            raise TypeError(f"{owner}: {tensor} is parametrized; torch's remove_parametrizations makes it plain first")
+        restore(camera)
+        values = getattr(camera, tensor).detach().clone()
+        now = torch.full_like(values, torch.nan) if before is None else before.clone()
+        now[..., chosen] = values[..., chosen] if frozen else torch.nan
+        if bool(now.isnan().all()):
+            del camera._buffers[PREFIX + tensor]
+        else:
+            camera.put(PREFIX + tensor, now)
+
+
+def restore(camera: Camera) -> None:
+    """Bring Parameters back to the frozen values, as they are about to be saved or to learn."""
+    for tensor in camera.tensor_names:
+        frozen, parameter = camera._buffers.get(PREFIX + tensor), camera._parameters.get(tensor)
+        if frozen is not None and isinstance(parameter, nn.Parameter):
+            with torch.no_grad():
+                parameter.copy_(with_frozen(parameter, frozen))
+
+
+def loaded(camera: Camera, metadata: dict[str, Any]) -> None:
+    """After a state was loaded: what is frozen has the values of the state, and what the state says is frozen too."""
+    names = {*frozen_names(camera), *metadata.get("frozen", ())}
+    for tensor in camera.tensor_names:
+        camera._buffers.pop(PREFIX + tensor, None)
+    if names:
+        freeze(camera, sorted(names), True)
+
+
+def _tensors_of(camera: Camera) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    return ("intrinsics", INTRINSICS), ("distortion", tuple(camera.distortion_names))

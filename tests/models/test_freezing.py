@@ -1,0 +1,129 @@
+"""Parameters that stay, by name: in gradients, under any optimizer, in copies and states, and in fits."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+from cameras import each_kind, spread
+
+import camtorch as ct
+
+
+def names_of(camera):
+    return ["fx", "cy", *camera.distortion_names[-1:]]
+
+
+def numbers(camera):
+    return torch.cat((camera.intrinsics, camera.distortion), -1).detach()
+
+
+def is_frozen(camera):
+    names = ("fx", "fy", "cx", "cy", *camera.distortion_names)
+    return torch.tensor([name in names_of(camera) for name in names])
+
+
+def loss(camera, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    rays = torch.randn(64, 3, generator=generator, dtype=camera.intrinsics.dtype) * 0.3 + torch.tensor([0.0, 0, 1])
+    pixels, valid = camera.project(rays)
+    return ((pixels - 100) ** 2)[valid].mean()
+
+
+@each_kind
+def test_what_is_frozen_has_no_gradient_and_the_rest_has_its_own(key):
+    plain, camera = spread(key), spread(key)
+    assert camera.freeze(*names_of(camera)) is camera
+    frozen = is_frozen(camera)
+    parts = [p for p in (camera.intrinsics, camera.distortion) if p.requires_grad]
+    for one in (plain, camera):
+        loss(one).backward()
+    want = torch.cat([p.grad for p in plain.parameters()])
+    found = torch.cat([p.grad for p in camera.parameters()])
+    assert parts
+    learns = ~frozen[: len(found)]
+    assert (found[~learns] == 0).all()
+    torch.testing.assert_close(found[learns], want[learns])
+
+
+@each_kind
+@pytest.mark.parametrize("make", [torch.optim.Adam, torch.optim.AdamW, torch.optim.SGD])
+def test_no_optimizer_moves_it(key, make):
+    camera = spread(key)
+    before = numbers(camera)
+    options = {"momentum": 0.9} if make is torch.optim.SGD else {}
+    optimizer = make(camera.parameters(), lr=1e-4, weight_decay=0.1, **options)
+    loss(camera).backward()  # momentum from before it was frozen
+    optimizer.step()
+    camera.freeze(*names_of(camera))
+    held = numbers(camera)
+    for _ in range(3):
+        optimizer.zero_grad()
+        loss(camera).backward()
+        optimizer.step()
+    frozen, now = is_frozen(camera), numbers(camera)
+    assert torch.equal(now[frozen], held[frozen])
+    assert (now != before)[:4][~frozen[:4]].all()
+    camera.unfreeze()
+    assert torch.equal(numbers(camera), now)
+
+
+def test_copies_pickles_and_states_keep_it():
+    camera = spread("kannala_brandt", torch.float32).freeze("fx", "k2")
+    with torch.no_grad():
+        camera._parameters["intrinsics"].mul_(1.1)  # as weight decay does
+    held = numbers(camera)
+    state = io.BytesIO()
+    torch.save(camera.state_dict(), state)
+    state.seek(0)
+    other = ct.KannalaBrandt([1.0, 1, 1, 1])
+    other.load_state_dict(torch.load(state))
+    for made in (copy.deepcopy(camera), pickle.loads(pickle.dumps(camera)), other):
+        assert torch.equal(numbers(made), held)
+        assert "frozen=(fx, k2)" in repr(made)
+    assert "frozen=(fx, k2)" in repr(copy.deepcopy(camera).to(torch.float64))
+    assert "frozen" not in repr(camera.resize(24, 32))
+    assert "frozen=(k2)" in repr(copy.deepcopy(camera).unfreeze("fx"))
+    # a state of one that was not frozen leaves it to the module
+    camera.load_state_dict(ct.KannalaBrandt([5.0, 6, 7, 8]).state_dict())
+    assert camera.fx == 5
+    assert "frozen=(fx, k2)" in repr(camera)
+
+
+@pytest.mark.parametrize(
+    ("camera", "error", "message"),
+    [
+        (lambda: ct.Pinhole([9.0, 9, 4, 4]), ValueError, "'k1' is no parameter; there are fx, fy, cx, cy"),
+        (lambda: ct.Mixed([spread("pinhole"), spread("fov")]), TypeError, "Mixed"),
+    ],
+)
+def test_what_cannot_be_frozen_is_refused(camera, error, message):
+    with pytest.raises(error, match=message):
+        camera().freeze("k1")
+
+
+def test_a_parametrized_tensor_is_refused():
+    camera = spread("kannala_brandt")
+    torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", ct.PositiveFocal())
+    with pytest.raises(TypeError, match="parametrized"):
+        camera.freeze("fx")
+    assert "frozen=(k1)" in repr(camera.freeze("k1"))
+
+
+def test_fits_hold_what_is_fixed_and_what_is_frozen():
+    truth = ct.KannalaBrandt([200.0, 210, 320, 240], [0.01, -0.002, 0.001, 0.0003], image_size=(480, 640)).double()
+    pixels = truth.pixel_grid()[::40, ::40].reshape(-1, 2).double()
+    rays = truth.unproject(pixels)[0].detach()
+    found = ct.fit("kannala_brandt", pixels, rays, image_size=(480, 640), fixed=("cx", "cy", "k3")).camera
+    assert (found.cx, found.cy, found.distortion[2]) == (319.5, 239.5, 0)
+    start = ct.KannalaBrandt([200.0, 205, 318, 240], [0.01, -0.002, 0.0, 0.0003], image_size=(480, 640)).double()
+    result = ct.fit(start.freeze("fx", "k1"), pixels, rays)
+    assert result.camera.fx == 200
+    assert result.camera.distortion[0] == start.distortion[0]
+    assert result.rms < 1e-9
+    assert result.camera.image_size == (480, 640)
+    with pytest.raises(ValueError, match="focal length is held"):
+        ct.fit("kannala_brandt", pixels, rays, fixed="fx")
+    with pytest.raises(ValueError, match="image_size"):
+        ct.fit("kannala_brandt", pixels, rays, fixed="cx")
